@@ -1,0 +1,189 @@
+"""Remove what does nothing: identities, dead code, repeated expressions, work on constants."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy.typing as npt
+import torch
+
+from ttscompile.ir.dataflow import reaching
+from ttscompile.ir.evaluate import Evaluator
+from ttscompile.ir.graph import Argument, Batch, Graph, Node, Ref, TensorType
+from ttscompile.ir.program import Pieces, Program
+
+from .base import Pass, PassResult
+
+Weights = dict[str, npt.NDArray[Any]]
+
+_SAME = frozenset("aten.clone aten.alias aten.detach aten.contiguous aten.lift_fresh_copy".split())
+_SAME_IF_OFF = frozenset("aten.dropout aten.feature_dropout aten.alpha_dropout".split())
+_SAME_IF_TYPE_KEPT = frozenset(
+    "aten.view aten.reshape aten._unsafe_view aten.flatten aten.expand aten.slice aten._to_copy aten.to aten.squeeze".split()
+)
+
+
+class CleanUp(Pass):
+    """Simplify every graph of the program.
+
+    Before::
+
+        %clone = aten.clone.default(%x)
+        %t     = aten.permute.default(%weight, [1, 0])
+        %y     = aten.matmul.default(%clone, %t)
+
+    After (``t`` is a new constant)::
+
+        %y     = aten.matmul.default(%x, %t)
+
+    Graph outputs keep their names, so pieces that are wired by name still fit together.
+    """
+
+    def call(self, program: Program) -> PassResult:
+        """Clean the denoiser, and the pieces if there are any."""
+        weights = dict(program.weights)
+        before = sum(len(g.nodes) for g in _all_graphs(program))
+        clean: Callable[[Graph], Graph] = lambda graph: clean_graph(graph, weights)  # noqa: E731
+        new = replace(program, denoiser=clean(program.denoiser))
+        if program.pieces is not None:
+            new = replace(new, pieces=_map_graphs(program.pieces, clean))
+        used = {name for graph in _all_graphs(new) for name in graph.constants}
+        kept = {name: value for name, value in weights.items() if name in used}
+        if list(_all_graphs(new)) == list(_all_graphs(program)) and kept.keys() == program.weights.keys():
+            return PassResult(program, modified=False)
+        after = sum(len(g.nodes) for g in _all_graphs(new))
+        return PassResult(replace(new, weights=kept), True, (f"{before} nodes became {after}",))
+
+
+def clean_graph(graph: Graph, weights: Weights) -> Graph:
+    """One graph, simplified; constants that it folds are added to ``weights``."""
+    return drop_dead(merge_repeated(fold_constants(drop_identities(graph), weights)))
+
+
+def drop_identities(graph: Graph) -> Graph:
+    """Replace the uses of operations that return their first argument."""
+    types = graph.types()
+    same: dict[str, str] = {}
+    nodes = []
+    for node in graph.nodes:
+        node = node.renamed(lambda name: same.get(name, name))
+        if node.name not in graph.outputs and _is_identity(node, types):
+            source = node.args[0]
+            assert isinstance(source, Ref)
+            same[node.name] = source.name
+        else:
+            nodes.append(node)
+    return replace(graph, nodes=tuple(nodes))
+
+
+def _is_identity(node: Node, types: dict[str, TensorType]) -> bool:
+    base = node.op.rsplit(".", 1)[0]
+    source = node.args[0] if node.args else None
+    if not isinstance(source, Ref) or len(node.types) != 1 or types.get(source.name) != node.type:
+        return False
+    if base in _SAME_IF_OFF:
+        return node.args[2] is False
+    return base in _SAME or base in _SAME_IF_TYPE_KEPT
+
+
+def fold_constants(graph: Graph, weights: Weights) -> Graph:
+    """Evaluate what depends on nothing but constants, unless its shape depends on the batch."""
+    types = graph.types()
+    known = set(graph.constants)
+    folded: list[Node] = []
+    for node in graph.nodes:
+        if all(name in known for name in node.refs()) and not _mentions_batch(node):
+            folded.append(node)
+            known.add(node.name)
+    if not folded:
+        return graph
+    rest = [n for n in graph.nodes if n.name not in known]
+    read = {name for n in rest for name in n.refs()} | set(graph.outputs)
+    wanted = tuple(n.name for n in folded if n.name in read and len(n.types) == 1)
+    # An output stays a node: pieces are wired by the names of outputs.
+    outputs = [n for n in folded if n.name in graph.outputs]
+    fragment = Graph({}, graph.constants, tuple(folded), wanted)
+    used = reaching(fragment, wanted)
+    tensors = {n: torch.from_numpy(weights[n]) for n in graph.constants if n in used}
+    fragment = replace(fragment, constants={n: t for n, t in graph.constants.items() if n in used},
+                       nodes=tuple(n for n in folded if n.name in used))
+    with torch.no_grad():
+        values = Evaluator(fragment, tensors)({})
+    constants = dict(graph.constants)
+    for name, value in zip(wanted, values, strict=True):
+        constants[name] = types[name]
+        weights[name] = value.contiguous().numpy().copy()
+    if outputs:
+        renamed = {n.name: f"{n.name}.constant" for n in outputs}
+        for old, new in renamed.items():
+            constants[new] = constants.pop(old)
+            weights[new] = weights.pop(old)
+            rest.append(Node(old, "aten.clone.default", (Ref(new),), (), (types[old],), "constant output"))
+        first = [n for n in rest if n.name in renamed]
+        rest = first + [n for n in rest if n.name not in renamed]
+    return replace(graph, constants=constants, nodes=tuple(rest))
+
+
+def _mentions_batch(node: Node) -> bool:
+    def inside(argument: Argument) -> bool:
+        if isinstance(argument, tuple):
+            return any(map(inside, argument))
+        return isinstance(argument, Batch)
+
+    return any(map(inside, node.args)) or any(inside(v) for _, v in node.kwargs)
+
+
+def merge_repeated(graph: Graph) -> Graph:
+    """Compute equal expressions once."""
+    seen: dict[tuple[object, ...], str] = {}
+    same: dict[str, str] = {}
+    nodes = []
+    for node in graph.nodes:
+        node = node.renamed(lambda name: same.get(name, name))
+        key = (node.op, node.args, node.kwargs, node.types)
+        # 1 == True == 1.0 in Python, so the key has to hold the types of the numbers as well
+        key = (*key, repr(node.args), repr(node.kwargs))
+        if key in seen and node.name not in graph.outputs:
+            same[node.name] = seen[key]
+        else:
+            seen.setdefault(key, node.name)
+            nodes.append(node)
+    return replace(graph, nodes=tuple(nodes))
+
+
+def drop_dead(graph: Graph) -> Graph:
+    """Drop nodes and constants that no output needs; inputs stay, they are the graph's signature."""
+    live = reaching(graph, graph.outputs)
+    return replace(
+        graph,
+        constants={n: t for n, t in graph.constants.items() if n in live},
+        nodes=tuple(n for n in graph.nodes if n.name in live),
+    )
+
+
+def _map_graphs(pieces: Pieces, function: Callable[[Graph], Graph]) -> Pieces:
+    return replace(
+        pieces,
+        condition=function(pieces.condition),
+        step=function(pieces.step) if pieces.step is not None else None,
+        stem=function(pieces.stem),
+        blocks=tuple(function(b) for b in pieces.blocks),
+        tail=function(pieces.tail),
+        pruner=function(pieces.pruner) if pieces.pruner is not None else None,
+    )
+
+
+def _all_graphs(program: Program) -> list[Graph]:
+    found = [program.denoiser]
+    if program.pieces is not None:
+        collected: list[Graph] = []
+
+        def collect(graph: Graph) -> Graph:
+            collected.append(graph)
+            return graph
+
+        _map_graphs(program.pieces, collect)
+        found += collected
+    return found

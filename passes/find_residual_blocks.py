@@ -1,0 +1,235 @@
+"""Find the residual blocks of a denoiser by dataflow: no module name, attribute name or hint is read."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from ttscompile.errors import NoResidualBlocksError
+from ttscompile.ir.dataflow import between, dominators, reachable_from
+from ttscompile.ir.flops import node_flops
+from ttscompile.ir.graph import Graph, Node, Ref, TensorType
+from ttscompile.ir.program import Block
+
+_ADD = "aten.add.Tensor"
+_SOFTMAX = ("aten.softmax.", "aten._softmax.", "aten._safe_softmax.")
+_SDPA = "aten.scaled_dot_product_attention."
+_MATMUL = ("aten.matmul.", "aten.bmm.", "aten.baddbmm.", "aten.einsum.")
+
+
+@dataclass(frozen=True)
+class BlockTable:
+    """The residual stream of a denoiser.
+
+    Attributes:
+        blocks: in the order of execution.
+        declined: additions and other values that were looked at and are no block of their own, each with its reason.
+    """
+
+    blocks: tuple[Block, ...]
+    declined: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Link:
+    """One addition ``result = stream + residual`` on the chain."""
+
+    stream: str
+    residual: str
+    result: str
+
+
+def find_residual_blocks(graph: Graph, sample: str) -> BlockTable:
+    """The chain of additions ``a_i = a_{i-1} + r_i`` through which everything goes from the sample to the output.
+
+    ``a_{i-1}`` has to be a value that every path from the sample to the output crosses (a dominator), and ``r_i`` has
+    to depend on it. Where the chain is broken between two dominators of the stream's type (a long skip, a value
+    that is added but does not depend on the stream, a normalisation of the stream itself), what lies between them is
+    one coarse block, whose residual is the difference.
+
+    Args:
+        graph: one evaluation of the denoiser.
+        sample: name of its noisy sample.
+
+    Raises:
+        NoResidualBlocksError: there is no such addition; names the node at which the search ended.
+    """
+    points = dominators(graph, [sample], graph.outputs)
+    if sample not in points:
+        raise NoResidualBlocksError(f"the output does not depend on the sample %{sample}.")
+    loop = reachable_from(graph, [sample])
+    links, declined = _links(graph, points, loop)
+    if not links:
+        producers = graph.producers()
+        end = producers.get(points[-2] if len(points) > 1 else points[-1])
+        where = f"%{end.name} = {end.op} ({end.source or 'source unknown'})" if end else f"%{points[-1]}"
+        raise NoResidualBlocksError(
+            "no residual block found: between the sample and the output no value a is updated as a + f(a)."
+            f" The search walked {len(points)} dominators and ended at {where}."
+            + "".join(f"\n  declined: {reason}" for reason in declined)
+            + "\nWithout residuals there is nothing to cache; this network cannot be made sparse by ttscompile."
+        )
+    links = _main_stream(graph, links, declined)
+    blocks = _chain(graph, points, links, declined)
+    return BlockTable(tuple(_number(graph, blocks)), tuple(declined))
+
+
+def _links(graph: Graph, points: Sequence[str], loop: set[str]) -> tuple[list[_Link], list[str]]:
+    types, on_path = graph.types(), set(points)
+    links, declined = [], []
+    for node in graph.nodes:
+        if node.op != _ADD or node.name not in loop:
+            continue
+        operands = [a.name for a in node.args if isinstance(a, Ref)]
+        where = f"%{node.name} ({node.source or 'source unknown'})"
+        streams = [o for o in operands if o in on_path and types[o] == node.type]
+        if node.name not in on_path:
+            if any(types[o] == node.type and o in loop for o in operands) and len(set(operands) & loop) == 2:
+                declined.append(f"{where}: another path to the output goes around it")
+            continue
+        if not streams:
+            declined.append(f"{where}: neither operand carries the stream with the shape of the sum, {node.type}")
+            continue
+        stream = streams[0]
+        others = [o for o in operands if o != stream]
+        if len(others) != 1:
+            declined.append(f"{where}: it adds a value to itself")
+        elif others[0] not in loop:
+            declined.append(f"{where}: the added %{others[0]} does not depend on the stream")
+        elif dict(node.kwargs).get("alpha", 1) != 1:
+            declined.append(f"{where}: it adds with a factor alpha")
+        elif types[others[0]] != node.type:
+            declined.append(f"{where}: the added {types[others[0]]} is broadcast to {node.type}")
+        else:
+            links.append(_Link(stream, others[0], node.name))
+    return links, declined
+
+
+def _main_stream(graph: Graph, links: list[_Link], declined: list[str]) -> list[_Link]:
+    """Keep the links of the type that carries most FLOPs: an embedding may have residuals of its own."""
+    types = graph.types()
+    work: Counter[TensorType] = Counter()
+    for link in links:
+        flops = sum(node_flops(n, types) for n in between(graph, link.stream, link.residual))
+        work[types[link.result]] += 1 + flops
+    main = work.most_common(1)[0][0]
+    for link in links:
+        if types[link.result] != main:
+            declined.append(f"%{link.result}: a residual of {types[link.result]}, beside the main stream of {main}")
+    return [link for link in links if types[link.result] == main]
+
+
+def _chain(graph: Graph, points: Sequence[str], links: list[_Link], declined: list[str]) -> list[Block]:
+    """Blocks from links, with coarse blocks over what lies between and around them."""
+    types = graph.types()
+    stream_type = types[links[0].result]
+    blocks: list[Block] = []
+
+    def add(stream: str, result: str, residual: str | None, reason: str = "") -> None:
+        nodes = between(graph, stream, residual if residual is not None else result)
+        kind = _kind(graph, nodes, stream)
+        blocks.append(Block(len(blocks), kind, stream, result, residual, stream_type, group=0, reason=reason))
+
+    cursor = links[0].stream
+    early = _first_of_type(points, types, stream_type, before=cursor)
+    if early is not None and _hides_residuals(graph, early, cursor, stream_type):
+        add(early, cursor, None, "the chain starts late: a skip connection goes around the additions before it")
+    for link in links:
+        if link.stream == cursor:
+            add(cursor, link.result, link.residual)
+        else:
+            gap = between(graph, cursor, link.stream)
+            add(cursor, link.result, None, f"the stream is changed by {_describe(gap)} before the addition")
+            declined.append(f"%{link.result}: merged with what comes before it; {blocks[-1].reason}")
+        cursor = link.result
+    late = _last_of_type(points, types, stream_type)
+    if late != cursor and _hides_residuals(graph, cursor, late, stream_type):
+        add(cursor, late, None, "the chain ends early: a skip connection goes around the additions after it")
+    return blocks
+
+
+def _first_of_type(
+    points: Sequence[str], types: dict[str, TensorType], wanted: TensorType, before: str
+) -> str | None:
+    for name in points:
+        if name == before:
+            return None
+        if types[name] == wanted:
+            return name
+    return None
+
+
+def _last_of_type(points: Sequence[str], types: dict[str, TensorType], wanted: TensorType) -> str:
+    return [name for name in points if types[name] == wanted][-1]
+
+
+def _hides_residuals(graph: Graph, start: str, stop: str, stream_type: TensorType) -> bool:
+    """Whether two values of the stream's type that depend on ``start`` are added or joined on the way to ``stop``."""
+    inside = between(graph, start, stop)
+    names = {n.name for n in inside} | {start}
+    types = graph.types()
+    return any(
+        node.op in (_ADD, "aten.cat.default")
+        and sum(types[o] == stream_type and o in names for o in dict.fromkeys(node.refs())) >= 2
+        for node in inside
+    )
+
+
+def _describe(nodes: Sequence[Node]) -> str:
+    first = nodes[0]
+    more = f" and {len(nodes) - 1} more" if len(nodes) > 1 else ""
+    return f"%{first.name} = {first.op} ({first.source or 'source unknown'}){more}"
+
+
+def _kind(graph: Graph, nodes: Sequence[Node], stream: str) -> str:
+    """``self_attention``, ``cross_attention``, ``feed_forward``, or a signature of the structure."""
+    types, producers = graph.types(), graph.producers()
+    inside = {n.name for n in nodes} | {stream}
+    attentions = []
+    for node in nodes:
+        if node.op.startswith(_SDPA):
+            keys = [a.name for a in node.args[1:2] if isinstance(a, Ref)]
+        elif node.op.startswith(_SOFTMAX):
+            keys = _key_operands(producers, node)
+        else:
+            continue
+        attentions.append("self_attention" if any(k in inside for k in keys) else "cross_attention")
+    if len(attentions) == 1 and not _convolves(nodes):
+        return attentions[0]
+    contractions = sum(node_flops(n, types) > 0 for n in nodes)
+    if not attentions and contractions and not _convolves(nodes):
+        return "feed_forward"
+    signature = hashlib.sha256("|".join(n.op for n in nodes).encode()).hexdigest()[:8]
+    shape = f"{len(attentions)}attention_" if attentions else ""
+    return f"{shape}{len(nodes)}ops_{signature}"
+
+
+def _convolves(nodes: Sequence[Node]) -> bool:
+    return any(n.op.startswith(("aten.conv", "aten.convolution")) for n in nodes)
+
+
+def _key_operands(producers: dict[str, Node], softmax: Node) -> list[str]:
+    """Second operand of the product of queries and keys above a softmax, through scaling, masking and views."""
+    pending = [a.name for a in softmax.args[:1] if isinstance(a, Ref)]
+    while pending:
+        node = producers.get(pending.pop())
+        if node is None:
+            continue
+        if node.op.startswith(_MATMUL):
+            return list(node.refs())[-1:]
+        pending.extend(node.refs())
+    return []
+
+
+def _number(graph: Graph, blocks: Sequence[Block]) -> list[Block]:
+    """Give every block its FORWARD group: the blocks of its kind and shape."""
+    groups: dict[tuple[str, TensorType], int] = {}
+    numbered = []
+    for block in blocks:
+        group = groups.setdefault((block.kind, block.type), len(groups))
+        numbered.append(
+            Block(block.index, block.kind, block.stream, block.result, block.residual, block.type, group, 0, block.reason)
+        )
+    return numbered

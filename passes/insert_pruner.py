@@ -1,0 +1,185 @@
+"""Add the pruner: a small head on the hoisted condition features that predicts the plan of a whole call."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from ttscompile.ir.dataflow import dominators
+from ttscompile.ir.flops import graph_flops, node_flops
+from ttscompile.ir.graph import Argument, Batch, Graph, Node, Ref, TensorType
+from ttscompile.ir.program import Binding, Program
+
+from .base import Pass, PassResult
+
+SOURCES = 4
+MASKED = -1e9
+"""Logit of a source that is illegal in a cell whatever the caches hold."""
+
+MAX_SHARE = 0.01
+"""The head may cost at most this share of the dense FLOPs."""
+
+
+@dataclass(frozen=True)
+class InsertPruner(Pass):
+    """Put a low-rank plan head on the features of the policy's own condition encoder.
+
+    Before::
+
+        pieces.condition : observations -> condition values
+
+    After::
+
+        features = flatten and normalise the last value that all condition values come from
+        code     = tanh(linear(gelu(linear(features))))                          # [B, rank]
+        logits   = pruner.base + (code * pruner.step) @ pruner.block + mask       # [B, K, blocks, 4]
+
+    What depends on step and block alone is a constant; only ``code`` depends on the observation. The plan is the
+    argmax over the sources. Before calibration it is dense.
+
+    Attributes:
+        rank: number of observation-dependent directions in the space of plans.
+        width: of the hidden layer.
+    """
+
+    rank: int = 16
+    width: int = 64
+
+    def requires(self, program: Program) -> None:
+        """The program is hoisted."""
+        if program.pieces is None or not program.pieces.bindings:
+            raise self.fail("the condition features are known only after hoist.")
+
+    def call(self, program: Program) -> PassResult:
+        """Build the head and choose its features."""
+        assert program.pieces is not None
+        condition, features = _features(program)
+        types = condition.types()
+        steps, blocks = program.spec.sampler.steps, len(program.blocks)
+        head = self._fitted([types[f] for f in features], steps, blocks, program.dense_flops)
+        parameters = head._parameters([types[f] for f in features], steps, blocks)
+        graph = head._head({f: types[f] for f in features}, parameters, steps, blocks)
+        pieces = replace(program.pieces, condition=condition, pruner=graph, features=features)
+        pieces = replace(pieces, bindings={**pieces.bindings, **dict.fromkeys(features, Binding.CONDITION)})
+        new = replace(program, pieces=pieces, weights={**program.weights, **parameters})
+        where = ", ".join(f"%{f} {types[f]}" for f in features)
+        share = graph_flops(graph) / max(program.dense_flops, 1)
+        notes = [f"reads {where}", f"rank {head.rank}, {graph_flops(graph):,} FLOPs, {share:.4%} of a dense call"]
+        if share > MAX_SHARE:
+            notes.append(f"more than {MAX_SHARE:.0%} even at its smallest: on a policy this small sparsity hardly pays")
+        return PassResult(new, True, tuple(notes))
+
+    def _fitted(self, features: Sequence[TensorType], steps: int, blocks: int, dense: int) -> InsertPruner:
+        """This head, halved until it costs at most ``MAX_SHARE`` of a dense call or cannot shrink."""
+        inputs = sum(math.prod(t.at(1)) for t in features)
+        head = self
+        while head.rank > 1:
+            contractions = inputs * head.width + head.width * head.rank + steps * head.rank * blocks * SOURCES
+            if 2 * contractions <= MAX_SHARE * dense:
+                break
+            head = InsertPruner(rank=head.rank // 2, width=max(head.width // 2, 4))
+        return head
+
+    def _parameters(
+        self, features: Sequence[TensorType], steps: int, blocks: int
+    ) -> dict[str, npt.NDArray[np.float32]]:
+        inputs = sum(math.prod(t.at(1)) for t in features)
+        draw = np.random.default_rng(0)
+
+        def normal(*shape: int, scale: float) -> npt.NDArray[np.float32]:
+            return (draw.standard_normal(shape) * scale).astype(np.float32)
+
+        base = np.zeros((steps, blocks, SOURCES), np.float32)
+        base[..., 0] = 4.0  # dense until calibrated: |tanh| <= 1 keeps the observation's part below this
+        mask = np.zeros_like(base)
+        mask[0, :, 1:] = MASKED
+        return {
+            "pruner.hidden.weight": normal(self.width, inputs, scale=inputs**-0.5),
+            "pruner.hidden.bias": np.zeros(self.width, np.float32),
+            "pruner.code.weight": normal(self.rank, self.width, scale=self.width**-0.5),
+            "pruner.code.bias": np.zeros(self.rank, np.float32),
+            "pruner.step": normal(steps, self.rank, scale=0.1),
+            "pruner.block": normal(self.rank, blocks * SOURCES, scale=0.1),
+            "pruner.base": base,
+            "pruner.mask": mask,
+        }
+
+    def _head(
+        self,
+        features: dict[str, TensorType],
+        parameters: dict[str, npt.NDArray[np.float32]],
+        steps: int,
+        blocks: int,
+    ) -> Graph:
+        nodes: list[Node] = []
+
+        def emit(name: str, op: str, shape: Sequence[int], *args: Argument) -> Ref:
+            type_ = TensorType((Batch(), *shape), "float32")
+            nodes.append(Node(f"plan.{name}", f"aten.{op}", args, (), (type_,), "plan head"))
+            return Ref(nodes[-1].name)
+
+        flat = []
+        for i, (name, type_) in enumerate(features.items()):
+            size = math.prod(type_.at(1))
+            value: Ref = Ref(name)
+            axis = type_.batch_axis
+            if axis:  # the batch first, whatever the layout of the encoder
+                shape = tuple(n for n in type_.at(1)[:axis] + type_.at(1)[axis + 1 :])
+                order = (axis, *(a for a in range(len(type_.shape)) if a != axis))
+                value = emit(f"batch_first{i}", "permute.default", shape, value, order)
+            flat.append(emit(f"flat{i}", "reshape.default", (size,), value, (Batch(), size)))
+        width = sum(math.prod(t.at(1)) for t in features.values())
+        joined = flat[0] if len(flat) == 1 else emit("joined", "cat.default", (width,), tuple(flat), 1)
+        normed = emit("normed", "layer_norm.default", (width,), joined, (width,))
+        hidden = emit("hidden", "linear.default", (self.width,), normed, _p("hidden.weight"), _p("hidden.bias"))
+        active = emit("active", "gelu.default", (self.width,), hidden)
+        code = emit("pre_code", "linear.default", (self.rank,), active, _p("code.weight"), _p("code.bias"))
+        code = emit("code", "tanh.default", (self.rank,), code)
+        code = emit("code_row", "unsqueeze.default", (1, self.rank), code, 1)
+        by_step = emit("by_step", "mul.Tensor", (steps, self.rank), code, _p("step"))
+        product = emit("product", "matmul.default", (steps, blocks * SOURCES), by_step, _p("block"))
+        cells = (steps, blocks, SOURCES)
+        shaped = emit("shaped", "reshape.default", cells, product, (Batch(), *cells))
+        based = emit("based", "add.Tensor", cells, shaped, _p("base"))
+        logits = emit("logits", "add.Tensor", cells, based, _p("mask"))
+        constants = {name: TensorType(value.shape, "float32") for name, value in parameters.items()}
+        return Graph(features, constants, tuple(nodes), (logits.name,))
+
+
+def _p(name: str) -> Ref:
+    return Ref(f"pruner.{name}")
+
+
+def _features(program: Program) -> tuple[Graph, tuple[str, ...]]:
+    """The condition graph and the values of it that the head reads.
+
+    The last value that everything the loop gets from the observation goes through and that some arithmetic has
+    produced is the output of the policy's condition encoder; without one the observations themselves are read.
+    """
+    pieces = program.pieces
+    assert pieces is not None
+    graph = pieces.condition
+    types, producers = graph.types(), graph.producers()
+    worked = False
+    chosen: str | None = None
+    by_flops = {n.name: node_flops(n, types) for n in graph.nodes}
+    for name in dominators(graph, graph.inputs, graph.outputs):
+        worked = worked or by_flops.get(name, 0) > 0
+        node = producers.get(name)
+        if worked and node is not None and len(node.types) == 1 and types[name].batch_axis is not None:
+            chosen = name
+    if chosen is not None:
+        outputs = graph.outputs if chosen in graph.outputs else (*graph.outputs, chosen)
+        return replace(graph, outputs=outputs), (chosen,)
+    nodes, outputs = list(graph.nodes), list(graph.outputs)
+    features = []
+    for key, type_ in graph.inputs.items():
+        name = f"{key}.feature"
+        nodes.append(Node(name, "aten.clone.default", (Ref(key),), (), (type_,), "feature of the plan head"))
+        outputs.append(name)
+        features.append(name)
+    return replace(graph, nodes=tuple(nodes), outputs=tuple(outputs)), tuple(features)

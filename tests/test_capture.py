@@ -1,0 +1,80 @@
+"""What capture refuses, and how it says so."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import nn
+
+from tests.passes.specs import toy_spec
+from ttscompile.capture import capture
+from ttscompile.errors import CaptureError
+from ttscompile.ir.graph import Batch, TensorType
+
+
+class Denoiser(nn.Module):
+    """A linear layer and then whatever the test wants."""
+
+    def __init__(self, then: Callable[[torch.Tensor, torch.Tensor, torch.Tensor], object]) -> None:
+        super().__init__()
+        self.linear, self.then = nn.Linear(2, 2), then
+
+    def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> object:
+        return self.then(self.linear(sample), timestep, obs)
+
+
+def test_batch_is_the_only_symbolic_size() -> None:
+    graph, weights = capture(Denoiser(lambda y, t, o: y + t.view(-1, 1, 1) * o[:, None, :2]), toy_spec())
+    assert list(graph.inputs) == ["sample", "timestep", "obs"]
+    assert graph.inputs["sample"] == TensorType((Batch(), 4, 2), "float32")
+    assert graph.inputs["timestep"] == TensorType((Batch(),), "int64")
+    assert set(weights) == {"linear.weight", "linear.bias"}
+    assert {n for node in graph.nodes for n in node.type.shape if isinstance(n, Batch)} == {Batch()}
+
+
+def test_multiples_of_the_batch_are_kept() -> None:
+    graph, _ = capture(Denoiser(lambda y, t, o: (y.reshape(-1, 2) * 2).reshape(y.shape)), toy_spec())
+    assert any(node.type.shape == (Batch(4), 2) for node in graph.nodes)
+
+
+def test_the_users_module_is_not_touched() -> None:
+    module = Denoiser(lambda y, t, o: y).double().train()
+    capture(module, toy_spec())
+    assert module.training and module.linear.weight.dtype is torch.float64
+
+
+@pytest.mark.parametrize(
+    ("then", "message"),
+    [
+        (lambda y, t, o: y if o.sum() > 0 else -y, "could not capture Denoiser"),
+        (lambda y, t, o: (y, y), "returns 2 values"),
+        (lambda y, t, o: y[:, :2], r"returns float32\[B, 2, 2\]; expected the type of its sample, float32\[B, 4, 2\]"),
+        (lambda y, t, o: y.double(), "returns float64"),
+        (lambda y, t, o: torch.cat([y, y, y[:1]])[: y.shape[0]], "not a multiple of the batch size"),
+    ],
+)
+def test_what_cannot_be_compiled_is_refused(then: Callable[..., object], message: str) -> None:
+    with pytest.raises(CaptureError, match=message):
+        capture(Denoiser(then), toy_spec())
+
+
+def test_state_that_changes_is_refused() -> None:
+    class Counter(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.count = nn.Buffer(torch.zeros(()))
+
+        def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
+            self.count.add_(1)
+            return sample + self.count
+
+    with pytest.raises(CaptureError, match="changes its own buffers"):
+        capture(Counter(), toy_spec())
+
+
+def test_messages_name_a_line_and_no_path() -> None:
+    graph, _ = capture(Denoiser(lambda y, t, o: y), toy_spec())
+    (node,) = [n for n in graph.nodes if n.op == "aten.linear.default"]
+    assert node.source.startswith("test_capture.py:") and "/" not in node.source

@@ -1,0 +1,214 @@
+"""Capture one evaluation of a denoiser as a graph: ``torch.export``, ATen level, weights lifted, batch symbolic."""
+
+from __future__ import annotations
+
+import copy
+import operator
+import re
+import warnings
+from collections.abc import Mapping
+from pathlib import PurePath
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import nn
+from torch.export.graph_signature import InputKind, OutputKind
+
+from .config import PolicySpec
+from .errors import CaptureError
+from .ir.graph import GETITEM, Argument, Batch, Enum, Graph, Node, Ref, Size, TensorType
+
+EXAMPLE_STREAMS = 3
+"""Batch size of the example inputs; neither 0 nor 1, which torch.export would specialise on."""
+
+_TORCH = PurePath(torch.__file__).parent
+_RESHAPE = "aten.reshape.default"
+_VIEWS = (torch.ops.aten.view.default, torch.ops.aten._unsafe_view.default)
+
+Weights = dict[str, npt.NDArray[np.generic]]
+
+
+def capture(module: nn.Module, spec: PolicySpec) -> tuple[Graph, Weights]:
+    """Capture ``module(sample, timestep, **observations)``, one denoising step, for any number of streams.
+
+    The module is copied, set to eval mode and to float32; the user's object is not touched.
+
+    Args:
+        module: takes ``spec.sample_argument`` float32 ``[B, T, D]``, ``spec.timestep_argument`` ``[B]`` of the dtype of
+            ``spec.sampler.timesteps`` and every observation ``[B, ...]`` by keyword; returns one tensor ``[B, T, D]``.
+        spec: the policy beside its network.
+
+    Returns:
+        The graph, whose inputs are sample, timestep and the observations in this order, and the value of each constant.
+
+    Raises:
+        CaptureError: torch.export failed, or the graph uses what the compiler cannot express; names the node.
+    """
+    module = copy.deepcopy(module).float().eval()
+    examples = _examples(spec)
+    batch = torch.export.Dim("B")
+    fastpath = torch.backends.mha.get_fastpath_enabled()
+    torch.backends.mha.set_fastpath_enabled(False)  # the fused encoder layer is opaque to every pass
+    try:
+        with warnings.catch_warnings():
+            # torch.export warns about its own use of a deprecated class
+            warnings.filterwarnings("ignore", message=".*LeafSpec.*", category=FutureWarning)
+            exported = torch.export.export(
+                module, (), kwargs=examples, dynamic_shapes={name: {0: batch} for name in examples}, strict=False
+            ).run_decompositions({})
+    except Exception as error:  # torch.export raises whatever the user's code or its own machinery raises
+        raise CaptureError(
+            f"torch.export could not capture {type(module).__name__}: {type(error).__name__}: {error}\n"
+            f"It was called with {', '.join(f'{n} {tuple(t.shape)} {t.dtype}' for n, t in examples.items())}."
+            " A denoiser must be one step (no sampling loop), without data-dependent control flow, for any batch size."
+        ) from error
+    finally:
+        torch.backends.mha.set_fastpath_enabled(fastpath)
+    return _Converter(exported, examples).convert(spec)
+
+
+def _examples(spec: PolicySpec) -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    examples = {
+        spec.sample_argument: torch.randn(EXAMPLE_STREAMS, *spec.sample, generator=generator),
+        spec.timestep_argument: torch.full(
+            (EXAMPLE_STREAMS,), spec.sampler.timesteps[0].item(), dtype=torch.from_numpy(spec.sampler.timesteps).dtype
+        ),
+    }
+    for key, observation in spec.observations.items():
+        value = torch.randn(EXAMPLE_STREAMS, *observation.shape, generator=generator)
+        examples[key] = value.to(getattr(torch, observation.dtype))
+    return examples
+
+
+class _Converter:
+    """From an exported program to ``Graph``; every symbolic size becomes a multiple of the batch size."""
+
+    def __init__(self, exported: torch.export.ExportedProgram, examples: Mapping[str, torch.Tensor]) -> None:
+        self.exported = exported
+        self.examples = examples
+        self.names: dict[torch.fx.Node, str] = {}
+        self.symbol: Any = None
+
+    def convert(self, spec: PolicySpec) -> tuple[Graph, Weights]:
+        signature = self.exported.graph_signature
+        kinds = {s.arg.name: s for s in signature.input_specs}
+        inputs: dict[str, TensorType] = {}
+        constants: dict[str, TensorType] = {}
+        weights: Weights = {}
+        nodes: list[Node] = []
+        state = {**self.exported.state_dict, **self.exported.constants}
+        placeholders = [n for n in self.exported.graph.nodes if n.op == "placeholder"]
+        users = [n for n in placeholders if kinds[n.name].kind is InputKind.USER_INPUT]
+        self.symbol = self._batch_symbol(users[0])
+        for fx_node, key in zip(users, self.examples, strict=True):
+            self.names[fx_node] = key
+            inputs[key] = self._type(fx_node, fx_node.meta["val"])
+        for fx_node in placeholders:
+            if fx_node in self.names:
+                continue
+            target = str(kinds[fx_node.name].target)
+            if not fx_node.users:
+                continue
+            self.names[fx_node] = target
+            constants[target] = self._type(fx_node, fx_node.meta["val"])
+            weights[target] = state[target].detach().cpu().contiguous().numpy().copy()
+        for fx_node in self.exported.graph.nodes:
+            if fx_node.op == "call_function" and (node := self._node(fx_node)) is not None:
+                nodes.append(node)
+        return Graph(inputs, constants, tuple(nodes), (self._output(spec, inputs),)), weights
+
+    def _batch_symbol(self, sample: torch.fx.Node) -> Any:
+        size = sample.meta["val"].shape[0]
+        if isinstance(size, int):
+            raise CaptureError(
+                f"the module works for a batch of {size} only: its code fixes the batch size. Take sizes from the inputs."
+            )
+        return size.node.expr
+
+    def _size(self, fx_node: torch.fx.Node, size: Any) -> Size:
+        if isinstance(size, int):
+            return size
+        expression = size.node.expr
+        if expression.is_Integer:
+            return int(expression)
+        multiple = expression / self.symbol
+        if not multiple.is_Integer:
+            raise CaptureError(
+                f"size {expression} at %{fx_node.name} ({_source(fx_node)}) is not a multiple of the batch size."
+                " Only the batch may vary; write the other sizes as numbers."
+            )
+        return Batch(int(multiple))
+
+    def _type(self, fx_node: torch.fx.Node, value: Any) -> TensorType:
+        return TensorType(tuple(self._size(fx_node, n) for n in value.shape), str(value.dtype).removeprefix("torch."))
+
+    def _node(self, fx_node: torch.fx.Node) -> Node | None:
+        value, target = fx_node.meta.get("val"), fx_node.target
+        if value is None or isinstance(value, torch.SymInt | torch.SymBool | int | bool):
+            return None  # sizes are solved by _size; assertions on them hold by construction
+        if target is operator.getitem:
+            op = GETITEM
+        elif isinstance(target, torch._ops.OpOverload) and target.namespace == "aten":
+            # Values have no strides here: a view of whatever layout is a reshape.
+            op = _RESHAPE if target in _VIEWS else str(target)
+        else:
+            raise CaptureError(
+                f"%{fx_node.name} ({_source(fx_node)}) calls {target}, which is no ATen operation."
+                " Replace the custom or higher-order operation (cond, scan, autocast region) by plain tensor code."
+            )
+        values = value if isinstance(value, tuple | list) else (value,)
+        self.names[fx_node] = fx_node.name
+        return Node(
+            name=fx_node.name,
+            op=op,
+            args=tuple(self._argument(fx_node, a) for a in fx_node.args),
+            kwargs=tuple((k, self._argument(fx_node, a)) for k, a in sorted(fx_node.kwargs.items())),
+            types=tuple(self._type(fx_node, v) for v in values),
+            source=_source(fx_node),
+        )
+
+    def _argument(self, fx_node: torch.fx.Node, argument: Any) -> Argument:
+        if isinstance(argument, torch.fx.Node):
+            if argument in self.names:
+                return Ref(self.names[argument])
+            return self._size(fx_node, argument.meta["val"])
+        if isinstance(argument, torch.SymInt):
+            return self._size(fx_node, argument)
+        if isinstance(argument, list | tuple):
+            return tuple(self._argument(fx_node, a) for a in argument)
+        if argument is None or isinstance(argument, bool | int | float | str):
+            return argument
+        for kind, cls in (("dtype", torch.dtype), ("memory_format", torch.memory_format), ("layout", torch.layout)):
+            if isinstance(argument, cls):
+                return Enum(kind, str(argument).removeprefix("torch."))
+        if isinstance(argument, torch.device):
+            return Enum("device", "cpu")  # the artifact runs where it is loaded
+        raise CaptureError(f"%{fx_node.name} ({_source(fx_node)}) has an argument of type {type(argument).__name__}.")
+
+    def _output(self, spec: PolicySpec, inputs: Mapping[str, TensorType]) -> str:
+        outputs = self.exported.graph_signature.output_specs
+        mutated = [o.target for o in outputs if o.kind is not OutputKind.USER_OUTPUT]
+        if mutated:
+            raise CaptureError(f"the module changes its own buffers {mutated} in a forward call; a denoiser must be pure.")
+        (output,) = [n for n in self.exported.graph.nodes if n.op == "output"]
+        results = output.args[0]
+        if len(results) != 1 or not isinstance(results[0], torch.fx.Node):
+            raise CaptureError(f"the module returns {len(results)} values; expected one tensor, the prediction.")
+        result: torch.fx.Node = results[0]
+        found, expected = self._type(result, result.meta["val"]), inputs[spec.sample_argument]
+        if found != expected:
+            raise CaptureError(f"the module returns {found}; expected the type of its sample, {expected}.")
+        return self.names[result]
+
+
+def _source(fx_node: torch.fx.Node) -> str:
+    """``file:line in function`` of the innermost frame outside torch; the file's name only, no path of this machine."""
+    frames = re.findall(r'File "([^"]+)", line (\d+), in (\S+)', fx_node.meta.get("stack_trace") or "")
+    own = [frame for frame in frames if not PurePath(frame[0]).is_relative_to(_TORCH)]
+    if not frames:
+        return "source unknown"
+    path, line, function = (own or frames)[-1]
+    return f"{PurePath(path).name}:{line} in {function}"

@@ -1,0 +1,46 @@
+"""Binding times: the earliest moment at which each value of a graph is known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from .graph import Argument, Batch, Graph, Node
+from .program import Binding
+
+_RANK = {Binding.CONSTANT: 0, Binding.TABLE: 1, Binding.CONDITION: 1, Binding.STEP: 2, Binding.LOOP: 3}
+
+
+def join(left: Binding, right: Binding) -> Binding:
+    """The binding of what depends on both: a table row and a condition make a step value."""
+    if left is not right and _RANK[left] == _RANK[right]:
+        return Binding.STEP
+    return left if _RANK[left] >= _RANK[right] else right
+
+
+def bindings(graph: Graph, inputs: Mapping[str, Binding]) -> dict[str, Binding]:
+    """Binding of every value.
+
+    A value without inputs whose shape has the batch in it (``zeros(B, 1, E)``) is no constant; it counts as a table,
+    whose rows are made for a batch of one.
+
+    Args:
+        graph: any graph.
+        inputs: binding of each of its inputs.
+    """
+    found = {**dict.fromkeys(graph.constants, Binding.CONSTANT), **inputs}
+    for node in graph.nodes:
+        binding = Binding.TABLE if _batch_shaped(node) else Binding.CONSTANT
+        read = [found[name] for name in node.refs()]
+        if any(b is not Binding.CONSTANT for b in read):
+            binding = Binding.CONSTANT  # the batch size comes with the inputs
+        for other in read:
+            binding = join(binding, other)
+        found[node.name] = binding
+    return found
+
+
+def _batch_shaped(node: Node) -> bool:
+    def inside(argument: Argument) -> bool:
+        return any(map(inside, argument)) if isinstance(argument, tuple) else isinstance(argument, Batch)
+
+    return any(map(inside, node.args)) or any(inside(v) for _, v in node.kwargs)

@@ -1,0 +1,60 @@
+"""Analyses of a graph: what depends on what, and through which values every path must go."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from .graph import Graph, Node
+
+
+def reachable_from(graph: Graph, sources: Iterable[str]) -> set[str]:
+    """Names of the values that depend on any of ``sources``, themselves included."""
+    reached = set(sources)
+    for node in graph.nodes:
+        if any(name in reached for name in node.refs()):
+            reached.add(node.name)
+    return reached
+
+
+def reaching(graph: Graph, targets: Iterable[str]) -> set[str]:
+    """Names of the values on which any of ``targets`` depends, themselves included."""
+    reached = set(targets)
+    for node in reversed(graph.nodes):
+        if node.name in reached:
+            reached.update(node.refs())
+    return reached
+
+
+def between(graph: Graph, start: str, stop: str) -> list[Node]:
+    """Nodes on some path from ``start`` (excluded) to ``stop`` (included), in order."""
+    forward, backward = reachable_from(graph, [start]), reaching(graph, [stop])
+    return [n for n in graph.nodes if n.name in forward and n.name in backward and n.name != start]
+
+
+def dominators(graph: Graph, sources: Iterable[str], sinks: Iterable[str]) -> list[str]:
+    """Values through which every path from ``sources`` to ``sinks`` goes, in order.
+
+    With several sources or sinks the paths from all of them to all of them count, so a source is listed only when it
+    is the only one, and likewise a sink.
+
+    In a topological order a value is such a point exactly if no edge on a live path jumps over it.
+    """
+    source_list, sink_list = list(sources), list(sinks)
+    live = reachable_from(graph, source_list) & reaching(graph, sink_list)
+    order = [s for s in source_list if s in live] + [n.name for n in graph.nodes if n.name in live]
+    position = {name: i for i, name in enumerate(order)}
+    last_use = dict.fromkeys(order, -1)
+    for node in graph.nodes:
+        if node.name in live:
+            for name in node.refs():
+                if name in live:
+                    last_use[name] = position[node.name]
+    for sink in sink_list:
+        last_use[sink] = len(order)  # an edge to a sink behind all of them
+    points, horizon = [], -1
+    first_inner = len(order) - len([n for n in graph.nodes if n.name in live])
+    for i, name in enumerate(order):
+        if horizon <= i and (i >= first_inner or first_inner == 1):
+            points.append(name)
+        horizon = max(horizon, last_use[name])
+    return points

@@ -1,0 +1,280 @@
+"""Run a graph with torch: literally, node by node, differentiable.
+
+This is what a graph *means*: passes are tested against it, the reference runtime and calibration run on it, and the
+ONNX models are checked against it.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Mapping
+from typing import Any, TypeAlias
+
+import torch
+
+from ..errors import CaptureError, ObservationError
+from .graph import GETITEM, Argument, Batch, Enum, Graph, Node, Ref, TensorType
+
+Frame: TypeAlias = list[Any]
+Getter: TypeAlias = Callable[[Frame, int], Any]
+
+# Functional by their schema, and yet not functions of their arguments: they read the machine.
+_REFUSED = frozenset({"aten.from_file.default"})
+
+# Tagged as random for the sake of their dropout argument, which is checked to be off.
+_RANDOM_ONLY_WITH_DROPOUT = {"aten.scaled_dot_product_attention.default": (4, "dropout_p"), "aten.dropout.default": (2, "train")}
+
+_ENUM_TYPES = {"dtype": torch.dtype, "memory_format": torch.memory_format, "layout": torch.layout}
+
+
+def resolve_op(node: Node) -> Callable[..., Any]:
+    """The function of a node: a functional ATen overload, or ``operator.getitem``.
+
+    Args:
+        node: its ``op`` is looked up below ``torch.ops.aten`` and nowhere else.
+
+    Raises:
+        CaptureError: no such operation, or one that changes its arguments, draws random numbers or reads files.
+    """
+    if node.op == GETITEM:
+        return operator.getitem
+    namespace, _, rest = node.op.partition(".")
+    packet_name, _, overload_name = rest.partition(".")
+    if namespace != "aten" or not packet_name.isidentifier() or not overload_name.isidentifier():
+        raise CaptureError(
+            f"operation {node.op!r} of {_where(node)} is not of the form aten.NAME.OVERLOAD."
+            " Only ATen operations can be compiled; express custom operators in ATen, or decompose them before export."
+        )
+    overload = getattr(getattr(torch.ops.aten, packet_name, None), overload_name, None)
+    if not isinstance(overload, torch._ops.OpOverload):
+        raise CaptureError(
+            f"operation {node.op!r} of {_where(node)} does not exist in torch {torch.__version__}."
+            " Compile the policy again with this version of torch, or install the version it was compiled with."
+        )
+    if overload._schema.is_mutable or node.op in _REFUSED:
+        raise CaptureError(
+            f"operation {node.op!r} of {_where(node)} is not a pure function of its arguments"
+            f" ({overload._schema}). Graphs hold functional operations only: capture the module again."
+        )
+    if torch.Tag.nondeterministic_seeded in overload.tags and not _dropout_is_off(node):
+        raise CaptureError(
+            f"operation {node.op!r} of {_where(node)} draws random numbers. All randomness of a policy must come from"
+            " its noise argument: call eval() on the module, and remove dropout and sampling inside the denoiser."
+        )
+    return overload
+
+
+def evaluate(
+    graph: Graph, weights: Mapping[str, torch.Tensor], inputs: Mapping[str, torch.Tensor]
+) -> tuple[torch.Tensor, ...]:
+    """Run ``graph`` once; see ``Evaluator`` for shapes, errors, and for running it many times."""
+    return Evaluator(graph, weights)(inputs)
+
+
+class Evaluator:
+    """A graph made callable: operations looked up and arguments laid out once.
+
+    The weights are held by reference, not copied: an optimiser's in-place update shows in the next call, and gradients
+    flow to them and to the inputs.
+
+    Args:
+        graph: what to run.
+        weights: value of each of the graph's constants, by name; others are ignored.
+        device: where device arguments inside the graph point. Weights and inputs must be there.
+
+    Raises:
+        CaptureError: an operation that ``resolve_op`` refuses, an argument that names no value, a constant that is
+            missing or does not have its type, or a symbolic size that no input can give a value.
+    """
+
+    def __init__(
+        self, graph: Graph, weights: Mapping[str, torch.Tensor], device: torch.device | str = "cpu"
+    ) -> None:
+        self._graph = graph
+        self._device = torch.device(device)
+        self._bound = any(isinstance(n, Batch) for t in graph.inputs.values() for n in t.shape)
+        self._slots: dict[str, int] = {}
+        for name in (*graph.inputs, *graph.constants):
+            self._slots[name] = len(self._slots)
+        self._constants = [_checked_constant(n, t, weights) for n, t in graph.constants.items()]
+        self._steps: list[tuple[Callable[[Frame, int], Any], tuple[int, ...]]] = []
+        dead = _dead_after(graph)
+        for node in graph.nodes:
+            call = self._compile(node)
+            if node.name in self._slots:
+                raise CaptureError(f"two values are called %{node.name}; the second is {_where(node)}.")
+            self._slots[node.name] = len(self._slots)
+            self._steps.append((call, tuple(self._slots[name] for name in dead[node.name])))
+        missing = [name for name in graph.outputs if name not in self._slots]
+        if missing:
+            raise CaptureError(f"outputs {missing} of the graph are values that nothing computes.")
+        self._outputs = tuple(self._slots[name] for name in graph.outputs)
+
+    def __call__(self, inputs: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
+        """Run the graph.
+
+        Args:
+            inputs: value of each of the graph's inputs, by name, of its type for some number of streams B; entries
+                that are no inputs are ignored, so that one environment can be given to several graphs.
+
+        Returns:
+            The outputs in the order of ``graph.outputs``.
+
+        Raises:
+            ObservationError: an input is missing, or has a dtype or shape that is not its type's, or sizes
+                contradict each other about B.
+            CaptureError: an operation fails on these values; names the node.
+        """
+        streams = bind_batch(self._graph.inputs, inputs)
+        frame: Frame = [inputs[name] for name in self._graph.inputs]
+        frame += self._constants
+        index = 0
+        try:
+            for call, dead in self._steps:
+                frame.append(call(frame, streams))
+                for slot in dead:
+                    frame[slot] = None
+                index += 1
+        except (RuntimeError, TypeError, ValueError, IndexError, NotImplementedError) as error:
+            node = self._graph.nodes[index]
+            raise CaptureError(f"{_where(node)} failed for {streams} streams: {error}") from error
+        return tuple(frame[slot] for slot in self._outputs)
+
+    def _compile(self, node: Node) -> Callable[[Frame, int], Any]:
+        """A closure that computes one node from the frame."""
+        function = resolve_op(node)
+        args, changing = self._layout(node, node.args)
+        names = tuple(name for name, _ in node.kwargs)
+        kwargs, changing_kwargs = self._layout(node, tuple(value for _, value in node.kwargs))
+
+        def call(frame: Frame, streams: int) -> Any:
+            values = args.copy()
+            for i, getter in changing:
+                values[i] = getter(frame, streams)
+            if not names:
+                return function(*values)
+            named = kwargs.copy()
+            for i, getter in changing_kwargs:
+                named[i] = getter(frame, streams)
+            return function(*values, **dict(zip(names, named, strict=True)))
+
+        return call
+
+    def _layout(self, node: Node, arguments: tuple[Argument, ...]) -> tuple[list[Any], list[tuple[int, Getter]]]:
+        """Arguments that never change, and getters of those that do, by position."""
+        fixed: list[Any] = []
+        changing: list[tuple[int, Getter]] = []
+        for i, argument in enumerate(arguments):
+            value, getter = self._argument(node, argument)
+            fixed.append(value)
+            if getter is not None:
+                changing.append((i, getter))
+        return fixed, changing
+
+    def _argument(self, node: Node, argument: Argument) -> tuple[Any, Getter | None]:
+        """Either a value, or a getter of a value that depends on the frame or on B."""
+        if isinstance(argument, Ref):
+            if argument.name not in self._slots:
+                raise CaptureError(f"{_where(node)} reads %{argument.name}, which nothing before it computes.")
+            slot = self._slots[argument.name]
+            return None, lambda frame, streams: frame[slot]
+        if isinstance(argument, Batch):
+            if not self._bound:
+                raise CaptureError(f"{_where(node)} has the size {argument}, but no input of the graph has a batch axis.")
+            multiple = argument.multiple
+            return None, lambda frame, streams: multiple * streams
+        if isinstance(argument, Enum):
+            return self._enum(node, argument), None
+        if isinstance(argument, tuple):
+            fixed, changing = self._layout(node, argument)
+            if not changing:
+                return fixed, None
+
+            def build(frame: Frame, streams: int) -> list[Any]:
+                values = fixed.copy()
+                for i, getter in changing:
+                    values[i] = getter(frame, streams)
+                return values
+
+            return None, build
+        return argument, None
+
+    def _enum(self, node: Node, argument: Enum) -> Any:
+        """The torch object that an enumeration names."""
+        if argument.kind == "device":
+            return self._device
+        value = getattr(torch, argument.name, None)
+        if argument.kind not in _ENUM_TYPES or not isinstance(value, _ENUM_TYPES[argument.kind]):
+            raise CaptureError(f"{_where(node)} has the argument {argument}; torch has no such {argument.kind}.")
+        return value
+
+
+def bind_batch(types: Mapping[str, TensorType], values: Mapping[str, torch.Tensor]) -> int:
+    """The number of streams B that makes ``values`` fit ``types``; 1 if no type depends on it.
+
+    Raises:
+        ObservationError: a value is missing, or does not fit; names it.
+    """
+    streams: int | None = None
+    origin = ""
+    for name, type_ in types.items():
+        value = values.get(name)
+        if value is None:
+            raise ObservationError(f"input {name!r} is missing; expected {type_}, found inputs {sorted(values)}.")
+        shape = tuple(value.shape)
+        if len(shape) != len(type_.shape) or value.dtype != getattr(torch, type_.dtype, None):
+            raise ObservationError(f"input {name!r} has type {_describe(value)}; expected {type_}.")
+        for axis, (found, expected) in enumerate(zip(shape, type_.shape, strict=True)):
+            if isinstance(expected, int):
+                if found != expected:
+                    raise ObservationError(
+                        f"input {name!r} has type {_describe(value)}; expected {type_}: axis {axis} differs."
+                    )
+                continue
+            count, rest = divmod(found, expected.multiple)
+            if rest or count < 1 or streams not in (None, count):
+                known = f" with B = {streams} from {origin!r}" if streams is not None else ""
+                raise ObservationError(
+                    f"input {name!r} has size {found} in axis {axis}; expected {expected}{known}. All inputs of a call"
+                    " must hold the same number of streams, at least one."
+                )
+            streams, origin = count, name
+    return 1 if streams is None else streams
+
+
+def _checked_constant(name: str, type_: TensorType, weights: Mapping[str, torch.Tensor]) -> torch.Tensor:
+    value = weights.get(name)
+    if value is None:
+        raise CaptureError(f"constant %{name} : {type_} of the graph has no value among the weights.")
+    if value.dtype != getattr(torch, type_.dtype, None) or tuple(value.shape) != type_.shape:
+        raise CaptureError(f"constant %{name} has type {_describe(value)}; the graph expects {type_}.")
+    return value
+
+
+def _dead_after(graph: Graph) -> dict[str, list[str]]:
+    """By node: the inputs and results that nothing reads after it. Constants stay."""
+    last = {node.name: node.name for node in graph.nodes}
+    for node in graph.nodes:
+        for name in node.refs():
+            last[name] = node.name
+    dead: dict[str, list[str]] = {node.name: [] for node in graph.nodes}
+    for name, reader in last.items():
+        if name not in graph.outputs and name not in graph.constants:
+            dead[reader].append(name)
+    return dead
+
+
+def _dropout_is_off(node: Node) -> bool:
+    if node.op not in _RANDOM_ONLY_WITH_DROPOUT:
+        return False
+    position, name = _RANDOM_ONLY_WITH_DROPOUT[node.op]
+    value = node.args[position] if len(node.args) > position else dict(node.kwargs).get(name, 0)
+    return value in (0, 0.0, False)
+
+
+def _where(node: Node) -> str:
+    return f"node {node}" + (f" ({node.source})" if node.source else "")
+
+
+def _describe(value: torch.Tensor) -> str:
+    return f"{str(value.dtype).removeprefix('torch.')}{list(value.shape)}"

@@ -1,0 +1,55 @@
+"""FLOPs of a graph: multiply and add counted as two, contractions only (element-wise work is not counted)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from ..errors import PassError
+from .graph import Graph, Node, Ref, TensorType
+
+_ELEMENTWISE_FREE = 0
+
+
+def _shape(types: Mapping[str, TensorType], argument: object) -> tuple[int, ...]:
+    assert isinstance(argument, Ref)
+    return types[argument.name].at(1)
+
+
+def node_flops(node: Node, types: Mapping[str, TensorType]) -> int:
+    """FLOPs of one node for one stream.
+
+    Raises:
+        PassError: an einsum whose equation cannot be read.
+    """
+    base = node.op.split(".")[1] if node.op.startswith("aten.") else node.op
+    if base in ("linear", "mm", "matmul", "bmm"):
+        contracted = _shape(types, node.args[0])[-1]
+        return 2 * math.prod(node.type.at(1)) * contracted
+    if base in ("addmm", "baddbmm"):
+        return 2 * math.prod(node.type.at(1)) * _shape(types, node.args[1])[-1]
+    if base == "scaled_dot_product_attention":
+        query, key, value = (_shape(types, a) for a in node.args[:3])
+        return 2 * math.prod(query[:-1]) * key[-2] * (query[-1] + value[-1])
+    if base.startswith("conv") or base == "convolution":
+        weight = _shape(types, node.args[1])
+        return 2 * math.prod(node.type.at(1)) * math.prod(weight[1:])
+    if base == "einsum":
+        return _einsum_flops(node, types)
+    return _ELEMENTWISE_FREE
+
+
+def _einsum_flops(node: Node, types: Mapping[str, TensorType]) -> int:
+    equation, operands = node.args[0], node.args[1]
+    if not isinstance(equation, str) or not isinstance(operands, tuple) or "." in equation:
+        raise PassError(f"cannot count the FLOPs of {node}: write the einsum without an ellipsis.")
+    sizes: dict[str, int] = {}
+    for term, operand in zip(equation.replace(" ", "").split("->")[0].split(","), operands, strict=True):
+        sizes.update(zip(term, _shape(types, operand), strict=True))
+    return 2 * math.prod(sizes.values())
+
+
+def graph_flops(graph: Graph) -> int:
+    """FLOPs of one evaluation of the graph for one stream."""
+    types = graph.types()
+    return sum(node_flops(node, types) for node in graph.nodes)

@@ -1,0 +1,204 @@
+"""The graph of a denoiser, and of every piece it is cut into: ATen operations on named values.
+
+A ``Graph`` is immutable and knows no torch. The batch size is the only symbolic size: ``Batch(c)`` stands for
+``c * B``, so that every piece runs on any number of streams. Weights are named constants, kept beside the graph.
+
+    Graph(inputs=(h,), constants=(w, b), outputs=(linear,))
+      %linear : float32[B, 16, 64] = aten.linear.default(%h, %w, %b)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import TypeAlias, Union
+
+
+@dataclass(frozen=True)
+class Batch:
+    """The symbolic size ``multiple * B``, B being the number of streams in a batch."""
+
+    multiple: int = 1
+
+    def __str__(self) -> str:
+        return "B" if self.multiple == 1 else f"{self.multiple}*B"
+
+
+Size: TypeAlias = Union[int, Batch]
+
+
+@dataclass(frozen=True)
+class Ref:
+    """A use of the value ``name``: an input, a constant or the result of a node."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class Enum:
+    """A torch enumeration as an argument: ``Enum("dtype", "float32")``, ``Enum("memory_format", "contiguous_format")``."""
+
+    kind: str
+    name: str
+
+
+Argument: TypeAlias = Union[None, bool, int, float, str, Batch, Ref, Enum, "tuple[Argument, ...]"]
+
+
+@dataclass(frozen=True)
+class TensorType:
+    """Shape and dtype (numpy name) of a value."""
+
+    shape: tuple[Size, ...]
+    dtype: str
+
+    @property
+    def batch_axis(self) -> int | None:
+        """The axis of size exactly ``B``; None if there is none."""
+        return self.shape.index(Batch()) if Batch() in self.shape else None
+
+    def at(self, streams: int) -> tuple[int, ...]:
+        """The concrete shape for this number of streams."""
+        return tuple(n.multiple * streams if isinstance(n, Batch) else n for n in self.shape)
+
+    def __str__(self) -> str:
+        return f"{self.dtype}[{', '.join(map(str, self.shape))}]"
+
+
+GETITEM = "getitem"
+"""The one operation that is not ATen's: ``getitem(node, i)`` takes the i-th result of a node with several."""
+
+
+@dataclass(frozen=True)
+class Node:
+    """One operation.
+
+    Attributes:
+        name: of its result, unique in the graph.
+        op: full ATen name, ``aten.linear.default``, or ``getitem``.
+        args: positional arguments; values are ``Ref``, lists are tuples.
+        kwargs: keyword arguments, sorted by name.
+        types: one type a result; a node with one result has one.
+        source: where it comes from in the user's code (``file:line``), for messages; never written to an artifact.
+    """
+
+    name: str
+    op: str
+    args: tuple[Argument, ...]
+    kwargs: tuple[tuple[str, Argument], ...]
+    types: tuple[TensorType, ...]
+    source: str = ""
+
+    @property
+    def type(self) -> TensorType:
+        """Type of the only result."""
+        return self.types[0]
+
+    def refs(self) -> Iterator[str]:
+        """Names of the values that it reads, with repetitions, in order."""
+        yield from _refs(self.args)
+        for _, value in self.kwargs:
+            yield from _refs(value)
+
+    def renamed(self, rename: Callable[[str], str]) -> Node:
+        """The same operation on other values; its own name is kept."""
+        return replace(
+            self,
+            args=tuple(_rename(a, rename) for a in self.args),
+            kwargs=tuple((k, _rename(a, rename)) for k, a in self.kwargs),
+        )
+
+    def __str__(self) -> str:
+        args = [_show(a) for a in self.args] + [f"{k}={_show(a)}" for k, a in self.kwargs]
+        types = ", ".join(map(str, self.types))
+        return f"%{self.name} : {types} = {self.op}({', '.join(args)})"
+
+
+@dataclass(frozen=True)
+class Graph:
+    """A straight-line function.
+
+    Attributes:
+        inputs: name and type of each input, in order.
+        constants: name and type of each weight; their values live in the program's ``weights``.
+        nodes: in topological order.
+        outputs: names of values.
+    """
+
+    inputs: Mapping[str, TensorType]
+    constants: Mapping[str, TensorType]
+    nodes: tuple[Node, ...]
+    outputs: tuple[str, ...]
+
+    def types(self) -> dict[str, TensorType]:
+        """Type of every value; of a node with several results the type of the first."""
+        return {**self.inputs, **self.constants, **{n.name: n.type for n in self.nodes}}
+
+    def producers(self) -> dict[str, Node]:
+        """Node by the name of its result."""
+        return {n.name: n for n in self.nodes}
+
+    def users(self) -> dict[str, list[Node]]:
+        """Nodes that read each value, in order; a value nobody reads has an empty list."""
+        users: dict[str, list[Node]] = {name: [] for name in self.types()}
+        for node in self.nodes:
+            for name in dict.fromkeys(node.refs()):
+                users[name].append(node)
+        return users
+
+    def __str__(self) -> str:
+        lines = ["inputs    " + ", ".join(f"%{n} : {t}" for n, t in self.inputs.items())]
+        lines += ["constants " + ", ".join(f"%{n} : {t}" for n, t in self.constants.items())]
+        lines += ["  " + str(node) for node in self.nodes]
+        lines += ["outputs   " + ", ".join(f"%{n}" for n in self.outputs)]
+        return "\n".join(lines)
+
+
+def backward_slice(graph: Graph, outputs: tuple[str, ...], stops: Mapping[str, TensorType]) -> Graph:
+    """The part of ``graph`` that computes ``outputs`` from ``stops`` and constants.
+
+    Inputs of the result are the stops that it reads, in the order of ``stops``, and then inputs of ``graph``.
+    """
+    producers = graph.producers()
+    needed: set[str] = set()
+    pending = list(outputs)
+    while pending:
+        name = pending.pop()
+        if name in needed:
+            continue
+        needed.add(name)
+        if name in producers and name not in stops:
+            pending.extend(producers[name].refs())
+    candidates = {**stops, **graph.inputs}
+    return Graph(
+        inputs={n: t for n, t in candidates.items() if n in needed},
+        constants={n: t for n, t in graph.constants.items() if n in needed and n not in stops},
+        nodes=tuple(n for n in graph.nodes if n.name in needed and n.name not in stops),
+        outputs=outputs,
+    )
+
+
+def _refs(argument: Argument) -> Iterator[str]:
+    if isinstance(argument, Ref):
+        yield argument.name
+    elif isinstance(argument, tuple):
+        for item in argument:
+            yield from _refs(item)
+
+
+def _rename(argument: Argument, rename: Callable[[str], str]) -> Argument:
+    if isinstance(argument, Ref):
+        return Ref(rename(argument.name))
+    if isinstance(argument, tuple):
+        return tuple(_rename(item, rename) for item in argument)
+    return argument
+
+
+def _show(argument: Argument) -> str:
+    if isinstance(argument, Ref):
+        return f"%{argument.name}"
+    if isinstance(argument, tuple):
+        return "[" + ", ".join(map(_show, argument)) + "]"
+    if isinstance(argument, Enum):
+        return argument.name
+    return str(argument)

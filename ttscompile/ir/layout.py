@@ -1,0 +1,320 @@
+"""Move reshapes and transpositions out of the way of arithmetic, so that a small graph is mostly arithmetic.
+
+Attention modules are written with the batch in the middle, heads folded into the batch, and so on: twenty
+operations that only move data, around four that compute. Each costs about as much as a normalisation when the tensors
+are 16 x 256. Moving operations are not executed where they stand; they are remembered as a description of the value
+(which factors of which computed value, in which order), composed, and executed where an operation needs the result.
+Token-wise operations do not: a linear layer of transposed tokens is the transposed linear layer.
+
+Before::
+
+    %t : [16, B, 256] = aten.transpose.int(%h, 1, 0)
+    %l : [16, B, 64]  = aten.linear.default(%t, %w, %b)
+    %y : [B, 16, 64]  = aten.transpose.int(%l, 1, 0)
+
+After (two dimensions, as a matrix product wants them)::
+
+    %r : [16*B, 256]  = aten.reshape.default(%h, [16*B, 256])
+    %l : [16*B, 64]   = aten.linear.default(%r, %w, %b)
+    %y : [B, 16, 64]  = aten.reshape.default(%l, [B, 16, 64])
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+from .graph import Argument, Batch, Graph, Node, Ref, Size, TensorType
+
+_RESHAPES = frozenset(
+    "aten.reshape.default aten.view.default aten._unsafe_view.default aten.unsqueeze.default aten.squeeze.default"
+    " aten.squeeze.dim aten.squeeze.dims aten.flatten.using_ints aten.unflatten.int aten.clone.default"
+    " aten.alias.default aten.contiguous.default".split()
+)
+_ELEMENTWISE = frozenset(
+    "aten.gelu.default aten.relu.default aten.silu.default aten.mish.default aten.tanh.default aten.sigmoid.default"
+    " aten.elu.default aten.leaky_relu.default aten.softplus.default aten.hardtanh.default aten.neg.default"
+    " aten.exp.default aten.sin.default aten.cos.default aten.sqrt.default aten.rsqrt.default aten.abs.default"
+    " aten.clamp.default aten.pow.Tensor_Scalar aten.add.Tensor aten.add.Scalar aten.sub.Tensor aten.sub.Scalar"
+    " aten.mul.Tensor aten.mul.Scalar aten.div.Tensor aten.div.Scalar".split()
+)
+
+
+@dataclass(frozen=True)
+class _Atom:
+    """A factor of a size; two atoms are the same if they are the same object's number."""
+
+    number: int
+    size: Size
+
+
+@dataclass(frozen=True)
+class _View:
+    """A value as a rearrangement of a computed one.
+
+    Attributes:
+        base: the computed value.
+        order: its factors in memory order; none of size 1.
+        dims: the factors of each of this value's axes, outermost first.
+        picks: factors of the base at which one index was selected.
+    """
+
+    base: str
+    order: tuple[_Atom, ...]
+    dims: tuple[tuple[_Atom, ...], ...]
+    picks: tuple[tuple[_Atom, int], ...] = ()
+
+
+def sink_layout(graph: Graph) -> Graph:
+    """The same function with moving operations composed and delayed; inputs, constants and outputs keep their names.
+
+    Constants that are not read any more are dropped.
+    """
+    return _Sinker(graph).run()
+
+
+class _Sinker:
+    """State of one rewrite: the new nodes, and what is known of values whose nodes are not written."""
+
+    def __init__(self, graph: Graph) -> None:
+        self.graph = graph
+        self.types: dict[str, TensorType] = {**graph.inputs, **graph.constants}
+        self.taken = set(graph.types())
+        self.views: dict[str, _View] = {}
+        self.nodes: list[Node] = []
+        self.written: dict[tuple[str, str], str] = {}
+        self.numbers = 0
+        self.source = ""
+
+    def run(self) -> Graph:
+        for node in self.graph.nodes:
+            self.source = node.source
+            view = self.moved(node) or self.sunk(node)
+            if view is not None:
+                self.views[node.name] = view
+            else:
+                self.keep(node)
+        nodes = self.named_outputs()
+        read = {name for node in nodes for name in node.refs()} | set(self.graph.outputs)
+        constants = {n: t for n, t in self.graph.constants.items() if n in read}
+        return Graph(self.graph.inputs, constants, nodes, self.graph.outputs)
+
+    def moved(self, node: Node) -> _View | None:
+        """The view that a moving operation makes; None for another operation or an inexpressible view."""
+        if not node.args or not isinstance(node.args[0], Ref) or len(node.types) != 1:
+            return None
+        name, rank = node.args[0].name, len(self.type_of(node.args[0].name).shape)
+        if node.op in _RESHAPES and node.type.dtype == self.type_of(name).dtype:
+            return self.regrouped(self.view(name), node.type.shape)
+        match node.op, node.args:
+            case "aten.permute.default", (_, tuple(axes)):
+                return _permuted(self.view(name), [a % rank for a in axes if isinstance(a, int)])
+            case "aten.transpose.int", (_, int(a), int(b)):
+                axes = list(range(rank))
+                axes[a % rank], axes[b % rank] = axes[b % rank], axes[a % rank]
+                return _permuted(self.view(name), axes)
+            case "aten.t.default", _:
+                return _permuted(self.view(name), list(reversed(range(rank))))
+            case "aten.select.int", (_, int(axis), int(index)):
+                return _selected(self.view(name), axis % rank, index)
+        return None
+
+    def sunk(self, node: Node) -> _View | None:
+        """The view of an operation that was done before its argument's move; None if it has to be done after."""
+        refs = list(node.refs())
+        if not refs or not isinstance(node.args[0], Ref) or refs[0] != node.args[0].name or len(node.types) != 1:
+            return None
+        view = self.view(refs[0])
+        if node.op == "aten.linear.default" and len(view.dims) > 1 and refs[0] not in self.graph.constants:
+            return self.tokenwise(node, view)
+        if node.op == "aten.layer_norm.default" and not self.is_plain(view):
+            shape = node.args[1]
+            return self.tokenwise(node, view) if isinstance(shape, tuple) and len(shape) == 1 else None
+        if node.op in _ELEMENTWISE and len(refs) == 1 and not view.picks and not self.is_plain(view):
+            type_ = TensorType(self.types[view.base].shape, node.type.dtype)
+            return replace(view, base=self.write(node.op, (Ref(view.base), *node.args[1:]), type_, node.kwargs))
+        return None
+
+    def tokenwise(self, node: Node, view: _View) -> _View | None:
+        """An operation on the last axis alone, done on ``[tokens, channels]``, tokens in the order of the base."""
+        channels = view.dims[-1]
+        picked = {atom for atom, _ in view.picks}
+        tokens = tuple(a for a in view.order if a not in channels and a not in picked)
+        if product(a.size for a in tokens) is None:
+            return None
+        flat = self.compute(view, (tokens, channels))
+        rest = tuple(Ref(self.compute_name(a.name)) if isinstance(a, Ref) else a for a in node.args[1:])
+        last = self.atoms(node.type.shape[-1:])[0]
+        type_ = TensorType((self.types[flat].shape[0], node.type.shape[-1]), node.type.dtype)
+        base = self.write(node.op, (Ref(flat), *rest), type_, node.kwargs)
+        return _View(base, tokens + last, (*view.dims[:-1], last))
+
+    def keep(self, node: Node) -> None:
+        """Write the node as it is, on computed arguments."""
+        if len(node.types) == 1:
+            self.types[node.name] = node.type
+        self.nodes.append(node.renamed(self.compute_name))
+
+    def named_outputs(self) -> tuple[Node, ...]:
+        """The nodes, with outputs that were views computed and called by their names."""
+        names: dict[str, str] = {}
+        own = {node.name for node in self.graph.nodes} | set(self.graph.inputs) | set(self.graph.constants)
+        for output in self.graph.outputs:
+            if output not in self.views:
+                continue
+            computed = self.compute_name(output)
+            if computed in names or computed in own:
+                self.nodes.append(Node(output, "aten.clone.default", (Ref(computed),), (), (self.types[computed],)))
+            else:
+                names[computed] = output
+        rename = lambda name: names.get(name, name)  # noqa: E731
+        return tuple(replace(node.renamed(rename), name=rename(node.name)) for node in self.nodes)
+
+    def type_of(self, name: str) -> TensorType:
+        if name in self.views:
+            view = self.views[name]
+            sizes = [product(a.size for a in dim) for dim in view.dims]
+            return TensorType(tuple(s for s in sizes if s is not None), self.types[view.base].dtype)
+        return self.types.get(name, TensorType((), ""))
+
+    def view(self, name: str) -> _View:
+        if name in self.views:
+            return self.views[name]
+        dims = self.atoms(self.type_of(name).shape)
+        return _View(name, tuple(a for dim in dims for a in dim), dims)
+
+    def is_plain(self, view: _View) -> bool:
+        """Whether it is the base itself."""
+        sizes = tuple(product(a.size for a in dim) for dim in view.dims)
+        flat = tuple(a for dim in view.dims for a in dim)
+        return flat == view.order and sizes == self.types[view.base].shape
+
+    def atoms(self, shape: Sequence[Size]) -> tuple[tuple[_Atom, ...], ...]:
+        """New atoms, one an axis, none for an axis of size 1."""
+        dims: list[tuple[_Atom, ...]] = []
+        for size in shape:
+            self.numbers += 1
+            dims.append(() if size == 1 else (_Atom(self.numbers, size),))
+        return tuple(dims)
+
+    def regrouped(self, view: _View, shape: Sequence[Size]) -> _View | None:
+        """A reshape: the same factors in the same order, split where an axis ends inside one."""
+        pending = deque(a for dim in view.dims for a in dim)
+        split: dict[_Atom, tuple[_Atom, ...]] = {}
+        dims: list[tuple[_Atom, ...]] = []
+        for size in shape:
+            dim: list[_Atom] = []
+            need = size
+            while need != 1:
+                if not pending:
+                    return None
+                atom = pending.popleft()
+                rest = ratio(need, atom.size)
+                if rest is None:
+                    inner = ratio(atom.size, need)
+                    if inner is None:
+                        return None
+                    (outer,), (remainder,) = self.atoms((need, inner))
+                    split[atom] = (outer, remainder)
+                    pending.appendleft(remainder)
+                    atom, rest = outer, 1
+                dim.append(atom)
+                need = rest
+            dims.append(tuple(dim))
+        return None if pending else _View(view.base, _split(view.order, split), tuple(dims), view.picks)
+
+    def compute_name(self, name: str) -> str:
+        """The computed value of this name, written now if it was only described."""
+        return self.compute(self.views[name], self.views[name].dims) if name in self.views else name
+
+    def compute(self, view: _View, groups: tuple[tuple[_Atom, ...], ...]) -> str:
+        """Write what turns the base into axes of these groups of atoms: reshape, select, permute, reshape."""
+        shape = tuple(size for size in (product(a.size for a in g) for g in groups) if size is not None)
+        target = [a for g in groups for a in g]
+        chunks = _chunks(view.order, target, {a for a, _ in view.picks})
+        wanted = sorted((c for c in chunks if c[0] in target), key=lambda c: target.index(c[0]))
+        name = view.base
+        if chunks != wanted:
+            name = self.write_reshape(name, tuple(product(a.size for a in c) or 1 for c in chunks))
+            for atom, index in view.picks:
+                axis = next(i for i, c in enumerate(chunks) if c[0] == atom)
+                chunks.pop(axis)
+                sizes = self.types[name].shape
+                type_ = replace(self.types[name], shape=sizes[:axis] + sizes[axis + 1 :])
+                name = self.write("aten.select.int", (Ref(name), axis, index), type_)
+            axes = tuple(chunks.index(c) for c in wanted)
+            if axes != tuple(range(len(axes))):
+                type_ = replace(self.types[name], shape=tuple(self.types[name].shape[a] for a in axes))
+                name = self.write("aten.permute.default", (Ref(name), axes), type_)
+        return self.write_reshape(name, shape)
+
+    def write_reshape(self, name: str, shape: tuple[Size, ...]) -> str:
+        if self.types[name].shape == shape:
+            return name
+        return self.write("aten.reshape.default", (Ref(name), shape), replace(self.types[name], shape=shape))
+
+    def write(
+        self, op: str, args: tuple[Argument, ...], type_: TensorType, kwargs: tuple[tuple[str, Argument], ...] = ()
+    ) -> str:
+        """A node, or the one that was written before with the same arguments; its name."""
+        key = (op, repr((args, kwargs)))
+        if key not in self.written:
+            name = f"{op.split('.')[1]}_l{len(self.written)}"
+            while name in self.taken:
+                name += "_"
+            self.taken.add(name)
+            self.types[name] = type_
+            self.nodes.append(Node(name, op, args, kwargs, (type_,), self.source))
+            self.written[key] = name
+        return self.written[key]
+
+
+def product(sizes: Iterable[Size]) -> Size | None:
+    """Product of sizes; None if it is not a number or a multiple of B."""
+    number, batches = 1, 0
+    for size in sizes:
+        number *= size.multiple if isinstance(size, Batch) else size
+        batches += isinstance(size, Batch)
+    return None if batches > 1 else Batch(number) if batches else number
+
+
+def ratio(a: Size, b: Size) -> Size | None:
+    """``a / b`` if that is a positive number or a multiple of B, whatever B is; else None."""
+    numerator, denominator = (s.multiple if isinstance(s, Batch) else s for s in (a, b))
+    if denominator < 1 or numerator < 1 or numerator % denominator:
+        return None
+    if isinstance(a, Batch):
+        return numerator // denominator if isinstance(b, Batch) else Batch(numerator // denominator)
+    return None if isinstance(b, Batch) else numerator // denominator
+
+
+def _permuted(view: _View, axes: Sequence[int]) -> _View:
+    return replace(view, dims=tuple(view.dims[a] for a in axes))
+
+
+def _selected(view: _View, axis: int, index: int) -> _View | None:
+    atoms = view.dims[axis]
+    dims = view.dims[:axis] + view.dims[axis + 1 :]
+    if not atoms:
+        return replace(view, dims=dims)
+    if len(atoms) > 1 or not isinstance(atoms[0].size, int):
+        return None
+    return replace(view, dims=dims, picks=(*view.picks, (atoms[0], index % atoms[0].size)))
+
+
+def _split(atoms: Sequence[_Atom], split: dict[_Atom, tuple[_Atom, ...]]) -> tuple[_Atom, ...]:
+    return tuple(b for a in atoms for b in (_split(split[a], split) if a in split else (a,)))
+
+
+def _chunks(order: Sequence[_Atom], target: Sequence[_Atom], picked: set[_Atom]) -> list[tuple[_Atom, ...]]:
+    """The factors of the base, those that stay neighbours in the target merged."""
+    chunks: list[tuple[_Atom, ...]] = []
+    for atom in order:
+        if chunks and atom not in picked and chunks[-1][-1] not in picked:
+            follows = target.index(atom) == target.index(chunks[-1][-1]) + 1
+            if follows and product(a.size for a in (*chunks[-1], atom)) is not None:
+                chunks[-1] = (*chunks[-1], atom)
+                continue
+        chunks.append((atom,))
+    return chunks

@@ -1,0 +1,209 @@
+"""Plans on the lattice of steps and blocks: what a cell reads, what is legal, what it costs.
+
+Everything here is numpy and pure. ``docs/design.md`` section 2 has the semantics in words; the reference runtime
+executes them literally, and ``origins`` is the same meaning solved ahead of time, for lowering.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from .errors import IllegalPlanError
+
+IntArray = npt.NDArray[np.int64]
+PlanArray = npt.NDArray[np.int8]
+BoolArray = npt.NDArray[np.bool_]
+
+
+class Source(enum.IntEnum):
+    """Where the residual of one cell comes from."""
+
+    COMPUTE = 0
+    FORWARD = 1
+    TIMESTEP = 2
+    ROLLOUT = 3
+
+
+UNWRITTEN = -1
+"""In ``origins``: the cell reads a residual that was never computed."""
+
+
+@dataclass(frozen=True)
+class Origins:
+    """Which computed residual every cell adds.
+
+    Attributes:
+        cell: int64 ``[K, blocks]``; flat index ``k * blocks + b`` of the cell of *this* call whose computed residual
+            is added, or ``UNWRITTEN``. For a cell in ``rollout`` it is the index of the rollout entry instead.
+        rollout: bool ``[K, blocks]``; the cell reads the rollout cache of an earlier call.
+    """
+
+    cell: IntArray
+    rollout: BoolArray
+
+
+def check_plan(plan: npt.ArrayLike, steps: int, blocks: int, streams: int) -> PlanArray:
+    """Validate the shape and values of a plan and give it a row per stream.
+
+    Args:
+        plan: ``[K, blocks]`` or ``[B, K, blocks]`` of ``Source``, any integer dtype.
+        steps: K.
+        blocks: number of residual blocks.
+        streams: B.
+
+    Returns:
+        int8 ``[B, K, blocks]``, contiguous.
+
+    Raises:
+        IllegalPlanError: wrong dtype, shape or values.
+    """
+    array = np.asarray(plan)
+    if array.dtype.kind not in "iu":
+        raise IllegalPlanError(
+            f"plan has dtype {array.dtype}; expected an integer array of ttscompile.Source. Use plan.astype(np.int8)."
+        )
+    if array.ndim == 2:
+        array = np.broadcast_to(array, (streams, *array.shape))
+    if array.shape != (streams, steps, blocks):
+        raise IllegalPlanError(
+            f"plan has shape {np.shape(plan)}; expected [K, blocks] = ({steps}, {blocks}) or"
+            f" [B, K, blocks] = ({streams}, {steps}, {blocks})."
+        )
+    if array.size and (array.min() < 0 or array.max() > 3):
+        raise IllegalPlanError(
+            f"plan holds values {int(array.min())}..{int(array.max())}; expected ttscompile.Source, 0..3."
+        )
+    return np.ascontiguousarray(array, dtype=np.int8)
+
+
+def _last_computed(computed: BoolArray, index: IntArray) -> IntArray:
+    """Running maximum along axis 0 of the indices of computed cells, exclusive of the row itself."""
+    running = np.maximum.accumulate(np.where(computed, index, UNWRITTEN), axis=0)
+    return np.concatenate([np.full_like(running[:1], UNWRITTEN), running[:-1]])
+
+
+def origins(plan: PlanArray, groups: Sequence[int]) -> Origins:
+    """Resolve every cell of one stream's plan to the computed residual that it adds.
+
+    Args:
+        plan: int8 ``[K, blocks]``.
+        groups: for each block the number of its FORWARD group (one kind and one shape).
+
+    Returns:
+        The origins; cells that read nothing have ``UNWRITTEN``. Rollout cells are resolved to their own index
+        whether or not the rollout cache holds them: that depends on the episode.
+    """
+    steps, blocks = plan.shape
+    own = np.arange(steps * blocks, dtype=np.int64).reshape(steps, blocks)
+    computed = plan == Source.COMPUTE
+    timestep = _last_computed(computed, own)
+    forward = np.empty_like(own)
+    group_of = np.asarray(groups)
+    for group in np.unique(group_of):
+        members = np.flatnonzero(group_of == group)
+        flat = _last_computed(computed[:, members].reshape(-1), own[:, members].reshape(-1))
+        forward[:, members] = flat.reshape(steps, len(members))
+    cell = np.where(computed, own, UNWRITTEN)
+    cell = np.where(plan == Source.TIMESTEP, timestep, cell)
+    cell = np.where(plan == Source.FORWARD, forward, cell)
+    rollout = plan == Source.ROLLOUT
+    return Origins(cell=np.where(rollout, own, cell), rollout=rollout)
+
+
+def illegal_cells(plan: PlanArray, groups: Sequence[int], written: BoolArray) -> BoolArray:
+    """Cells of one stream's plan that may not be executed.
+
+    Args:
+        plan: int8 ``[K, blocks]``.
+        groups: FORWARD group of each block.
+        written: bool ``[K, blocks]``; rollout entries that an earlier call of the episode computed.
+
+    Returns:
+        bool ``[K, blocks]``: a reuse in step 0, or a read of a residual that was never computed.
+    """
+    resolved = origins(plan, groups)
+    illegal: BoolArray = np.where(resolved.rollout, ~written, resolved.cell == UNWRITTEN)
+    illegal[0] |= plan[0] != Source.COMPUTE
+    return illegal
+
+
+def require_legal(plans: PlanArray, groups: Sequence[int], written: BoolArray) -> None:
+    """Raise if any stream's plan is illegal.
+
+    Args:
+        plans: int8 ``[B, K, blocks]``.
+        groups: FORWARD group of each block.
+        written: bool ``[B, K, blocks]``.
+
+    Raises:
+        IllegalPlanError: names the first cell, and how many there are.
+    """
+    for stream, (plan, cells) in enumerate(zip(plans, written, strict=True)):
+        bad = np.argwhere(illegal_cells(plan, groups, cells))
+        if len(bad):
+            step, block = (int(i) for i in bad[0])
+            what = (
+                "step 0 must be dense"
+                if step == 0
+                else f"its {Source(int(plan[step, block])).name} residual was never computed"
+            )
+            raise IllegalPlanError(
+                f"plan of stream {stream} is illegal at step {step}, block {block} ({what});"
+                f" {len(bad)} illegal cells in all. Pass it through ttscompile.legalize first, or use plan='dense'"
+                " for the first call after reset()."
+            )
+
+
+def legalize(plan: PlanArray, groups: Sequence[int], written: BoolArray) -> tuple[PlanArray, int]:
+    """Replace illegal reads: step 0 becomes COMPUTE, ROLLOUT becomes TIMESTEP, anything still unread COMPUTE.
+
+    Pure: neither argument is changed. Works on one plan or on one a stream.
+
+    Args:
+        plan: int8 ``[K, blocks]`` or ``[B, K, blocks]``.
+        groups: FORWARD group of each block.
+        written: bool, of the plan's shape; the rollout entries that exist.
+
+    Returns:
+        A legal plan of the same shape, and the number of cells that were replaced.
+    """
+    plan = np.asarray(plan, dtype=np.int8)
+    if plan.ndim == 3:
+        pairs = [legalize(one, groups, cells) for one, cells in zip(plan, written, strict=True)]
+        return np.stack([p for p, _ in pairs]), sum(n for _, n in pairs)
+    legal = plan.copy()
+    legal[0] = Source.COMPUTE
+    legal[(legal == Source.ROLLOUT) & ~written] = Source.TIMESTEP
+    # With step 0 dense every TIMESTEP and FORWARD read after it is written, so one sweep is enough.
+    return legal, int(np.count_nonzero(legal != plan))
+
+
+def dense_plan(steps: int, blocks: int) -> PlanArray:
+    """The plan that computes everything, int8 ``[K, blocks]``."""
+    return np.full((steps, blocks), Source.COMPUTE, dtype=np.int8)
+
+
+def uniform_plan(steps: int, blocks: int, full_steps: int) -> PlanArray:
+    """Every block computed at ``full_steps`` evenly spaced steps (step 0 among them), TIMESTEP elsewhere.
+
+    Returns:
+        int8 ``[K, blocks]``.
+    """
+    plan = np.full((steps, blocks), Source.TIMESTEP, dtype=np.int8)
+    plan[np.unique(np.floor(np.arange(full_steps) * steps / full_steps).astype(int))] = Source.COMPUTE
+    return plan
+
+
+def sparsity(plan: PlanArray) -> float:
+    """Share of the cells that are not COMPUTE."""
+    return float(np.mean(plan != Source.COMPUTE))
+
+
+def plan_flops(plan: PlanArray, block_flops: npt.ArrayLike) -> float:
+    """FLOPs of the computed cells of one plan ``[K, blocks]``, given FLOPs of one evaluation of each block."""
+    return float(((plan == Source.COMPUTE) * np.asarray(block_flops, dtype=np.float64)).sum())
