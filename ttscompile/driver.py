@@ -40,6 +40,7 @@ def convert(
     format: str = "auto",
     sampler: str | None = None,
     steps: int | None = None,
+    spacing: str | None = None,
     explain: Explain = _silent,
 ) -> Program:
     """Compile a trained policy and write the artifact; its plan is dense until it is calibrated.
@@ -50,12 +51,13 @@ def convert(
         format: ``auto`` or ``diffusion_policy``.
         sampler: ``ddpm`` or ``ddim`` in place of the checkpoint's own; None keeps it.
         steps: number of denoising steps; None keeps the checkpoint's.
+        spacing: ``leading``, ``trailing`` or ``linspace``: which timesteps fewer steps visit; None keeps the checkpoint's.
         explain: told what each stage did.
 
     Raises:
         TtscompileError: the checkpoint is refused, its network cannot be compiled, or the artifact cannot be written.
     """
-    module, spec = load_checkpoint_policy(checkpoint, format=format, sampler=sampler, steps=steps)
+    module, spec = load_checkpoint_policy(checkpoint, format=format, sampler=sampler, steps=steps, spacing=spacing)
     return compile_denoiser(module, spec, directory, explain=explain)
 
 

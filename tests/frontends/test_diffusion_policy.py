@@ -1,0 +1,349 @@
+"""Configuration to policy: variants, sizes, samplers, and every way in which configuration and weights can disagree."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from diffusers.schedulers.scheduling_ddim import DDIMScheduler
+
+from ttscompile.errors import CheckpointError, SpecError
+from ttscompile.frontends import load_checkpoint_policy
+from ttscompile.samplers import sampler_table
+
+Build = Callable[..., dict[str, Any]]
+Save = Callable[[dict[str, Any]], Path]
+
+VARIANTS: list[tuple[str, bool, dict[str, Any]]] = [
+    ("token-wise condition encoder", True, {}),
+    ("token-wise condition encoder", True, {"causal_attn": False, "n_layer": 2, "n_emb": 24, "n_head": 3}),
+    ("token-wise condition encoder", True, {"causal_attn": False, "n_obs_steps": None}),
+    ("transformer condition encoder", True, {"n_cond_layers": 2}),
+    ("inpainting", False, {}),
+    ("inpainting", False, {"n_cond_layers": 1, "causal_attn": False}),
+    ("encoder-only", False, {"time_as_cond": False}),
+    ("encoder-only", False, {"time_as_cond": False, "causal_attn": False}),
+]
+
+
+@pytest.mark.parametrize(("variant", "as_cond", "model"), VARIANTS)
+def test_variants(payload: Build, save: Save, variant: str, as_cond: bool, model: dict[str, Any]) -> None:
+    """Each loads, says what it is, and predicts the same for streams together and alone."""
+    module, spec = load_checkpoint_policy(save(payload(as_cond, **model)))
+    assert spec.source == {
+        "format": "diffusion_policy",
+        "policy": "DiffusionTransformerLowdimPolicy",
+        "variant": variant,
+        "weights": "ema_model",
+    }
+    assert spec.sample == (6, 3 if as_cond else 8)
+    assert spec.observations["obs"].shape == (2, 5)
+    assert (spec.chunk.action_dim, spec.chunk.start, spec.chunk.stop) == (3, 1, 4)
+    assert not module.training
+    x, obs, t = torch.randn(3, *spec.sample), torch.randn(3, 2, 5), torch.tensor([19, 7, 0])
+    with torch.inference_mode():
+        together = module(x, t, obs)
+        alone = torch.cat([module(x[i : i + 1], t[i : i + 1], obs[i : i + 1]) for i in range(3)])
+        moved = [module(x, (t + 1) % 20, obs), module(x, t, obs + 1)]
+    torch.testing.assert_close(together, alone, rtol=1e-5, atol=1e-5)
+    assert together.shape == x.shape
+    assert all((together - other).abs().max() > 1e-3 for other in moved)
+
+
+def test_causal_masks_hold(payload: Build, save: Save) -> None:
+    """Token t sees the sample up to t and the observations up to t; without causal_attn it sees all."""
+    for causal in (True, False):
+        module, _ = load_checkpoint_policy(save(payload(True, causal_attn=causal)))
+        x, obs, t = torch.randn(1, 6, 3), torch.randn(1, 2, 5), torch.tensor([3])
+        late_x, late_obs = x.clone(), obs.clone()
+        late_x[:, 4] += 1
+        late_obs[:, 1] += 1
+        with torch.inference_mode():
+            before = module(x, t, obs)
+            changed_x = (module(late_x, t, obs) - before).abs().amax(dim=(0, 2)) > 1e-6
+            changed_obs = (module(x, t, late_obs) - before).abs().amax(dim=(0, 2)) > 1e-6
+        assert changed_x.tolist() == ([False] * 4 + [True] * 2 if causal else [True] * 6)
+        assert changed_obs.tolist() == ([False] + [True] * 5 if causal else [True] * 6)
+
+
+def test_pred_action_steps_only(payload: Build, save: Save) -> None:
+    """The sample is the executed steps alone, and all of it is executed."""
+    built = payload(True, causal_attn=False)
+    built["cfg"]["policy"]["pred_action_steps_only"] = True
+    module, spec = load_checkpoint_policy(save(built))
+    assert spec.sample == (3, 3)
+    assert (spec.chunk.start, spec.chunk.stop) == (0, 3)
+    assert module(torch.randn(2, 3, 3), torch.tensor([1, 2]), torch.randn(2, 2, 5)).shape == (2, 3, 3)
+
+
+def test_chunk_ends_with_the_horizon(payload: Build, save: Save) -> None:
+    """More action steps than are left after the observations: the original's slice is cut, and so is ours."""
+    built = payload()
+    built["cfg"]["policy"]["n_action_steps"] = 8
+    assert load_checkpoint_policy(save(built))[1].chunk.stop == 6
+
+
+def test_interpolated_configuration_is_the_same_policy(payload: Build, save: Save) -> None:
+    """As a fork may save it: unresolved, with the original's own expressions."""
+    built = payload()
+    expected = load_checkpoint_policy(save(built))[0].state_dict()
+    config = built["cfg"]
+    config |= {"obs_dim": 5, "action_dim": 3, "obs_as_cond": True, "horizon": 6, "run": "${now:%Y}"}
+    config["policy"] |= {"obs_dim": "${obs_dim}", "horizon": "${horizon}", "obs_as_cond": "${obs_as_cond}"}
+    config["policy"]["model"] |= {
+        "input_dim": "${eval:'${action_dim} if ${obs_as_cond} else ${obs_dim} + ${action_dim}'}",
+        "output_dim": "${policy.model.input_dim}",
+        "cond_dim": "${eval:'${obs_dim} if ${obs_as_cond} else 0'}",
+    }
+    found = load_checkpoint_policy(save(built))[0].state_dict()
+    assert found.keys() == expected.keys()
+    assert all(torch.equal(found[key], expected[key]) for key in found)
+    config["policy"]["model"]["n_emb"] = "${oc.env:WIDTH}"
+    with pytest.raises(CheckpointError, match=r"cfg\.policy\.model\.n_emb is '\$\{oc\.env:WIDTH\}'"):
+        load_checkpoint_policy(save(built))
+
+
+# Weights
+
+
+def test_wanted_weights_are_missing(payload: Build, save: Save) -> None:
+    """The other ones are taken, and it is said; nothing is said where the configuration does not choose."""
+    built = payload()
+    del built["state_dicts"]["ema_model"]
+    with pytest.warns(UserWarning, match=r"asks for the weights 'ema_model'.*using 'model'"):
+        assert load_checkpoint_policy(save(built))[1].source["weights"] == "model"
+    del built["cfg"]["training"]["use_ema"]
+    assert load_checkpoint_policy(save(built))[1].source["weights"] == "model"
+    built["state_dicts"] = {"optimizer": {}}
+    with pytest.raises(CheckpointError, match=r"state_dicts holds \['optimizer'\]"):
+        load_checkpoint_policy(save(built))
+
+
+def test_half_precision_is_loaded_as_float32(payload: Build, save: Save) -> None:
+    """Masks included, whose -inf survives."""
+    built = payload()
+    built["state_dicts"]["ema_model"] = {k: v.half() for k, v in built["state_dicts"]["ema_model"].items()}
+    module, _ = load_checkpoint_policy(save(built))
+    assert {value.dtype for value in module.state_dict().values()} == {torch.float32}
+    assert module.get_buffer("model.mask")[0, 1] == -math.inf
+
+
+@pytest.mark.parametrize(
+    "key", ["model.head.bias", "model.decoder.layers.0.norm3.weight", "model.mask", "model.cond_obs_emb.weight"]
+)
+def test_missing_weights_are_named(payload: Build, save: Save, key: str) -> None:
+    """Any one of them."""
+    built = payload()
+    del built["state_dicts"]["ema_model"][key]
+    with pytest.raises(CheckpointError, match=rf"missing {key}\."):
+        load_checkpoint_policy(save(built))
+
+
+@pytest.mark.parametrize(
+    "key", ["model.extra.weight", "obs_encoder.weight", "normalizer.other", "model.decoder.layers.1.norm3.weight"]
+)
+def test_extra_weights_are_named(payload: Build, save: Save, key: str) -> None:
+    """A network with more in it is another network."""
+    built = payload()
+    built["state_dicts"]["ema_model"][key] = torch.zeros(8)
+    with pytest.raises(CheckpointError, match=rf"unexpected {key}\."):
+        load_checkpoint_policy(save(built))
+
+
+def test_many_missing_weights_are_counted(payload: Build, save: Save) -> None:
+    """The message stays readable."""
+    built = payload()
+    built["cfg"]["policy"]["model"]["n_layer"] = 3
+    with pytest.raises(CheckpointError, match=r"missing model\.decoder\.layers\.1\.\S+,.* and 30 more\."):
+        load_checkpoint_policy(save(built))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("model.head.bias", torch.zeros(4), r"model\.head\.bias has shape \(4,\); expected \(3,\)"),
+        ("model.head.bias", torch.tensor([0.0, math.nan, math.inf]), r"model\.head\.bias holds 2 values that are not"),
+        ("model.head.bias", torch.zeros(3, dtype=torch.int64), r"model\.head\.bias is a torch\.int64 tensor"),
+        ("model.head.bias", [0.0, 0.0, 0.0], r"model\.head\.bias is a list"),
+        ("model.mask", torch.zeros(6, 6), r"model\.mask is not the causal mask"),
+        ("normalizer.params_dict.obs.scale", torch.tensor([1.0, 1, 0, 1, 1]), r"obs\.scale is .* no zero"),
+        ("normalizer.params_dict.action.offset", torch.tensor([1.0, math.nan, 0]), r"action\.offset is .* finite"),
+        ("normalizer.params_dict.obs.offset", torch.zeros(10), r"obs\.offset has shape \(10,\).* 5 channels"),
+    ],
+)
+def test_wrong_weights_are_refused(payload: Build, save: Save, key: str, value: Any, message: str) -> None:
+    """Shape, type, and values that are not finite; masks hold -inf and are compared instead."""
+    built = payload()
+    built["state_dicts"]["ema_model"][key] = value
+    with pytest.raises(CheckpointError, match=message):
+        load_checkpoint_policy(save(built))
+
+
+def test_normalizer(payload: Build, save: Save) -> None:
+    """Scale and offset reach observation and action; a single entry stands for all channels; none is an error."""
+    built = payload()
+    weights = built["state_dicts"]["ema_model"]
+    _, spec = load_checkpoint_policy(save(built))
+    for affine, key in ((spec.observations["obs"].normalizer, "obs"), (spec.chunk.normalizer, "action")):
+        assert affine is not None
+        np.testing.assert_array_equal(affine.scale, weights[f"normalizer.params_dict.{key}.scale"].numpy())
+        np.testing.assert_array_equal(affine.offset, weights[f"normalizer.params_dict.{key}.offset"].numpy())
+    weights["normalizer.params_dict.obs.scale"] = torch.tensor([2.0])
+    affine = load_checkpoint_policy(save(built))[1].observations["obs"].normalizer
+    assert affine is not None
+    assert affine.scale.tolist() == [2.0] * 5
+    del weights["normalizer.params_dict.action.scale"]
+    with pytest.raises(CheckpointError, match=r"no normalizer\.params_dict\.action\.scale"):
+        load_checkpoint_policy(save(built))
+
+
+# Configuration
+
+
+@pytest.mark.parametrize(
+    ("target", "message"),
+    [
+        ("diffusion_policy.policy.diffusion_unet_lowdim_policy.DiffusionUnetLowdimPolicy", "a U-Net: its denoiser is"),
+        ("diffusion_policy.policy.diffusion_unet_image_policy.DiffusionUnetImagePolicy", "a U-Net: its denoiser is"),
+        (
+            "diffusion_policy.policy.diffusion_transformer_hybrid_image_policy.DiffusionTransformerHybridImagePolicy",
+            "image encoder is not supported.*compile_denoiser",
+        ),
+        ("diffusion_policy.policy.bet_lowdim_policy.BETLowdimPolicy", "the policy is BETLowdimPolicy; expected"),
+    ],
+)
+def test_other_policies_are_refused_by_name(payload: Build, save: Save, target: str, message: str) -> None:
+    """With what can be done about it."""
+    built = payload()
+    built["cfg"]["policy"]["_target_"] = target
+    with pytest.raises(CheckpointError, match=message) as caught:
+        load_checkpoint_policy(save(built))
+    assert target.rpartition(".")[2] in str(caught.value)
+
+
+@pytest.mark.parametrize("part", ["cfg", "state_dicts"])
+def test_checkpoint_of_something_else(payload: Build, save: Save, part: str) -> None:
+    """What is missing and what is there instead."""
+    built = payload()
+    built["weights"] = built.pop(part)
+    with pytest.raises(CheckpointError, match=rf"policy\.ckpt: no entry '{part}'; found .*'weights'"):
+        load_checkpoint_policy(save(built))
+
+
+@pytest.mark.parametrize(
+    ("place", "changes", "message"),
+    [
+        ("model", {"n_head": 3}, "n_emb = 8 with n_head = 3"),
+        ("model", {"n_layer": 0}, "n_layer is 0; expected at least 1"),
+        ("model", {"n_layer": "8"}, "n_layer is '8'; expected int"),
+        ("model", {"causal_attn": 1}, "causal_attn is 1; expected bool"),
+        ("model", {"time_as_cond": False}, "cond_dim > 0 needs time_as_cond"),
+        ("model", {"cond_dim": 4}, "cond_dim is 4; expected 5"),
+        ("model", {"input_dim": 8}, "input_dim is 8; expected 3"),
+        ("model", {"horizon": None}, "model.horizon is missing"),
+        ("model", {"flash": True}, "settings that TransformerForDiffusion does not know: flash"),
+        ("model", {"_target_": "fork.BetterTransformer"}, "network is BetterTransformer; expected"),
+        ("model", {"n_obs_steps": 3}, "n_obs_steps is 3, but the policy gives the network 2 tokens.*causal"),
+        ("policy", {"horizon": 7}, "horizon is 6, but the policy gives the network 7"),
+        ("policy", {"obs_as_cond": False}, "expected 8 with obs_as_cond = False"),
+        ("policy", {"pred_action_steps_only": True}, "gives the network 3 tokens.*causal"),
+        ("policy", {"pred_action_steps_only": True, "obs_as_cond": False}, "needs obs_as_cond"),
+        ("policy", {"n_action_steps": 0}, "n_action_steps is 0; expected a positive"),
+        ("policy", {"obs_as_cond": "yes"}, "obs_as_cond is 'yes'; expected true or false"),
+        ("policy", {"noise_scheduler": None}, "noise_scheduler is missing"),
+        ("policy", {"guidance": 2.0}, "cfg.policy has settings that are not known: guidance"),
+        ("policy", {"predict_epsilon": False}, "contradicts noise_scheduler.prediction_type = 'epsilon'"),
+        (
+            "noise_scheduler",
+            {"_target_": "diffusers.PNDMScheduler"},
+            "noise_scheduler is PNDMScheduler.*sampler='ddpm'",
+        ),
+        ("noise_scheduler", {"karras": True}, "does not know: karras"),
+        ("noise_scheduler", {"beta_schedule": "none"}, "diffusers refuses the settings"),
+        ("training", {"use_ema": "maybe"}, "use_ema is 'maybe'"),
+    ],
+)
+def test_contradictions_are_refused(
+    payload: Build, save: Save, place: str, changes: dict[str, Any], message: str
+) -> None:
+    """Each one names the key, what is expected and what was found."""
+    built = payload()
+    policy = built["cfg"]["policy"]
+    {"policy": policy, "training": built["cfg"]["training"], **policy}[place].update(changes)
+    with pytest.raises(CheckpointError, match=message):
+        load_checkpoint_policy(save(built))
+
+
+# Samplers
+
+
+def test_the_checkpoints_own_sampler(payload: Build, save: Save) -> None:
+    """Steps of the policy, or of training where it gives none; the class and settings of the scheduler."""
+    built = payload()
+    assert load_checkpoint_policy(save(built))[1].sampler.timesteps.tolist() == list(range(19, -1, -1))
+    built["cfg"]["policy"] |= {"num_inference_steps": None, "predict_epsilon": True}
+    assert load_checkpoint_policy(save(built))[1].sampler.steps == 20
+    scheduler = built["cfg"]["policy"]["noise_scheduler"]
+    scheduler |= {"_target_": "diffusers.schedulers.scheduling_ddim.DDIMScheduler", "set_alpha_to_one": True}
+    del scheduler["variance_type"]
+    built["cfg"]["policy"]["num_inference_steps"] = 4
+    plain = load_checkpoint_policy(save(built))[1].sampler
+    assert (plain.name, plain.timesteps.tolist(), plain.stochastic) == ("ddim", [15, 10, 5, 0], False)
+    scheduler["timestep_spacing"] = "trailing"
+    assert load_checkpoint_policy(save(built))[1].sampler.timesteps.tolist() == [19, 14, 9, 4]
+    built["cfg"]["policy"]["eta"] = 0.5
+    assert load_checkpoint_policy(save(built))[1].sampler.stochastic
+    assert not load_checkpoint_policy(save(built), sampler="ddpm")[1].sampler.out_to_next.any()
+
+
+def test_sample_prediction(payload: Build, save: Save) -> None:
+    """The network's output is the clean sample."""
+    built = payload()
+    built["cfg"]["policy"]["noise_scheduler"]["prediction_type"] = "sample"
+    table = load_checkpoint_policy(save(built))[1].sampler
+    assert not table.sample_to_x0.any()
+    assert (table.out_to_x0 == 1).all()
+
+
+def test_sampler_override_keeps_the_betas(payload: Build, save: Save) -> None:
+    """DDIM on the checkpoint's own betas, with both spacings."""
+    path = save(payload())
+    betas = {"num_train_timesteps": 20, "beta_schedule": "squaredcos_cap_v2"}
+    for spacing, timesteps in ((None, [15, 10, 5, 0]), ("trailing", [19, 14, 9, 4])):
+        found = load_checkpoint_policy(path, sampler="ddim", steps=4, spacing=spacing)[1].sampler
+        expected = sampler_table(DDIMScheduler(**betas, timestep_spacing=spacing or "leading"), 4)
+        assert found.timesteps.tolist() == timesteps
+        for column in found.COLUMNS:
+            np.testing.assert_array_equal(getattr(found, column), getattr(expected, column))
+    assert load_checkpoint_policy(path, steps=5)[1].sampler.stochastic
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"sampler": "euler"}, "'euler' is not known; expected ddpm or ddim"),
+        ({"steps": 21}, "21 denoising steps are not possible"),
+        ({"steps": 0}, "0 denoising steps are not possible"),
+        ({"steps": -1}, "-1 denoising steps are not possible"),
+        ({"spacing": "even"}, "'even' is not known; expected one of leading"),
+    ],
+)
+def test_impossible_samplers(payload: Build, save: Save, arguments: dict[str, Any], message: str) -> None:
+    """What was asked for, and what can be asked for."""
+    with pytest.raises(SpecError, match=message):
+        load_checkpoint_policy(save(payload()), **arguments)
+
+
+def test_another_schedulers_betas(payload: Build, save: Save) -> None:
+    """A policy trained with a sampler that is not supported runs on its betas when one is asked for."""
+    built = payload()
+    built["cfg"]["policy"]["noise_scheduler"] |= {
+        "_target_": "diffusers.DPMSolverMultistepScheduler",
+        "solver_order": 2,
+    }
+    assert load_checkpoint_policy(save(built), sampler="ddim", steps=5)[1].sampler.name == "ddim"

@@ -1,0 +1,174 @@
+"""Parity with the original implementation, on checkpoints that it saved."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch
+from torch import nn
+
+from ttscompile.config import Noise, PolicySpec
+from ttscompile.errors import ObservationError
+from ttscompile.frontends import load_checkpoint_policy
+from ttscompile.frontends.checkpoint import plain_config, read_checkpoint
+from ttscompile.frontends.eager import eager_policy
+
+GOLDEN = {
+    "mlp_encoder_causal": "token-wise condition encoder",
+    "ddim8": "token-wise condition encoder",
+    "transformer_encoder_causal": "transformer condition encoder",
+    "inpainting": "inpainting",
+    "bert": "encoder-only",
+}
+
+Loaded = tuple[nn.Module, PolicySpec, dict[str, npt.NDArray[Any]]]
+
+
+@pytest.fixture(scope="module", params=GOLDEN)
+def golden(request: pytest.FixtureRequest, shared: Path) -> Loaded:
+    """Module, specification and the original's numbers, of one golden checkpoint."""
+    base = shared / "golden" / "diffusion_policy" / request.param
+    module, spec = load_checkpoint_policy(base.with_suffix(".ckpt"))
+    assert spec.source["variant"] == GOLDEN[request.param]
+    with np.load(base.with_suffix(".npz")) as numbers:
+        return module, spec, dict(numbers)
+
+
+def normalized(spec: PolicySpec, obs: npt.NDArray[np.float32]) -> torch.Tensor:
+    """The observation as the network sees it."""
+    normalizer = spec.observations["obs"].normalizer
+    assert normalizer is not None
+    return torch.from_numpy(normalizer.normalize(obs))
+
+
+def test_single_evaluations(golden: Loaded) -> None:
+    """The network alone, at three timesteps, within 1e-5."""
+    module, spec, numbers = golden
+    network: Any = module.model
+    cond = normalized(spec, numbers["obs"]) if network.config.cond_dim else None
+    for timestep, expected in zip(numbers["probe_t"], numbers["probe_eps"], strict=True):
+        with torch.inference_mode():
+            found = network(torch.from_numpy(numbers["probe_x"]), torch.full((2,), int(timestep)), cond)
+        assert np.abs(found.numpy() - expected).max() < 1e-5
+
+
+def test_module_is_the_network_with_the_observation_in_place(golden: Loaded) -> None:
+    """Inpainting overwrites exactly the first To rows of the observation channels, whatever was there."""
+    module, spec, numbers = golden
+    network: Any = module.model
+    obs, x, t = normalized(spec, numbers["obs"]), torch.from_numpy(numbers["probe_x"]), torch.full((2,), 7)
+    with torch.inference_mode():
+        found = module(x, t, obs)
+        if network.config.cond_dim:
+            expected = network(x, t, obs)
+        else:
+            placed = x.clone()
+            placed[:, : obs.shape[1], spec.chunk.action_dim :] = obs
+            expected = network(placed, t)
+            assert not torch.equal(expected, network(x, t))
+    assert torch.equal(found, expected)
+
+
+def test_whole_call(golden: Loaded) -> None:
+    """The denoising loop from the stored noise gives the stored actions within 1e-4 of their range."""
+    module, spec, numbers = golden
+    assert spec.sampler.timesteps.tolist() == numbers["timesteps"].tolist()
+    assert spec.sample == numbers["noise_initial"].shape[1:]
+    noise = Noise(numbers["noise_initial"], numbers["noise_steps"])
+    sample = eager_policy(module, spec)({"obs": normalized(spec, numbers["obs"])}, noise).numpy()
+    assert spec.chunk.normalizer is not None
+    actions = spec.chunk.normalizer.unnormalize(sample[..., : spec.chunk.action_dim])
+    tolerance = 1e-4 * np.ptp(numbers["action_pred"])
+    assert np.abs(actions - numbers["action_pred"]).max() < tolerance
+    executed = actions[:, spec.chunk.start : spec.chunk.stop]
+    assert executed.shape == numbers["action"].shape
+    assert np.abs(executed - numbers["action"]).max() < tolerance
+
+
+# torch's own deprecation, raised while it copies an exported program.
+@pytest.mark.filterwarnings("ignore:.*LeafSpec.*:FutureWarning")
+def test_exports_for_any_batch(golden: Loaded) -> None:
+    """torch.export captures the module once for every batch size, and decomposing it changes nothing."""
+    module, spec, numbers = golden
+    obs, x, t = normalized(spec, numbers["obs"]), torch.from_numpy(numbers["probe_x"]), torch.full((2,), 7)
+    batch = torch.export.Dim("B")
+    exported = torch.export.export(module, (x, t, obs), dynamic_shapes=({0: batch},) * 3, strict=False)
+    decomposed = exported.run_decompositions({})
+    for streams in (1, 5):
+        generator = torch.Generator().manual_seed(streams)
+        inputs = (
+            torch.randn(streams, *x.shape[1:], generator=generator),
+            torch.arange(streams),
+            torch.randn(streams, *obs.shape[1:], generator=generator),
+        )
+        with torch.no_grad():
+            expected = module(*inputs)
+            for program in (exported, decomposed):
+                torch.testing.assert_close(program.module()(*inputs), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_eager_policy_needs_noise_for_a_stochastic_sampler(golden: Loaded) -> None:
+    """A missing draw is an error, not a deterministic sampler; DDIM needs none."""
+    module, spec, numbers = golden
+    run, obs = eager_policy(module, spec), {"obs": normalized(spec, numbers["obs"])}
+    if spec.sampler.stochastic:
+        with pytest.raises(ObservationError, match=r"noise\.steps is None"):
+            run(obs, Noise(numbers["noise_initial"]))
+    else:
+        assert torch.isfinite(run(obs, Noise(numbers["noise_initial"]))).all()
+
+
+def test_use_ema_decides_which_weights(shared: Path, tmp_path: Path) -> None:
+    """The same file with use_ema = false gives the other weights."""
+    path = shared / "golden" / "diffusion_policy" / "mlp_encoder_causal.ckpt"
+    payload = read_checkpoint(path)
+    config = plain_config(payload["cfg"])
+    assert config["training"]["use_ema"] is True
+    config["training"]["use_ema"] = False
+    torch.save({**payload, "cfg": config}, tmp_path / "plain.ckpt")
+    stored = {name: weights["model.head.weight"] for name, weights in payload["state_dicts"].items()}
+    assert not torch.equal(stored["model"], stored["ema_model"])
+    for file, name in ((path, "ema_model"), (tmp_path / "plain.ckpt", "model")):
+        module, spec = load_checkpoint_policy(file)
+        assert spec.source["weights"] == name
+        assert torch.equal(module.get_parameter("model.head.weight"), stored[name])
+
+
+@pytest.fixture(scope="module")
+def pusht(shared: Path) -> tuple[nn.Module, PolicySpec]:
+    """The policy at its real size."""
+    return load_checkpoint_policy(shared / "policies" / "pusht_dpt.ckpt")
+
+
+def test_dense_call_of_the_real_policy(shared: Path, pusht: tuple[nn.Module, PolicySpec]) -> None:
+    """The first call of a TTS episode is dense: the authors' implementation and ours agree on it."""
+    module, spec = pusht
+    with np.load(shared / "golden" / "tts" / "timestep_95.npz") as numbers:
+        assert not numbers["plans"][0].any()
+        noise = Noise(numbers["noise_initial"][0], numbers["noise_steps"][0])
+        sample = eager_policy(module, spec)({"obs": normalized(spec, numbers["obs"][0])}, noise).numpy()
+        assert spec.chunk.normalizer is not None
+        actions = spec.chunk.normalizer.unnormalize(sample)
+        assert np.abs(actions - numbers["action_pred"][0]).max() < 1e-4 * np.ptp(numbers["action_pred"])
+
+
+def test_half_precision_policy_is_the_same_policy(shared: Path, pusht: tuple[nn.Module, PolicySpec]) -> None:
+    """EMA weights only, in half precision: loaded as float32, and equal to the original up to rounding."""
+    full, spec = pusht
+    half, half_spec = load_checkpoint_policy(shared / "policies" / "pusht_dpt_ema_fp16.ckpt")
+    assert half_spec.source == spec.source
+    assert half_spec.source["weights"] == "ema_model"
+    expected = full.state_dict()
+    for key, value in half.state_dict().items():
+        assert value.dtype == torch.float32, key
+        assert torch.equal(value, expected[key].half().float()), key
+    generator = torch.Generator().manual_seed(0)
+    x, obs = torch.randn(4, 16, 2, generator=generator), torch.randn(4, 2, 20, generator=generator)
+    with torch.inference_mode():
+        outputs = [module(x, torch.full((4,), 50), obs) for module in (full, half)]
+    error = float((outputs[0] - outputs[1]).abs().max())
+    assert 0 < error < 1e-2

@@ -1,0 +1,215 @@
+"""Sampler tables against the diffusers schedulers they are measured on, and the schedulers that are refused."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from diffusers.schedulers.scheduling_ddim import DDIMScheduler
+from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
+from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultistepScheduler
+from diffusers.schedulers.scheduling_euler_discrete import EulerDiscreteScheduler
+from diffusers.schedulers.scheduling_lcm import LCMScheduler
+from diffusers.schedulers.scheduling_pndm import PNDMScheduler
+
+from ttscompile.config import SamplerTable
+from ttscompile.errors import SpecError
+from ttscompile.samplers import sampler_table
+
+BETAS: dict[str, Any] = {"num_train_timesteps": 50, "beta_schedule": "squaredcos_cap_v2"}
+
+
+def chain_of_table(table: SamplerTable, start: torch.Tensor, outs: torch.Tensor, draws: torch.Tensor) -> torch.Tensor:
+    """The loop that every runtime executes, in float32."""
+    x = start
+    for k in range(table.steps):
+        a, b, p, q, r, n = (float(getattr(table, column)[k]) for column in table.COLUMNS)
+        x0 = a * x + b * outs[k]
+        if table.clip is not None:
+            x0 = x0.clamp(-table.clip, table.clip)
+        x = p * x0 + q * x + r * outs[k] + n * draws[k]
+    return x
+
+
+CASES: list[tuple[type[Any], dict[str, Any], int, dict[str, Any]]] = [
+    (DDPMScheduler, {}, 50, {}),
+    (DDPMScheduler, {}, 10, {}),
+    (DDPMScheduler, {"timestep_spacing": "trailing"}, 10, {}),
+    (DDPMScheduler, {"prediction_type": "sample"}, 50, {}),
+    (DDPMScheduler, {"variance_type": "fixed_large", "clip_sample_range": 2.0}, 25, {}),
+    (DDPMScheduler, {"variance_type": "fixed_small_log", "clip_sample": False, "beta_schedule": "linear"}, 25, {}),
+    (DDIMScheduler, {}, 8, {}),
+    (DDIMScheduler, {}, 1, {}),
+    (DDIMScheduler, {"set_alpha_to_one": False, "steps_offset": 1}, 10, {}),
+    (DDIMScheduler, {"timestep_spacing": "trailing"}, 10, {}),
+    (DDIMScheduler, {"timestep_spacing": "linspace", "prediction_type": "sample"}, 10, {}),
+    (DDIMScheduler, {"clip_sample": False, "beta_schedule": "linear"}, 10, {}),
+    (DDIMScheduler, {}, 10, {"eta": 0.7}),
+    (DDIMScheduler, {}, 10, {"eta": 1.0, "use_clipped_model_output": True}),
+    (DDIMScheduler, {"prediction_type": "v_prediction"}, 10, {}),
+]
+
+
+@pytest.mark.parametrize(("scheduler_class", "settings", "steps", "arguments"), CASES)
+def test_table_gives_what_the_scheduler_gives(
+    scheduler_class: type[Any], settings: dict[str, Any], steps: int, arguments: dict[str, Any]
+) -> None:
+    """Whole loops in float32, from the same noise; outputs are made up, and feed on the sample as a network's do."""
+    scheduler = scheduler_class(**(BETAS | settings))
+    table = sampler_table(scheduler, steps, step_arguments=arguments)
+    scheduler.set_timesteps(steps)
+    assert table.timesteps.tolist() == scheduler.timesteps.tolist()
+    generator = torch.Generator().manual_seed(3)
+    start, outs = torch.randn(2, 4, 3, generator=generator), torch.randn(steps, 2, 4, 3, generator=generator)
+    x, draws = start, []
+    for k, timestep in enumerate(scheduler.timesteps):
+        draws.append(torch.randn(x.shape, generator=torch.Generator().manual_seed(k)))
+        x = scheduler.step(outs[k], timestep, x, generator=torch.Generator().manual_seed(k), **arguments).prev_sample
+    found = chain_of_table(table, start, outs, torch.stack(draws))
+    torch.testing.assert_close(found, x, rtol=2e-5, atol=2e-5)
+    assert table.stochastic == (scheduler_class is DDPMScheduler or arguments.get("eta", 0) > 0)
+
+
+def test_columns_of_ddpm_are_the_formula() -> None:
+    """One row against the closed form of Ho et al., equation (7), by hand."""
+    scheduler = DDPMScheduler(**BETAS)
+    table = sampler_table(scheduler, 50, name="ddpm")
+    assert (table.name, table.clip, table.steps) == ("ddpm", 1.0, 50)
+    k = 20
+    now, before = (float(scheduler.alphas_cumprod[t]) for t in (49 - k, 48 - k))
+    beta = 1 - now / before
+    expected = {
+        "sample_to_x0": now**-0.5,
+        "out_to_x0": -((1 - now) ** 0.5) * now**-0.5,
+        "x0_to_next": before**0.5 * beta / (1 - now),
+        "sample_to_next": (1 - beta) ** 0.5 * (1 - before) / (1 - now),
+        "out_to_next": 0.0,
+        "noise_to_next": ((1 - before) / (1 - now) * beta) ** 0.5,
+    }
+    for column, value in expected.items():
+        assert getattr(table, column)[k] == pytest.approx(value, rel=1e-5), column
+    assert table.noise_to_next[-1] == 0  # the last step draws none
+    assert np.all(table.noise_to_next[:-1] > 0)
+
+
+def test_paths_are_told_apart() -> None:
+    """DDIM's output reaches the next sample past the clip; DDPM's does not, its sample does."""
+    ddim, ddpm = sampler_table(DDIMScheduler(**BETAS), 10), sampler_table(DDPMScheduler(**BETAS), 10)
+    assert np.all(ddim.out_to_next[:-1] > 0.01)
+    assert np.all(ddim.sample_to_next == 0)
+    assert np.all(ddpm.out_to_next == 0)
+    assert np.all(ddpm.sample_to_next[:-1] > 0)
+    rows = [[getattr(table, c)[-1] for c in table.COLUMNS[2:]] for table in (ddim, ddpm)]
+    np.testing.assert_array_equal(rows, [[1, 0, 0, 0]] * 2)  # both end on x0 itself
+
+
+class Multistep(DDIMScheduler):
+    """Averages with the output of the step before."""
+
+    before: Any = None
+
+    def set_timesteps(self, *args: Any, **kwargs: Any) -> None:
+        super().set_timesteps(*args, **kwargs)
+        self.before = None
+
+    def step(self, model_output: Any, timestep: Any, sample: Any, **kwargs: Any) -> Any:
+        mixed = model_output if self.before is None else 0.9 * model_output + 0.1 * self.before
+        self.before = model_output
+        return super().step(mixed, timestep, sample, **kwargs)
+
+
+class Curved(DDIMScheduler):
+    """Adds a small square of the output."""
+
+    def step(self, model_output: Any, timestep: Any, sample: Any, **kwargs: Any) -> Any:
+        result = super().step(model_output, timestep, sample, **kwargs)
+        result.prev_sample = result.prev_sample + 1e-4 * model_output**2
+        return result
+
+
+class PerChannel(DDIMScheduler):
+    """Scales one channel differently."""
+
+    def step(self, model_output: Any, timestep: Any, sample: Any, **kwargs: Any) -> Any:
+        result = super().step(model_output, timestep, sample, **kwargs)
+        result.prev_sample[..., 2] *= 1.01
+        return result
+
+
+class Mixing(DDIMScheduler):
+    """Takes the mean out of the sample."""
+
+    def step(self, model_output: Any, timestep: Any, sample: Any, **kwargs: Any) -> Any:
+        result = super().step(model_output, timestep, sample, **kwargs)
+        result.prev_sample = result.prev_sample - 0.01 * sample.mean(dim=1, keepdim=True)
+        return result
+
+
+class Shifting(DDIMScheduler):
+    """Adds a constant."""
+
+    def step(self, model_output: Any, timestep: Any, sample: Any, **kwargs: Any) -> Any:
+        result = super().step(model_output, timestep, sample, **kwargs)
+        result.prev_sample = result.prev_sample + 0.01
+        return result
+
+
+class OneSided(DDIMScheduler):
+    """Bounds the sample from above, so that x0 stops at another value in every step."""
+
+    def step(self, model_output: Any, timestep: Any, sample: Any, **kwargs: Any) -> Any:
+        return super().step(model_output, timestep, sample.clamp(max=0.3), **kwargs)
+
+
+class TwoDraws(DDPMScheduler):
+    """Draws its noise twice."""
+
+    def step(self, model_output: Any, timestep: Any, sample: Any, generator: Any = None, **kwargs: Any) -> Any:
+        torch.randn(sample.shape, generator=generator, dtype=sample.dtype)
+        return super().step(model_output, timestep, sample, generator=generator, **kwargs)
+
+
+@pytest.mark.parametrize("scheduler_class", [Multistep, Curved, PerChannel, Mixing, Shifting, TwoDraws])
+def test_near_misses_are_refused(scheduler_class: type[Any]) -> None:
+    """Each differs from a good scheduler by little, and each is found out."""
+    with pytest.raises(SpecError, match=f"{scheduler_class.__name__} does not have the form"):
+        sampler_table(scheduler_class(**BETAS), 10)
+
+
+def test_bounds_that_differ_are_refused() -> None:
+    """One bound holds for the whole table."""
+    with pytest.raises(SpecError, match="OneSided clips x0 at .* not alike at every step"):
+        sampler_table(OneSided(**BETAS), 10)
+
+
+@pytest.mark.parametrize(
+    ("scheduler_class", "settings", "message"),
+    [
+        (DDPMScheduler, {"thresholding": True}, "thresholding=True"),
+        (DDPMScheduler, {"variance_type": "learned_range"}, "variance_type='learned_range'"),
+        (DDIMScheduler, {"rescale_betas_zero_snr": True, "timestep_spacing": "trailing"}, "not finite"),
+        (DPMSolverMultistepScheduler, {}, "DPMSolverMultistepScheduler"),
+        (EulerDiscreteScheduler, {}, "standard deviation"),
+        (LCMScheduler, {"original_inference_steps": 20}, "LCMScheduler: its step at timestep"),
+        (PNDMScheduler, {}, "19 timesteps for 10 steps"),
+    ],
+)
+def test_other_samplers_are_refused_by_name(scheduler_class: type[Any], settings: dict[str, Any], message: str) -> None:
+    """With what they are, not with a stack trace of diffusers."""
+    with pytest.raises(SpecError, match=message):
+        sampler_table(scheduler_class(**(BETAS | settings)), 10)
+
+
+@pytest.mark.parametrize(
+    ("steps", "arguments", "message"),
+    [
+        (51, {}, "51 denoising steps are not possible"),
+        (10, {"eta": 0.5}, r"unexpected keyword argument 'eta'.*\['eta'\]"),
+    ],
+)
+def test_impossible_settings(steps: int, arguments: dict[str, Any], message: str) -> None:
+    """More steps than were trained; DDIM's eta for DDPM."""
+    with pytest.raises(SpecError, match=message):
+        sampler_table(DDPMScheduler(**BETAS), steps, step_arguments=arguments)

@@ -1,0 +1,83 @@
+"""An ahead-of-time compiler for diffusion-transformer robot policies.
+
+``import ttscompile`` loads neither torch nor onnx: the names below are imported when they are first used (PEP 562), so
+that a robot with numpy and onnxruntime alone can ``load`` an artifact, and the compiler's dependencies are only needed
+by ``convert``, ``calibrate`` and ``compile_denoiser``.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .calibration import calibrate
+    from .config import Affine, ChunkSpec, Noise, ObservationSpec, PolicySpec, SamplerTable
+    from .driver import compile_denoiser, convert
+    from .errors import TtscompileError
+    from .lattice import Source, legalize
+    from .runtimes.base import CallReport
+    from .runtimes.policy import CompiledPolicy, PolicyInfo, load
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Affine",
+    "CallReport",
+    "ChunkSpec",
+    "CompiledPolicy",
+    "Noise",
+    "ObservationSpec",
+    "PolicyInfo",
+    "PolicySpec",
+    "SamplerTable",
+    "Source",
+    "TtscompileError",
+    "__version__",
+    "calibrate",
+    "compile_denoiser",
+    "convert",
+    "legalize",
+    "load",
+]
+
+_HOMES = {
+    "Affine": "config",
+    "CallReport": "runtimes.base",
+    "ChunkSpec": "config",
+    "CompiledPolicy": "runtimes.policy",
+    "Noise": "config",
+    "ObservationSpec": "config",
+    "PolicyInfo": "runtimes.policy",
+    "PolicySpec": "config",
+    "SamplerTable": "config",
+    "Source": "lattice",
+    "TtscompileError": "errors",
+    "calibrate": "calibration",
+    "compile_denoiser": "driver",
+    "convert": "driver",
+    "legalize": "lattice",
+    "load": "runtimes.policy",
+}
+
+
+def __getattr__(name: str) -> Any:
+    home = _HOMES.get(name)
+    if home is None:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it has {', '.join(__all__)}")
+    try:
+        value = getattr(importlib.import_module(f"{__name__}.{home}"), name)
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.partition(".")[0] == __name__:
+            raise
+        from .errors import RuntimeUnavailableError
+
+        raise RuntimeUnavailableError(
+            f"{__name__}.{name} needs {error.name}, which is not installed. Run: pip install '{__name__}[compile]'."
+        ) from error
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,0 +1,176 @@
+"""Reading a torch checkpoint without running anything that it contains.
+
+A ``.ckpt`` of Diffusion Policy is a torch zip whose pickle names classes of omegaconf and a function of dill. They are
+answered by the inert stand-ins below, so neither package is needed and neither runs; any other name outside torch's
+own list is refused before a single object is built.
+"""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch.serialization import get_unsafe_globals_in_checkpoint, safe_globals
+
+from ..errors import CheckpointError
+
+_DEEPEST = 64  # nesting of a configuration; a real one has about 6 levels, a cycle has no end
+
+
+class _Inert:
+    """Stand-in for a pickled class: keeps the state that it is given, and does nothing."""
+
+    def __setstate__(self, state: object) -> None:
+        self.state = state
+
+
+class _Container(_Inert):
+    """Stand-in for omegaconf's DictConfig and ListConfig; the data is in ``state["_content"]``."""
+
+
+class _Node(_Inert):
+    """Stand-in for omegaconf's value nodes; the data is in ``state["_val"]``."""
+
+
+class _Metadata(_Inert):
+    """Stand-in for what omegaconf notes beside the data; never read."""
+
+
+class _Defaults(dict[Any, Any]):
+    """Stand-in for ``collections.defaultdict`` inside the metadata; its factory is dropped."""
+
+    def __init__(self, factory: object = None) -> None:
+        super().__init__()
+
+
+class _AnyType:
+    """Stand-in for ``typing.Any``."""
+
+
+_BUILTIN_TYPES: Mapping[str, type] = {
+    t.__name__: t for t in (dict, list, tuple, set, int, float, bool, str, bytes, complex, object, type(None))
+}
+
+
+def _load_type(name: str) -> type:
+    """Stand-in for ``dill._dill._load_type``: the plain built-in types that a configuration can hold.
+
+    Raises:
+        CheckpointError: any other name; dill itself would look it up among all it knows, callables included.
+    """
+    if not isinstance(name, str) or name not in _BUILTIN_TYPES:
+        raise CheckpointError(
+            f"the checkpoint asks dill for the type {name!r}; expected one of {sorted(_BUILTIN_TYPES)}. Nothing of the"
+            " file was executed. Only load checkpoints that you trust, or save it again without dill."
+        )
+    return _BUILTIN_TYPES[name]
+
+
+_STAND_INS: list[Callable[..., Any] | tuple[Callable[..., Any], str]] = [
+    (_Container, "omegaconf.dictconfig.DictConfig"),
+    (_Container, "omegaconf.listconfig.ListConfig"),
+    (_Node, "omegaconf.nodes.AnyNode"),
+    (_Node, "omegaconf.nodes.BooleanNode"),
+    (_Node, "omegaconf.nodes.FloatNode"),
+    (_Node, "omegaconf.nodes.IntegerNode"),
+    (_Node, "omegaconf.nodes.StringNode"),
+    (_Metadata, "omegaconf.base.Metadata"),
+    (_Metadata, "omegaconf.base.ContainerMetadata"),
+    (_Defaults, "collections.defaultdict"),
+    (_AnyType, "typing.Any"),
+    (_load_type, "dill._dill._load_type"),
+]
+
+
+def read_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read a torch zip checkpoint; tensors on the CPU, configuration objects as inert stand-ins.
+
+    Entries that are pickles of their own (``pickles``) stay the bytes they are.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The dictionary that was saved.
+
+    Raises:
+        CheckpointError: missing, truncated, not a torch zip, or naming a global that is not known to be harmless.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise CheckpointError(f"{path}: no such file; expected a checkpoint saved by torch.save.")
+    if not zipfile.is_zipfile(path):
+        raise CheckpointError(
+            f"{path}: not a torch checkpoint, or a truncated one: expected a zip archive as torch.save writes it, found"
+            f" {path.stat().st_size} bytes without a zip directory. Copy the file again, or save it with torch >= 1.6."
+        )
+    with safe_globals(_STAND_INS):
+        try:
+            unknown = sorted(get_unsafe_globals_in_checkpoint(path))
+        except Exception as error:
+            raise _unreadable(path, error) from error
+        if unknown:
+            raise CheckpointError(
+                f"{path}: refused, because its pickle names {', '.join(unknown)}, which could run code while loading."
+                " Nothing of the file was executed. Expected tensors, plain containers and omegaconf's configuration"
+                " only: save the checkpoint again without these objects."
+            )
+        try:
+            payload = torch.load(path, map_location="cpu", weights_only=True)
+        except CheckpointError:
+            raise
+        except Exception as error:
+            raise _unreadable(path, error) from error
+    if not isinstance(payload, dict):
+        raise CheckpointError(
+            f"{path}: holds a {type(payload).__name__}; expected a dictionary with cfg and state_dicts."
+        )
+    return payload
+
+
+def _unreadable(path: Path, error: Exception) -> CheckpointError:
+    """A damaged or foreign archive, in one line: torch's own pages of text advise to switch the protection off."""
+    lines = str(error).strip().splitlines() or [""]
+    exact = [line.split("WeightsUnpickler error:", 1)[1] for line in lines if "WeightsUnpickler error:" in line]
+    reason = (exact or lines)[0].strip().rstrip(".") + "."
+    return CheckpointError(
+        f"{path}: cannot be read as a torch checkpoint ({type(error).__name__}: {reason}) Nothing of the file was"
+        " executed. It is damaged, or not written by torch.save: copy it again, or save it again."
+    )
+
+
+def plain_config(value: Any, where: str = "cfg", depth: int = 0) -> Any:
+    """Turn inert configuration objects into dictionaries, lists and scalars.
+
+    Args:
+        value: what ``read_checkpoint`` found, or a part of it; plain dictionaries and lists pass as they are.
+        where: dotted name of ``value``, for messages.
+        depth: of ``value`` below the root.
+
+    Returns:
+        dict, list, str, int, float, bool or None, nested.
+
+    Raises:
+        CheckpointError: an object of another type, a malformed one, or nesting without end.
+    """
+    if depth > _DEEPEST:
+        raise CheckpointError(f"{where}: the configuration is nested deeper than {_DEEPEST} levels; it is malformed.")
+    if isinstance(value, (_Container, _Node)):
+        key = "_content" if isinstance(value, _Container) else "_val"
+        state = getattr(value, "state", None)
+        if not isinstance(state, dict) or key not in state:
+            raise CheckpointError(f"{where}: a configuration object without {key}; the checkpoint is malformed.")
+        return plain_config(state[key], where, depth + 1)
+    if isinstance(value, dict):
+        return {str(name): plain_config(item, f"{where}.{name}", depth + 1) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain_config(item, f"{where}[{i}]", depth + 1) for i, item in enumerate(value)]
+    if value is None or isinstance(value, (str, int, float, bool)):
+        return value
+    raise CheckpointError(
+        f"{where}: found a {type(value).__name__}; expected dictionaries, lists, strings, numbers or None."
+    )

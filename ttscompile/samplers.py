@@ -1,0 +1,217 @@
+"""A diffusers scheduler as a table of numbers, found by probing its ``step``.
+
+The maths of DDPM and DDIM is not written down here a second time: every coefficient is measured on the scheduler
+itself, in float64, and the finished table is held against it on random inputs. Whatever does not have the form of
+``SamplerTable`` (thresholding, multistep histories, scaled inputs, learned variances) is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from .config import SamplerTable
+from .errors import SpecError
+
+_SHAPE = (2, 3, 4)  # of a probe; small, with no two sizes equal, so that a broadcast along the wrong axis shows
+_FAR = 2.0**30  # an input this large saturates any clip that is there; its inverse stays inside any
+_TOLERANCE = 1e-8  # of the largest term of a step; float64 leaves 1e-12, a wrong form leaves 1e-3 and more
+
+
+@dataclass(frozen=True)
+class _Row:
+    """One step of the loop in float64; the columns of ``SamplerTable``."""
+
+    sample_to_x0: float
+    out_to_x0: float
+    x0_to_next: float
+    sample_to_next: float
+    out_to_next: float
+    noise_to_next: float
+    clip: float | None
+
+
+class _Probe:
+    """Calls one scheduler's ``step`` on chosen inputs, in float64.
+
+    Args:
+        scheduler: a configured diffusers scheduler, on which ``set_timesteps`` was called.
+        step_arguments: further keyword arguments of ``step``, for instance ``eta``.
+    """
+
+    def __init__(self, scheduler: Any, step_arguments: Mapping[str, Any]) -> None:
+        self._scheduler = scheduler
+        self._step_arguments = dict(step_arguments)
+        self.name = type(scheduler).__name__
+
+    def __call__(
+        self, timestep: torch.Tensor, x: torch.Tensor, out: torch.Tensor, seed: int = 0
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """One step; gives ``x0`` and ``next``, or a SpecError in the scheduler's own words."""
+        generator = torch.Generator().manual_seed(seed)
+        try:
+            result = self._scheduler.step(out, timestep, x, generator=generator, **self._step_arguments)
+            x0, following = result.pred_original_sample, result.prev_sample
+        except Exception as error:
+            raise SpecError(
+                f"sampler {self.name}: its step at timestep {int(timestep)} failed: {error} Use a DDPM or DDIM"
+                f" scheduler; arguments given to step: {sorted(self._step_arguments)}."
+            ) from error
+        if x0 is None or not (torch.isfinite(x0).all() and torch.isfinite(following).all()):
+            raise SpecError(
+                f"sampler {self.name}: its step at timestep {int(timestep)} gives values that are not finite, or no"
+                " prediction of the clean sample. Check the betas (rescale_betas_zero_snr needs v_prediction)."
+            )
+        return x0, following
+
+    def fill(self, timestep: torch.Tensor, x: float, out: float) -> tuple[float, float]:
+        """One step from constant inputs without its noise; gives ``x0`` and ``next`` as numbers."""
+        zero = torch.zeros(_SHAPE, dtype=torch.float64)
+        _, noise = self(timestep, zero, zero)
+        x0, following = self(timestep, zero + x, zero + out)
+        # Adding zero turns -0.0 into 0.0, so that a table reads well and its bytes do not depend on a sign of nothing.
+        return float(x0.flatten()[0]) + 0.0, float((following - noise).flatten()[0]) + 0.0
+
+
+def _draw(seed: int) -> torch.Tensor:
+    """The normal numbers that a scheduler draws from a generator of this seed."""
+    return torch.randn(_SHAPE, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def _bound(probe: _Probe, timestep: torch.Tensor, x: float, out: float) -> float | None:
+    """The value at which x0 saturates in the direction ``(x, out)``; None if it does not."""
+    near, far = probe.fill(timestep, x, out)[0], probe.fill(timestep, 2 * x, 2 * out)[0]
+    return abs(near) if near == far else None
+
+
+def _probe_step(probe: _Probe, timestep: torch.Tensor) -> _Row:
+    """Measure one row.
+
+    x0 is read from the step's own ``pred_original_sample``. Where it is clipped, inputs far beyond the bound hold it
+    constant, so what is left of the change in ``next`` is the direct path; otherwise the two paths cannot be told
+    apart, need not be, and all of it is put on the direct one.
+    """
+    small = 1 / _FAR
+    sample_to_x0 = probe.fill(timestep, small, 0.0)[0] / small
+    out_to_x0 = probe.fill(timestep, 0.0, small)[0] / small
+    zero = torch.zeros(_SHAPE, dtype=torch.float64)
+    noise_to_next = float((probe(timestep, zero, zero)[1] / _draw(0)).flatten()[0]) + 0.0
+    if sample_to_x0 == out_to_x0 == 0:
+        raise SpecError(f"sampler {probe.name}: at timestep {int(timestep)} x0 depends on neither sample nor output.")
+
+    from_sample = abs(sample_to_x0) >= abs(out_to_x0)
+    gain = sample_to_x0 if from_sample else out_to_x0
+    clip = _bound(probe, timestep, _FAR * from_sample / gain, _FAR * (not from_sample) / gain)
+    if clip is None:
+        sample_to_next, out_to_next = probe.fill(timestep, 1.0, 0.0)[1], probe.fill(timestep, 0.0, 1.0)[1]
+        return _Row(sample_to_x0, out_to_x0, 0.0, sample_to_next, out_to_next, noise_to_next, None)
+    if clip == 0:
+        raise SpecError(f"sampler {probe.name}: at timestep {int(timestep)} x0 is clipped to zero.")
+
+    # Far enough out that a quarter of the way back along either input leaves x0 at its bound.
+    x, out = (8 * clip / gain, 0.0) if from_sample else (0.0, 8 * clip / gain)
+    delta = clip / abs(gain)
+    base = probe.fill(timestep, x, out)[1]
+    sample_to_next = (probe.fill(timestep, x + delta, out)[1] - base) / delta
+    out_to_next = (probe.fill(timestep, x, out + delta)[1] - base) / delta
+    x0_to_next = (base - sample_to_next * x - out_to_next * out) / clip
+    return _Row(sample_to_x0, out_to_x0, x0_to_next, sample_to_next, out_to_next, noise_to_next, clip)
+
+
+def _verify(
+    probe: _Probe, timestep: torch.Tensor, row: _Row, x: torch.Tensor, out: torch.Tensor, seed: int
+) -> torch.Tensor:
+    """Hold a row against the scheduler on one input; gives ``next``."""
+    x0, following = probe(timestep, x, out, seed)
+    unclipped = row.sample_to_x0 * x + row.out_to_x0 * out
+    expected_x0 = unclipped if row.clip is None else unclipped.clamp(-row.clip, row.clip)
+    terms = (
+        row.x0_to_next * expected_x0,
+        row.sample_to_next * x,
+        row.out_to_next * out,
+        row.noise_to_next * _draw(seed),
+    )
+    expected = terms[0] + terms[1] + terms[2] + terms[3]
+    scale = max(1.0, float(unclipped.abs().max()), *(float(term.abs().max()) for term in terms))
+    error = max(float((x0 - expected_x0).abs().max()), float((following - expected).abs().max()))
+    if error > _TOLERANCE * scale:
+        raise SpecError(
+            f"sampler {probe.name} does not have the form next = p * clip(a * x + b * out) + q * x + r * out + n *"
+            f" noise at timestep {int(timestep)}: a random input is off by {error:.1e} (largest term {scale:.1e})."
+            " Thresholding, multistep and dynamic samplers are not supported; use DDPM or DDIM."
+        )
+    return following
+
+
+def _refuse_known(scheduler: Any) -> None:
+    """Refuse by name what probing would refuse by number."""
+    name, config = type(scheduler).__name__, scheduler.config
+    if config.get("thresholding"):
+        raise SpecError(f"sampler {name}: thresholding=True depends on the whole sample; set it to False.")
+    if str(config.get("variance_type", "")).startswith("learned"):
+        raise SpecError(
+            f"sampler {name}: variance_type={config['variance_type']!r} needs a network with twice the channels;"
+            " expected fixed_small, fixed_small_log, fixed_large or fixed_large_log."
+        )
+    deviation = float(getattr(scheduler, "init_noise_sigma", 1.0))
+    if deviation != 1.0:
+        raise SpecError(
+            f"sampler {name} starts from noise of standard deviation {deviation:g}; expected 1. Use DDPM or DDIM."
+        )
+
+
+def sampler_table(
+    scheduler: Any, steps: int, *, name: str | None = None, step_arguments: Mapping[str, Any] | None = None
+) -> SamplerTable:
+    """Measure a denoising loop.
+
+    Args:
+        scheduler: a diffusers scheduler, configured; ``set_timesteps`` is called on it.
+        steps: K, number of denoising steps.
+        name: of the table, for people; the scheduler's class otherwise.
+        step_arguments: further keyword arguments of ``step`` (``eta`` of DDIM).
+
+    Returns:
+        The table, K rows in order of execution.
+
+    Raises:
+        SpecError: the scheduler refuses the settings, or its step is not of the form of ``SamplerTable``.
+    """
+    probe = _Probe(scheduler, step_arguments or {})
+    _refuse_known(scheduler)
+    try:
+        scheduler.set_timesteps(steps)
+    except Exception as error:
+        raise SpecError(f"sampler {probe.name}: {steps} denoising steps are not possible: {error}") from error
+    timesteps = torch.as_tensor(scheduler.timesteps)
+    if timesteps.shape != (steps,):
+        raise SpecError(f"sampler {probe.name} has {len(timesteps)} timesteps for {steps} steps; use DDPM or DDIM.")
+
+    x = _draw(1)
+    out = _draw(2)
+    rescale = getattr(scheduler, "scale_model_input", None)
+    if rescale is not None and not torch.equal(rescale(x, timesteps[0]), x):
+        raise SpecError(f"sampler {probe.name} rescales the sample before the network; use DDPM or DDIM.")
+    rows = [_probe_step(probe, timestep) for timestep in timesteps]
+    clips = {row.clip for row in rows}
+    if len(clips) != 1:
+        raise SpecError(f"sampler {probe.name} clips x0 at {clips}, not alike at every step.")
+
+    # A chain in order of execution, from fresh timesteps: a scheduler that remembers earlier outputs fails here.
+    scheduler.set_timesteps(steps)
+    for k, (timestep, row) in enumerate(zip(timesteps, rows, strict=True)):
+        x = _verify(probe, timestep, row, x, _draw(100 + k), seed=1000 + k)
+    # And single steps, where x0 is inside its bound and where it is outside.
+    for k, (timestep, row) in enumerate(zip(timesteps, rows, strict=True)):
+        for factor in (0.01, 3.0):
+            reach = factor * (row.clip or 1.0) / max(abs(row.sample_to_x0), abs(row.out_to_x0))
+            _verify(probe, timestep, row, reach * _draw(2 * k), reach * out, seed=k)
+
+    columns = {
+        column: np.array([getattr(row, column) for row in rows], dtype=np.float32) for column in SamplerTable.COLUMNS
+    }
+    return SamplerTable(name=name or probe.name, timesteps=timesteps.numpy(), clip=clips.pop(), **columns)
