@@ -12,7 +12,8 @@ from typing import Any, TypeAlias
 
 import torch
 
-from ..errors import CaptureError, ObservationError
+from ttscompile.errors import CaptureError, ObservationError
+
 from .graph import GETITEM, Argument, Batch, Enum, Graph, Node, Ref, TensorType
 
 Frame: TypeAlias = list[Any]
@@ -22,7 +23,10 @@ Getter: TypeAlias = Callable[[Frame, int], Any]
 _REFUSED = frozenset({"aten.from_file.default"})
 
 # Tagged as random for the sake of their dropout argument, which is checked to be off.
-_RANDOM_ONLY_WITH_DROPOUT = {"aten.scaled_dot_product_attention.default": (4, "dropout_p"), "aten.dropout.default": (2, "train")}
+_RANDOM_ONLY_WITH_DROPOUT = {
+    "aten.scaled_dot_product_attention.default": (4, "dropout_p"),
+    "aten.dropout.default": (2, "train"),
+}
 
 _ENUM_TYPES = {"dtype": torch.dtype, "memory_format": torch.memory_format, "layout": torch.layout}
 
@@ -87,9 +91,7 @@ class Evaluator:
             missing or does not have its type, or a symbolic size that no input can give a value.
     """
 
-    def __init__(
-        self, graph: Graph, weights: Mapping[str, torch.Tensor], device: torch.device | str = "cpu"
-    ) -> None:
+    def __init__(self, graph: Graph, weights: Mapping[str, torch.Tensor], device: torch.device | str = "cpu") -> None:
         self._graph = graph
         self._device = torch.device(device)
         self._bound = any(isinstance(n, Batch) for t in graph.inputs.values() for n in t.shape)
@@ -180,7 +182,7 @@ class Evaluator:
             return None, lambda frame, streams: frame[slot]
         if isinstance(argument, Batch):
             if not self._bound:
-                raise CaptureError(f"{_where(node)} has the size {argument}, but no input of the graph has a batch axis.")
+                raise CaptureError(f"{_where(node)} has the size {argument}, but no input of its graph has a batch.")
             multiple = argument.multiple
             return None, lambda frame, streams: multiple * streams
         if isinstance(argument, Enum):

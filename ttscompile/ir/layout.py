@@ -28,16 +28,51 @@ from dataclasses import dataclass, replace
 from .graph import Argument, Batch, Graph, Node, Ref, Size, TensorType
 
 _RESHAPES = frozenset(
-    "aten.reshape.default aten.view.default aten._unsafe_view.default aten.unsqueeze.default aten.squeeze.default"
-    " aten.squeeze.dim aten.squeeze.dims aten.flatten.using_ints aten.unflatten.int aten.clone.default"
-    " aten.alias.default aten.contiguous.default".split()
+    {
+        "aten.reshape.default",
+        "aten.view.default",
+        "aten._unsafe_view.default",
+        "aten.unsqueeze.default",
+        "aten.squeeze.default",
+        "aten.squeeze.dim",
+        "aten.squeeze.dims",
+        "aten.flatten.using_ints",
+        "aten.unflatten.int",
+        "aten.clone.default",
+        "aten.alias.default",
+        "aten.contiguous.default",
+    }
 )
 _ELEMENTWISE = frozenset(
-    "aten.gelu.default aten.relu.default aten.silu.default aten.mish.default aten.tanh.default aten.sigmoid.default"
-    " aten.elu.default aten.leaky_relu.default aten.softplus.default aten.hardtanh.default aten.neg.default"
-    " aten.exp.default aten.sin.default aten.cos.default aten.sqrt.default aten.rsqrt.default aten.abs.default"
-    " aten.clamp.default aten.pow.Tensor_Scalar aten.add.Tensor aten.add.Scalar aten.sub.Tensor aten.sub.Scalar"
-    " aten.mul.Tensor aten.mul.Scalar aten.div.Tensor aten.div.Scalar".split()
+    {
+        "aten.gelu.default",
+        "aten.relu.default",
+        "aten.silu.default",
+        "aten.mish.default",
+        "aten.tanh.default",
+        "aten.sigmoid.default",
+        "aten.elu.default",
+        "aten.leaky_relu.default",
+        "aten.softplus.default",
+        "aten.hardtanh.default",
+        "aten.neg.default",
+        "aten.exp.default",
+        "aten.sin.default",
+        "aten.cos.default",
+        "aten.sqrt.default",
+        "aten.rsqrt.default",
+        "aten.abs.default",
+        "aten.clamp.default",
+        "aten.pow.Tensor_Scalar",
+        "aten.add.Tensor",
+        "aten.add.Scalar",
+        "aten.sub.Tensor",
+        "aten.sub.Scalar",
+        "aten.mul.Tensor",
+        "aten.mul.Scalar",
+        "aten.div.Tensor",
+        "aten.div.Scalar",
+    }
 )
 
 
@@ -111,9 +146,9 @@ class _Sinker:
             case "aten.permute.default", (_, tuple(axes)):
                 return _permuted(self.view(name), [a % rank for a in axes if isinstance(a, int)])
             case "aten.transpose.int", (_, int(a), int(b)):
-                axes = list(range(rank))
-                axes[a % rank], axes[b % rank] = axes[b % rank], axes[a % rank]
-                return _permuted(self.view(name), axes)
+                order = list(range(rank))
+                order[a % rank], order[b % rank] = order[b % rank], order[a % rank]
+                return _permuted(self.view(name), order)
             case "aten.t.default", _:
                 return _permuted(self.view(name), list(reversed(range(rank))))
             case "aten.select.int", (_, int(axis), int(index)):
@@ -131,10 +166,21 @@ class _Sinker:
         if node.op == "aten.layer_norm.default" and not self.is_plain(view):
             shape = node.args[1]
             return self.tokenwise(node, view) if isinstance(shape, tuple) and len(shape) == 1 else None
-        if node.op in _ELEMENTWISE and len(refs) == 1 and not view.picks and not self.is_plain(view):
+        if node.op in _ELEMENTWISE and not view.picks and not self.is_plain(view):
+            views = [self.view(name) for name in refs]
+            if any(self.arrangement(v) != self.arrangement(view) for v in views):
+                return None
+            bases = {name: v.base for name, v in zip(refs, views, strict=True)}
             type_ = TensorType(self.types[view.base].shape, node.type.dtype)
-            return replace(view, base=self.write(node.op, (Ref(view.base), *node.args[1:]), type_, node.kwargs))
+            moved = node.renamed(bases.__getitem__)
+            return replace(view, base=self.write(node.op, moved.args, type_, moved.kwargs))
         return None
+
+    def arrangement(self, view: _View) -> tuple[object, ...]:
+        """Equal for views that rearrange bases of one shape in the same way."""
+        places = {atom: i for i, atom in enumerate(view.order)}
+        dims = tuple(tuple(places[a] for a in dim) for dim in view.dims)
+        return (self.types[view.base].shape, tuple(a.size for a in view.order), dims, view.picks)
 
     def tokenwise(self, node: Node, view: _View) -> _View | None:
         """An operation on the last axis alone, done on ``[tokens, channels]``, tokens in the order of the base."""
@@ -168,8 +214,10 @@ class _Sinker:
                 self.nodes.append(Node(output, "aten.clone.default", (Ref(computed),), (), (self.types[computed],)))
             else:
                 names[computed] = output
-        rename = lambda name: names.get(name, name)  # noqa: E731
-        return tuple(replace(node.renamed(rename), name=rename(node.name)) for node in self.nodes)
+        return tuple(
+            replace(node.renamed(lambda name: names.get(name, name)), name=names.get(node.name, node.name))
+            for node in self.nodes
+        )
 
     def type_of(self, name: str) -> TensorType:
         if name in self.views:

@@ -14,7 +14,8 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, TypeAlias
 
-from ..errors import ArtifactError
+from ttscompile.errors import ArtifactError
+
 from .graph import GETITEM, Argument, Batch, Enum, Graph, Node, Ref, Size, TensorType
 
 Json: TypeAlias = Any
@@ -28,9 +29,7 @@ MAX_ITEMS = 65_536
 MAX_SIZE = 2**40
 MAX_INT = 2**63
 
-DTYPES = frozenset(
-    {"bool", "uint8", "int8", "int16", "int32", "int64", "float16", "bfloat16", "float32", "float64"}
-)
+DTYPES = frozenset({"bool", "uint8", "int8", "int16", "int32", "int64", "float16", "bfloat16", "float32", "float64"})
 ENUM_KINDS = frozenset({"dtype", "memory_format", "layout", "device"})
 
 _OP = re.compile(r"aten\.[A-Za-z_][A-Za-z0-9_]*\.[A-Za-z_][A-Za-z0-9_]*")

@@ -1,0 +1,185 @@
+from __future__ import annotations
+
+import gc
+import stat
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.artifact.folders import flip
+from ttscompile.artifact import archive, load_artifact
+from ttscompile.errors import ArtifactError
+
+Edit = Callable[[zipfile.ZipFile], object]
+
+
+def packed(written: Path, prefix: str = "", edit: Edit | None = None, skip: str = "") -> Path:
+    path = written.parent / "artifact.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        for member in sorted(written.iterdir()):
+            if member.name != skip:
+                file.write(member, prefix + member.name)
+        if edit is not None:
+            edit(file)
+    return path
+
+
+@pytest.mark.parametrize("prefix", ["", "compiled/", "./"])
+def test_a_zipped_artifact(written: Path, prefix: str) -> None:
+    directory = load_artifact(written)
+    artifact = load_artifact(packed(written, prefix))
+    assert artifact.manifest.identity == directory.manifest.identity
+    assert artifact.weights["tail.weight"].tobytes() == directory.weights["tail.weight"].tobytes()
+    assert artifact.graph("stem") == directory.graph("stem")
+
+
+def test_the_folder_lives_as_long_as_the_artifact(written: Path) -> None:
+    artifact = load_artifact(packed(written))
+    folder = artifact.path
+    gc.collect()
+    assert artifact.onnx_path("stem").is_file()
+    del artifact
+    gc.collect()
+    assert not folder.exists()
+
+
+def test_folder_entries_and_strangers_are_not_unpacked(written: Path) -> None:
+    def edit(file: zipfile.ZipFile) -> None:
+        file.mkdir("compiled")
+        file.writestr("compiled/README.txt", "hello")
+
+    artifact = load_artifact(packed(written, "compiled/", edit))
+    assert "README.txt" not in {path.name for path in artifact.path.iterdir()}
+
+
+def linked(file: zipfile.ZipFile) -> None:
+    info = zipfile.ZipInfo("passwords")
+    info.external_attr = (stat.S_IFLNK | 0o777) << 16
+    file.writestr(info, "/etc/passwd")
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (lambda f: f.writestr("../evil.txt", "x"), "leaves the archive"),
+        (lambda f: f.writestr("a/../../evil.txt", "x"), "leaves the archive"),
+        (lambda f: f.writestr("/tmp/evil.txt", "x"), "leaves the archive"),
+        (lambda f: f.writestr("..\\evil.txt", "x"), "leaves the archive"),
+        (lambda f: f.writestr("C:evil.txt", "x"), "leaves the archive"),
+        (linked, "link or a device"),
+        (lambda f: f.writestr("deep/er/file", "x"), "one folder at most"),
+        (lambda f: f.writestr("other/file", "x"), "one folder at most"),
+    ],
+)
+def test_entries_that_no_artifact_has(
+    written: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, edit: Edit, message: str
+) -> None:
+    folders = watch(monkeypatch)
+    path = packed(written, edit=edit)
+    before = set(tmp_path.rglob("*"))
+    with pytest.raises(ArtifactError, match=message):
+        load_artifact(path)
+    assert set(tmp_path.rglob("*")) == before
+    assert folders
+    assert not any(folder.exists() for folder in folders)
+
+
+def watch(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """The temporary folders that are made from now on."""
+    folders: list[Path] = []
+    original = archive.tempfile.mkdtemp
+
+    def mkdtemp(prefix: str) -> str:
+        folders.append(Path(original(prefix=prefix)))
+        return str(folders[-1])
+
+    monkeypatch.setattr(archive.tempfile, "mkdtemp", mkdtemp)
+    return folders
+
+
+def test_two_entries_of_one_name(written: Path) -> None:
+    with pytest.warns(UserWarning, match="Duplicate name"):
+        path = packed(written, edit=lambda f: f.writestr("stem.onnx", "x"))
+    with pytest.raises(ArtifactError, match="same name"):
+        load_artifact(path)
+
+
+def test_a_missing_file(written: Path) -> None:
+    with pytest.raises(ArtifactError, match="stem.onnx is missing"):
+        load_artifact(packed(written, skip="stem.onnx"))
+
+
+def test_an_archive_that_is_a_checkpoint(written: Path) -> None:
+    path = written.parent / "policy.ckpt"
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("archive/data.pkl", b"x")
+        file.writestr("archive/data/0", b"x")
+    with pytest.raises(ArtifactError, match="convert it first with 'ttscompile convert'"):
+        load_artifact(path)
+    path = packed(written, skip="manifest.json")
+    with pytest.raises(ArtifactError, match="expected manifest.json in the archive"):
+        load_artifact(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK", b"hello" * 100])
+def test_a_file_that_is_no_archive(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "a.zip").write_bytes(content)
+    with pytest.raises(ArtifactError, match="not a zip file"):
+        load_artifact(tmp_path / "a.zip")
+
+
+def test_every_truncation_is_found(written: Path) -> None:
+    path = packed(written)
+    content = path.read_bytes()
+    for size in range(0, len(content) - 1, 97):
+        path.write_bytes(content[:size])
+        with pytest.raises(ArtifactError):
+            load_artifact(path)
+
+
+def test_flipped_bits_are_found_or_harmless(written: Path) -> None:
+    """Attributes and dates of the entries may change, contents may not."""
+    path = packed(written)
+    content = path.read_bytes()
+    expected = load_artifact(written)
+    for position in range(0, len(content), 61):
+        path.write_bytes(content)
+        flip(path, position, position % 8)
+        try:
+            artifact = load_artifact(path)
+        except ArtifactError:
+            continue
+        assert artifact.manifest.identity == expected.manifest.identity
+        assert artifact.weights["tail.weight"].tobytes() == expected.weights["tail.weight"].tobytes()
+
+
+def test_damage_inside_is_reported_with_the_name_of_the_archive(written: Path) -> None:
+    flip(written / "stem.onnx", 5)
+    with pytest.raises(ArtifactError, match=r"artifact\.zip/stem\.onnx: .*changed since"):
+        load_artifact(packed(written))
+
+
+def test_a_size_that_differs_from_the_declared_one(written: Path) -> None:
+    with (written / "stem.onnx").open("ab") as file:
+        file.write(b"more")
+    with pytest.raises(ArtifactError, match="stem.onnx: expected .* bytes"):
+        load_artifact(packed(written))
+
+
+def test_an_archive_out_of_proportion(written: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = packed(written)
+    monkeypatch.setattr(archive, "FREE_BYTES", 0)
+    monkeypatch.setattr(archive, "MAX_RATIO", 1)
+    with pytest.raises(ArtifactError, match="in so small an archive"):
+        load_artifact(path)
+
+
+def test_too_many_entries(written: Path) -> None:
+    def edit(file: zipfile.ZipFile) -> None:
+        for i in range(archive.MAX_ENTRIES):
+            file.writestr(f"{i}", b"")
+
+    with pytest.raises(ArtifactError, match="at most 4096 entries"):
+        load_artifact(packed(written, edit=edit))

@@ -1,0 +1,193 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.artifact.tiny import tiny_spec
+from ttscompile.artifact import codec
+from ttscompile.artifact.manifest import Manifest, PlanRecord
+from ttscompile.artifact.spec_json import spec_from_json, spec_to_json, type_from_json, type_to_json
+from ttscompile.artifact.strict_json import Value, dump, parse
+from ttscompile.config import Affine, ObservationSpec, PolicySpec, SamplerTable
+from ttscompile.errors import ArtifactError
+from ttscompile.ir.graph import Batch, TensorType
+
+finite = st.floats(width=32, allow_nan=False, allow_infinity=False)
+
+
+@pytest.fixture
+def manifest(written: Path) -> Manifest:
+    return codec.decode((written / "manifest.json").read_bytes())
+
+
+def through_json(spec: PolicySpec) -> PolicySpec:
+    return spec_from_json(parse(dump(spec_to_json(spec)), "spec"))
+
+
+@given(st.lists(finite.filter(bool), min_size=1, max_size=8), st.data())
+def test_float32_comes_back_bit_by_bit(scale: list[float], data: st.DataObject) -> None:
+    n = len(scale)
+    offset = data.draw(st.lists(finite, min_size=n, max_size=n))
+    affine = Affine(np.array(scale, np.float32), np.array(offset, np.float32))
+    triples = st.lists(finite, min_size=3, max_size=3).map(lambda values: np.array(values, np.float32))
+    columns = {name: data.draw(triples) for name in SamplerTable.COLUMNS}
+    timesteps = data.draw(triples)
+    base = tiny_spec()
+    sampler = replace(base.sampler, timesteps=timesteps, clip=data.draw(st.none() | st.floats(0, 1e9)), **columns)
+    spec = replace(base, sampler=sampler, observations={"obs": ObservationSpec((n,), affine)})
+    found = through_json(spec)
+    normalizer = found.observations["obs"].normalizer
+    assert normalizer is not None
+    assert normalizer.scale.tobytes() == affine.scale.tobytes()
+    assert normalizer.offset.tobytes() == affine.offset.tobytes()
+    assert found.sampler.timesteps.tobytes() == timesteps.tobytes()
+    assert found.sampler.timesteps.dtype == np.float32
+    assert found.sampler.clip == sampler.clip
+    for name, column in columns.items():
+        assert getattr(found.sampler, name).tobytes() == column.tobytes()
+
+
+def test_spec_comes_back_with_its_order() -> None:
+    spec = tiny_spec()
+    found = through_json(spec)
+    assert list(found.observations) == ["obs", "goal"]
+    assert spec_to_json(found) == spec_to_json(spec)
+    assert found.sampler.timesteps.dtype == np.int64
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [TensorType((Batch(), 16, 64), "float32"), TensorType((Batch(12), 0), "int64"), TensorType((), "bool")],
+)
+def test_types_come_back(kind: TensorType) -> None:
+    assert type_from_json(Value(type_to_json(kind), "t")) == kind
+
+
+@pytest.mark.parametrize("size", ["b", "1*B", "0*B", "-2*B", "B*2", "", " B", -1, 1.5, None, True])
+def test_sizes_that_are_none(size: object) -> None:
+    with pytest.raises(ArtifactError, match=r"t\.shape\[1\]"):
+        type_from_json(Value({"dtype": "float32", "shape": ["B", size]}, "t"))
+
+
+def test_manifest_comes_back(manifest: Manifest) -> None:
+    content = codec.encode(manifest)
+    again = codec.decode(content)
+    assert codec.encode(again) == content
+    assert again.pieces == manifest.pieces
+    assert again.contexts == manifest.contexts
+    assert again.blocks == manifest.blocks
+    assert again.reuse == manifest.reuse
+    assert again.flops == manifest.flops
+    assert again.files == manifest.files
+
+
+def test_a_manifest_with_plans_comes_back(manifest: Manifest) -> None:
+    plans = {"tts": PlanRecord("pruner", None, 0.5)}
+    changed = replace(manifest, plans=plans, default_plan="tts", calibration={"seed": 0, "loss": [1.5, {"a": None}]})
+    again = codec.decode(codec.encode(changed))
+    assert again.plans == plans
+    assert again.calibration == changed.calibration
+
+
+def test_every_flipped_bit_of_a_value_is_found(written: Path) -> None:
+    """White space may change; whatever is read may not."""
+    content = (written / "manifest.json").read_bytes()
+    expected = json.loads(content)
+    for position in range(0, len(content), 3):
+        for bit in (0, 3, 6):
+            changed = bytearray(content)
+            changed[position] ^= 1 << bit
+            try:
+                same = json.loads(changed) == expected
+            except ValueError:
+                same = False
+            if not same:
+                with pytest.raises(ArtifactError):
+                    codec.decode(bytes(changed))
+
+
+def test_every_truncation_is_found(written: Path) -> None:
+    content = (written / "manifest.json").read_bytes()
+    for size in range(len(content) - 1):  # the last byte is a newline
+        with pytest.raises(ArtifactError):
+            codec.decode(content[:size])
+
+
+Change = Callable[[dict[str, Any]], object]
+
+
+def change(manifest: Manifest, edit: Change) -> bytes:
+    """A manifest whose checksum is right and whose content is not."""
+    document = codec.to_json(manifest)
+    edit(document)
+    return dump({**document, "checksum": codec._checksum(document)})
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (lambda d: d.pop("spec"), r"missing: \['spec'\]"),
+        (lambda d: d.update(more=1), r"unknown: \['more'\]"),
+        (lambda d: d["spec"]["sampler"]["out_to_x0"].pop(), "spec: sampler column out_to_x0 must hold 3"),
+        (lambda d: d["spec"]["sampler"]["out_to_x0"].__setitem__(1, 0.1), r"out_to_x0\[1\]: .*float32 holds exactly"),
+        (lambda d: d["spec"]["sampler"]["out_to_x0"].__setitem__(1, 1e300), r"out_to_x0\[1\]: .*float32"),
+        (lambda d: d["spec"]["chunk"].update(stop=99), "does not fit a sample"),
+        (lambda d: d["spec"].update(sample=[1, 2, 3]), r"spec\.sample: expected two sizes"),
+        (lambda d: d["spec"]["observations"].clear(), "at least one observation"),
+        (lambda d: d["spec"]["observations"]["obs"].update(dtype="object"), r"observations\.obs\.dtype"),
+        (lambda d: d["spec"]["observations"]["obs"]["normalizer"]["scale"].__setitem__(0, 0), "scale is zero"),
+        (lambda d: d["blocks"].pop(), "expected FLOPs of 1 blocks"),
+        (lambda d: d["blocks"][1].update(flops=-1), r"blocks\[1\]\.flops"),
+        (lambda d: d["reuse"].pop(), "one for each of 2 blocks"),
+        (lambda d: d["pieces"].pop("advance"), "'advance'"),
+        (lambda d: d["pieces"].pop("block_01"), "'block_01'"),
+        (lambda d: d["pieces"].pop("pruner"), "exactly when there is a piece called pruner"),
+        (lambda d: d["pieces"]["stem"].update(file="../stem.onnx"), "plain file name"),
+        (lambda d: d["pieces"]["stem"].update(stream="no"), r"pieces\.stem\.stream: expected one of"),
+        (lambda d: d["pieces"]["stem"].update(contexts=["no"]), "contexts of stem"),
+        (lambda d: d["pieces"]["stem"].update(file="other.onnx"), "exactly the files"),
+        (lambda d: d["contexts"]["memory"].update(binding="loop"), r"contexts\.memory\.binding"),
+        (lambda d: d["files"].update({"../../etc/passwd": d["files"]["stem.onnx"]}), "plain file name"),
+        (lambda d: d["files"].update({"manifest.json": d["files"]["stem.onnx"]}), "plain file name"),
+        (lambda d: d["files"]["stem.onnx"].update(sha256="ab"), "64 hexadecimal"),
+        (lambda d: d.update(identity="A" * 64), "64 hexadecimal"),
+        (lambda d: d.update(default_plan="none"), r"default_plan: expected one of \['dense'\]"),
+        (lambda d: d["plans"].update(s={"kind": "schedule", "sparsity": 0.5, "flops_sparsity": 0.5}), "file of plans"),
+        (lambda d: d["plans"].update(s={"kind": "pruner", "sparsity": 1.5, "flops_sparsity": 0.5}), r"0\.\.1"),
+        (lambda d: d["plans"].update(s={"kind": "magic", "sparsity": 0.5, "flops_sparsity": 0.5}), "'schedule'"),
+        (lambda d: d["plans"].update(dense={"kind": "pruner", "sparsity": 0, "flops_sparsity": 0}), "called 'dense'"),
+        (lambda d: d["requires"].update(onnxruntime="latest"), "a version like"),
+        (lambda d: d["requires"].update(opset=0), "at least 1"),
+        (lambda d: d.update(calibration=[]), "calibration: expected an object"),
+    ],
+)
+def test_contents_that_are_refused(manifest: Manifest, edit: Change, message: str) -> None:
+    with pytest.raises(ArtifactError, match=message):
+        codec.decode(change(manifest, edit))
+
+
+@pytest.mark.parametrize("version", [0, 2, 99, "1", 1.0, True, None])
+def test_another_schema_version_says_what_to_do(manifest: Manifest, version: object) -> None:
+    content = change(manifest, lambda d: d.update(schema_version=version, ttscompile_version="7.8.9"))
+    with pytest.raises(ArtifactError, match=r"Convert the checkpoint again .* install ttscompile==7\.8\.9"):
+        codec.decode(content)
+
+
+def test_a_future_schema_is_named_before_anything_else_is_read() -> None:
+    content = dump({"format": "ttscompile artifact", "schema_version": 2, "new": "thing"})
+    with pytest.raises(ArtifactError, match="schema_version: expected 1, .*; found 2"):
+        codec.decode(content)
+
+
+@pytest.mark.parametrize("content", [b"{}", b'{"format": "onnx"}', b"[]", b"1", b'{"schema_version": 1}'])
+def test_other_documents(content: bytes) -> None:
+    with pytest.raises(ArtifactError, match="manifest"):
+        codec.decode(content)

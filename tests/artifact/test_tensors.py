@@ -1,0 +1,127 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from safetensors.numpy import load_file
+
+from ttscompile.artifact import tensors
+from ttscompile.errors import ArtifactError
+
+DTYPES = [np.bool_, np.uint8, np.int8, np.int16, np.int32, np.int64, np.float16, np.float32, np.float64]
+
+arrays = st.dictionaries(
+    st.text(min_size=1, max_size=8).filter(lambda name: name != "__metadata__"),
+    st.sampled_from(DTYPES).flatmap(lambda d: hnp.arrays(d, hnp.array_shapes(min_dims=0, min_side=0, max_dims=3))),
+    max_size=5,
+)
+
+
+@given(arrays)
+def test_what_is_written_is_read_by_us_and_by_the_library(values: dict[str, np.ndarray]) -> None:
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "t.safetensors"
+        path.write_bytes(tensors.serialize(values))
+        found, theirs = tensors.read(path), load_file(path)
+        assert set(found) == set(values) == set(theirs)
+        for name, value in values.items():
+            assert found[name].dtype == value.dtype
+            assert found[name].shape == value.shape
+            assert found[name].tobytes() == value.tobytes() == theirs[name].tobytes()
+        raw = path.read_bytes()
+        for name, (offset, length) in tensors.offsets(path).items():
+            assert raw[offset : offset + length] == values[name].tobytes()
+
+
+def test_strides_and_byte_order_do_not_matter(tmp_path: Path) -> None:
+    value = np.arange(12, dtype=np.float32).reshape(3, 4)
+    expected = tensors.serialize({"a": value, "b": value.T.copy()})
+    assert tensors.serialize({"b": value.T, "a": np.asfortranarray(value).astype(">f4")}) == expected
+
+
+def test_arrays_are_read_only_views(tmp_path: Path) -> None:
+    path = tmp_path / "t.safetensors"
+    path.write_bytes(tensors.serialize({"a": np.zeros(3, np.float32)}))
+    with pytest.raises(ValueError, match="read-only"):
+        tensors.read(path)["a"][0] = 1
+
+
+def test_a_dtype_that_numpy_lacks_is_not_written() -> None:
+    with pytest.raises(ArtifactError, match="'a' has dtype complex64"):
+        tensors.serialize({"a": np.zeros(3, np.complex64)})
+
+
+def entry(dtype: object = "F32", shape: object = (2,), begin: object = 0, end: object = 8) -> dict[str, object]:
+    return {"dtype": dtype, "shape": shape, "data_offsets": [begin, end]}
+
+
+def file_of(tmp_path: Path, header: object, data: bytes = bytes(8), length: int | None = None) -> Path:
+    content = header if isinstance(header, bytes) else json.dumps(header).encode()
+    content += b" " * (-len(content) % 8)
+    path = tmp_path / "t.safetensors"
+    path.write_bytes((len(content) if length is None else length).to_bytes(8, "little") + content + data)
+    return path
+
+
+def test_the_hand_made_file_is_good(tmp_path: Path) -> None:
+    path = file_of(tmp_path, {"__metadata__": {"format": "np"}, "a": entry()})
+    assert tensors.read(path)["a"].tolist() == [0, 0]
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        ({"a": entry(dtype="BF16")}, "one of 'BOOL'"),
+        ({"a": entry(dtype=3)}, "one of 'BOOL'"),
+        ({"a": entry(shape=[3])}, r"\[begin, begin \+ 12\]"),
+        ({"a": entry(shape=[-2])}, "at least 0"),
+        ({"a": entry(shape=[2**62, 2**62])}, "begin, begin"),
+        ({"a": entry(shape=[2**64])}, "64-bit"),
+        ({"a": entry(shape=[1] * 17, end=4)}, "at most 16 sizes"),
+        ({"a": entry(shape=[True, 2])}, "integer"),
+        ({"a": entry(begin=8, end=16)}, "'a' at byte"),
+        ({"a": entry(begin=8, end=0)}, "begin, begin"),
+        ({"a": entry(begin=-8, end=0)}, "at least 0"),
+        ({"a": entry(), "b": entry()}, "'b' at byte"),
+        ({"a": entry(shape=[1], end=4), "b": entry(shape=[1], begin=3, end=7)}, "'b' at byte"),
+        ({"a": entry(dtype="U8", shape=[1], end=1), "b": entry(dtype="I16", shape=[1], begin=1, end=3)}, "aligned"),
+        ({"a": entry(shape=[1], end=4)}, "expected .* bytes; found"),
+        ({"a": entry(shape=[4], end=16)}, "expected .* bytes; found"),
+        ({"a": {"dtype": "F32", "shape": [2]}}, "missing"),
+        ({"a": {**entry(), "more": 1}}, "unknown"),
+        ({"__metadata__": {"a": 1}, "a": entry()}, "__metadata__.a"),
+        ([], "an object"),
+        (b'{"a": 1, "a": 2}', "twice"),
+        (b"not json", "JSON document"),
+    ],
+)
+def test_headers_that_are_refused(tmp_path: Path, header: object, message: str) -> None:
+    with pytest.raises(ArtifactError, match=message):
+        tensors.read(file_of(tmp_path, header))
+
+
+@pytest.mark.parametrize("length", [2**63, 2**64 - 1, 1000])
+def test_a_header_longer_than_the_file(tmp_path: Path, length: int) -> None:
+    with pytest.raises(ArtifactError, match="inside the file"):
+        tensors.read(file_of(tmp_path, {"a": entry()}, length=length))
+
+
+def test_every_truncation_is_found(tmp_path: Path) -> None:
+    path = tmp_path / "t.safetensors"
+    content = tensors.serialize({"a": np.ones(3, np.float32), "b": np.ones((), np.int64)})
+    for size in range(len(content)):
+        path.write_bytes(content[:size])
+        with pytest.raises(ArtifactError):
+            tensors.read(path)
+
+
+def test_a_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(ArtifactError, match="cannot be read"):
+        tensors.read(tmp_path / "none")

@@ -1,0 +1,268 @@
+from __future__ import annotations
+
+import fcntl
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.artifact.folders import contents
+from tests.artifact.test_archive import packed
+from tests.artifact.tiny import tiny_models, tiny_program
+from ttscompile.artifact import load_artifact
+from ttscompile.artifact.manifest import Manifest, PlanRecord
+from ttscompile.artifact.write import update_calibration, write_artifact
+from ttscompile.errors import ArtifactError, IllegalPlanError
+
+ROOT = Path(__file__).resolve().parents[2]
+PLAN = np.array([[0, 0], [1, 2], [0, 3]], np.int8)
+
+
+def new_pruner(path: Path, by: float = 1) -> dict[str, np.ndarray]:
+    pruner = {name: np.array(value) for name, value in load_artifact(path).pruner.items()}
+    pruner["pruner.weight"] += by
+    pruner["pruner.bias"] += by
+    return pruner
+
+
+def update(path: Path, by: float = 1, **changes: Any) -> Manifest:
+    arguments: dict[str, Any] = {
+        "pruner_weights": new_pruner(path, by),
+        "schedules": {"mine": PLAN},
+        "default_plan": "tts",
+        "record": {"strategy": "tts", "seed": 0, "sparsity": 0.75, "losses": [1.5, None]},
+    }
+    return update_calibration(path, **{**arguments, **changes})
+
+
+def logits(path: Path) -> np.ndarray:
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(load_artifact(path).onnx_path("pruner"), providers=["CPUExecutionProvider"])
+    return np.asarray(session.run(None, {"memory": np.ones((2, 1, 16), np.float32)})[0])
+
+
+def test_plans_weights_and_record_are_replaced(written: Path) -> None:
+    before = load_artifact(written).manifest
+    old = logits(written)
+    pruner = new_pruner(written)
+    returned = update(written)
+    artifact = load_artifact(written)
+    manifest = artifact.manifest
+    assert manifest.identity == returned.identity != before.identity
+    assert manifest.model_identity == before.model_identity
+    assert manifest.default_plan == "tts"
+    assert manifest.plans == {
+        "mine": PlanRecord("schedule", 0.5, 0.5),
+        "tts": PlanRecord("pruner", 0.75, None),
+    }
+    assert manifest.calibration == {"strategy": "tts", "seed": 0, "sparsity": 0.75, "losses": [1.5, None]}
+    np.testing.assert_array_equal(artifact.schedule("mine"), PLAN)
+    for name, value in pruner.items():
+        assert artifact.pruner[name].tobytes() == value.tobytes()
+    # All weights one larger, on 16 inputs of one; the bias is small enough to be in the model and has to follow too.
+    np.testing.assert_allclose(logits(written), old + 17, rtol=1e-5)
+    assert set(contents(written)) == {"manifest.json", *manifest.files}
+    shared = set(before.files) & set(manifest.files)
+    assert shared == {name for name in before.files if not name.startswith("pruner")}
+
+
+def test_an_update_equals_a_fresh_one_byte_by_byte(written: Path, tmp_path: Path) -> None:
+    update(written)
+    once = contents(written)
+    update(written, by=0)
+    assert contents(written) == once
+    update(written, by=5, schedules={}, default_plan="other")
+    update(written, by=-5)
+    program = tiny_program()
+    write_artifact(program, tiny_models(program), tmp_path / "b")
+    update(tmp_path / "b", by=0, pruner_weights=load_artifact(written).pruner)
+    assert contents(tmp_path / "b") == contents(written)
+
+
+def test_schedules_alone(written: Path) -> None:
+    update(written)
+    before = load_artifact(written)
+    manifest = update(written, pruner_weights=None, schedules={"a": PLAN, "b-95%": PLAN * 0}, default_plan="a")
+    assert {name: plan.kind for name, plan in manifest.plans.items()} == {"a": "schedule", "b-95%": "schedule"}
+    assert manifest.stores.pruner == before.manifest.stores.pruner
+    assert manifest.plans["b-95%"].flops_sparsity == 0
+    manifest = update(written, pruner_weights=None, schedules={}, default_plan="dense", record={})
+    assert (manifest.plans, manifest.default_plan, manifest.stores.plans) == ({}, "dense", None)
+    assert manifest.calibration == {}
+    load_artifact(written)
+
+
+def test_the_pruner_beside_a_default_schedule(written: Path) -> None:
+    assert set(update(written, default_plan="mine").plans) == {"mine", "pruner"}
+    assert set(update(written, default_plan="dense", schedules={}).plans) == {"pruner"}
+
+
+BAD: list[tuple[dict[str, Any], type[Exception], str]] = [
+    ({"schedules": {"dense": PLAN}}, ArtifactError, "not 'dense'"),
+    ({"schedules": {"../x": PLAN}}, ArtifactError, "schedule '../x'"),
+    ({"schedules": {"": PLAN}}, ArtifactError, "schedule ''"),
+    ({"schedules": {"pruner": PLAN}, "default_plan": "dense"}, ArtifactError, "cannot be called 'pruner'"),
+    ({"schedules": {"a": PLAN[:2]}}, IllegalPlanError, "'a': plan has shape"),
+    ({"schedules": {"a": PLAN.astype(np.int64)}}, IllegalPlanError, "int64"),
+    ({"schedules": {"a": PLAN[::-1]}}, IllegalPlanError, "step 0"),
+    ({"pruner_weights": None}, ArtifactError, "default plan 'tts'"),
+    ({"pruner_weights": {}}, ArtifactError, "3 differ"),
+    ({"default_plan": "no such name!"}, ArtifactError, "cannot be called"),
+    ({"record": {"x": float("nan")}}, ArtifactError, "expected JSON"),
+    ({"record": {"x": np.zeros(2)}}, ArtifactError, "expected JSON"),
+    ({"record": {"sparsity": 1.5}}, ArtifactError, r"sparsity: expected a number in 0\.\.1"),
+    ({"model_identity": "0" * 64}, ArtifactError, "converted again"),
+]
+
+
+@pytest.mark.parametrize(("changes", "error", "message"), BAD)
+def test_arguments_that_do_not_fit(
+    written: Path, changes: dict[str, Any], error: type[Exception], message: str
+) -> None:
+    before = contents(written)
+    with pytest.raises(error, match=message):
+        update(written, **changes)
+    assert contents(written) == before
+
+
+@pytest.mark.parametrize("edit", ["dtype", "shape", "name"])
+def test_pruner_weights_of_another_type(written: Path, edit: str) -> None:
+    pruner = new_pruner(written)
+    if edit == "dtype":
+        pruner["pruner.bias"] = pruner["pruner.bias"].astype(np.float64)
+    elif edit == "shape":
+        pruner["pruner.bias"] = pruner["pruner.bias"][None]
+    else:
+        pruner["pruner.offset"] = pruner.pop("pruner.bias")
+    before = contents(written)
+    with pytest.raises(ArtifactError, match="'pruner.bias'"):
+        update(written, pruner_weights=pruner)
+    assert contents(written) == before
+
+
+def test_what_cannot_be_updated(written: Path, tmp_path: Path) -> None:
+    pruner = new_pruner(written)
+    with pytest.raises(ArtifactError, match="Unzip the artifact"):
+        update(packed(written), pruner_weights=pruner)
+    with pytest.raises(ArtifactError, match="does not exist"):
+        update(tmp_path / "none", pruner_weights=pruner)
+    (written / "stem.onnx").unlink()
+    with pytest.raises(ArtifactError, match="missing"):
+        update(written, pruner_weights=pruner)
+
+
+def test_one_at_a_time(written: Path) -> None:
+    program = tiny_program()
+    descriptor = os.open(written, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        with pytest.raises(ArtifactError, match="another process is changing the artifact"):
+            update(written)
+        with pytest.raises(ArtifactError, match="another process is changing the artifact"):
+            write_artifact(program, tiny_models(program), written)
+    finally:
+        os.close(descriptor)
+    update(written)
+
+
+def test_an_open_artifact_survives_an_update(written: Path) -> None:
+    artifact = load_artifact(written)
+    before = {name: np.array(value) for name, value in artifact.pruner.items()}
+    update(written)
+    for name, value in before.items():
+        assert artifact.pruner[name].tobytes() == value.tobytes()
+
+
+@pytest.mark.parametrize("function", ["replace", "fsync"])
+def test_failure_anywhere_leaves_the_old_or_the_new(
+    written: Path, monkeypatch: pytest.MonkeyPatch, function: str
+) -> None:
+    update(written, by=3)
+    before = contents(written)
+    pruner = new_pruner(written)
+    original = getattr(os, function)
+    outcomes: list[str] = []
+    messages: list[str] = []
+    for fail_at in range(100):
+        calls = 0
+
+        def failing(*args: Any, fail_at: int = fail_at, **kwargs: Any) -> Any:
+            nonlocal calls
+            calls += 1
+            if calls == fail_at + 1:
+                raise OSError("no space left on device")
+            return original(*args, **kwargs)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(os, function, failing)
+            try:
+                update(written, pruner_weights=pruner, schedules={"new": PLAN * 0}, default_plan="new")
+                break
+            except ArtifactError as error:
+                messages.append(str(error))
+        outcomes.append("old" if contents(written) == before else load_artifact(written).manifest.default_plan)
+        if outcomes[-1] == "new":
+            break
+    assert outcomes.count("old") >= 4
+    assert set(outcomes) <= {"old", "new"}
+    assert all("no space left on device" in message for message in messages)
+    manifest = load_artifact(written).manifest
+    assert manifest.default_plan == "new"
+    assert set(contents(written)) == {"manifest.json", *manifest.files}
+
+
+def test_a_process_that_is_killed_anywhere_leaves_the_old_or_the_new(written: Path) -> None:
+    """Children die without a word at the n-th sync, rename or removal; the next update cleans up after them."""
+    script = textwrap.dedent(
+        """
+        import os, sys
+        sys.path.insert(0, sys.argv[1])
+        from pathlib import Path
+        from tests.artifact.test_update import update
+        from ttscompile.artifact import load_artifact
+
+        path, left, seen = Path(sys.argv[2]), 0, []
+        import onnx  # before the children, so that they are quick
+
+        def dying(original):
+            def call(*args, **kwargs):
+                global left
+                left -= 1
+                if left < 0:
+                    os._exit(3)
+                return original(*args, **kwargs)
+            return call
+
+        for left in range(100):
+            child = os.fork()
+            if child == 0:
+                for name in ("fsync", "replace", "unlink"):
+                    setattr(os, name, dying(getattr(os, name)))
+                update(path, record={"left": left})
+                os._exit(0)
+            status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+            seen.append((load_artifact(path).manifest.calibration or {}).get("left", "none"))
+            assert status in (0, 3), status
+            if status == 0:
+                break
+        print(*seen)
+        """
+    )
+    result = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", script, ROOT, written], check=True, capture_output=True, text=True
+    )
+    seen = result.stdout.split()
+    assert len(seen) > 10
+    # Killed early: what was there before; killed late: what was being written.
+    changed = [i for i, left in enumerate(seen) if left == str(i)]
+    assert seen[0] == "none"
+    assert changed[-1] == len(seen) - 1
+    assert all(left in ("none", *map(str, changed)) for left in seen)
+    manifest = update(written)
+    assert set(contents(written)) == {"manifest.json", *manifest.files}

@@ -1,0 +1,124 @@
+"""A zipped artifact, unpacked without trusting it: only declared files, only plain names, only declared sizes."""
+
+from __future__ import annotations
+
+import shutil
+import stat
+import tempfile
+import weakref
+import zipfile
+import zlib
+from pathlib import Path, PurePosixPath
+
+from ..errors import ArtifactError
+from .codec import MAX_MANIFEST_BYTES, decode
+from .manifest import MANIFEST
+
+MAX_ENTRIES = 4096
+MAX_RATIO = 200
+"""Deflate reaches 1000 on zeros; real weights 1.1. Beyond this, and beyond ``FREE_BYTES``, it is a bomb."""
+FREE_BYTES = 256 * 2**20
+
+_AGAIN = "Zip the artifact's directory again, or give the directory itself."
+
+
+class Unpacked:
+    """A temporary folder that goes when this object does.
+
+    Attributes:
+        path: the folder.
+    """
+
+    def __init__(self) -> None:
+        self.path = Path(tempfile.mkdtemp(prefix="ttscompile-"))
+        self._finalizer = weakref.finalize(self, shutil.rmtree, self.path, True)
+
+    def remove(self) -> None:
+        """Remove the folder now."""
+        self._finalizer()
+
+
+def unpack(path: Path) -> Unpacked:
+    """Unpack a zipped artifact into a temporary folder.
+
+    The files may stand at the top of the archive or all in one folder, as ``zip -r a.zip compiled/`` puts them.
+
+    Args:
+        path: the zip file.
+
+    Returns:
+        The folder, with the files that the manifest declares and no others.
+
+    Raises:
+        ArtifactError: no zip file, no artifact in it, an entry with a name or of a kind that an artifact cannot have,
+            or sizes that contradict the manifest or are out of proportion.
+    """
+    unpacked = Unpacked()
+    try:
+        with zipfile.ZipFile(path) as archive:
+            _extract(archive, path, unpacked.path)
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError) as error:
+        unpacked.remove()
+        raise ArtifactError(f"{path}: not a zip file that can be read: {error}. {_AGAIN}") from error
+    except BaseException:
+        unpacked.remove()
+        raise
+    return unpacked
+
+
+def _extract(archive: zipfile.ZipFile, path: Path, folder: Path) -> None:
+    entries = _entries(archive, path)
+    if MANIFEST not in entries:
+        raise ArtifactError(
+            f"{path}: expected {MANIFEST} in the archive; found {sorted(entries)[:5]}. This is no artifact: if it is a"
+            " checkpoint, convert it first with 'ttscompile convert'."
+        )
+    allowed = max(FREE_BYTES, MAX_RATIO * path.stat().st_size)
+    content = _member(archive, entries[MANIFEST], min(entries[MANIFEST].file_size, MAX_MANIFEST_BYTES), path)
+    (folder / MANIFEST).write_bytes(content)
+    manifest = decode(content, f"{path}: {MANIFEST}")
+    total = sum(record.bytes for record in manifest.files.values())
+    if total > allowed:
+        raise ArtifactError(
+            f"{path}: expected at most {allowed} bytes in so small an archive; its manifest declares {total}. {_AGAIN}"
+        )
+    for name, record in manifest.files.items():
+        if name not in entries:
+            raise ArtifactError(f"{path}: the file {name} is missing; {MANIFEST} lists it. {_AGAIN}")
+        (folder / name).write_bytes(_member(archive, entries[name], record.bytes, path))
+
+
+def _entries(archive: zipfile.ZipFile, path: Path) -> dict[str, zipfile.ZipInfo]:
+    """The files of the archive by plain name; every entry is checked, also those that nobody will read."""
+    infos = archive.infolist()
+    if len(infos) > MAX_ENTRIES:
+        raise ArtifactError(f"{path}: expected at most {MAX_ENTRIES} entries; found {len(infos)}. {_AGAIN}")
+    files = []
+    for info in infos:
+        kind = stat.S_IFMT(info.external_attr >> 16)
+        name = PurePosixPath(info.filename)
+        if name.is_absolute() or ".." in name.parts or "\\" in info.filename or ":" in info.filename:
+            raise ArtifactError(f"{path}: entry {info.filename!r} leaves the archive; found in no artifact. {_AGAIN}")
+        if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
+            raise ArtifactError(f"{path}: entry {info.filename!r} is a link or a device, not a file. {_AGAIN}")
+        if not info.is_dir():
+            files.append((name, info))
+    folders = {name.parent for name, _ in files}
+    if len(folders) > 1 or any(len(folder.parts) > 1 for folder in folders):
+        raise ArtifactError(
+            f"{path}: expected files in one folder at most; found {sorted(map(str, folders))[:5]}. This is no artifact:"
+            " if it is a checkpoint, convert it first with 'ttscompile convert'."
+        )
+    entries = {name.name: info for name, info in files}
+    if len(entries) != len(files):
+        raise ArtifactError(f"{path}: two entries have the same name. {_AGAIN}")
+    return entries
+
+
+def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, size: int, path: Path) -> bytes:
+    """The content of an entry, which has to be of exactly this size."""
+    with archive.open(info) as file:
+        content = file.read(size + 1)
+    if info.file_size != size or len(content) != size:
+        raise ArtifactError(f"{path}: {info.filename}: expected {size} bytes; found {info.file_size}. {_AGAIN}")
+    return content

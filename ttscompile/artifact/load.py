@@ -1,0 +1,297 @@
+"""Open an artifact: everything is checked before anything of it is used. Needs numpy alone."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import ArtifactError, IllegalPlanError
+from ..ir.graph import Graph
+from ..ir.program import Binding, Block, Pieces, Program
+from ..ir.serialize import graph_from_json
+from ..lattice import PlanArray, Source, check_plan, dense_plan
+from . import tensors
+from .archive import Unpacked, unpack
+from .codec import decode
+from .files import verify
+from .identity import identities
+from .manifest import DENSE, MANIFEST, Manifest, Requires, block_name
+from .strict_json import REMEDY, parse
+
+TABLE_PREFIX = "table/"
+
+
+@dataclass(frozen=True, eq=False)
+class Artifact:
+    """An artifact on disk, checked.
+
+    Attributes:
+        path: the directory; of a zipped artifact a temporary one, which lives as long as this object.
+        manifest: what is not array or graph.
+        weights: constants of all pieces but the pruner's, read-only views of the file.
+        tables: TABLE contexts ``[K, ...]``, read-only views of the file.
+        pruner: constants of the pruner (their names start with ``pruner.``); empty if there is none.
+        schedules: int8 ``[K, blocks]`` by name, without ``dense``.
+    """
+
+    path: Path
+    manifest: Manifest
+    weights: Mapping[str, npt.NDArray[Any]]
+    tables: Mapping[str, npt.NDArray[Any]]
+    pruner: Mapping[str, npt.NDArray[Any]]
+    schedules: Mapping[str, PlanArray]
+    _unpacked: Unpacked | None = field(default=None, repr=False)
+
+    def onnx_path(self, piece: str) -> Path:
+        """The ONNX file of a piece, whose weights onnxruntime finds beside it."""
+        return self.path / self.manifest.pieces[piece].file
+
+    def schedule(self, name: str) -> PlanArray:
+        """A schedule by name, ``dense`` among them, int8 ``[K, blocks]``.
+
+        Raises:
+            ArtifactError: there is none of this name.
+        """
+        if name == DENSE:
+            return dense_plan(self.manifest.steps, len(self.manifest.blocks))
+        if name not in self.schedules:
+            known = [DENSE, *self.schedules]
+            raise ArtifactError(f"{self.path}: has no schedule {name!r}; it has {known}. Use one of these.")
+        return self.schedules[name]
+
+    @cached_property
+    def graphs(self) -> Mapping[str, Graph]:
+        """Graphs of all pieces: ``condition``, ``step``, ``pruner``, ``stem``, ``block_00``..., ``tail``.
+
+        Raises:
+            ArtifactError: ``program.json`` is not valid, or asks for a constant that the artifact lacks.
+        """
+        path = self.path / self.manifest.stores.program
+        try:
+            content = path.read_bytes()
+        except OSError as error:
+            raise ArtifactError(f"{path}: cannot be read: {error}. {REMEDY}") from error
+        members = parse(content, path.name).keys("graphs")["graphs"].members()
+        graphs = {}
+        for name, value in members.items():
+            try:
+                graphs[name] = graph_from_json(value.data)
+            except ArtifactError as error:
+                raise ArtifactError(f"{value.path}: {error}") from error
+            self._check_constants(graphs[name], value.path)
+        return MappingProxyType(graphs)
+
+    def graph(self, name: str) -> Graph:
+        """The graph of one piece.
+
+        Raises:
+            ArtifactError: ``program.json`` is not valid or has no such graph.
+        """
+        if name not in self.graphs:
+            raise ArtifactError(f"{self.path}: has no graph {name!r}; it has {list(self.graphs)}. {REMEDY}")
+        return self.graphs[name]
+
+    def program(self) -> Program:
+        """The program as the reference runtime takes it.
+
+        The captured denoiser is not kept in an artifact: its graph is empty here, and blocks name no values of it.
+
+        Raises:
+            ArtifactError: see ``graphs``.
+        """
+        manifest = self.manifest
+        pieces = Pieces(
+            condition=self.graph("condition"),
+            step=self.graphs.get("step"),
+            stem=self.graph("stem"),
+            blocks=tuple(self.graph(block_name(i)) for i in range(len(manifest.blocks))),
+            tail=self.graph("tail"),
+            pruner=self.graphs.get("pruner"),
+            tables=self.tables,
+            bindings={name: context.binding for name, context in manifest.contexts.items()},
+            features=manifest.features,
+        )
+        blocks = tuple(
+            Block(
+                i,
+                b.kind,
+                stream="",
+                result="",
+                residual=None,
+                type=b.type,
+                group=b.group,
+                flops=b.flops,
+                reason=b.reason,
+            )
+            for i, b in enumerate(manifest.blocks)
+        )
+        return Program(
+            spec=manifest.spec,
+            denoiser=Graph(inputs={}, constants={}, nodes=(), outputs=()),
+            weights={**self.weights, **self.pruner},
+            blocks=blocks,
+            pieces=pieces,
+            reuse=manifest.reuse,
+            dense_flops=manifest.flops.dense,
+        )
+
+    def _check_constants(self, graph: Graph, where: str) -> None:
+        for name, kind in graph.constants.items():
+            array = self.weights.get(name, self.pruner.get(name))
+            if array is None or array.shape != kind.at(1) or str(array.dtype) != kind.dtype:
+                found = "none" if array is None else f"{array.dtype}{list(array.shape)}"
+                raise ArtifactError(f"{where}: expected the constant {name!r} : {kind}; found {found}. {REMEDY}")
+
+
+def load_artifact(path: str | Path) -> Artifact:
+    """Open an artifact and check all of it: schema, sizes and hashes of all files, identity, plans, onnxruntime.
+
+    Args:
+        path: the directory that ``convert`` wrote, or the same zipped.
+
+    Returns:
+        The artifact; arrays are mapped, not read.
+
+    Raises:
+        ArtifactError: says what is wrong, where, and what to do.
+    """
+    place = Path(path)
+    if place.is_dir():
+        return _load_directory(place)
+    if not place.exists():
+        raise ArtifactError(f"{place}: does not exist. Give the directory that 'ttscompile convert' wrote.")
+    unpacked = unpack(place)
+    try:
+        return replace(_load_directory(unpacked.path), _unpacked=unpacked)
+    except ArtifactError as error:
+        unpacked.remove()
+        raise ArtifactError(str(error).replace(str(unpacked.path), str(place))) from error
+
+
+def read_manifest(directory: Path) -> Manifest:
+    """Read ``manifest.json`` of a directory, and nothing else.
+
+    Raises:
+        ArtifactError: not an artifact, or a manifest that is damaged or of another schema version.
+    """
+    path = directory / MANIFEST
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise ArtifactError(
+            f"{directory}: not an artifact: it has no {MANIFEST}. Give the directory that 'ttscompile convert' wrote."
+        ) from None
+    except OSError as error:
+        raise ArtifactError(f"{path}: cannot be read: {error}. {REMEDY}") from error
+    return decode(content, str(path))
+
+
+def _load_directory(directory: Path) -> Artifact:
+    manifest = read_manifest(directory)
+    _check_runtime(manifest.requires, directory)
+    for name, record in manifest.files.items():
+        verify(directory / name, record)
+    if identities(manifest) != (manifest.identity, manifest.model_identity):
+        raise ArtifactError(
+            f"{directory}: expected the identity {manifest.short_identity}; its content has"
+            f" {identities(manifest)[0][:12]}. {REMEDY}"
+        )
+    stored = tensors.read(directory / manifest.stores.weights)
+    tables = {n.removeprefix(TABLE_PREFIX): a for n, a in stored.items() if n.startswith(TABLE_PREFIX)}
+    artifact = Artifact(
+        path=directory,
+        manifest=manifest,
+        weights=MappingProxyType({n: a for n, a in stored.items() if not n.startswith(TABLE_PREFIX)}),
+        tables=MappingProxyType(tables),
+        pruner=_optional(directory, manifest.stores.pruner),
+        schedules=_optional(directory, manifest.stores.plans),
+    )
+    _check_tables(artifact)
+    _check_schedules(artifact)
+    return artifact
+
+
+def _optional(directory: Path, name: str | None) -> Mapping[str, npt.NDArray[Any]]:
+    return MappingProxyType({}) if name is None else tensors.read(directory / name)
+
+
+def _check_tables(artifact: Artifact) -> None:
+    manifest = artifact.manifest
+    expected = {n: c.type for n, c in manifest.contexts.items() if c.binding is Binding.TABLE}
+    where = artifact.path / manifest.stores.weights
+    if set(expected) != set(artifact.tables):
+        raise ArtifactError(
+            f"{where}: expected tables of {sorted(expected)}; found {sorted(artifact.tables)}. {REMEDY}"
+        )
+    for name, kind in expected.items():
+        table, shape = artifact.tables[name], (manifest.steps, *kind.at(1))
+        if table.shape != shape or str(table.dtype) != kind.dtype:
+            raise ArtifactError(
+                f"{where}: expected the table {name!r} : {kind.dtype}{list(shape)};"
+                f" found {table.dtype}{list(table.shape)}. {REMEDY}"
+            )
+
+
+def _check_schedules(artifact: Artifact) -> None:
+    manifest = artifact.manifest
+    names = {name for name, plan in manifest.plans.items() if plan.kind == "schedule"}
+    where = artifact.path / (manifest.stores.plans or MANIFEST)
+    if names != set(artifact.schedules):
+        raise ArtifactError(
+            f"{where}: expected schedules {sorted(names)}; found {sorted(artifact.schedules)}. {REMEDY}"
+        )
+    for name, plan in artifact.schedules.items():
+        try:
+            check_schedule(name, plan, manifest)
+        except IllegalPlanError as error:
+            raise ArtifactError(f"{where}: {error} {REMEDY}") from error
+
+
+def check_schedule(name: str, plan: npt.NDArray[Any], manifest: Manifest) -> None:
+    """Raise unless this is a schedule of the policy: int8 ``[K, blocks]`` with a dense step 0.
+
+    Raises:
+        IllegalPlanError: it is not.
+    """
+    steps, blocks = manifest.steps, len(manifest.blocks)
+    if plan.dtype != np.int8 or plan.ndim != 2:
+        raise IllegalPlanError(
+            f"schedule {name!r}: expected int8[{steps}, {blocks}]; found {plan.dtype}{list(plan.shape)}."
+        )
+    try:
+        check_plan(plan, steps, blocks, 1)
+    except IllegalPlanError as error:
+        raise IllegalPlanError(f"schedule {name!r}: {error}") from error
+    if (plan[0] != Source.COMPUTE).any():
+        raise IllegalPlanError(f"schedule {name!r}: expected COMPUTE in all of step 0; found {plan[0].tolist()}.")
+
+
+def _check_runtime(requires: Requires, directory: Path) -> None:
+    if importlib.util.find_spec("onnxruntime") is None:
+        return  # the reference runtime does without; the onnxruntime runtime says that it is missing
+    import onnxruntime
+
+    found = str(onnxruntime.__version__)
+    if _release(found) < _release(requires.onnxruntime):
+        raise ArtifactError(
+            f"{directory}: its graphs (opset {requires.opset}) need onnxruntime >= {requires.onnxruntime}; {found} is"
+            f" installed. Run: pip install 'onnxruntime>={requires.onnxruntime}'."
+        )
+
+
+def _release(version: str) -> tuple[int, ...]:
+    """``1.23.0.dev3+cpu`` as (1, 23); trailing zeros do not count."""
+    match = re.match(r"\d+(?:\.\d+)*", version)
+    numbers = [int(n) for n in match[0].split(".")] if match else [0]
+    while numbers and numbers[-1] == 0:
+        numbers.pop()
+    return tuple(numbers)

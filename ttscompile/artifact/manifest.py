@@ -1,0 +1,205 @@
+"""The manifest of an artifact: everything about a compiled policy that is not an array or a graph.
+
+Frozen records; ``codec`` writes and reads them. ``docs/design.md`` section 5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from ..config import PolicySpec
+from ..ir.graph import TensorType
+from ..ir.program import Binding, Reuse
+from ..lattice import PlanArray, plan_flops
+
+FORMAT = "ttscompile artifact"
+SCHEMA_VERSION = 1
+MANIFEST = "manifest.json"
+DENSE = "dense"
+"""The plan that computes every cell; every artifact has it without listing it."""
+
+
+@dataclass(frozen=True)
+class BlockRecord:
+    """One residual block; its index is its position in ``Manifest.blocks``.
+
+    Attributes:
+        kind: ``self_attention``, ``cross_attention``, ``feed_forward`` or a structural signature.
+        type: of the residual, and of the stream that it is added to.
+        group: number of its FORWARD group.
+        flops: of one evaluation for one stream.
+        reason: why it is coarse; empty for a plain residual.
+    """
+
+    kind: str
+    type: TensorType
+    group: int
+    flops: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class PieceRecord:
+    """One ONNX graph.
+
+    Attributes:
+        file: its name in the artifact.
+        inputs: names of all its inputs, in order.
+        stream: the input that carries the sample (``stem``) or the residual stream (blocks, ``advance``); None for the
+            pieces outside the loop.
+        contexts: the values that its other inputs want: names in ``Manifest.contexts``. The input of a context has the
+            name of the context, in ``advance`` after ``tail.`` or ``stem.``.
+        outputs: names of its outputs, in order.
+    """
+
+    file: str
+    inputs: tuple[str, ...]
+    stream: str | None
+    contexts: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class ContextRecord:
+    """A value that the loop reads beside the stream: when it is known, and what it is for one step."""
+
+    binding: Binding
+    type: TensorType
+
+
+@dataclass(frozen=True)
+class FlopsRecord:
+    """FLOPs for one stream, multiply and add counted as two.
+
+    Attributes:
+        dense: one call of the captured denoiser as it was: K evaluations.
+        prologue: once a call: condition, and step values for all K steps.
+        pruner: once a call.
+        stem: one evaluation of sample to stream; there are K a call.
+        tail: one evaluation of stream to prediction; there are K a call.
+        blocks: one evaluation of each block.
+    """
+
+    dense: int
+    prologue: int
+    pruner: int
+    stem: int
+    tail: int
+    blocks: tuple[int, ...]
+
+    def call(self, plan: PlanArray, pruned: bool) -> float:
+        """FLOPs of one call of one stream.
+
+        Args:
+            plan: int8 ``[K, blocks]``.
+            pruned: whether the pruner ran to make it.
+        """
+        fixed = self.prologue + (self.pruner if pruned else 0) + len(plan) * (self.stem + self.tail)
+        return fixed + plan_flops(plan, self.blocks)
+
+
+@dataclass(frozen=True)
+class PlanRecord:
+    """A plan that ``predict_action(plan=name)`` knows.
+
+    Attributes:
+        kind: ``schedule`` (in ``Artifact.schedules``) or ``pruner`` (made for each observation).
+        sparsity: share of reused cells; of a pruner the measured mean, None if it was not measured.
+        flops_sparsity: the same with each cell weighed by its FLOPs.
+    """
+
+    kind: str
+    sparsity: float | None
+    flops_sparsity: float | None
+
+
+@dataclass(frozen=True)
+class FileRecord:
+    """What a file of the artifact must be."""
+
+    sha256: str
+    bytes: int
+
+
+@dataclass(frozen=True)
+class Stores:
+    """Names of the files that are not ONNX; None where the artifact has none."""
+
+    program: str
+    weights: str
+    pruner: str | None
+    plans: str | None
+
+
+@dataclass(frozen=True)
+class Requires:
+    """What the ONNX graphs need: the least onnxruntime, and their opset."""
+
+    onnxruntime: str
+    opset: int
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """The manifest.
+
+    Attributes:
+        schema_version: of this format.
+        ttscompile_version: that wrote the artifact.
+        identity: sha256 of what the artifact computes; independent of paths, time and calibration record.
+        model_identity: the same without plans and pruner weights: what a calibration belongs to.
+        spec: the policy beside its network.
+        blocks: block table, in order of execution.
+        reuse: reuse branch of each block.
+        pieces: ONNX graphs: ``condition``, ``step``, ``pruner``, ``stem``, ``advance``, ``block_00``...; those that the
+            policy has.
+        contexts: binding and type of every context.
+        features: condition values that the pruner reads.
+        flops: see ``FlopsRecord``.
+        plans: beside ``dense``, by name.
+        default_plan: ``dense`` or a name in ``plans``.
+        calibration: record of the calibration, free JSON; None before any.
+        stores: names of the files that are not ONNX.
+        requires: what the ONNX graphs need.
+        files: every file but the manifest.
+    """
+
+    schema_version: int
+    ttscompile_version: str
+    identity: str
+    model_identity: str
+    spec: PolicySpec
+    blocks: tuple[BlockRecord, ...]
+    reuse: tuple[Reuse, ...]
+    pieces: Mapping[str, PieceRecord]
+    contexts: Mapping[str, ContextRecord]
+    features: tuple[str, ...]
+    flops: FlopsRecord
+    plans: Mapping[str, PlanRecord]
+    default_plan: str
+    calibration: Mapping[str, Any] | None
+    stores: Stores
+    requires: Requires
+    files: Mapping[str, FileRecord]
+
+    @property
+    def steps(self) -> int:
+        """K."""
+        return self.spec.sampler.steps
+
+    @property
+    def groups(self) -> tuple[int, ...]:
+        """FORWARD group of each block, as ``lattice`` wants them."""
+        return tuple(block.group for block in self.blocks)
+
+    @property
+    def short_identity(self) -> str:
+        """The first 12 digits of the identity, for people."""
+        return self.identity[:12]
+
+
+def block_name(index: int) -> str:
+    """``block_07``: name of a block's piece and graph."""
+    return f"block_{index:02d}"

@@ -1,0 +1,165 @@
+"""JSON that is read strictly: every error names the path in the document, what was expected and what was found."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+from ..errors import ArtifactError
+
+MAX_BYTES = 256 * 2**20
+MAX_DEPTH = 64
+REMEDY = "The file was changed or damaged; copy the artifact again, or convert the checkpoint again."
+
+
+@dataclass(frozen=True)
+class Value:
+    """A value of a parsed document together with where it stands.
+
+    Attributes:
+        data: what ``json.loads`` gave.
+        path: for messages, ``manifest.json: spec.sampler.clip``.
+    """
+
+    data: Any
+    path: str
+
+    def fail(self, expected: str) -> NoReturn:
+        """Raise for this value.
+
+        Raises:
+            ArtifactError: always.
+        """
+        raise ArtifactError(f"{self.path}: expected {expected}; found {_shorten(self.data)}. {REMEDY}")
+
+    def keys(self, *required: str) -> dict[str, Value]:
+        """The members of an object that has exactly these keys."""
+        members = self.members()
+        missing = [key for key in required if key not in members]
+        unknown = [key for key in members if key not in required]
+        if missing or unknown:
+            self.fail(f"an object with the keys {', '.join(required)} (missing: {missing}, unknown: {unknown})")
+        return members
+
+    def members(self) -> dict[str, Value]:
+        """The members of an object with any keys, in order."""
+        if not isinstance(self.data, dict):
+            self.fail("an object")
+        return {key: Value(item, f"{self.path}.{key}") for key, item in self.data.items()}
+
+    def items(self) -> list[Value]:
+        """The items of a list."""
+        if not isinstance(self.data, list):
+            self.fail("a list")
+        return [Value(item, f"{self.path}[{i}]") for i, item in enumerate(self.data)]
+
+    def text(self, *allowed: str) -> str:
+        """A string; one of ``allowed`` if any are given."""
+        if not isinstance(self.data, str) or (allowed and self.data not in allowed):
+            self.fail(f"one of {', '.join(map(repr, allowed))}" if allowed else "a string")
+        return self.data
+
+    def integer(self, least: int | None = 0) -> int:
+        """An integer, by default not negative; a boolean is none."""
+        if not isinstance(self.data, int) or isinstance(self.data, bool):
+            self.fail("an integer")
+        if not -(2**63) <= self.data < 2**63 or (least is not None and self.data < least):
+            self.fail("a 64-bit integer" if least is None else f"a 64-bit integer of at least {least}")
+        return self.data
+
+    def number(self) -> float:
+        """A finite number."""
+        if not isinstance(self.data, int | float) or isinstance(self.data, bool):
+            self.fail("a number")
+        try:
+            number = float(self.data)
+        except OverflowError:
+            number = math.inf
+        if not math.isfinite(number):
+            self.fail("a finite number")
+        return number
+
+    def share(self) -> float:
+        """A number in 0..1."""
+        number = self.number()
+        if not 0 <= number <= 1:
+            self.fail("a number in 0..1")
+        return number
+
+    @property
+    def absent(self) -> bool:
+        """Whether the value is ``null``."""
+        return self.data is None
+
+
+def parse(content: bytes, where: str, limit: int = MAX_BYTES) -> Value:
+    """Parse UTF-8 JSON without duplicate keys, NaN, or absurd size or depth.
+
+    Args:
+        content: the document.
+        where: name of the file, for messages.
+        limit: largest accepted size in bytes.
+
+    Raises:
+        ArtifactError: not such a document.
+    """
+    if len(content) > limit:
+        raise ArtifactError(f"{where}: expected at most {limit} bytes of JSON; found {len(content)}. {REMEDY}")
+    try:
+        data = json.loads(content.decode("utf-8"), object_pairs_hook=_unique, parse_constant=_no_constant)
+    except RecursionError:
+        raise ArtifactError(f"{where}: expected JSON at most {MAX_DEPTH} levels deep; found more. {REMEDY}") from None
+    except ValueError as error:  # UnicodeDecodeError and JSONDecodeError among them
+        raise ArtifactError(f"{where}: expected a JSON document; found {error}. {REMEDY}") from None
+    check_depth(data, where)
+    return Value(data, where)
+
+
+def check_depth(data: object, where: str) -> None:
+    """Raise if a document is deeper than ``MAX_DEPTH``.
+
+    Raises:
+        ArtifactError: it is.
+    """
+    level = [data]
+    for _ in range(MAX_DEPTH + 1):
+        level = [child for item in level for child in _children(item)]
+        if not level:
+            return
+    raise ArtifactError(f"{where}: expected JSON at most {MAX_DEPTH} levels deep; found more. {REMEDY}")
+
+
+def dump(data: object) -> bytes:
+    """A document for people: one space of indentation, order of the keys kept, a newline at the end."""
+    return (json.dumps(data, indent=1, allow_nan=False) + "\n").encode("ascii")
+
+
+def dump_compact(data: object) -> bytes:
+    """A document for hashing: no white space, order of the keys kept."""
+    return json.dumps(data, separators=(",", ":"), allow_nan=False).encode("ascii")
+
+
+def _children(item: object) -> Sequence[object]:
+    if isinstance(item, Mapping):
+        return list(item.values())
+    return item if isinstance(item, list) else ()
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    members = dict(pairs)
+    if len(members) != len(pairs):
+        names = [key for key, _ in pairs]
+        raise ValueError(f"the key {next(key for key in names if names.count(key) > 1)!r} twice in one object")
+    return members
+
+
+def _no_constant(name: str) -> NoReturn:
+    raise ValueError(f"the number {name}, which is not JSON")
+
+
+def _shorten(data: object) -> str:
+    text = repr(data)
+    return text if len(text) <= 80 else f"{text[:77]}..."

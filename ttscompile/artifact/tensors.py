@@ -1,0 +1,167 @@
+"""safetensors files: read with numpy alone, written with the safetensors library.
+
+Layout of a file: length of the header (8 bytes, little-endian); header (JSON: name -> dtype, shape, offsets into the
+data); data.
+Source: the format's description, https://github.com/huggingface/safetensors#format.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import ArtifactError
+from .strict_json import REMEDY, Value, parse
+
+Array = npt.NDArray[Any]
+
+MAX_HEADER_BYTES = 64 * 2**20
+MAX_RANK = 16
+
+_PREFIX = 8
+_DTYPES: Mapping[str, np.dtype[Any]] = MappingProxyType(
+    {
+        "BOOL": np.dtype(np.bool_),
+        "U8": np.dtype(np.uint8),
+        "I8": np.dtype(np.int8),
+        "I16": np.dtype("<i2"),
+        "I32": np.dtype("<i4"),
+        "I64": np.dtype("<i8"),
+        "F16": np.dtype("<f2"),
+        "F32": np.dtype("<f4"),
+        "F64": np.dtype("<f8"),
+    }
+)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Where one tensor lies.
+
+    Attributes:
+        dtype: of its elements.
+        shape: of the tensor.
+        offset: of its first byte, from the start of the file.
+        length: in bytes.
+    """
+
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+    offset: int
+    length: int
+
+
+def read_header(path: Path) -> dict[str, Entry]:
+    """Read and check the header of a safetensors file.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The entries in the order of their data.
+
+    Raises:
+        ArtifactError: unreadable or truncated; a dtype that numpy lacks; sizes that contradict each other; data that
+            overlap, have gaps, are not aligned or lie outside of the file.
+    """
+    try:
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            prefix = file.read(_PREFIX)
+            length = int.from_bytes(prefix, "little")
+            if len(prefix) < _PREFIX or length > min(MAX_HEADER_BYTES, size - _PREFIX):
+                raise _error(path, f"a header of at most {MAX_HEADER_BYTES} bytes inside the file", f"{size} bytes")
+            content = file.read(length)
+    except OSError as error:
+        raise ArtifactError(f"{path.name}: cannot be read: {error}. {REMEDY}") from error
+    root = parse(content, path.name, MAX_HEADER_BYTES)
+    members = root.members()
+    if "__metadata__" in members:
+        for value in members.pop("__metadata__").members().values():
+            value.text()
+    start = _PREFIX + length
+    entries = sorted(
+        ((name, _entry(value, start)) for name, value in members.items()),
+        key=lambda item: (item[1].offset, item[1].length),
+    )
+    end = start
+    for name, entry in entries:
+        if entry.offset != end or entry.offset % entry.dtype.itemsize:
+            raise _error(path, f"the data of {name!r} at byte {end}, aligned", f"byte {entry.offset}")
+        end += entry.length
+    if end != size:
+        raise _error(path, f"{end} bytes", f"{size}")
+    return dict(entries)
+
+
+def offsets(path: Path) -> dict[str, tuple[int, int]]:
+    """Byte offset in the file, and length in bytes, of each tensor.
+
+    Raises:
+        ArtifactError: see ``read_header``.
+    """
+    return {name: (entry.offset, entry.length) for name, entry in read_header(path).items()}
+
+
+def read(path: Path) -> Mapping[str, Array]:
+    """Map a safetensors file into memory.
+
+    Returns:
+        Read-only arrays, views of the file: nothing is read before it is used.
+
+    Raises:
+        ArtifactError: see ``read_header``.
+    """
+    entries = read_header(path)
+    data: Array = np.memmap(path, dtype=np.uint8, mode="r").view(np.ndarray)
+    return MappingProxyType(
+        {
+            name: data[entry.offset : entry.offset + entry.length].view(entry.dtype).reshape(entry.shape)
+            for name, entry in entries.items()
+        }
+    )
+
+
+def serialize(arrays: Mapping[str, Array]) -> bytes:
+    """The bytes of a safetensors file, the same whatever the order of the arrays; needs the safetensors library.
+
+    Raises:
+        ArtifactError: an array of a dtype that the format or the reader lacks.
+    """
+    from safetensors.numpy import save
+
+    plain = {}
+    for name in sorted(arrays):
+        array = np.asarray(arrays[name])
+        if array.dtype.newbyteorder("<") not in _DTYPES.values():
+            raise ArtifactError(
+                f"tensor {name!r} has dtype {array.dtype}; an artifact can hold"
+                f" {', '.join(str(d) for d in _DTYPES.values())}. Convert the weight before compiling."
+            )
+        # The library writes an array's buffer as it lies in memory, whatever its strides.
+        plain[name] = np.asarray(array, dtype=array.dtype.newbyteorder("<"), order="C")
+    return bytes(save(plain))
+
+
+def _entry(value: Value, start: int) -> Entry:
+    fields = value.keys("dtype", "shape", "data_offsets")
+    dtype = _DTYPES[fields["dtype"].text(*_DTYPES)]
+    shape = tuple(item.integer() for item in fields["shape"].items())
+    if len(shape) > MAX_RANK:
+        fields["shape"].fail(f"at most {MAX_RANK} sizes")
+    span = [item.integer() for item in fields["data_offsets"].items()]
+    length = math.prod(shape) * dtype.itemsize  # Python's integers do not overflow
+    if len(span) != 2 or span[1] - span[0] != length:
+        fields["data_offsets"].fail(f"[begin, begin + {length}] for {dtype}{list(shape)}")
+    return Entry(dtype=dtype, shape=shape, offset=start + span[0], length=length)
+
+
+def _error(path: Path, expected: str, found: str) -> ArtifactError:
+    return ArtifactError(f"{path.name}: expected {expected}; found {found}. {REMEDY}")
