@@ -1,0 +1,45 @@
+# Two commands for people: `make demo` and `make test`. Each sets up what it needs in .venv, once.
+#
+#   make PYTHON=python3.12 test      another interpreter (3.11 or later)
+#   make PIP_FLAGS="--extra-index-url https://download.pytorch.org/whl/cpu" test
+#                                    PyTorch's small CPU build, where pip's own index has the CUDA build only
+
+PYTHON ?= python3.11
+PIP_FLAGS ?=
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/installed.stamp
+
+.DELETE_ON_ERROR:
+.PHONY: demo test lint types pytest benchmark clean
+
+demo: $(READY)
+	$(BIN)/python examples/pusht/demo.py
+
+test: lint types pytest
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+# mypy must see the package as it is installed, with passes/ and runtimes/ inside it: it gets a copy laid out like that.
+types: $(READY)
+	rm -rf build/types
+	mkdir -p build/types
+	cp -Rp ttscompile build/types/ttscompile
+	cp -Rp passes runtimes build/types/ttscompile/
+	cd build/types && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache -p ttscompile
+
+pytest: $(READY)
+	$(BIN)/pytest
+
+benchmark: $(READY)
+	$(BIN)/pytest --benchmark-only
+
+clean:
+	rm -rf $(VENV) build ttscompile.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+
+$(READY): pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) -c constraints.txt -e '.[dev]'
+	touch $@

@@ -1,0 +1,48 @@
+"""How ``calibrate`` reads its command line: ``--trajectories`` takes several files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from ttscompile.cli import main
+from ttscompile.errors import CalibrationError
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """What ``ttscompile.calibrate`` was called with; the call itself ends in an error."""
+    calls: list[Any] = []
+
+    def calibrate(*args: Any, **kwargs: Any) -> None:
+        calls.append((args, kwargs))
+        raise CalibrationError("stopped here")
+
+    monkeypatch.setattr("ttscompile.calibrate", calibrate, raising=False)
+    return calls
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["out", "--trajectories", "a.npz", "b.npz", "--seed", "3"],
+        ["--seed", "3", "out", "--trajectories", "a.npz", "b.npz"],
+        ["--trajectories", "a.npz", "--trajectories", "b.npz", "--seed", "3", "out"],
+    ],
+)
+def test_every_file_up_to_the_next_option_is_taken(arguments: list[str], asked: list[Any]) -> None:
+    result = CliRunner().invoke(main, ["calibrate", *arguments])
+    assert result.stderr == "error: stopped here\n"
+    assert result.exit_code == 2
+    ((args, kwargs),) = asked
+    assert args == (Path("out"),)
+    assert kwargs == {
+        "trajectories": [Path("a.npz"), Path("b.npz")],
+        "target_sparsity": 0.95,
+        "strategy": "tts",
+        "seed": 3,
+        "resume": False,
+    }

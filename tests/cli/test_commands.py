@@ -1,0 +1,133 @@
+"""The commands on the Push-T policy: what they print is one JSON document, or tables that say the same."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from ttscompile.artifact.write import update_calibration
+from ttscompile.cli import main
+from ttscompile.lattice import uniform_plan
+
+
+def run(*arguments: object) -> Any:
+    result = CliRunner().invoke(main, [str(a) for a in arguments], catch_exceptions=False)
+    assert result.exit_code == 0, result.stderr
+    return result
+
+
+@pytest.fixture(scope="module")
+def scheduled(compiled_pusht: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The Push-T artifact with a uniform schedule of 5 full steps as its default plan."""
+    directory = tmp_path_factory.mktemp("scheduled") / "compiled"
+    shutil.copytree(compiled_pusht, directory)
+    update_calibration(directory, None, {"uniform": uniform_plan(100, 24, 5)}, "uniform", {"strategy": "uniform"})
+    return directory
+
+
+@pytest.fixture(scope="module")
+def pruned(compiled_pusht: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The Push-T artifact with its untrained pruner as the default plan."""
+    from ttscompile.artifact.load import load_artifact
+
+    directory = tmp_path_factory.mktemp("pruned") / "compiled"
+    shutil.copytree(compiled_pusht, directory)
+    weights = {name: np.array(array) for name, array in load_artifact(directory).pruner.items()}
+    update_calibration(directory, weights, {}, "tts", {"strategy": "tts"})
+    return directory
+
+
+def test_convert_says_what_it_made_and_explains_on_standard_error(pusht_checkpoint: Path, tmp_path: Path) -> None:
+    arguments = ("--sampler", "ddim", "--steps", "4", "--explain", "--json")
+    result = run("convert", pusht_checkpoint, "-o", tmp_path / "compiled", *arguments)
+    made = json.loads(result.stdout)
+    assert made["sampler"]["name"] == "ddim"
+    assert made["sampler"]["steps"] == 4
+    assert len(made["blocks"]) == 24
+    stages = [stage["stage"] for stage in made["stages"]]
+    assert stages[0] == "capture"
+    assert stages[-1] == "write"
+    assert all(stage in result.stderr for stage in stages)
+    del made["stages"]
+    assert json.loads(run("inspect", tmp_path / "compiled", "--json").stdout) == made
+
+
+def test_inspect_accounts_for_every_flop(scheduled: Path) -> None:
+    made = json.loads(run("inspect", scheduled, "--json").stdout)
+    flops, plans = made["flops"], made["plans"]
+    assert flops["blocks"] == 100 * sum(block["flops"] for block in made["blocks"])
+    assert plans["dense"]["flops"] == flops["prologue"] + flops["stems_and_tails"] + flops["blocks"]
+    assert plans["dense"]["flops"] < flops["captured"], "hoisting left as much work as there was"
+    assert made["default_plan"] == "uniform"
+    assert plans["uniform"]["sparsity"] == pytest.approx(0.95)
+    assert plans["uniform"]["flops"] == pytest.approx(plans["dense"]["flops"] - 0.95 * flops["blocks"])
+
+
+def test_inspect_tells_the_same_in_tables(scheduled: Path) -> None:
+    text = run("inspect", scheduled).stdout
+    for expected in ("K = 100", "self_attention", "cross_attention", "feed_forward", "uniform (default)", "95.0%"):
+        assert expected in text
+
+
+def test_inspect_draws_the_default_plan(scheduled: Path, tmp_path: Path) -> None:
+    result = run("inspect", scheduled, "--plot", tmp_path / "plan.png", "--json")
+    json.loads(result.stdout)
+    assert (tmp_path / "plan.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_pruners_plan_needs_an_observation(pruned: Path, tmp_path: Path) -> None:
+    picture = tmp_path / "plan.png"
+    result = CliRunner().invoke(main, ["inspect", str(pruned), "--plot", str(picture)])
+    assert result.exit_code == 2
+    assert "Add --observation FILE.npz" in result.stderr
+    assert not picture.exists()
+    rng = np.random.default_rng(0)
+    np.savez(tmp_path / "calls.npz", obs=rng.uniform(100, 400, (2, 2, 20)).astype(np.float32))
+    run("inspect", pruned, "--plot", picture, "--observation", tmp_path / "calls.npz")
+    assert picture.exists()
+
+
+@pytest.mark.parametrize(
+    ("arrays", "reason"),
+    [
+        ({"state": np.zeros((2, 20), np.float32)}, "has no array 'obs'"),
+        ({"obs": np.zeros((0, 2, 20), np.float32)}, "at least one"),
+    ],
+)
+def test_an_observation_that_does_not_fit(arrays: dict[str, Any], reason: str, pruned: Path, tmp_path: Path) -> None:
+    np.savez(tmp_path / "calls.npz", **arrays)
+    arguments = ["inspect", pruned, "--plot", tmp_path / "plan.png", "--observation", tmp_path / "calls.npz"]
+    result = CliRunner().invoke(main, [str(a) for a in arguments])
+    assert result.exit_code == 2
+    assert reason in result.stderr
+
+
+def test_a_plan_that_is_not_there_is_named_beside_those_that_are(scheduled: Path, tmp_path: Path) -> None:
+    arguments = ["inspect", str(scheduled), "--plot", str(tmp_path / "plan.png"), "--plan", "best"]
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 2
+    assert "has no plan 'best'; it has ['dense', 'uniform']" in result.stderr
+
+
+def test_bench_times_everybody_on_the_same_calls(scheduled: Path, pusht_checkpoint: Path) -> None:
+    arguments = ("--runs", 2, "--against", "eager,onnxruntime-dense", "--checkpoint", pusht_checkpoint, "--json")
+    made = json.loads(run("bench", scheduled, *arguments).stdout)
+    assert made["machine"]["cores"] >= 1
+    compiled, eager, dense = made["contestants"]
+    assert [len(c["times_ms"]) for c in (compiled, eager, dense)] == [2, 2, 2]
+    assert compiled["plan"] == "uniform"
+    assert compiled["sparsity"] == pytest.approx(0.95)
+    assert dense["sparsity"] == 0
+    assert compiled["flops"] < dense["flops"] < eager["flops"]
+
+
+def test_bench_prints_a_table_and_warns_of_a_dense_artifact(compiled_pusht: Path) -> None:
+    result = run("bench", compiled_pusht, "--runs", 1)
+    assert "dense onnxruntime" in result.stdout
+    assert "is not calibrated" in result.stderr

@@ -1,0 +1,77 @@
+"""Bad usage and bad input: one message, exit status 2, no traceback, nothing left behind."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from ttscompile.cli import main
+
+
+@pytest.fixture
+def no_checkpoint(tmp_path: Path) -> Path:
+    path = tmp_path / "notes.ckpt"
+    path.write_text("not a checkpoint")
+    return path
+
+
+def test_a_file_that_is_no_checkpoint(no_checkpoint: Path) -> None:
+    out = no_checkpoint.with_name("compiled")
+    result = CliRunner().invoke(main, ["convert", str(no_checkpoint), "-o", str(out)])
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert result.stderr.startswith("error: ")
+    assert str(no_checkpoint) in result.stderr
+    assert "Traceback" not in result.stderr
+    assert list(no_checkpoint.parent.iterdir()) == [no_checkpoint]
+
+
+@pytest.mark.parametrize("command", ["inspect", "bench", "calibrate"])
+@pytest.mark.parametrize("made", [False, True])
+def test_what_is_no_artifact(command: str, made: bool, tmp_path: Path) -> None:
+    directory = tmp_path / "nothing"
+    if made:
+        directory.mkdir()
+    arguments = [command, str(directory)] + ["--trajectories", "calls.npz"] * (command == "calibrate")
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert result.stderr.startswith("error: ")
+    assert result.stderr.count("\n") == 1
+    assert str(directory) in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["convert", "policy.ckpt"], "Missing option '-o'"),
+        (["convert", "policy.ckpt", "-o", "out", "--sampler", "euler"], "'euler' is not one of"),
+        (["convert", "policy.ckpt", "-o", "out", "--steps", "0"], "not in the range"),
+        (["calibrate", "out"], "Missing option '--trajectories'"),
+        (["calibrate", "out", "--trajectories"], "Missing option '--trajectories'"),
+        (["calibrate", "out", "--trajectories", "a.npz", "--target-sparsity", "1"], "not in the range"),
+        (["inspect", "out", "--plan", "dense"], "give --plot FILE too"),
+        (["bench", "out", "--against", "eager"], "give --checkpoint FILE too"),
+        (["bench", "out", "--against", "tensorrt"], "'tensorrt' is not one of eager, onnxruntime-dense"),
+        (["doctor"], "No such command"),
+    ],
+)
+def test_bad_usage(arguments: list[str], reason: str) -> None:
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert reason in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_an_error_that_is_nobodys_fault_is_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError("a bug")
+
+    # The package's attribute of this name is the command, not the module.
+    monkeypatch.setattr(sys.modules["ttscompile.cli.inspect"], "load_artifact", broken)
+    result = CliRunner().invoke(main, ["inspect", "out"])
+    assert isinstance(result.exception, ZeroDivisionError)

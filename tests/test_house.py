@@ -1,0 +1,157 @@
+"""The rules of the house: which way imports go, what the robot must not need, how long a file may be."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import ttscompile
+
+from .imports import PACKAGES, Import, eager_closure, home, imports, modules
+
+ROOT = Path(__file__).resolve().parents[1]
+MODULES = modules(ROOT)
+GRAPH = {name: imports(name, path) for name, path in MODULES.items()}
+
+BASE = {"errors", "config", "lattice"}
+BELOW_ARTIFACT = BASE | {"ir", "artifact"}
+COMPILER = {"capture", "frontends", "lower", "passes", "samplers"}
+MAY_IMPORT = {
+    "errors": set(),
+    "config": {"errors"},
+    "lattice": {"errors"},
+    "machine": set(),
+    "plots": {"errors", "lattice"},
+    "samplers": BASE,
+    "trajectories": BASE,
+    "ir": BASE,
+    "capture": BASE | {"ir"},
+    "lower": BASE | {"ir"},
+    "passes": BASE | {"ir"},
+    "frontends": BASE | {"samplers"},
+    "artifact": BASE | {"ir"},
+    "runtimes": BELOW_ARTIFACT,
+    "calibration": BELOW_ARTIFACT | {"runtimes", "trajectories"},
+    "driver": BELOW_ARTIFACT | COMPILER,
+    "cli": BELOW_ARTIFACT | COMPILER | {"calibration", "driver", "machine", "plots", "runtimes", "trajectories"},
+}
+"""Part of the package -> the other parts that it may import, anywhere in its code. Design, section 4."""
+
+COMPILERS_ONLY = {"diffusers", "matplotlib", "onnx", "onnx_ir", "onnxscript", "pydantic", "safetensors", "torch"}
+COMPILES = (
+    "ttscompile.calibration",
+    "ttscompile.capture",
+    "ttscompile.driver",
+    "ttscompile.frontends",
+    "ttscompile.ir.evaluate",
+    "ttscompile.lower",
+    "ttscompile.passes",
+    "ttscompile.runtimes.reference",
+    "ttscompile.samplers",
+)
+"""Modules that may need the compiler's dependencies when they are imported; nothing else may, not even indirectly."""
+
+
+def part(module: str) -> str:
+    """``ttscompile.ir.graph`` -> ``ir``, ``ttscompile.lower_onnx`` -> ``lower``, ``ttscompile`` -> the empty string."""
+    return module.removeprefix("ttscompile").lstrip(".").partition(".")[0].partition("_")[0]
+
+
+def direction_errors(found: list[Import], known: set[str]) -> list[str]:
+    """Imports against the direction, one line each."""
+    errors = []
+    for each in found:
+        target = home(each.target, known)
+        if target is None or target == "ttscompile":  # the package itself: its version, and the public names
+            continue
+        importer, imported = part(each.importer), part(target)
+        if importer not in {"", imported} and imported not in MAY_IMPORT[importer]:
+            errors.append(f"{each.importer}:{each.line} imports {target}: {importer} must not know {imported}")
+        if importer == imported == "passes" and target not in {"ttscompile.passes.base", "ttscompile.passes"}:
+            errors.append(f"{each.importer}:{each.line} imports {target}: passes do not import each other")
+    return errors
+
+
+def compiles(module: str) -> bool:
+    return any(module == name or module.startswith((f"{name}.", f"{name}_")) for name in COMPILES)
+
+
+def test_every_part_of_the_package_has_its_place_in_the_direction() -> None:
+    assert {part(name) for name in MODULES} - {""} == set(MAY_IMPORT)
+
+
+def test_imports_go_one_way() -> None:
+    found = [each for each_module in GRAPH.values() for each in each_module]
+    assert len(found) > 100, "the walk over the source found hardly anything"
+    assert direction_errors(found, set(MODULES)) == []
+
+
+@pytest.mark.parametrize(
+    ("importer", "target"),
+    [
+        ("ttscompile.ir.graph", "ttscompile.passes.hoist"),
+        ("ttscompile.passes.hoist", "ttscompile.runtimes.base"),
+        ("ttscompile.passes.hoist", "ttscompile.passes.partition"),
+        ("ttscompile.runtimes.base", "ttscompile.frontends"),
+        ("ttscompile.runtimes.base", "ttscompile.calibration"),
+        ("ttscompile.artifact.load", "ttscompile.runtimes.policy.load"),
+        ("ttscompile.errors", "ttscompile.config"),
+        ("ttscompile.driver", "ttscompile.cli"),
+    ],
+)
+def test_an_import_the_wrong_way_is_found(importer: str, target: str) -> None:
+    known = {importer, target, "ttscompile", "ttscompile.runtimes.policy"}
+    assert len(direction_errors([Import(importer, target, 1, True)], known)) == 1
+
+
+def test_the_runtime_side_needs_nothing_of_the_compilers() -> None:
+    light = [name for name in MODULES if not compiles(name)]
+    assert "ttscompile.runtimes.base" in light
+    for name in light:
+        chains = eager_closure(name, GRAPH)
+        heavy = {foreign: " -> ".join(chain) for foreign, chain in chains.items() if foreign in COMPILERS_ONLY}
+        assert heavy == {}
+
+
+def test_the_closure_sees_through_modules_and_parents_but_not_into_functions(tmp_path: Path) -> None:
+    folder = tmp_path / "ttscompile"
+    (folder / "inner").mkdir(parents=True)
+    (folder / "__init__.py").write_text("")
+    (folder / "a.py").write_text("from .inner import deep\n")
+    (folder / "inner" / "__init__.py").write_text("try:\n    import torch.nn\nexcept ImportError:\n    pass\n")
+    (folder / "inner" / "deep.py").write_text(
+        "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import onnx\ndef f():\n    import diffusers\n"
+    )
+    graph = {name: imports(name, path) for name, path in modules(tmp_path).items()}
+    chains = eager_closure("ttscompile.a", graph)
+    assert "torch" in chains
+    assert {"onnx", "diffusers"}.isdisjoint(chains)
+
+
+def test_files_are_short() -> None:
+    files = [p for top in (*PACKAGES, "tests", "examples") for p in (ROOT / top).rglob("*.py")]
+    lengths = {str(p.relative_to(ROOT)): len(p.read_text().splitlines()) for p in files}
+    assert {name: n for name, n in lengths.items() if n >= 400} == {}
+
+
+def test_every_package_is_installed() -> None:
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+    assert sorted(listed) == sorted(name for name, path in MODULES.items() if path.name == "__init__.py")
+
+
+def test_every_public_name_can_be_had_and_an_unknown_one_is_explained() -> None:
+    for name in ttscompile.__all__:
+        assert getattr(ttscompile, name) is not None
+    assert set(ttscompile.__all__) <= set(dir(ttscompile))
+    with pytest.raises(AttributeError, match="no attribute 'compile'; it has .*convert"):
+        ttscompile.compile  # noqa: B018
+
+
+def test_importing_the_package_loads_neither_numpy_nor_torch() -> None:
+    code = "import sys, ttscompile; print(sorted({'numpy', 'torch', 'onnx', 'onnxruntime'} & set(sys.modules)))"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT.parent)
+    assert result.stdout == "[]\n"

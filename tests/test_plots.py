@@ -1,0 +1,48 @@
+"""Pictures of plans: every cell has the colour of its source, and the same plan is the same file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+from PIL import Image
+
+from ttscompile.errors import IllegalPlanError
+from ttscompile.lattice import Source
+from ttscompile.plots import COLOURS, plot_plan
+
+
+def pixels_of(source: Source, picture: Path) -> int:
+    """Pixels of exactly the source's colour."""
+    wanted = np.round(np.array(to_rgb(COLOURS[source])) * 255)
+    return int(np.all(np.asarray(Image.open(picture).convert("RGB")) == wanted, axis=-1).sum())
+
+
+def test_colours_cover_the_picture_as_the_plan_says(tmp_path: Path) -> None:
+    plan = np.full((20, 10), Source.TIMESTEP, np.int8)
+    plan[0] = Source.COMPUTE  # 10 cells
+    plan[5:15, 2] = Source.FORWARD  # 10 cells
+    plan[5:15, 4:8] = Source.ROLLOUT  # 40 cells, which leaves 140
+    plot_plan(plan, ["feed_forward"] * 10, tmp_path / "plan.png", "a plan")
+    counts = {source: pixels_of(source, tmp_path / "plan.png") for source in Source}
+    cell = counts[Source.TIMESTEP] / 140
+    assert cell > 50, "a cell of the picture is too small to be seen"
+    # Grid lines and the patches of the legend blur the figures.
+    for source, cells in {Source.COMPUTE: 10, Source.FORWARD: 10, Source.ROLLOUT: 40}.items():
+        assert counts[source] / cell == pytest.approx(cells, abs=3)
+
+
+def test_the_same_plan_is_the_same_file(tmp_path: Path) -> None:
+    plan = np.zeros((4, 2), np.int8)
+    for name in ("a.png", "b.png"):
+        plot_plan(plan, ["self_attention", "x"], tmp_path / name)
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+@pytest.mark.parametrize("plan", [np.zeros((4, 3), np.int8), np.full((4, 2), 4, np.int8), np.zeros((1, 4, 2), np.int8)])
+def test_what_is_no_plan_of_these_blocks_is_refused(plan: np.ndarray, tmp_path: Path) -> None:
+    with pytest.raises(IllegalPlanError, match=r"expected \[K, 2\]"):
+        plot_plan(plan, ["self_attention", "feed_forward"], tmp_path / "plan.png")
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,108 @@
+"""Loading an artifact where there is no torch, and loading none where there is."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import textwrap
+import venv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ttscompile
+
+ROOT = Path(__file__).resolve().parents[1]
+COMPILERS_ONLY = ["diffusers", "matplotlib", "onnx", "onnx_ir", "onnxscript", "pydantic", "safetensors", "torch"]
+
+ACT = textwrap.dedent(
+    """
+    import json, sys, time
+    started = time.perf_counter()
+    import ttscompile
+    policy = ttscompile.load(sys.argv[1])
+    loaded = time.perf_counter() - started
+    import numpy as np
+    with np.load(sys.argv[2]) as given:
+        noise = ttscompile.Noise(given["initial"], given["steps"])
+        out = policy.predict_action({"obs": given["obs"]}, noise=noise, plan="dense")
+    print(json.dumps({"seconds": loaded, "modules": sorted(sys.modules), "action": out["action"].tolist()}))
+    """
+)
+
+
+@pytest.fixture(scope="module")
+def call(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One observation of the Push-T policy, and noise."""
+    rng = np.random.default_rng(0)
+    path = tmp_path_factory.mktemp("call") / "call.npz"
+    np.savez(
+        path,
+        obs=rng.uniform(100, 400, (1, 2, 20)).astype(np.float32),
+        initial=rng.standard_normal((1, 16, 2), dtype=np.float32),
+        steps=rng.standard_normal((100, 1, 16, 2), dtype=np.float32),
+    )
+    return path
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Python of a new environment that has numpy, onnxruntime and this project, and nothing that they do not need."""
+    folder = tmp_path_factory.mktemp("robot")
+    venv.create(folder, with_pip=True)
+    python = folder / "bin" / "python"
+    pip = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+    subprocess.run([*pip, "-c", str(ROOT / "constraints.txt"), "numpy", "onnxruntime"], check=True)
+    # Into a copy of the tree: building a wheel leaves its build folder in the tree.
+    subprocess.run([*pip, "--no-deps", str(source_copy(folder / "source"))], check=True)
+    return python
+
+
+def source_copy(target: Path) -> Path:
+    """What the wheel is built from, without what git ignores."""
+    import shutil
+
+    target.mkdir()
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, target)
+    for name in ("ttscompile", "passes", "runtimes"):
+        shutil.copytree(ROOT / name, target / name, ignore=shutil.ignore_patterns("__pycache__"))
+    return target
+
+
+def act(python: Path | str, artifact: Path, call: Path) -> dict[str, object]:
+    """Load and act in another process, started where no part of the source tree can be imported by accident."""
+    command = [str(python), "-W", "error", "-c", ACT, str(artifact), str(call)]
+    result = subprocess.run(command, capture_output=True, text=True, cwd=call.parent, check=False)
+    assert result.returncode == 0, result.stderr
+    report: dict[str, object] = json.loads(result.stdout)
+    return report
+
+
+@pytest.mark.slow
+def test_a_robot_without_torch_acts_as_the_full_environment_does(robot: Path, compiled_pusht: Path, call: Path) -> None:
+    runs = [act(robot, compiled_pusht, call) for _ in range(3)]
+    here = act(sys.executable, compiled_pusht, call)
+    assert not set(COMPILERS_ONLY) & set(runs[0]["modules"])
+    assert not {"click", "rich"} & set(runs[0]["modules"]), "they are the command line's, and not installed there"
+    np.testing.assert_array_equal(runs[0]["action"], here["action"])
+    seconds = min(float(str(run["seconds"])) for run in runs)
+    print(f"import and load without torch: {seconds:.3f} s")
+    assert seconds < 2.0
+
+
+def test_loading_imports_nothing_of_the_compilers_where_it_is_installed(compiled_pusht: Path, call: Path) -> None:
+    modules = act(sys.executable, compiled_pusht, call)["modules"]
+    assert not set(COMPILERS_ONLY) & set(modules)
+
+
+def test_what_needs_the_compiler_says_so_on_a_robot(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch", None)  # import torch now fails as if it were not installed
+    for name in [n for n in sys.modules if n.startswith(("ttscompile.driver", "ttscompile.frontends"))]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.delitem(vars(ttscompile), "convert", raising=False)
+    monkeypatch.delattr(ttscompile, "driver", raising=False)
+    with pytest.raises(ttscompile.TtscompileError, match=r"needs torch, .* pip install 'ttscompile\[compile\]'"):
+        ttscompile.convert  # noqa: B018

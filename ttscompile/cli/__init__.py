@@ -1,0 +1,39 @@
+"""The command ``ttscompile``: one file a command.
+
+Exit status: 0 done; 1 a check failed; 2 bad usage or bad input. Results go to standard output, as a table or with
+``--json`` as one JSON document and nothing else; progress and warnings go to standard error.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from ttscompile import __version__
+from ttscompile.cli.bench import bench
+from ttscompile.cli.calibrate import calibrate
+from ttscompile.cli.convert import convert
+from ttscompile.cli.inspect import inspect
+from ttscompile.errors import TtscompileError
+
+
+class _Commands(click.Group):
+    """Tells every error of ttscompile in one message, without a traceback."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except TtscompileError as error:
+            click.echo(f"error: {error}", err=True)
+            ctx.exit(2)
+
+
+@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="ttscompile")
+def main() -> None:
+    """Compile diffusion-transformer robot policies into artifacts that run in real time without PyTorch."""
+
+
+for _command in (convert, calibrate, inspect, bench):
+    main.add_command(_command)

@@ -1,0 +1,90 @@
+"""``ttscompile bench``: what a call of the compiled policy takes, beside what it replaces."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from ttscompile.cli.output import artifact_argument, json_option, print_json, progress, results, share, table
+from ttscompile.cli.timing import Measurement, contestants, measure
+from ttscompile.machine import fingerprint, one_line
+
+RIVALS = ("eager", "onnxruntime-dense")
+
+
+def _rivals(_: click.Context, __: click.Parameter, value: str) -> tuple[str, ...]:
+    names = tuple(dict.fromkeys(name.strip() for name in value.split(",") if name.strip()))
+    unknown = [name for name in names if name not in RIVALS]
+    if unknown:
+        raise click.BadParameter(f"{unknown[0]!r} is not one of {', '.join(RIVALS)}.")
+    return names
+
+
+@click.command()
+@artifact_argument
+@click.option("--threads", type=click.IntRange(min=1), default=1, show_default=True, help="Of each contestant.")
+@click.option("--runs", type=click.IntRange(min=1), default=20, show_default=True, help="Counted calls of each.")
+@click.option("--plan", help="Of the compiled policy; the artifact's default plan if not given.")
+@click.option("--against", default="onnxruntime-dense", show_default=True, callback=_rivals, help=", ".join(RIVALS))
+@click.option("--checkpoint", type=click.Path(path_type=Path), help="What the artifact was made from, for 'eager'.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Of observations and noise.")
+@json_option
+def bench(
+    directory: Path,
+    threads: int,
+    runs: int,
+    plan: str | None,
+    against: tuple[str, ...],
+    checkpoint: Path | None,
+    seed: int,
+    as_json: bool,
+) -> None:
+    """Time calls of the artifact DIRECTORY on one stream, in turn with its rivals, on random observations.
+
+    Every figure is of whole calls: prologue, pruner and all. Warm-up calls are not counted.
+    """
+    if "eager" in against and checkpoint is None:
+        raise click.UsageError("--against eager runs the original network: give --checkpoint FILE too.")
+    console = progress()
+    with console.status("loading"):
+        entered = contestants(directory, threads, plan, against, checkpoint)
+    if entered[0].plan == "dense":
+        console.print(
+            f"warning: {directory} runs dense: it is not calibrated, or --plan dense was given.",
+            markup=False,
+            soft_wrap=True,
+        )
+    with console.status("timing") as status:
+        measured = measure(entered, runs, seed, lambda done, total: status.update(f"timing: round {done} of {total}"))
+    if as_json:
+        print_json(
+            {"machine": fingerprint(), "threads": threads, "runs": runs, "contestants": [m.to_json() for m in measured]}
+        )
+        return
+    made = table("", "ms a call", "quartiles", "calls/s", "speed-up", "GFLOP", "reused", "prologue", "pruner")
+    for m in measured:
+        made.add_row(*_row(m, measured[0]))
+    output = results()
+    output.print(made)
+    output.print(
+        f"Medians of {runs} calls, one stream, {threads} thread{'s' * (threads > 1)}; plan {entered[0].plan!r}."
+        " Speed-up: how many times faster the first row is. Prologue and pruner: their ms of the call.",
+        soft_wrap=True,
+    )
+    output.print(one_line(fingerprint()), markup=False, soft_wrap=True)
+
+
+def _row(m: Measurement, compiled: Measurement) -> tuple[str, ...]:
+    low, high = m.quartiles_ms
+    return (
+        m.label,
+        f"{m.median_ms:.4g}",
+        f"{low:.4g}..{high:.4g}",
+        f"{1000 / m.median_ms:.1f}",
+        "" if m is compiled else f"{m.median_ms / compiled.median_ms:.1f} x",
+        f"{m.flops / 1e9:.3f}",
+        share(m.sparsity),
+        "" if m.prologue_ms is None else f"{m.prologue_ms:.2f}",
+        "" if m.pruner_ms is None else f"{m.pruner_ms:.2f}",
+    )

@@ -1,0 +1,57 @@
+"""``ttscompile convert``: a trained policy becomes an artifact."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+import ttscompile
+from ttscompile.cli.output import json_option, only_results_on_stdout, print_json, progress, results
+from ttscompile.cli.summary import document, print_summary
+
+
+@click.command()
+@click.argument("checkpoint", type=click.Path(path_type=Path))
+@click.option("-o", "--output", "directory", required=True, type=click.Path(path_type=Path), help="The artifact.")
+@click.option(
+    "--format",
+    type=click.Choice(["auto", "diffusion_policy"]),
+    default="auto",
+    show_default=True,
+    help="Of CHECKPOINT.",
+)
+@click.option("--sampler", type=click.Choice(["ddpm", "ddim"]), help="In place of the checkpoint's own.")
+@click.option("--steps", type=click.IntRange(min=1), help="Denoising steps, in place of the checkpoint's own.")
+@click.option("--explain", is_flag=True, help="Say on standard error what each pass did.")
+@json_option
+def convert(
+    checkpoint: Path,
+    directory: Path,
+    format: str,
+    sampler: str | None,
+    steps: int | None,
+    explain: bool,
+    as_json: bool,
+) -> None:
+    """Compile CHECKPOINT, a trained policy. Nothing in the file is executed.
+
+    The artifact computes everything until 'ttscompile calibrate' gives it a plan.
+    """
+    stages: list[dict[str, object]] = []
+    console = progress()
+    with only_results_on_stdout(), console.status("compiling") as status:
+
+        def on_stage(name: str, notes: tuple[str, ...]) -> None:
+            stages.append({"stage": name, "notes": list(notes)})
+            status.update(f"compiling: after {name}")
+            if explain:
+                for i, note in enumerate(notes or ("nothing to do",)):
+                    console.print(f"{name if i == 0 else '':<22}{note}", markup=False, soft_wrap=True)
+
+        ttscompile.convert(checkpoint, directory, format=format, sampler=sampler, steps=steps, explain=on_stage)
+    summary = document(directory)
+    if as_json:
+        print_json(summary | {"stages": stages})
+    else:
+        print_summary(summary, results())

@@ -1,0 +1,102 @@
+"""``ttscompile inspect``: what is in an artifact, and a picture of one of its plans."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+import numpy as np
+import numpy.typing as npt
+
+import ttscompile
+from ttscompile.artifact.load import Artifact, load_artifact
+from ttscompile.artifact.manifest import DENSE
+from ttscompile.cli.output import artifact_argument, json_option, print_json, progress, results
+from ttscompile.cli.summary import document, print_summary
+from ttscompile.errors import ArtifactError, ObservationError
+from ttscompile.lattice import PlanArray
+from ttscompile.plots import plot_plan
+
+
+@click.command()
+@artifact_argument
+@click.option(
+    "--plot", "picture", type=click.Path(path_type=Path), help="Draw a plan into this file (.png, .svg, .pdf)."
+)
+@click.option("--plan", "name", help="Which plan to draw; the artifact's default plan if not given.")
+@click.option(
+    "--observation",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="For a plan that depends on the observation: an .npz with an array a key, one observation or, of the calls of"
+    " one episode, [N, ...]. The plan of the last call is drawn.",
+)
+@json_option
+def inspect(directory: Path, picture: Path | None, name: str | None, observation: Path | None, as_json: bool) -> None:
+    """Show what the artifact DIRECTORY holds: the policy, its blocks, what they cost, its plans and calibration."""
+    if picture is None and (name is not None or observation is not None):
+        raise click.UsageError("--plan and --observation choose what --plot draws; give --plot FILE too.")
+    artifact = load_artifact(directory)
+    summary = document(directory, artifact)
+    if picture is not None:
+        name = name or artifact.manifest.default_plan
+        plan = _plan(artifact, name, observation)
+        plot_plan(plan, [block.kind for block in artifact.manifest.blocks], picture, f"plan {name!r}")
+        progress().print(f"wrote {picture}", markup=False, soft_wrap=True)
+    if as_json:
+        print_json(summary)
+    else:
+        print_summary(summary, results())
+
+
+def _plan(artifact: Artifact, name: str, observation: Path | None) -> PlanArray:
+    """The plan to draw, int8 ``[K, blocks]``.
+
+    Raises:
+        ArtifactError: there is no plan of this name, or it depends on an observation and none was given.
+        ObservationError: the observation does not fit the policy.
+    """
+    plans = artifact.manifest.plans
+    if name != DENSE and name not in plans:
+        raise ArtifactError(f"{artifact.path}: has no plan {name!r}; it has {[DENSE, *plans]}. Use one of these.")
+    if name == DENSE or plans[name].kind == "schedule":
+        return artifact.schedule(name)
+    if observation is None:
+        others = [DENSE, *artifact.schedules]
+        raise ArtifactError(
+            f"{artifact.path}: plan {name!r} is made for each observation, and none was given. Add --observation"
+            f" FILE.npz, or draw a schedule with --plan: {', '.join(others)}."
+        )
+    policy = ttscompile.load(artifact.path, seed=0)
+    for call in _calls(observation, artifact):
+        policy.predict_action(call, plan=name)
+    report = policy.last_report
+    assert report is not None  # there is at least one call
+    plan: PlanArray = report.plan[0]
+    return plan
+
+
+def _calls(path: Path, artifact: Artifact) -> list[dict[str, npt.NDArray[np.generic]]]:
+    """The observations of consecutive calls, ``[1, ...]`` an array; the policy checks all but their number.
+
+    Raises:
+        ObservationError: not an npz, a key is missing, or the arrays do not hold the same number of calls.
+    """
+    specs = artifact.manifest.spec.observations
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = {key: stored[key] for key in specs if key in stored.files}
+            found = stored.files
+    except (OSError, ValueError) as error:
+        raise ObservationError(
+            f"{path}: cannot be read as .npz: {error}. Give an .npz with the keys {list(specs)}."
+        ) from error
+    missing = [key for key in specs if key not in arrays]
+    if missing:
+        raise ObservationError(f"{path}: has no array {missing[0]!r}; expected {list(specs)}, found {found}.")
+    rows = {k: a if a.ndim > len(specs[k].shape) else a[None] for k, a in arrays.items()}
+    counts = {k: len(a) for k, a in rows.items()}
+    if len(set(counts.values())) != 1 or 0 in counts.values():
+        raise ObservationError(
+            f"{path}: expected the same number of calls, at least one, for every key; found {counts}."
+        )
+    return [{k: a[i : i + 1] for k, a in rows.items()} for i in range(min(counts.values()))]

@@ -1,0 +1,219 @@
+"""Timing of policies that take turns, call by call, on the same observations and noise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+import ttscompile
+from ttscompile.artifact.load import load_artifact
+from ttscompile.config import Noise, PolicySpec
+from ttscompile.errors import RuntimeUnavailableError, SpecError
+from ttscompile.lattice import Source
+
+WARM_UP = 3
+"""Calls of each that are not counted: allocations, and the first call of an episode, which cannot use ROLLOUT."""
+
+Observation = dict[str, npt.NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Contestant:
+    """One way to make a call.
+
+    Attributes:
+        label: for people.
+        plan: that it runs; for people and the warning about a dense one.
+        call: one call, given an observation of one stream and noise.
+        report: the report of the last call; None if there is none, and everything was computed.
+        spec: of the policy.
+        dense_flops: of a call without a report.
+    """
+
+    label: str
+    plan: str
+    call: Callable[[Observation, Noise], object]
+    report: Callable[[], Any]
+    spec: PolicySpec
+    dense_flops: float
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What the counted calls of one contestant took.
+
+    Attributes:
+        label: of the contestant.
+        plan: that it ran.
+        times_ms: wall time of each call.
+        median_ms: their median.
+        quartiles_ms: their first and third quartile.
+        prologue_ms: median of the report's timing; None without reports.
+        pruner_ms: likewise.
+        flops: median over the calls.
+        sparsity: mean share of reused cells.
+        legalised: cells that had to be replaced because they were never computed, all calls together.
+    """
+
+    label: str
+    plan: str
+    times_ms: tuple[float, ...]
+    median_ms: float
+    quartiles_ms: tuple[float, float]
+    prologue_ms: float | None
+    pruner_ms: float | None
+    flops: float
+    sparsity: float
+    legalised: int
+
+    def to_json(self) -> dict[str, Any]:
+        """As plain JSON values."""
+        return asdict(self)
+
+
+def contestants(
+    directory: Path, threads: int, plan: str | None, against: Sequence[str], checkpoint: Path | None
+) -> list[Contestant]:
+    """The compiled policy first, then its rivals; each with a policy, and caches, of its own.
+
+    Args:
+        directory: the artifact.
+        threads: of each.
+        plan: of the compiled policy; None for the artifact's default.
+        against: ``eager``, ``onnxruntime-dense``.
+        checkpoint: for ``eager``.
+
+    Raises:
+        ArtifactError: it cannot be opened.
+        RuntimeUnavailableError: ``eager`` without torch.
+        SpecError: the checkpoint is of another policy.
+    """
+    manifest = load_artifact(directory).manifest
+    name = plan or manifest.default_plan
+    made = [_compiled("compiled", directory, threads, name, manifest.spec)]
+    for rival in against:
+        if rival == "onnxruntime-dense":
+            made.append(_compiled("dense onnxruntime", directory, threads, "dense", manifest.spec))
+        elif checkpoint is not None:
+            made.append(_eager(checkpoint, threads, manifest.spec, manifest.flops.dense))
+    return made
+
+
+def random_calls(spec: PolicySpec, count: int, seed: int) -> list[tuple[Observation, Noise]]:
+    """Observations of one stream within the range of the normaliser, and noise, for consecutive calls.
+
+    Without a normaliser, observations are drawn from -1..1.
+    """
+    rng = np.random.default_rng(seed)
+    calls = []
+    for _ in range(count):
+        obs: Observation = {}
+        for key, observation in spec.observations.items():
+            drawn = rng.uniform(-1, 1, (1, *observation.shape)).astype(np.float32)
+            normalizer = observation.normalizer
+            obs[key] = (drawn if normalizer is None else normalizer.unnormalize(drawn)).astype(observation.dtype)
+        initial = rng.standard_normal((1, *spec.sample), dtype=np.float32)
+        draws = rng.standard_normal((spec.sampler.steps, *initial.shape), dtype=np.float32)
+        calls.append((obs, Noise(initial, draws if spec.sampler.stochastic else None)))
+    return calls
+
+
+def measure(
+    entered: Sequence[Contestant], runs: int, seed: int, on_round: Callable[[int, int], None] = lambda done, total: None
+) -> list[Measurement]:
+    """Time the contestants in turn, so that whatever else the machine does hits all of them.
+
+    Args:
+        entered: at least one.
+        runs: counted calls of each.
+        seed: of observations and noise.
+        on_round: told how many rounds of how many are done.
+
+    Returns:
+        One measurement a contestant.
+    """
+    times: list[list[float]] = [[] for _ in entered]
+    reports: list[list[Any]] = [[] for _ in entered]
+    calls = random_calls(entered[0].spec, WARM_UP + runs, seed)
+    for number, (obs, noise) in enumerate(calls):
+        for turn in range(len(entered)):
+            i = (turn + number) % len(entered)  # nobody always runs after the same one
+            started = perf_counter()
+            entered[i].call(obs, noise)
+            elapsed = 1000 * (perf_counter() - started)
+            if number >= WARM_UP:
+                times[i].append(elapsed)
+                reports[i].append(entered[i].report())
+        on_round(number + 1, len(calls))
+    return [_summary(*one) for one in zip(entered, times, reports, strict=True)]
+
+
+def _compiled(label: str, directory: Path, threads: int, plan: str, spec: PolicySpec) -> Contestant:
+    policy = ttscompile.load(directory, threads=threads)
+    policy.reset()
+    return Contestant(
+        label=label,
+        plan=plan,
+        call=lambda obs, noise: policy.predict_action(obs, noise=noise, plan=plan),
+        report=lambda: policy.last_report,
+        spec=spec,
+        dense_flops=0.0,
+    )
+
+
+def _eager(checkpoint: Path, threads: int, spec: PolicySpec, dense_flops: float) -> Contestant:
+    """The original network in eager PyTorch, in the artifact's own denoising loop."""
+    try:
+        import torch
+
+        from ttscompile.frontends import load_checkpoint_policy
+        from ttscompile.frontends.eager import eager_policy
+    except ModuleNotFoundError as error:
+        raise RuntimeUnavailableError(
+            f"--against eager needs {error.name}, which is not installed. Run: pip install 'ttscompile[compile]'."
+        ) from error
+    module, original = load_checkpoint_policy(checkpoint)
+    if _interface(original) != _interface(spec):
+        raise SpecError(
+            f"{checkpoint}: expected the policy that the artifact was made from, {_interface(spec)}; found"
+            f" {_interface(original)}. Give that policy's checkpoint."
+        )
+    torch.set_num_threads(threads)
+    run = eager_policy(module, spec)
+
+    def call(obs: Mapping[str, npt.NDArray[Any]], noise: Noise) -> object:
+        normalised = {}
+        for key, observation in spec.observations.items():
+            normalizer = observation.normalizer
+            normalised[key] = torch.from_numpy(obs[key] if normalizer is None else normalizer.normalize(obs[key]))
+        return run(normalised, noise)
+
+    return Contestant("eager PyTorch", "dense", call, lambda: None, spec, dense_flops)
+
+
+def _interface(spec: PolicySpec) -> str:
+    observations = ", ".join(f"{key} {observation.shape}" for key, observation in spec.observations.items())
+    return f"sample {spec.sample}, observations {observations}"
+
+
+def _summary(contestant: Contestant, times: Sequence[float], reports: Sequence[Any]) -> Measurement:
+    reported = reports[0] is not None
+    low, high = np.percentile(times, [25, 75])
+    return Measurement(
+        label=contestant.label,
+        plan=contestant.plan,
+        times_ms=tuple(times),
+        median_ms=float(np.median(times)),
+        quartiles_ms=(float(low), float(high)),
+        prologue_ms=float(np.median([r.timings.prologue for r in reports])) if reported else None,
+        pruner_ms=float(np.median([r.timings.pruner for r in reports])) if reported else None,
+        flops=float(np.median([r.flops[0] for r in reports])) if reported else contestant.dense_flops,
+        sparsity=float(np.mean([np.mean(r.plan != Source.COMPUTE) for r in reports])) if reported else 0.0,
+        legalised=sum(sum(r.legalised) for r in reports) if reported else 0,
+    )

@@ -1,0 +1,60 @@
+"""What a timing was taken on: without it a figure in milliseconds says little."""
+
+from __future__ import annotations
+
+import os
+import platform
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+PACKAGES = ("ttscompile", "numpy", "onnxruntime", "torch")
+_INSTRUCTIONS = ("avx2", "avx512f", "avx512_vnni", "amx_int8", "asimd", "sve")
+
+
+def fingerprint() -> dict[str, Any]:
+    """Processor, instruction sets, cores that this process may use, their load now, memory in GiB, system, versions.
+
+    Nothing that names the machine or its user. Packages that are not installed are left out.
+    """
+    fields = _cpuinfo()
+    flags = fields.get("flags", fields.get("Features", "")).split()
+    return {
+        "processor": fields.get("model name", platform.processor() or platform.machine()),
+        "instructions": [name for name in _INSTRUCTIONS if name in flags],
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "load_average": round(os.getloadavg()[0], 2),
+        "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        **_versions(),
+    }
+
+
+def one_line(machine: dict[str, Any]) -> str:
+    """The fingerprint for people."""
+    versions = ", ".join(f"{name} {machine[name]}" for name in ("python", *PACKAGES) if name in machine)
+    return (
+        f"{machine['processor']} ({' '.join(machine['instructions'])}), {machine['cores']} cores,"
+        f" load {machine['load_average']}, {machine['memory_gib']} GiB, {machine['system']}; {versions}"
+    )
+
+
+def _cpuinfo() -> dict[str, str]:
+    """The first processor's fields of ``/proc/cpuinfo``; empty where there is no such file."""
+    path = Path("/proc/cpuinfo")
+    if not path.exists():
+        return {}
+    first = path.read_text().split("\n\n", 1)[0]
+    pairs = (line.split(":", 1) for line in first.splitlines() if ":" in line)
+    return {name.strip(): value.strip() for name, value in pairs}
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
