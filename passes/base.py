@@ -41,8 +41,10 @@ class Pass(abc.ABC):
         self.requires(program)
         result = self.call(program)
         if result.modified == (result.program is program):
-            raise PassError(f"{self.name}: says modified={result.modified} and returned the "
-                            f"{'same' if result.program is program else 'new'} program.")
+            raise PassError(
+                f"{self.name}: says modified={result.modified} and returned the "
+                f"{'same' if result.program is program else 'new'} program."
+            )
         self.ensures(result.program)
         return result
 

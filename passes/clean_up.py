@@ -21,7 +21,7 @@ Weights = dict[str, npt.NDArray[Any]]
 _SAME = frozenset("aten.clone aten.alias aten.detach aten.contiguous aten.lift_fresh_copy".split())
 _SAME_IF_OFF = frozenset("aten.dropout aten.feature_dropout aten.alpha_dropout".split())
 _SAME_IF_TYPE_KEPT = frozenset(
-    "aten.view aten.reshape aten._unsafe_view aten.flatten aten.expand aten.slice aten._to_copy aten.to aten.squeeze".split()
+    "aten.reshape aten.flatten aten.expand aten.slice aten._to_copy aten.to aten.squeeze".split()
 )
 
 
@@ -107,8 +107,11 @@ def fold_constants(graph: Graph, weights: Weights) -> Graph:
     fragment = Graph({}, graph.constants, tuple(folded), wanted)
     used = reaching(fragment, wanted)
     tensors = {n: torch.from_numpy(weights[n]) for n in graph.constants if n in used}
-    fragment = replace(fragment, constants={n: t for n, t in graph.constants.items() if n in used},
-                       nodes=tuple(n for n in folded if n.name in used))
+    fragment = replace(
+        fragment,
+        constants={n: t for n, t in graph.constants.items() if n in used},
+        nodes=tuple(n for n in folded if n.name in used),
+    )
     with torch.no_grad():
         values = Evaluator(fragment, tensors)({})
     constants = dict(graph.constants)
@@ -142,9 +145,8 @@ def merge_repeated(graph: Graph) -> Graph:
     nodes = []
     for node in graph.nodes:
         node = node.renamed(lambda name: same.get(name, name))
-        key = (node.op, node.args, node.kwargs, node.types)
-        # 1 == True == 1.0 in Python, so the key has to hold the types of the numbers as well
-        key = (*key, repr(node.args), repr(node.kwargs))
+        # 1 == True == 1.0 in Python; their texts differ
+        key = (node.op, repr(node.args), repr(node.kwargs), node.types)
         if key in seen and node.name not in graph.outputs:
             same[node.name] = seen[key]
         else:

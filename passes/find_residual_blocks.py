@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ttscompile.errors import NoResidualBlocksError
 from ttscompile.ir.dataflow import between, dominators, reachable_from
@@ -150,9 +150,7 @@ def _chain(graph: Graph, points: Sequence[str], links: list[_Link], declined: li
     return blocks
 
 
-def _first_of_type(
-    points: Sequence[str], types: dict[str, TensorType], wanted: TensorType, before: str
-) -> str | None:
+def _first_of_type(points: Sequence[str], types: dict[str, TensorType], wanted: TensorType, before: str) -> str | None:
     for name in points:
         if name == before:
             return None
@@ -229,7 +227,5 @@ def _number(graph: Graph, blocks: Sequence[Block]) -> list[Block]:
     numbered = []
     for block in blocks:
         group = groups.setdefault((block.kind, block.type), len(groups))
-        numbered.append(
-            Block(block.index, block.kind, block.stream, block.result, block.residual, block.type, group, 0, block.reason)
-        )
+        numbered.append(replace(block, group=group))
     return numbered

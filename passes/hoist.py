@@ -54,10 +54,10 @@ class Hoist(Pass):
         wanted = list(dict.fromkeys(n for g in _loop(pieces) for n in list(g.inputs)[1:]))
         types = prologue.types()
         at = {b: [n for n in wanted if known[n] is b] for b in Binding}
-        constant = at[Binding.CONSTANT]
         step, boundary = _step_graph(prologue, at[Binding.STEP], known)
-        conditions = list(dict.fromkeys([*at[Binding.CONDITION], *(n for n in boundary if known[n] is Binding.CONDITION)]))
-        tables = list(dict.fromkeys([*at[Binding.TABLE], *constant, *(n for n in boundary if known[n] is Binding.TABLE)]))
+        early = {b: [n for n in boundary if known[n] is b] for b in (Binding.CONDITION, Binding.TABLE)}
+        conditions = list(dict.fromkeys(at[Binding.CONDITION] + early[Binding.CONDITION]))
+        tables = list(dict.fromkeys(at[Binding.TABLE] + at[Binding.CONSTANT] + early[Binding.TABLE]))
         condition = backward_slice(prologue, tuple(conditions), {})
         condition = replace(condition, inputs={k: types[k] for k in spec.observations})
         new = replace(
@@ -66,14 +66,12 @@ class Hoist(Pass):
             step=step,
             tables=_evaluate_tables(prologue, tables, program.weights, spec.sampler, spec.timestep_argument),
             bindings={
-                **{n: Binding.TABLE for n in tables},
-                **{n: Binding.CONDITION for n in conditions},
-                **{n: Binding.STEP for n in at[Binding.STEP]},
+                **dict.fromkeys(tables, Binding.TABLE),
+                **dict.fromkeys(conditions, Binding.CONDITION),
+                **dict.fromkeys(at[Binding.STEP], Binding.STEP),
             },
         )
-        blocks = tuple(
-            replace(b, flops=graph_flops(g)) for b, g in zip(program.blocks, new.blocks, strict=True)
-        )
+        blocks = tuple(replace(b, flops=graph_flops(g)) for b, g in zip(program.blocks, new.blocks, strict=True))
         return PassResult(replace(program, pieces=new, blocks=blocks), True, _notes(program, new))
 
     def ensures(self, program: Program) -> None:
@@ -114,9 +112,7 @@ def _sink(pieces: Pieces, prologue: Graph, known: Mapping[str, Binding]) -> Piec
                 inputs[name] = type_
         return replace(piece, inputs=inputs, nodes=(*moved, *piece.nodes)) if moved else piece
 
-    return replace(
-        pieces, stem=sink(pieces.stem), blocks=tuple(map(sink, pieces.blocks)), tail=sink(pieces.tail)
-    )
+    return replace(pieces, stem=sink(pieces.stem), blocks=tuple(map(sink, pieces.blocks)), tail=sink(pieces.tail))
 
 
 def _name_inputs(prologue: Graph) -> tuple[Graph, dict[str, str]]:
@@ -140,9 +136,7 @@ def _rename_contexts(pieces: Pieces, renamed: Mapping[str, str]) -> Pieces:
             nodes=tuple(n.renamed(lambda name: mapping.get(name, name)) for n in piece.nodes),
         )
 
-    return replace(
-        pieces, stem=rename(pieces.stem), blocks=tuple(map(rename, pieces.blocks)), tail=rename(pieces.tail)
-    )
+    return replace(pieces, stem=rename(pieces.stem), blocks=tuple(map(rename, pieces.blocks)), tail=rename(pieces.tail))
 
 
 def _step_graph(prologue: Graph, outputs: list[str], known: Mapping[str, Binding]) -> tuple[Graph | None, list[str]]:

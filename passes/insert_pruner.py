@@ -175,11 +175,10 @@ def _features(program: Program) -> tuple[Graph, tuple[str, ...]]:
     if chosen is not None:
         outputs = graph.outputs if chosen in graph.outputs else (*graph.outputs, chosen)
         return replace(graph, outputs=outputs), (chosen,)
-    nodes, outputs = list(graph.nodes), list(graph.outputs)
-    features = []
+    nodes = list(graph.nodes)
+    features: list[str] = []
     for key, type_ in graph.inputs.items():
         name = f"{key}.feature"
         nodes.append(Node(name, "aten.clone.default", (Ref(key),), (), (type_,), "feature of the plan head"))
-        outputs.append(name)
         features.append(name)
-    return replace(graph, nodes=tuple(nodes), outputs=tuple(outputs)), tuple(features)
+    return replace(graph, nodes=tuple(nodes), outputs=(*graph.outputs, *features)), tuple(features)

@@ -69,10 +69,10 @@ class Partition(Pass):
             blocks=tuple(cut),
             tail=tail,
         )
-        counts = f"stem {len(stem.nodes)}, {len(cut)} blocks {sum(len(c.nodes) for c in cut)}, tail {len(tail.nodes)} nodes"
-        return PassResult(
-            replace(program, pieces=pieces), True, (f"prologue {len(pieces.condition.nodes)} nodes, {counts}",)
-        )
+        sizes = {"prologue": pieces.condition, "stem": stem, "tail": tail}
+        counts = [f"{name} {len(graph.nodes)}" for name, graph in sizes.items()]
+        counts.insert(2, f"{len(cut)} blocks {sum(len(c.nodes) for c in cut)}")
+        return PassResult(replace(program, pieces=pieces), True, ("nodes: " + ", ".join(counts),))
 
     def ensures(self, program: Program) -> None:
         """Nothing in a loop piece reads timestep or observation except as a context."""

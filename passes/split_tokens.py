@@ -13,8 +13,8 @@ from ttscompile.ir.program import Binding, Program
 from .base import Pass, PassResult
 
 _UNARY = frozenset(
-    "gelu relu silu mish tanh sigmoid softplus exp sin cos neg rsqrt sqrt abs erf elu leaky_relu hardswish hardtanh clamp"
-    " clone pow reciprocal _to_copy to contiguous dropout square log1p expm1".split()
+    "gelu relu silu mish tanh sigmoid softplus exp sin cos neg rsqrt sqrt abs erf elu leaky_relu hardswish hardtanh"
+    " clamp clone pow reciprocal _to_copy to contiguous dropout square log1p expm1".split()
 )
 _BINARY = frozenset("add sub mul div".split())
 
@@ -120,7 +120,7 @@ class _Splitter:
         self.whole.add(name)
         refs: tuple[Argument, ...] = tuple(Ref(p) for p in parts.names)
         self.nodes.append(
-            Node(name, "aten.cat.default", (refs, parts.axis), (), (self.types[name],), "concatenation sunk by SplitTokens")
+            Node(name, "aten.cat.default", (refs, parts.axis), (), (self.types[name],), "sunk by SplitTokens")
         )
 
     def emit(self, node: Node, index: int, args: tuple[Argument, ...], types: tuple[TensorType, ...]) -> str:
@@ -347,8 +347,10 @@ def _along_other_axis(default: int) -> Callable[[_Splitter, Node], _Parts | None
 
 def _getitem(splitter: _Splitter, node: Node) -> _Parts | None:
     source = _only_first_is_split(splitter, node)
-    return None if source is None else _per_part(
-        splitter, node, source, source.axis, lambda part, _: (part, *node.args[1:])
+    return (
+        None
+        if source is None
+        else _per_part(splitter, node, source, source.axis, lambda part, _: (part, *node.args[1:]))
     )
 
 
@@ -365,12 +367,11 @@ def _view(splitter: _Splitter, node: Node) -> _Parts | None:
         return None
     shape, new = splitter.types[name].shape, node.type.shape
     before = _product(shape[: source.axis])
-    for axis in range(len(new)):
-        if _product(new[:axis]) == before and new[axis] == shape[source.axis]:
-            return _per_part(
-                splitter, node, source, axis, lambda part, size, axis=axis: (part, (*new[:axis], size, *new[axis + 1 :]))
-            )
-    return None
+    kept = [a for a in range(len(new)) if _product(new[:a]) == before and new[a] == shape[source.axis]]
+    if not kept:
+        return None
+    axis = kept[0]
+    return _per_part(splitter, node, source, axis, lambda part, size: (part, (*new[:axis], size, *new[axis + 1 :])))
 
 
 def _expand(splitter: _Splitter, node: Node) -> _Parts | None:

@@ -124,7 +124,7 @@ class _Converter:
         size = sample.meta["val"].shape[0]
         if isinstance(size, int):
             raise CaptureError(
-                f"the module works for a batch of {size} only: its code fixes the batch size. Take sizes from the inputs."
+                f"the module works for a batch of {size} only: its code fixes the size. Take sizes from the inputs."
             )
         return size.node.expr
 
@@ -192,7 +192,7 @@ class _Converter:
         outputs = self.exported.graph_signature.output_specs
         mutated = [o.target for o in outputs if o.kind is not OutputKind.USER_OUTPUT]
         if mutated:
-            raise CaptureError(f"the module changes its own buffers {mutated} in a forward call; a denoiser must be pure.")
+            raise CaptureError(f"the module changes its own buffers {mutated} when called; a denoiser must be pure.")
         (output,) = [n for n in self.exported.graph.nodes if n.op == "output"]
         results = output.args[0]
         if len(results) != 1 or not isinstance(results[0], torch.fx.Node):

@@ -57,7 +57,7 @@ class SamplerTable:
         x0   = clip(sample_to_x0[k] * x + out_to_x0[k] * out, -clip, clip)
         next = x0_to_next[k] * x0 + sample_to_next[k] * x + out_to_next[k] * out + noise_to_next[k] * noise
 
-    The tables are computed at compile time from diffusers' scheduler (``ttscompile.samplers``); all are float32 ``[K]``.
+    The tables are computed at compile time from diffusers' scheduler (``ttscompile.samplers``); all float32 ``[K]``.
 
     Attributes:
         name: ``ddpm`` or ``ddim``, for people.
@@ -186,7 +186,8 @@ class PolicySpec:
             )
         normalizer = self.chunk.normalizer
         if normalizer is not None and len(normalizer.scale) != self.chunk.action_dim:
-            raise SpecError(f"action normaliser has {len(normalizer.scale)} entries for {self.chunk.action_dim} channels.")
+            found = len(normalizer.scale)
+            raise SpecError(f"action normaliser has {found} entries for {self.chunk.action_dim} channels.")
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,7 @@ def convert(
         format: ``auto`` or ``diffusion_policy``.
         sampler: ``ddpm`` or ``ddim`` in place of the checkpoint's own; None keeps it.
         steps: number of denoising steps; None keeps the checkpoint's.
-        spacing: ``leading``, ``trailing`` or ``linspace``: which timesteps fewer steps visit; None keeps the checkpoint's.
+        spacing: ``leading``, ``trailing`` or ``linspace``: the timesteps that fewer steps visit; None: as trained.
         explain: told what each stage did.
 
     Raises:
@@ -71,7 +71,7 @@ def compile_denoiser(
     """Compile any denoiser that ``torch.export`` can capture.
 
     Args:
-        module: ``eps(sample, timestep, **observations)``, see ``ttscompile.PolicySpec``. Observations reach it normalised.
+        module: ``eps(sample, timestep, **observations)``, see ``ttscompile.PolicySpec``; observations come normalised.
         spec: the policy beside its network.
         directory: where the artifact goes; None compiles without writing.
         explain: told what each stage did.
@@ -94,7 +94,8 @@ def compile_denoiser(
 def transform(module: nn.Module, spec: PolicySpec, *, explain: Explain = _silent) -> Program:
     """Everything up to lowering: capture, analysis and passes."""
     graph, weights = capture(module, spec)
-    explain("capture", (f"{len(graph.nodes)} operations, {sum(w.nbytes for w in weights.values()) / 1e6:.1f} MB of weights",))
+    megabytes = sum(w.nbytes for w in weights.values()) / 1e6
+    explain("capture", (f"{len(graph.nodes)} operations, {megabytes:.1f} MB of weights",))
     program = Program(spec, graph, weights, dense_flops=graph_flops(graph) * spec.sampler.steps)
     verify(program)
     program = _run(CleanUp(), program, explain)

@@ -24,7 +24,8 @@ class Builder:
         return Ref(name)
 
     def op(self, name: str, op: str, shape: tuple[Size, ...], *args: Argument) -> Ref:
-        self.nodes.append(Node(name, f"aten.{op}", args, (), (TensorType(shape, "float32"),), f"toy.py:{len(self.nodes)}"))
+        type_ = TensorType(shape, "float32")
+        self.nodes.append(Node(name, f"aten.{op}", args, (), (type_,), f"toy.py:{len(self.nodes)}"))
         return Ref(name)
 
     def graph(self, *outputs: Ref) -> Graph:

@@ -65,7 +65,9 @@ class AdaLN(nn.Module):
         super().__init__()
         self.embed, self.head, self.obs = nn.Linear(2, width), nn.Linear(width, 2), nn.Linear(7, width)
         self.modulation = nn.ModuleList(nn.Linear(width, 3 * width) for _ in range(layers))
-        self.ff = nn.ModuleList(nn.Sequential(nn.Linear(width, 32), nn.GELU(), nn.Linear(32, width)) for _ in range(layers))
+        self.ff = nn.ModuleList(
+            nn.Sequential(nn.Linear(width, 32), nn.GELU(), nn.Linear(32, width)) for _ in range(layers)
+        )
 
     def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
         c = nn.functional.silu(timestep[:, None] * 0.1 + self.obs(obs).mean(1))
@@ -191,7 +193,9 @@ def test_time_token_becomes_a_table_and_observation_tokens_are_encoded_once() ->
     # Nothing but self-attention, queries, cross-attention itself, feed-forward, embedding and head is left in the loop.
     loop = sum(graph_flops(g) for g in (pieces.stem, *pieces.blocks, pieces.tail))
     attention = lambda keys: 2 * 4 * keys * 2 * width  # noqa: E731
-    layer = 2 * 4 * width * (4 * width) + attention(4) + 2 * 4 * width * (2 * width) + attention(4) + 2 * 4 * 2 * width * 32
+    layer = (
+        2 * 4 * width * (4 * width) + attention(4) + 2 * 4 * width * (2 * width) + attention(4) + 2 * 4 * 2 * width * 32
+    )
     assert loop == 2 * layer + 2 * (2 * 4 * 2 * width)
 
 
@@ -213,7 +217,8 @@ def test_stages_are_explained() -> None:
     told: dict[str, tuple[str, ...]] = {}
     transform(TokenDecoder().eval(), spec(), explain=lambda stage, notes: told.update({stage: notes}))
     assert list(told) == [
-        "capture", "CleanUp", "find_residual_blocks", "Partition", "SplitTokens", "Hoist", "InsertPruner", "InsertReuse",
+        "capture", "CleanUp", "find_residual_blocks", "Partition", "SplitTokens", "Hoist",
+        "InsertPruner", "InsertReuse",
     ]  # fmt: skip
     assert "6 blocks: self_attention, cross_attention, feed_forward" in told["find_residual_blocks"][0]
     assert any("left in the loop" in note for note in told["Hoist"])
@@ -242,7 +247,9 @@ def test_pruner_reads_the_encoded_observation_and_forces_step_zero() -> None:
     assert pieces is not None and pieces.pruner is not None
     (feature,) = pieces.features
     assert pieces.condition.types()[feature].shape[-1] == 16
-    features = dict(zip(pieces.condition.outputs, _run(program, pieces.condition, {"obs": torch.randn(2, 3, 7)}), strict=True))
+    features = dict(
+        zip(pieces.condition.outputs, _run(program, pieces.condition, {"obs": torch.randn(2, 3, 7)}), strict=True)
+    )
     (logits,) = _run(program, pieces.pruner, {feature: features[feature]})
     assert logits.shape == (2, 5, 6, 4)
     assert (logits[:, 0, :, 1:] < -1e8).all() and (logits.argmax(-1) == 0).all()
@@ -267,5 +274,7 @@ class NoResidual(nn.Module):
 
 
 def test_a_network_without_residuals_is_refused_with_its_source_line() -> None:
-    with pytest.raises(NoResidualBlocksError, match=r"ended at %\w+ = aten\.mul\.Tensor \(test_pipeline\.py:\d+ in forward\)"):
+    with pytest.raises(
+        NoResidualBlocksError, match=r"ended at %\w+ = aten\.mul\.Tensor \(test_pipeline\.py:\d+ in forward\)"
+    ):
         transform(NoResidual(), spec())

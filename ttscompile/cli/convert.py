@@ -23,6 +23,11 @@ from ttscompile.cli.summary import document, print_summary
 )
 @click.option("--sampler", type=click.Choice(["ddpm", "ddim"]), help="In place of the checkpoint's own.")
 @click.option("--steps", type=click.IntRange(min=1), help="Denoising steps, in place of the checkpoint's own.")
+@click.option(
+    "--spacing",
+    type=click.Choice(["leading", "trailing", "linspace"]),
+    help="Timesteps that fewer steps visit, in place of the checkpoint's own.",
+)
 @click.option("--explain", is_flag=True, help="Say on standard error what each pass did.")
 @json_option
 def convert(
@@ -31,6 +36,7 @@ def convert(
     format: str,
     sampler: str | None,
     steps: int | None,
+    spacing: str | None,
     explain: bool,
     as_json: bool,
 ) -> None:
@@ -49,7 +55,9 @@ def convert(
                 for i, note in enumerate(notes or ("nothing to do",)):
                     console.print(f"{name if i == 0 else '':<22}{note}", markup=False, soft_wrap=True)
 
-        ttscompile.convert(checkpoint, directory, format=format, sampler=sampler, steps=steps, explain=on_stage)
+        ttscompile.convert(
+            checkpoint, directory, format=format, sampler=sampler, steps=steps, spacing=spacing, explain=on_stage
+        )
     summary = document(directory)
     if as_json:
         print_json(summary | {"stages": stages})

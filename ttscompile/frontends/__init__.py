@@ -16,7 +16,7 @@ FORMATS = ("auto", "diffusion_policy")
 
 def load_checkpoint_policy(
     path: str | os.PathLike[str],
-    format: str = "auto",  # noqa: A002 - the name in the public interface
+    format: str = "auto",
     sampler: str | None = None,
     steps: int | None = None,
     spacing: str | None = None,

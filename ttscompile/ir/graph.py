@@ -36,7 +36,7 @@ class Ref:
 
 @dataclass(frozen=True)
 class Enum:
-    """A torch enumeration as an argument: ``Enum("dtype", "float32")``, ``Enum("memory_format", "contiguous_format")``."""
+    """A torch enumeration as an argument: ``Enum("dtype", "float32")``."""
 
     kind: str
     name: str

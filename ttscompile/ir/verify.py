@@ -25,7 +25,8 @@ def verify_graph(graph: Graph, what: str) -> None:
             raise PassError(f"{what}: %{node.name} is defined twice.\n{_around(graph, position)}")
         for name in node.refs():
             if name not in defined:
-                raise PassError(f"{what}: %{node.name} reads %{name}, which is not defined there.\n{_around(graph, position)}")
+                where = _around(graph, position)
+                raise PassError(f"{what}: %{node.name} reads %{name}, which is not defined there.\n{where}")
         if not node.types:
             raise PassError(f"{what}: %{node.name} has no result.\n{_around(graph, position)}")
         defined[node.name] = node.type
@@ -51,7 +52,8 @@ def verify(program: Program) -> None:
             if weight is None:
                 raise PassError(f"{what}: constant %{name} has no value in the program's weights.")
             if weight.shape != type_.shape or str(weight.dtype) != type_.dtype:
-                raise PassError(f"{what}: constant %{name} is {weight.dtype}{list(weight.shape)}; its type says {type_}.")
+                found = f"{weight.dtype}{list(weight.shape)}"
+                raise PassError(f"{what}: constant %{name} is {found}; its type says {type_}.")
     for i, block in enumerate(program.blocks):
         if block.index != i:
             raise PassError(f"block table: entry {i} calls itself block {block.index}.")
@@ -92,7 +94,8 @@ def _verify_pieces(program: Program) -> None:
         if first != flows_in:
             raise PassError(f"{what}: its first input is {first}; expected {flows_in}.")
         if len(graph.outputs) != 1 or graph.types()[graph.outputs[0]] != flows_out:
-            raise PassError(f"{what}: gives {[str(graph.types()[o]) for o in graph.outputs]}; expected one {flows_out}.")
+            given = [str(graph.types()[o]) for o in graph.outputs]
+            raise PassError(f"{what}: gives {given}; expected one {flows_out}.")
     if not pieces.bindings:
         return  # before hoist every context comes from the prologue
     provided = {Binding.CONDITION: set(pieces.condition.outputs), Binding.TABLE: set(pieces.tables)}

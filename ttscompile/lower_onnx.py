@@ -1,0 +1,148 @@
+"""From what torch's exporter writes to the ONNX model of a piece: our names, weights without data, nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import onnx
+from onnx import AttributeProto, GraphProto, ModelProto, NodeProto, TensorProto, ValueInfoProto, helper
+
+from .errors import LoweringError
+from .ir.graph import Batch, TensorType
+
+Values = Sequence[tuple[str, TensorType]]
+
+IR_VERSION = 10
+"""ONNX IR version of what is written; the lowest that allows the opset, for the sake of older onnxruntimes."""
+
+
+def name_model(exported: ModelProto, name: str, inputs: Values, constants: Values, outputs: Values) -> ModelProto:
+    """A model with the values of a graph in place of the exporter's.
+
+    Nodes are numbered, values in between are called ``v0, v1..``, constants that the exporter made ``k0, k1..`` in the
+    order of their first use; documentation, metadata, shapes of inner values and unused domains are dropped. The
+    result depends on the exported operations and the arguments alone.
+
+    Args:
+        exported: its inputs are the inputs and then the constants, by position.
+        name: of the ONNX graph.
+        inputs: name and type of each input of the model.
+        constants: name and type of each weight. Each becomes an initializer of this name with dtype and dims and *no
+            data*; the writer of the artifact gives it a place in a weights file (``artifact.bind``).
+        outputs: name and type of each output; an output may be an input or a constant.
+
+    Raises:
+        LoweringError: the exporter left local functions or control flow.
+    """
+    graph = exported.graph
+    if exported.functions:
+        raise LoweringError(f"{name}: the exporter left functions {[f.name for f in exported.functions]} in the model.")
+    names = {value.name: own for value, (own, _) in zip(graph.input, [*inputs, *constants], strict=True)}
+    bound = set(names.values())
+    made = {tensor.name: tensor for tensor in graph.initializer}
+    computed = {value for node in graph.node for value in node.output if value}
+    aliases: list[NodeProto] = []
+    needed: set[str] = set()
+    for value, (own, _) in zip(graph.output, outputs, strict=True):
+        if own in bound:
+            continue  # an input or constant that is an output needs no node
+        result = value.name
+        if result not in computed or result in names:
+            result = f"output {own}"  # no name of the exporter's has a blank
+            aliases.append(helper.make_node("Identity", [value.name], [result]))
+        names[result] = own
+        needed.add(result)
+    live = _live([*graph.node, *aliases], needed)
+    taken = bound | {own for own, _ in outputs}
+    counter = _fresh_names("v", taken)
+    for node in live:
+        for value in node.output:
+            if value and value not in names:
+                names[value] = next(counter)
+    counter = _fresh_names("k", taken | set(names.values()))
+    kept: dict[bytes, TensorProto] = {}
+    nodes = []
+    for index, node in enumerate(live):
+        for value in node.input:
+            if value in made and value not in names:
+                names[value] = _shared(made[value], kept, counter)
+        nodes.append(_renamed(node, f"n{index}", names, name))
+    types = dict(constants)
+    read = {value for node in nodes for value in node.input} | {own for own, _ in outputs}
+    empty = [TensorProto(name=c, dims=_dims(t), data_type=_dtype(t)) for c, t in types.items() if c in read]
+    domains = {node.domain for node in nodes} | {""}
+    return ModelProto(
+        ir_version=IR_VERSION,
+        producer_name="ttscompile",
+        opset_import=[o for o in exported.opset_import if o.domain in domains],
+        graph=GraphProto(
+            name=name,
+            input=[_value_info(own, type_) for own, type_ in inputs],
+            output=[_value_info(own, type_) for own, type_ in outputs],
+            initializer=[*empty, *kept.values()],
+            node=nodes,
+        ),
+    )
+
+
+def _live(nodes: Sequence[NodeProto], outputs: set[str]) -> list[NodeProto]:
+    """The nodes that outputs depend on."""
+    needed = set(outputs)
+    live = []
+    for node in reversed(nodes):
+        if needed.intersection(node.output):
+            live.append(node)
+            needed.update(node.input)
+    return live[::-1]
+
+
+def _shared(tensor: TensorProto, kept: dict[bytes, TensorProto], names: Iterator[str]) -> str:
+    """Name of the small constant with this value; one for all that are equal."""
+    data = onnx.numpy_helper.to_array(tensor).tobytes()
+    key = f"{tensor.data_type} {list(tensor.dims)} ".encode() + data
+    if key not in kept:
+        kept[key] = TensorProto(name=next(names), dims=tensor.dims, data_type=tensor.data_type, raw_data=data)
+    return kept[key].name
+
+
+def _renamed(node: NodeProto, name: str, names: dict[str, str], model: str) -> NodeProto:
+    for attribute in node.attribute:
+        if attribute.type in (AttributeProto.GRAPH, AttributeProto.GRAPHS):
+            raise LoweringError(f"{model}: {node.op_type} has a subgraph. Control flow on data cannot be compiled.")
+    attributes = []
+    for attribute in sorted(node.attribute, key=lambda a: a.name):
+        copy = AttributeProto()
+        copy.CopyFrom(attribute)
+        copy.ClearField("doc_string")
+        attributes.append(copy)
+    return NodeProto(
+        name=name,
+        op_type=node.op_type,
+        domain=node.domain,
+        input=[names.get(value, value) for value in node.input],
+        output=[names.get(value, value) for value in node.output],
+        attribute=attributes,
+    )
+
+
+def _fresh_names(prefix: str, taken: set[str]) -> Iterator[str]:
+    number = 0
+    while True:
+        if f"{prefix}{number}" not in taken:
+            yield f"{prefix}{number}"
+        number += 1
+
+
+def _value_info(name: str, type_: TensorType) -> ValueInfoProto:
+    shape = [str(n) if isinstance(n, Batch) else n for n in type_.shape]
+    return helper.make_tensor_value_info(name, _dtype(type_), shape)
+
+
+def _dims(type_: TensorType) -> list[int]:
+    return [n for n in type_.shape if isinstance(n, int)]
+
+
+def _dtype(type_: TensorType) -> int:
+    """ONNX's number of a dtype."""
+    names = {"float32": "FLOAT", "float64": "DOUBLE"}
+    return int(TensorProto.DataType.Value(names.get(type_.dtype, type_.dtype.upper())))
