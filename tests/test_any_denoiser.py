@@ -1,0 +1,41 @@
+"""``compile_denoiser`` on modules that nobody prepared, from the module to both runtimes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import ttscompile
+from tests.passes.test_pipeline import MODULES, spec
+from tests.runtimes.agreement import largest_difference
+from ttscompile.artifact import load_artifact
+from ttscompile.runtimes import open_runtime
+
+STREAMS = 3
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_from_a_module_to_both_runtimes(name: str, tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    module = MODULES[name]().eval()
+    ttscompile.compile_denoiser(module, spec(), tmp_path / "compiled")
+
+    rng = np.random.default_rng(0)
+    obs = rng.standard_normal((STREAMS, 3, 7), dtype=np.float32)
+    noise = ttscompile.Noise(rng.standard_normal((STREAMS, 4, 2), dtype=np.float32))
+    sample = torch.from_numpy(noise.initial)
+    with torch.no_grad():
+        for t in spec().sampler.timesteps:
+            sample = sample - 0.1 * module(sample, torch.full((STREAMS,), int(t)), torch.from_numpy(obs))
+    for runtime in ("reference", "onnxruntime"):
+        policy = ttscompile.load(tmp_path / "compiled", runtime=runtime)
+        found = policy.predict_action({"obs": obs}, noise=noise, plan="dense")["action_pred"]
+        np.testing.assert_allclose(found, sample.numpy(), rtol=1e-5, atol=1e-6)
+
+    artifact = load_artifact(tmp_path / "compiled")
+    left, right = open_runtime(artifact, "onnxruntime"), open_runtime(artifact, "reference")
+    for streams in (1, STREAMS):
+        assert largest_difference(artifact, left, right, rng, streams, calls=4) < 1e-5
