@@ -1,0 +1,146 @@
+"""What callers give: numpy arrays or torch tensors, checked against the policy's specification. Imports no torch."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from ttscompile.config import FloatArray, Noise, ObservationSpec
+from ttscompile.errors import ObservationError
+
+Array: TypeAlias = npt.NDArray[Any]
+
+
+def is_tensor(value: object) -> bool:
+    """Whether this is a torch tensor; if torch was never imported, nothing is."""
+    torch = sys.modules.get("torch")
+    return torch is not None and isinstance(value, torch.Tensor)
+
+
+def as_array(value: Any, what: str) -> Array:
+    """The numpy array of an array or tensor; no copy if it can be helped.
+
+    Args:
+        value: what the caller gave.
+        what: for the message, ``observation 'obs'``.
+
+    Raises:
+        ObservationError: neither an array nor a tensor, or a tensor of a dtype that numpy lacks.
+    """
+    if is_tensor(value):
+        try:
+            array: Array = value.detach().cpu().numpy()
+        except TypeError as error:
+            raise ObservationError(
+                f"{what} is a tensor of dtype {value.dtype}, which numpy does not have. Convert it with .float()."
+            ) from error
+        return array
+    if isinstance(value, np.ndarray):
+        return value
+    raise ObservationError(
+        f"{what} is a {type(value).__name__}; expected a numpy array or a torch tensor."
+        " Use np.asarray(..., dtype=np.float32)."
+    )
+
+
+def like(array: Array, example: Any) -> Any:
+    """The array as the kind that the caller uses: a tensor on the device of ``example``, or as it is."""
+    if not is_tensor(example):
+        return array
+    return sys.modules["torch"].from_numpy(array).to(example.device)
+
+
+def check_observation(obs: Mapping[str, Any], specs: Mapping[str, ObservationSpec]) -> dict[str, Array]:
+    """Observations as numpy arrays ``[B, ...]`` of their specified shapes and dtypes, finite, with one B.
+
+    Raises:
+        ObservationError: names the key, what was expected, what was found and the remedy.
+    """
+    if not isinstance(obs, Mapping):
+        raise ObservationError(
+            f"the observation is a {type(obs).__name__}; expected a dictionary with the keys {sorted(specs)}."
+        )
+    missing, unexpected = sorted(set(specs) - set(obs)), sorted(map(str, set(obs) - set(specs)))
+    if missing or unexpected:
+        raise ObservationError(
+            f"expected the observation keys {sorted(specs)}; found {sorted(map(str, obs))}"
+            f" (missing: {missing}, unexpected: {unexpected}). Give exactly the keys that the policy was compiled for."
+        )
+    arrays = {key: _one(key, as_array(obs[key], f"observation {key!r}"), spec) for key, spec in specs.items()}
+    counts = {key: len(array) for key, array in arrays.items()}
+    if len(set(counts.values())) > 1:
+        raise ObservationError(
+            f"observations hold different numbers of streams: {counts}. The first axis of all must be the same."
+        )
+    return arrays
+
+
+def _one(key: str, array: Array, spec: ObservationSpec) -> Array:
+    expected = f"{spec.dtype} [B, {', '.join(map(str, spec.shape))}]"
+    found = f"{array.dtype} {list(array.shape)}"
+    if array.shape[1:] != spec.shape or array.ndim != len(spec.shape) + 1 or len(array) < 1:
+        remedy = " A single stream needs a first axis of 1: use obs[None]." if array.shape == spec.shape else ""
+        raise ObservationError(f"observation {key!r} has the wrong shape: expected {expected}; found {found}.{remedy}")
+    if str(array.dtype) != spec.dtype:
+        raise ObservationError(
+            f"observation {key!r} has the wrong dtype: expected {expected}; found {found}. Convert it with"
+            f" .astype(np.{spec.dtype}), after making sure that its units are those of the training data."
+        )
+    check_finite(array, f"observation {key!r}", "Look for the sensor, or the division, that made it.")
+    return array
+
+
+def check_finite(array: Array, what: str, remedy: str) -> None:
+    """Raise if an array of floats holds NaN or infinity.
+
+    Raises:
+        ObservationError: says how many and where the first is.
+    """
+    if array.dtype.kind != "f" or np.isfinite(array).all():
+        return
+    bad = np.argwhere(~np.isfinite(array))
+    first = tuple(int(i) for i in bad[0])
+    raise ObservationError(
+        f"{what} must be finite; found {array[first]} at index {first}, {len(bad)} such values in all. {remedy}"
+    )
+
+
+def check_noise(noise: Noise, streams: int, steps: int, sample: tuple[int, int], stochastic: bool) -> Noise:
+    """The noise of a call as float32 arrays that fit it.
+
+    Args:
+        noise: the caller's.
+        streams: B of the observation.
+        steps: K.
+        sample: ``(T, D)``.
+        stochastic: whether the sampler draws noise in its steps; if not, ``noise.steps`` is not looked at.
+
+    Raises:
+        ObservationError: missing, of the wrong shape or dtype, or not finite.
+    """
+    if not isinstance(noise, Noise):
+        raise ObservationError(f"noise is a {type(noise).__name__}; expected ttscompile.Noise(initial, steps).")
+    initial = _noise(noise.initial, "noise.initial", "[B, T, D]", (streams, *sample))
+    if not stochastic:
+        return Noise(initial)
+    if noise.steps is None:
+        raise ObservationError(
+            f"noise.steps is missing: the sampler of this policy draws noise in its steps. Give [K, B, T, D] ="
+            f" {(steps, streams, *sample)}, or noise=None to have all of it drawn."
+        )
+    return Noise(initial, _noise(noise.steps, "noise.steps", "[K, B, T, D]", (steps, streams, *sample)))
+
+
+def _noise(value: Any, what: str, axes: str, shape: tuple[int, ...]) -> FloatArray:
+    array = as_array(value, what)
+    if array.shape != shape or array.dtype != np.float32:
+        raise ObservationError(
+            f"{what} must be float32 {axes} = {list(shape)}; found {array.dtype} {list(array.shape)}."
+            " Draw it with rng.standard_normal(shape, dtype=np.float32)."
+        )
+    check_finite(array, what, "Draw it again.")
+    return array

@@ -1,0 +1,214 @@
+"""The object that users hold: observations in, actions out. ``docs/design.md`` section 8."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.manifest import DENSE
+from ttscompile.config import ChunkSpec, FloatArray, Noise, ObservationSpec
+from ttscompile.errors import IllegalPlanError, ObservationError, TtscompileError
+
+from .arrays import as_array, check_noise, check_observation, is_tensor, like
+from .base import GIVEN, CallReport, Runtime, open_runtime
+
+if TYPE_CHECKING:
+    from ttscompile.artifact.load import Artifact
+
+
+@dataclass(frozen=True)
+class BlockInfo:
+    """One residual block: its kind, the shape of one stream's residual, and FLOPs of one evaluation."""
+
+    kind: str
+    shape: tuple[int, ...]
+    flops: int
+
+
+@dataclass(frozen=True)
+class PolicyInfo:
+    """What a compiled policy is.
+
+    Attributes:
+        K: number of denoising steps.
+        blocks: block table, in order of execution.
+        dense_flops: of one call of the policy as it was before it was compiled, one stream.
+        observation: specification of each key of the observation.
+        action: which part of the denoised sample is action, and which of it is executed.
+        sample: ``(T, D)``, the shape of one stream's noise.
+        stochastic: whether the sampler draws noise in its steps, so that ``Noise.steps`` is needed.
+        identity: sha256 of what the artifact computes.
+        plans: names that ``predict_action(plan=...)`` takes.
+        default_plan: the one that is taken when none is given.
+    """
+
+    K: int
+    blocks: tuple[BlockInfo, ...]
+    dense_flops: int
+    observation: Mapping[str, ObservationSpec]
+    action: ChunkSpec
+    sample: tuple[int, int]
+    stochastic: bool
+    identity: str
+    plans: tuple[str, ...]
+    default_plan: str
+
+
+def load(path: str | Path, runtime: str = "onnxruntime", threads: int = 1, seed: int | None = None) -> CompiledPolicy:
+    """Load a compiled policy.
+
+    Args:
+        path: the directory that ``convert`` wrote, or the same zipped.
+        runtime: ``onnxruntime``; or ``reference``, which is slow and needs torch.
+        threads: threads of arithmetic, shared by all policies of the process.
+        seed: of the noise that is drawn when none is given; None for another sequence every time.
+
+    Raises:
+        ArtifactError: the artifact is missing, damaged, or of another version.
+        RuntimeUnavailableError: the runtime cannot be had on this machine, or not with this number of threads.
+    """
+    artifact = load_artifact(path)
+    return CompiledPolicy(artifact, open_runtime(artifact, runtime, threads), seed)
+
+
+class CompiledPolicy:
+    """A policy that takes the place of the original: ``reset`` at the start of an episode, then ``predict_action``.
+
+    One caller at a time; a second one gets an error rather than somebody else's residuals.
+
+    Args:
+        artifact: loaded and checked.
+        runtime: opened on the same artifact.
+        seed: of the noise that is drawn when none is given.
+    """
+
+    def __init__(self, artifact: Artifact, runtime: Runtime, seed: int | None = None) -> None:
+        self._artifact, self._runtime = artifact, runtime
+        self._manifest = artifact.manifest
+        self._rng = np.random.default_rng(seed)
+        self._report: CallReport | None = None
+        self._lock = threading.Lock()
+
+    @property
+    def last_report(self) -> CallReport | None:
+        """What the last call did; None before the first."""
+        return self._report
+
+    @property
+    def info(self) -> PolicyInfo:
+        """What this policy is."""
+        manifest = self._manifest
+        return PolicyInfo(
+            K=manifest.steps,
+            blocks=tuple(BlockInfo(b.kind, b.type.at(1)[1:], b.flops) for b in manifest.blocks),
+            dense_flops=manifest.flops.dense,
+            observation=manifest.spec.observations,
+            action=manifest.spec.chunk,
+            sample=manifest.spec.sample,
+            stochastic=manifest.spec.sampler.stochastic,
+            identity=manifest.identity,
+            plans=(DENSE, *manifest.plans),
+            default_plan=manifest.default_plan,
+        )
+
+    def reset(self, seed: int | None = None) -> None:
+        """Start a new episode: nothing of earlier calls is reused.
+
+        Args:
+            seed: of the noise from here on; None goes on with the sequence under way.
+        """
+        with self._alone():
+            self._runtime.reset()
+            if seed is not None:
+                self._rng = np.random.default_rng(seed)
+
+    def predict_action(
+        self, obs_dict: Mapping[str, Any], noise: Noise | None = None, plan: str | npt.ArrayLike | None = None
+    ) -> dict[str, Any]:
+        """One call of the policy.
+
+        Args:
+            obs_dict: by key ``[B, ...]``, numpy arrays or torch tensors, not normalised. ``info.observation`` has keys,
+                shapes and dtypes. B may only change after ``reset``.
+            noise: the random numbers of the call; None has them drawn.
+            plan: None for the artifact's default; ``dense`` or the name of a plan of the artifact, whose reads of what
+                was never computed are repaired and counted in the report; or int8 ``[K, blocks]`` or
+                ``[B, K, blocks]`` of ``ttscompile.Source``, which is executed as it is or refused.
+
+        Returns:
+            ``action [B, Ta, Da]``, what to execute, and ``action_pred [B, T, Da]``, of the kind that came in.
+
+        Raises:
+            ObservationError: an observation or noise that does not fit; nothing was executed.
+            IllegalPlanError: a plan that is unknown, malformed or illegal; nothing was executed.
+        """
+        with self._alone():
+            spec = self._manifest.spec
+            obs = check_observation(obs_dict, spec.observations)
+            streams = len(next(iter(obs.values())))
+            if self._runtime.streams not in (None, streams):
+                raise ObservationError(
+                    f"the observation holds {streams} streams, and the episode under way {self._runtime.streams}:"
+                    " residuals are kept for each stream. Call reset() before changing the number of streams."
+                )
+            if noise is None:
+                noise = self._draw(streams)
+            else:
+                noise = check_noise(noise, streams, self._manifest.steps, spec.sample, spec.sampler.stochastic)
+            matrix, name, repair = self._plan(plan)
+            normalized = {key: _normalized(array, spec.observations[key]) for key, array in obs.items()}
+            sample, self._report = self._runtime.predict(normalized, noise, matrix, plan_name=name, repair=repair)
+            predicted = sample[..., : spec.chunk.action_dim]
+            if spec.chunk.normalizer is not None:
+                predicted = spec.chunk.normalizer.unnormalize(predicted)
+            example = next((value for value in obs_dict.values() if is_tensor(value)), None)
+            executed = predicted[:, spec.chunk.start : spec.chunk.stop]
+            return {"action": like(executed.copy(), example), "action_pred": like(predicted.copy(), example)}
+
+    def _draw(self, streams: int) -> Noise:
+        shape = (streams, *self._manifest.spec.sample)
+        initial = self._rng.standard_normal(shape, dtype=np.float32)
+        if not self._manifest.spec.sampler.stochastic:
+            return Noise(initial)
+        return Noise(initial, self._rng.standard_normal((self._manifest.steps, *shape), dtype=np.float32))
+
+    def _plan(self, plan: str | npt.ArrayLike | None) -> tuple[npt.NDArray[Any] | None, str, bool]:
+        """Matrix (None: the pruner's), name for the report, and whether illegal reads are repaired."""
+        if plan is None:
+            plan = self._manifest.default_plan
+        if not isinstance(plan, str):
+            return as_array(plan, "plan") if is_tensor(plan) else np.asarray(plan), GIVEN, False
+        if plan == DENSE:
+            return self._artifact.schedule(DENSE), DENSE, False
+        record = self._manifest.plans.get(plan)
+        if record is None:
+            raise IllegalPlanError(
+                f"the artifact has no plan {plan!r}; it has {[DENSE, *self._manifest.plans]}. Use one of these, or a"
+                " matrix [K, blocks] of ttscompile.Source."
+            )
+        return (None if record.kind == "pruner" else self._artifact.schedule(plan)), plan, True
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        if not self._lock.acquire(blocking=False):
+            raise TtscompileError(
+                "the policy is in the middle of a call on another thread. It serves one caller at a time: load one"
+                " policy a thread, or send all streams in one batch."
+            )
+        try:
+            yield
+        finally:
+            self._lock.release()
+
+
+def _normalized(array: npt.NDArray[Any], spec: ObservationSpec) -> FloatArray:
+    """The observation as the network wants it; integer observations pass as they are."""
+    return array if spec.normalizer is None else spec.normalizer.normalize(array)

@@ -1,0 +1,337 @@
+"""The reference: what reuse means, executed literally with torch, one block after the other, differentiable.
+
+``docs/design.md`` section 2 in code; what one cell does is in ``reference_reuse``. Every other runtime is tested
+against this one, and calibration trains through it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from ttscompile.artifact.load import Artifact
+from ttscompile.artifact.manifest import block_name
+from ttscompile.config import Noise, PolicySpec
+from ttscompile.errors import IllegalPlanError, PassError
+from ttscompile.ir.evaluate import Evaluator
+from ttscompile.ir.graph import Graph, TensorType
+from ttscompile.ir.program import Binding, Pieces, Program
+from ttscompile.lattice import PlanArray, Source, check_plan, require_legal
+
+from .reference_reuse import Caches, Cell, RolloutCache, reuse, stream_axis
+
+
+@dataclass(frozen=True)
+class Contexts:
+    """What the loop reads beside the stream, for one observation.
+
+    Attributes:
+        streams: B.
+        condition: condition values by name.
+        steps: step values by name, one mapping for each step k; empty mappings if the policy has none.
+    """
+
+    streams: int
+    condition: Mapping[str, Tensor]
+    steps: tuple[Mapping[str, Tensor], ...]
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """Result of one call.
+
+    Attributes:
+        sample: the denoised sample ``[B, T, D]``.
+        cache: for the next call of the episode.
+        samples: the sample after each step, K of them, if they were asked for.
+    """
+
+    sample: Tensor
+    cache: RolloutCache
+    samples: tuple[Tensor, ...] = ()
+
+
+class ReferenceModel:
+    """The pieces of a program as torch functions, and the denoising loop over them.
+
+    Weights are held by reference: an in-place update of ``weights`` (the pruner's, by an optimiser) shows in the next
+    call.
+
+    Args:
+        pieces: the denoiser cut up; the pruner may be missing.
+        spec: the policy beside its network.
+        types: type of each block's residual.
+        groups: FORWARD group of each block.
+        weights: value of every constant of the pieces.
+        override: tensors to use in place of constants of the same names.
+
+    Attributes:
+        steps: K.
+        blocks: number of residual blocks.
+        groups: FORWARD group of each block.
+        pruner_weights: the pruner's tensors by name.
+    """
+
+    def __init__(
+        self,
+        pieces: Pieces,
+        spec: PolicySpec,
+        types: Sequence[TensorType],
+        groups: Sequence[int],
+        weights: Mapping[str, npt.NDArray[np.generic]],
+        override: Mapping[str, Tensor] | None = None,
+    ) -> None:
+        self._pieces, self._types, self._sampler = pieces, tuple(types), spec.sampler
+        self._weights = {**{name: _tensor(value) for name, value in weights.items()}, **(override or {})}
+        self._tables = {name: _tensor(value) for name, value in self._pieces.tables.items()}
+        self._condition = Evaluator(self._pieces.condition, self._weights)
+        self._step = Evaluator(self._pieces.step, self._weights) if self._pieces.step is not None else None
+        self._stem = Evaluator(self._pieces.stem, self._weights)
+        self._blocks = tuple(Evaluator(graph, self._weights) for graph in self._pieces.blocks)
+        self._tail = Evaluator(self._pieces.tail, self._weights)
+        self.steps = spec.sampler.steps
+        self.blocks = len(self._pieces.blocks)
+        self.groups = tuple(groups)
+
+    @classmethod
+    def from_program(cls, program: Program, override: Mapping[str, Tensor] | None = None) -> ReferenceModel:
+        """The model of a program in memory, after all passes.
+
+        Raises:
+            PassError: the program has not been partitioned.
+        """
+        if program.pieces is None:
+            raise PassError("the program has no pieces: run all passes (driver.compile_module) before executing it.")
+        types = [block.type for block in program.blocks]
+        groups = [block.group for block in program.blocks]
+        return cls(program.pieces, program.spec, types, groups, program.weights, override)
+
+    @classmethod
+    def from_artifact(cls, artifact: Artifact, override: Mapping[str, Tensor] | None = None) -> ReferenceModel:
+        """The model of an artifact.
+
+        Raises:
+            ArtifactError: its graphs cannot be read.
+        """
+        manifest, graphs = artifact.manifest, artifact.graphs
+        pieces = Pieces(
+            condition=artifact.graph("condition"),
+            step=graphs.get("step"),
+            stem=artifact.graph("stem"),
+            blocks=tuple(artifact.graph(block_name(b)) for b in range(len(manifest.blocks))),
+            tail=artifact.graph("tail"),
+            pruner=graphs.get("pruner"),
+            tables=artifact.tables,
+            bindings={name: context.binding for name, context in manifest.contexts.items()},
+            features=manifest.features,
+        )
+        weights = {**artifact.weights, **artifact.pruner}
+        return cls(pieces, manifest.spec, [b.type for b in manifest.blocks], manifest.groups, weights, override)
+
+    @property
+    def pruner_weights(self) -> dict[str, Tensor]:
+        """The pruner's tensors by name; empty if the program has no pruner."""
+        pruner = self._pieces.pruner
+        return {} if pruner is None else {n: self._weights[n] for n in pruner.constants if n.startswith("pruner.")}
+
+    def prologue(self, obs: Mapping[str, Tensor]) -> Contexts:
+        """Everything that the observation decides before the loop starts.
+
+        Args:
+            obs: normalised observations by key, ``[B, ...]`` each.
+        """
+        graph = self._pieces.condition
+        condition = dict(zip(graph.outputs, self._condition(obs), strict=True))
+        streams = len(next(iter(obs.values())))
+        contexts = Contexts(streams, condition, ({},) * self.steps)
+        if self._pieces.step is None or self._step is None:
+            return contexts
+        names = self._pieces.step.outputs
+        rows = [self._step(self._bind(self._pieces.step, None, k, contexts)) for k in range(self.steps)]
+        return Contexts(streams, condition, tuple(dict(zip(names, row, strict=True)) for row in rows))
+
+    def logits(self, contexts: Contexts, weights: Mapping[str, Tensor] | None = None) -> Tensor:
+        """The pruner: float32 ``[B, K, blocks, 4]``.
+
+        Args:
+            contexts: of the observation.
+            weights: tensors to use in place of the pruner's constants of the same names; gradients flow to them.
+
+        Raises:
+            IllegalPlanError: the program has no pruner.
+        """
+        pruner = self._pieces.pruner
+        if pruner is None:
+            raise IllegalPlanError("the program has no pruner: run insert_pruner, or give a plan.")
+        return Evaluator(pruner, {**self._weights, **(weights or {})})(contexts.condition)[0]
+
+    def stem(self, sample: Tensor, k: int, contexts: Contexts) -> Tensor:
+        """The residual stream of step k from the sample ``[B, T, D]``."""
+        return self._stem(self._bind(self._pieces.stem, sample, k, contexts))[0]
+
+    def block(self, b: int, k: int, stream: Tensor, contexts: Contexts, streams: Sequence[int] | None = None) -> Tensor:
+        """The residual of block b at step k: what is added to the stream, not the sum.
+
+        Args:
+            b: block.
+            k: step.
+            stream: residual stream of all B streams.
+            contexts: of the observation.
+            streams: which streams to evaluate; None for all. The result holds these only.
+        """
+        return self._blocks[b](self._bind(self._pieces.blocks[b], stream, k, contexts, streams))[0]
+
+    def tail(self, stream: Tensor, k: int, contexts: Contexts) -> Tensor:
+        """The network's output ``[B, T, D]`` at step k from the residual stream after the last block."""
+        return self._tail(self._bind(self._pieces.tail, stream, k, contexts))[0]
+
+    def advance(self, sample: Tensor, prediction: Tensor, noise: Tensor | None, k: int) -> Tensor:
+        """The sampler: the sample of step k + 1 (``config.SamplerTable`` has the formula)."""
+        table = self._sampler
+        row = {name: float(getattr(table, name)[k]) for name in table.COLUMNS}
+        clean = row["sample_to_x0"] * sample + row["out_to_x0"] * prediction
+        if table.clip is not None:
+            clean = clean.clamp(-table.clip, table.clip)
+        following = row["x0_to_next"] * clean + row["sample_to_next"] * sample + row["out_to_next"] * prediction
+        return following if noise is None else following + row["noise_to_next"] * noise
+
+    def empty_cache(self, streams: int) -> RolloutCache:
+        """The rollout cache at the start of an episode."""
+        return RolloutCache({}, np.zeros((streams, self.steps, self.blocks), dtype=np.bool_))
+
+    def rollout(
+        self,
+        contexts: Contexts,
+        initial: Tensor,
+        noise: Tensor | None,
+        gates: Tensor | PlanArray,
+        cache: RolloutCache | None = None,
+        *,
+        write_gradients: bool = True,
+        keep_samples: bool = False,
+    ) -> Rollout:
+        """One call: K steps from noise to sample.
+
+        With gates that require a gradient every candidate of every cell is evaluated, since the gradient of a gate is
+        the product of its candidate and the gradient of the sum. A candidate that is computed although its gate is 0
+        is evaluated without recording: its own gradient would be multiplied by 0. With gates that do not, blocks are
+        evaluated for the streams that compute them, and nothing else.
+
+        Args:
+            contexts: from ``prologue``.
+            initial: the sample at step 0, ``[B, T, D]``.
+            noise: the draw used at each step, ``[K, B, T, D]``; None if the sampler is deterministic.
+            gates: one-hot ``[B, K, blocks, 4]``, float32; or a plan, int8 ``[K, blocks]`` or ``[B, K, blocks]``.
+            cache: what the previous call of the episode left; None at its start.
+            write_gradients: let the gradient of a COMPUTE gate include what writing the caches does to later steps,
+                by taking the written value to be ``g * computed + (1 - g) * old``. Values do not change.
+            keep_samples: return the sample after every step.
+
+        Raises:
+            IllegalPlanError: gates that are not one-hot, of the wrong shape, or that read what was never computed.
+        """
+        cache = cache if cache is not None else self.empty_cache(contexts.streams)
+        one_hot, plan = self._gates(gates, contexts.streams)
+        require_legal(plan, self.groups, cache.written)
+        caches = Caches(rollout=dict(cache.residuals))
+        sample, samples = initial, []
+        for k in range(self.steps):
+            stream = self.stem(sample, k, contexts)
+            for b in range(self.blocks):
+                cell = Cell(k, b, self.groups[b], plan[:, k, b], one_hot[:, k, b], self._types[b])
+                stream = stream + reuse(cell, self._candidate(cell, stream, contexts), caches, write_gradients)
+            prediction = self.tail(stream, k, contexts)
+            sample = self.advance(sample, prediction, None if noise is None else noise[k], k)
+            if keep_samples:
+                samples.append(sample)
+        return Rollout(sample, RolloutCache(caches.rollout, cache.written | (plan == Source.COMPUTE)), tuple(samples))
+
+    def _candidate(self, cell: Cell, stream: Tensor, contexts: Contexts) -> Tensor | None:
+        """The computed residual of all streams, or of those that take it with zeros for the others; None if none do."""
+        takers = np.flatnonzero(cell.plan == Source.COMPUTE).tolist()
+        others = np.flatnonzero(cell.plan != Source.COMPUTE).tolist()
+        if not others:
+            return self.block(cell.b, cell.k, stream, contexts)
+        if not takers and not cell.trains:
+            return None
+        axis = stream_axis(cell.type)
+        whole = torch.zeros_like(stream)
+        if cell.trains:
+            with torch.no_grad():
+                part = self.block(cell.b, cell.k, stream, contexts, others)
+            whole = whole.index_copy(axis, torch.tensor(others), part)
+        if takers:
+            part = self.block(cell.b, cell.k, stream, contexts, takers)
+            whole = whole.index_copy(axis, torch.tensor(takers), part)
+        return whole
+
+    def _gates(self, gates: Tensor | PlanArray, streams: int) -> tuple[Tensor, PlanArray]:
+        """Gates as float32 ``[B, K, blocks, 4]`` and the plan that they stand for."""
+        if not isinstance(gates, Tensor):
+            plan = check_plan(gates, self.steps, self.blocks, streams)
+            return torch.nn.functional.one_hot(torch.from_numpy(plan.astype(np.int64)), 4).float(), plan
+        if tuple(gates.shape) != (streams, self.steps, self.blocks, 4):
+            raise IllegalPlanError(
+                f"gates have shape {tuple(gates.shape)}; expected [B, K, blocks, 4] ="
+                f" ({streams}, {self.steps}, {self.blocks}, 4)."
+            )
+        values = gates.detach()
+        if not bool((((values == 0) | (values == 1)).all(-1) & (values.sum(-1) == 1)).all()):
+            raise IllegalPlanError(
+                "gates must be one-hot over their last axis: use straight-through gates, hard in the forward pass."
+            )
+        return gates, values.argmax(-1).numpy().astype(np.int8)
+
+    def _bind(
+        self,
+        graph: Graph,
+        value: Tensor | None,
+        k: int,
+        contexts: Contexts,
+        streams: Sequence[int] | None = None,
+    ) -> dict[str, Tensor]:
+        """Inputs of a piece at step k: the sample or stream (its first input, unless None), and its contexts."""
+        names: Iterator[tuple[str, TensorType]] = iter(graph.inputs.items())
+        bound: dict[str, Tensor] = {}
+        if value is not None:
+            name, kind = next(names)
+            bound[name] = _select(value, kind, streams)
+        for name, kind in names:
+            binding = self._pieces.bindings[name]
+            if binding is Binding.TABLE:
+                bound[name] = _select(_expanded(self._tables[name][k], kind, contexts.streams), kind, streams)
+            else:
+                source = contexts.steps[k] if binding is Binding.STEP else contexts.condition
+                bound[name] = _select(source[name], kind, streams)
+        return bound
+
+
+def noise_tensors(noise: Noise, stochastic: bool) -> tuple[Tensor, Tensor | None]:
+    """``Noise`` as tensors for ``rollout``; the draws of the steps are dropped if the sampler uses none."""
+    steps = _tensor(noise.steps) if stochastic and noise.steps is not None else None
+    return _tensor(noise.initial), steps
+
+
+def _tensor(array: npt.NDArray[np.generic]) -> Tensor:
+    """A copy as a tensor: arrays of an artifact are read-only, and torch has no such tensors."""
+    return torch.from_numpy(np.array(array))
+
+
+def _expanded(row: Tensor, kind: TensorType, streams: int) -> Tensor:
+    """A table's row for all streams: repeated along its batch axis, if it has one."""
+    axis = kind.batch_axis
+    if axis is None:
+        return row
+    return row.expand(*(streams if i == axis else n for i, n in enumerate(row.shape)))
+
+
+def _select(value: Tensor, kind: TensorType, streams: Sequence[int] | None) -> Tensor:
+    """The part of a value that belongs to these streams."""
+    if streams is None or kind.batch_axis is None:
+        return value
+    return value.index_select(kind.batch_axis, torch.tensor(streams))

@@ -1,0 +1,129 @@
+"""What one cell of the lattice adds and writes: ``docs/design.md`` section 2, literally."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from ttscompile.errors import IllegalPlanError
+from ttscompile.ir.graph import TensorType
+from ttscompile.lattice import BoolArray, Source
+
+
+@dataclass(frozen=True)
+class RolloutCache:
+    """``rollout[k, b]`` of every stream: what a call leaves for the next one of the episode.
+
+    Attributes:
+        residuals: by ``(k, b)``, each of the residual's type, detached; holds rubbish for streams that never computed.
+        written: bool ``[B, K, blocks]``; which entries a call of the episode has computed.
+    """
+
+    residuals: Mapping[tuple[int, int], Tensor]
+    written: BoolArray
+
+
+@dataclass
+class Caches:
+    """The three caches during a call, for all streams at once.
+
+    Attributes:
+        forward: by group; empty when the call starts.
+        timestep: by block; empty when the call starts.
+        rollout: by step and block; what earlier calls of the episode left.
+    """
+
+    forward: dict[int, Tensor] = field(default_factory=dict)
+    timestep: dict[int, Tensor] = field(default_factory=dict)
+    rollout: dict[tuple[int, int], Tensor] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell for all streams.
+
+    Attributes:
+        k: step.
+        b: block.
+        group: FORWARD group of the block.
+        plan: int8 ``[B]``, the source of each stream.
+        gates: float32 ``[B, 4]``, the same one-hot, with or without a gradient.
+        type: of the residual.
+    """
+
+    k: int
+    b: int
+    group: int
+    plan: npt.NDArray[np.int8]
+    gates: Tensor
+    type: TensorType
+
+    @property
+    def trains(self) -> bool:
+        """Whether the gates want a gradient."""
+        return self.gates.requires_grad
+
+    def takes(self, source: Source) -> bool:
+        """Whether any stream takes its residual from here."""
+        return bool((self.plan == source).any())
+
+    def gate(self, source: Source) -> Tensor:
+        """The gate of each stream, shaped to be multiplied with a residual."""
+        shape = [1] * len(self.type.shape)
+        shape[stream_axis(self.type)] = -1
+        return self.gates[:, source].reshape(shape)
+
+    def written(self, computed: Tensor, old: Tensor | None, gradients: bool) -> Tensor:
+        """A cache entry after this cell: computed where the stream computes, as it was elsewhere."""
+        if old is None:
+            return computed
+        gate = self.gate(Source.COMPUTE)
+        if gradients and self.trains:
+            return gate * computed + (1 - gate) * old
+        return torch.where(gate.detach() == 1, computed, old)
+
+
+def reuse(cell: Cell, computed: Tensor | None, caches: Caches, write_gradients: bool) -> Tensor:
+    """What one cell adds to the stream; writes the caches of the streams that compute it.
+
+    Args:
+        cell: legal for every stream.
+        computed: the block's residual, right for the streams that compute it, and where gates train for the others too;
+            None if nobody needs it.
+        caches: changed.
+        write_gradients: see ``ReferenceModel.rollout``.
+    """
+    forward, timestep = caches.forward.get(cell.group), caches.timestep.get(cell.b)
+    rollout = caches.rollout.get((cell.k, cell.b))
+    candidates = {
+        Source.COMPUTE: computed,
+        Source.FORWARD: forward,
+        Source.TIMESTEP: timestep,
+        Source.ROLLOUT: rollout,
+    }
+    if computed is not None and (cell.takes(Source.COMPUTE) or (cell.trains and write_gradients)):
+        caches.forward[cell.group] = cell.written(computed, forward, write_gradients)
+        caches.timestep[cell.b] = cell.written(computed, timestep, write_gradients)
+    if computed is not None and cell.takes(Source.COMPUTE):
+        caches.rollout[cell.k, cell.b] = cell.written(computed.detach(), rollout, False)
+    added = [cell.gate(s) * c for s, c in candidates.items() if c is not None and (cell.trains or cell.takes(s))]
+    return torch.stack(added).sum(0) if len(added) > 1 else added[0]
+
+
+def stream_axis(kind: TensorType) -> int:
+    """The axis of the streams in a residual.
+
+    Raises:
+        IllegalPlanError: there is none.
+    """
+    axis = kind.batch_axis
+    if axis is None:
+        raise IllegalPlanError(
+            f"the residual stream has type {kind}, without an axis for the streams: plans cannot differ by stream."
+        )
+    return axis

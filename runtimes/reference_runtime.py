@@ -1,0 +1,98 @@
+"""The reference as a runtime: an artifact in, the same calls as every other runtime."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from ttscompile.config import FloatArray, Noise
+
+from .base import (
+    GIVEN,
+    PRUNER,
+    CallReport,
+    Timings,
+    check_call,
+    computed_cells,
+    frozen,
+    milliseconds,
+    pruner_plan,
+    settle_plan,
+)
+from .reference import ReferenceModel, noise_tensors
+from .reference_reuse import RolloutCache
+
+if TYPE_CHECKING:
+    from ttscompile.artifact.load import Artifact
+
+
+class ReferenceRuntime:
+    """A ``Runtime`` on ``ReferenceModel``; see ``base.Runtime``.
+
+    Attributes:
+        model: what it runs.
+    """
+
+    def __init__(self, artifact: Artifact) -> None:
+        self.model = ReferenceModel.from_artifact(artifact)
+        self._manifest = artifact.manifest
+        self._cache: RolloutCache | None = None
+
+    @property
+    def streams(self) -> int | None:
+        """B of the episode under way."""
+        return None if self._cache is None else len(self._cache.written)
+
+    def reset(self) -> None:
+        """Forget the rollout cache."""
+        self._cache = None
+
+    def predict(
+        self,
+        obs: Mapping[str, FloatArray],
+        noise: Noise,
+        plan: npt.ArrayLike | None = None,
+        *,
+        plan_name: str | None = None,
+        repair: bool = False,
+    ) -> tuple[FloatArray, CallReport]:
+        """Denoise one chunk; see ``base.Runtime.predict``."""
+        spec = self._manifest.spec
+        draws = noise.steps if spec.sampler.stochastic else None
+        shape = None if draws is None else np.shape(draws)
+        streams = check_call(self.streams, np.shape(noise.initial), shape, spec.sample, spec.sampler.steps)
+        cache = self._cache if self._cache is not None else self.model.empty_cache(streams)
+        start = time.perf_counter()
+        with torch.no_grad():
+            contexts = self.model.prologue({key: torch.from_numpy(np.array(value)) for key, value in obs.items()})
+            prologue = time.perf_counter()
+            pruned = plan is None
+            if plan is None:
+                plan, repair = pruner_plan(self.model.logits(contexts).numpy()), True
+            pruner = time.perf_counter()
+            plans, legalised = settle_plan(plan, self.model.groups, cache.written, repair)
+            initial, steps = noise_tensors(noise, spec.sampler.stochastic)
+            result = self.model.rollout(contexts, initial, steps, plans, cache)
+        self._cache = result.cache
+        stop = time.perf_counter()
+        wait = milliseconds(prologue, pruner) if pruned else 0.0
+        report = CallReport(
+            plan=frozen(plans),
+            plan_name=plan_name or (PRUNER if pruned else GIVEN),
+            computed=computed_cells(plans),
+            legalised=legalised,
+            flops=tuple(self._manifest.flops.call(one, pruned) for one in plans),
+            timings=Timings(
+                prologue=milliseconds(start, prologue),
+                pruner=wait,
+                wait_pruner=wait,
+                decode=milliseconds(pruner, stop),
+                total=milliseconds(start, stop),
+            ),
+        )
+        return np.asarray(result.sample.numpy(), dtype=np.float32), report

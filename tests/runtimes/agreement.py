@@ -1,0 +1,42 @@
+"""Run two runtimes side by side over episodes of random legal plans."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ttscompile import Noise
+from ttscompile.artifact import Artifact
+from ttscompile.lattice import Source
+from ttscompile.runtimes import Runtime
+
+from .plans import random_plan
+
+Observation = dict[str, np.ndarray]
+
+
+def random_inputs(artifact: Artifact, rng: np.random.Generator, streams: int) -> tuple[Observation, Noise]:
+    """Normalised observation and noise of one call."""
+    spec = artifact.manifest.spec
+    shape = (streams, *spec.sample)
+    obs = {key: rng.standard_normal((streams, *o.shape)).astype(o.dtype) for key, o in spec.observations.items()}
+    initial = rng.standard_normal(shape, dtype=np.float32)
+    return obs, Noise(initial, rng.standard_normal((spec.sampler.steps, *shape), dtype=np.float32))
+
+
+def largest_difference(
+    artifact: Artifact, left: Runtime, right: Runtime, rng: np.random.Generator, streams: int, calls: int
+) -> float:
+    """One episode of random legal plans, one for each stream; differences relative to the sample's largest value."""
+    manifest = artifact.manifest
+    written = np.zeros((streams, manifest.steps, len(manifest.groups)), np.bool_)
+    left.reset()
+    right.reset()
+    worst = 0.0
+    for _ in range(calls):
+        computed = rng.uniform(0.02, 0.3)
+        plans = np.stack([random_plan(rng, manifest.steps, manifest.groups, cells, computed) for cells in written])
+        obs, noise = random_inputs(artifact, rng, streams)
+        samples = [runtime.predict(obs, noise, plans)[0] for runtime in (left, right)]
+        worst = max(worst, float(np.abs(samples[0] - samples[1]).max() / np.abs(samples[1]).max()))
+        written |= plans == Source.COMPUTE
+    return worst

@@ -1,0 +1,23 @@
+"""Random legal plans."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ttscompile import legalize
+from ttscompile.lattice import BoolArray, PlanArray
+
+
+def random_plan(
+    rng: np.random.Generator, steps: int, groups: Sequence[int], written: BoolArray, computed: float = 0.15
+) -> PlanArray:
+    """A legal plan ``[K, blocks]`` of all sources, of which a share ``computed`` is COMPUTE."""
+    rest = rng.dirichlet(np.ones(3)) * (1 - computed)
+    plan = rng.choice(4, size=(steps, len(groups)), p=[computed, *rest]).astype(np.int8)
+    if rng.random() < 0.5:  # most of a step like the step before, which is what lets sums be shared
+        repeat = rng.random(steps) < 0.5
+        for k in np.flatnonzero(repeat[1:]) + 1:
+            plan[k] = np.where(plan[k - 1] == 0, 2, plan[k - 1])
+    return legalize(plan, groups, written)[0]

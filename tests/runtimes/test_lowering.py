@@ -1,0 +1,204 @@
+"""Instructions against section 2 executed literally, and what makes them few."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ttscompile import Source
+from ttscompile.errors import IllegalPlanError
+from ttscompile.lattice import PlanArray, dense_plan, uniform_plan
+from ttscompile.runtimes.lowering import Lowered, LoweringCache, lower_plan
+from ttscompile.runtimes.onnxruntime_cpu import decode
+
+from .literal import Episode, Toy
+from .plans import random_plan
+
+C, F, T, R = Source.COMPUTE, Source.FORWARD, Source.TIMESTEP, Source.ROLLOUT
+
+
+class FakeWorkspace:
+    """The interface of ``Workspace`` over a numpy block function: a stream is a vector, several are a batch.
+
+    Args:
+        rng: of the policy's weights.
+        axis: of the streams in the residual stream.
+    """
+
+    def __init__(self, rng: np.random.Generator, steps: int, groups: tuple[int, ...], streams: int, axis: int) -> None:
+        self.steps, self.groups, self.streams, self.axis = steps, groups, streams, axis
+        blocks = len(groups)
+        self._w = rng.standard_normal((blocks, 4, 4)) / 2
+        self._c = rng.standard_normal((steps, blocks, streams, 1, 4))
+        shape = (streams, 3, 4) if axis == 0 else (3, streams, 4)
+        self.stream = [np.zeros(shape, np.float32) for _ in range(2)]
+        self.sample = [np.zeros((streams, 3, 4), np.float32) for _ in range(2)]
+        self.residuals = np.full((steps * blocks, *shape), np.nan, np.float32)
+        self.table = np.full((blocks, *shape), np.nan, np.float32)
+        self.runs: list[tuple[int, int, tuple[int, ...]]] = []
+
+    def toy(self, s: int) -> Toy:
+        """The policy of stream s."""
+        return Toy(
+            self.groups,
+            stem=lambda x, k: 0.5 * x,
+            block=lambda h, k, b: np.tanh(h @ self._w[b] + self._c[k, b, s]),
+            advance=lambda h, x, k: 0.3 * x + np.tanh(h),
+        )
+
+    def begin(self, x: np.ndarray) -> None:
+        self.sample[0][:] = x
+        np.moveaxis(self.stream[0], self.axis, 0)[:] = 0.5 * x
+
+    def block(self, k: int, b: int) -> Any:
+        return SimpleNamespace(run=lambda: self.run_some(k, b, list(range(self.streams))))
+
+    def run_some(self, k: int, b: int, streams: list[int]) -> None:
+        self.runs.append((k, b, tuple(streams)))
+        h = np.moveaxis(self.stream[k % 2], self.axis, 0)
+        row = np.moveaxis(self.residuals[k * len(self.groups) + b], self.axis, 0)
+        for s in streams:
+            row[s] = self.toy(s).block(h[s], k, b)
+
+    def advances(self) -> list[Any]:
+        return [SimpleNamespace(run=lambda k=k: self._advance(k)) for k in range(self.steps)]
+
+    def _advance(self, k: int) -> None:
+        now, then = k % 2, (k + 1) % 2
+        h = np.moveaxis(self.stream[now], self.axis, 0)
+        self.sample[then][:] = 0.3 * self.sample[now] + np.tanh(h)
+        np.moveaxis(self.stream[then], self.axis, 0)[:] = 0.5 * self.sample[then]
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    steps=st.integers(1, 7),
+    groups=st.lists(st.integers(0, 2), min_size=1, max_size=7).map(tuple),
+    streams=st.integers(1, 4),
+    axis=st.integers(0, 1),
+    shared=st.booleans(),
+    computed=st.floats(0, 1),
+)
+def test_instructions_do_what_section_2_says(
+    seed: int, steps: int, groups: tuple[int, ...], streams: int, axis: int, shared: bool, computed: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    work = FakeWorkspace(rng, steps, groups, streams, axis)
+    cache = LoweringCache(groups)
+    episodes = [Episode(work.toy(s)) for s in range(streams)]
+    written = np.zeros((streams, steps, len(groups)), np.bool_)
+    for _ in range(3):
+        plans = np.stack([random_plan(rng, steps, groups, cells, computed) for cells in written])
+        if shared:
+            plans = np.repeat(plans[:1], streams, axis=0)
+        x = rng.standard_normal((streams, 3, 4))
+        work.begin(x)
+        work.runs.clear()
+        found = decode(work, [cache.lower(plan) for plan in plans])  # type: ignore[arg-type]
+        expected = [episode.call(x[s], plans[s]) for s, episode in enumerate(episodes)]
+        np.testing.assert_allclose(found, np.stack(expected), rtol=1e-4, atol=1e-4)
+        ran = sorted((s, k, b) for k, b, some in work.runs for s in some)
+        assert ran == sorted(map(tuple, np.argwhere(plans == C).tolist()))  # nothing else, and nothing twice
+        assert len(work.runs) == np.count_nonzero((plans == C).any(axis=0))  # together where several compute
+        written |= plans == C
+
+
+def sums(lowered: Lowered) -> list[list[tuple[str, int]]]:
+    """Instructions by step, readable: ``("run", b)``, ``("new", slot)``, ``("old", slot)``."""
+    listed = []
+    for step in lowered.steps:
+        line: list[tuple[str, int]] = []
+        for i, gap in enumerate(step.gaps):
+            if gap is not None:
+                line.append(("new" if gap.make is not None else "old", gap.slot))
+            if i < len(step.blocks):
+                line.append(("run", step.blocks[i]))
+        listed.append(line)
+    return listed
+
+
+def test_the_docstrings_example() -> None:
+    plan = np.array([[C] * 7, [C, T, T, C, F, T, T]], np.int8)
+    lowered = lower_plan(plan, [0, 1, 2, 0, 0, 1, 2])
+    assert sums(lowered)[1] == [("run", 0), ("new", 0), ("run", 3), ("new", 0)]
+    assert lowered.load_blocks.tolist() == [1, 2, 4, 5, 6]
+    assert lowered.load_cells.tolist() == [1, 2, 7 + 3, 5, 6]
+    assert (lowered.segments, lowered.slots) == (2, 1)
+
+
+def test_steps_that_compute_nothing_are_one_addition_of_one_sum() -> None:
+    lowered = lower_plan(uniform_plan(100, 24, 5), [0, 1, 2] * 8)
+    assert lowered.segments == 5
+    assert [line for line in sums(lowered) if ("old", 0) not in line and ("new", 0) not in line] == [
+        [("run", b) for b in range(24)]
+    ] * 5
+    assert sum(line == [("old", 0)] for line in sums(lowered)) == 90
+
+
+def test_a_sum_is_made_again_when_one_of_its_residuals_is() -> None:
+    plan = np.array([[C, C, C], [T, T, T], [C, T, T], [T, T, T], [R, T, T]], np.int8)
+    lowered = lower_plan(plan, [0, 1, 2])
+    assert sums(lowered) == [
+        [("run", 0), ("run", 1), ("run", 2)],
+        [("new", 0)],
+        [("run", 0), ("new", 0)],
+        [("new", 0)],
+        [("new", 0)],
+    ]
+    # Rows 1 and 2 of the table are loaded once; row 0 in steps 1, 3 and 4.
+    assert sorted(zip(lowered.load_blocks.tolist(), lowered.load_cells.tolist(), strict=True)) == [
+        (0, 0),
+        (0, 6),
+        (0, 12),
+        (1, 1),
+        (2, 2),
+    ]
+    assert np.argwhere(lowered.rollout).tolist() == [[4, 0]]
+
+
+def test_the_same_residuals_by_another_way_are_the_same_sum() -> None:
+    plan = np.array([[C, C], [F, T], [T, F]], np.int8)  # F of block 0 is block 1's residual, and F of block 1 too
+    assert lower_plan(plan, [0, 0]).segments == 2
+    crossed = np.array([[C, C, C], [T, F, T], [T, T, F]], np.int8)  # residuals {0, 2, 2} and {0, 1, 2}
+    assert lower_plan(crossed, [0, 1, 1]).segments == 2
+    same = np.array([[C, C, C], [T, F, T], [T, F, F]], np.int8)
+    assert lower_plan(same, [0, 1, 1]).segments == 1
+
+
+def test_slots_are_kept_while_their_sum_is_needed() -> None:
+    plan = np.array([[C, C, C], [T, C, T], [T, C, T]], np.int8)
+    assert sums(lower_plan(plan, [0, 1, 2]))[1:] == [
+        [("new", 0), ("run", 1), ("new", 1)],
+        [("old", 0), ("run", 1), ("old", 1)],
+    ]
+
+
+def test_a_dense_plan_has_no_sums() -> None:
+    lowered = lower_plan(dense_plan(3, 2), [0, 1])
+    assert sums(lowered) == [[("run", 0), ("run", 1)]] * 3
+    assert (lowered.segments, lowered.slots, len(lowered.load_cells)) == (0, 0, 0)
+
+
+@pytest.mark.parametrize("plan", [[[T, C], [C, C]], [[C, R], [C, C]], [[F, C], [C, C]]])
+def test_an_illegal_plan_is_refused(plan: list[list[Source]]) -> None:
+    with pytest.raises(IllegalPlanError, match="step 0 must be dense"):
+        lower_plan(np.array(plan, np.int8), [0, 0])
+
+
+def test_the_cache_keeps_the_plans_used_last() -> None:
+    cache = LoweringCache([0, 0], capacity=2)
+
+    def plan(b: int) -> PlanArray:
+        return np.array([[C, C], [C if b == 0 else T, C if b == 1 else F]], np.int8)
+
+    first, second = cache.lower(plan(0)), cache.lower(plan(1))
+    assert cache.lower(plan(0)) is first
+    cache.lower(plan(2))
+    assert cache.lower(plan(0)) is first
+    assert cache.lower(plan(1)) is not second

@@ -1,0 +1,327 @@
+"""The onnxruntime runtime on toys: same answers as the reference, reports, threads, what is left after a failure."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ttscompile import Noise, Source
+from ttscompile.artifact import Artifact
+from ttscompile.errors import ArtifactError, IllegalPlanError, ObservationError, RuntimeUnavailableError
+from ttscompile.lattice import dense_plan, legalize, uniform_plan
+from ttscompile.runtimes import Runtime, open_runtime
+from ttscompile.runtimes.reference_runtime import ReferenceRuntime
+from ttscompile.runtimes.workspace import Workspace
+
+from .agreement import largest_difference, random_inputs
+from .conftest import MakeArtifact
+from .plans import random_plan
+from .toys import toy_program
+
+C, T, R = Source.COMPUTE, Source.TIMESTEP, Source.ROLLOUT
+
+
+@pytest.fixture(params=["onnxruntime", "reference"])
+def runtime(request: pytest.FixtureRequest, toy_artifact: Artifact) -> Runtime:
+    return open_runtime(toy_artifact, request.param)
+
+
+@pytest.mark.parametrize("name", ["onnxruntime", "reference"])
+def test_reuse_gives_41_and_compute_gives_44(pencil_artifact: Artifact, name: str) -> None:
+    runtime = open_runtime(pencil_artifact, name)
+
+    def call(x: float, plan: list[Source]) -> float:
+        obs = {"obs": np.array([[-32]], np.float32)}
+        sample, _ = runtime.predict(obs, Noise(np.full((1, 1, 1), x, np.float32)), np.array(plan)[:, None])
+        return float(sample[0, 0, 0])
+
+    assert call(35, [C, T]) == 41
+    assert call(35, [C, C]) == 44
+    assert call(40, [C, T]) == 56
+    assert call(33, [C, R]) == 40  # the 6 of the second call: the third computed nothing at step 1
+    runtime.reset()
+    with pytest.raises(IllegalPlanError, match="never computed"):
+        call(33, [C, R])
+    assert call(35, [C, C]) == 44
+
+
+@pytest.mark.parametrize(
+    "variant", [{}, {"sequence_first": True}, {"noise": 0.0, "steps": 8}, {"steps": 1}, {"blocks": 1}]
+)
+def test_it_agrees_with_the_reference(make_artifact: MakeArtifact, variant: dict[str, int]) -> None:
+    artifact = make_artifact(toy_program(**variant))
+    runtimes = open_runtime(artifact, "onnxruntime"), open_runtime(artifact, "reference")
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        assert largest_difference(artifact, *runtimes, rng, streams=1 + seed % 4, calls=4) < 1e-5
+
+
+def test_a_batch_of_streams_is_its_streams_one_by_one(toy_artifact: Artifact) -> None:
+    manifest = toy_artifact.manifest
+    rng = np.random.default_rng(0)
+    together = open_runtime(toy_artifact)
+    apart = [open_runtime(toy_artifact) for _ in range(3)]
+    written = np.zeros((3, manifest.steps, len(manifest.groups)), np.bool_)
+    for _ in range(4):
+        plans = np.stack([random_plan(rng, manifest.steps, manifest.groups, cells) for cells in written])
+        obs, noise = random_inputs(toy_artifact, rng, 3)
+        assert noise.steps is not None
+        sample, report = together.predict(obs, noise, plans)
+        for s, runtime in enumerate(apart):
+            own = Noise(noise.initial[s : s + 1], noise.steps[:, s : s + 1])
+            alone, single = runtime.predict({"obs": obs["obs"][s : s + 1]}, own, plans[s])
+            np.testing.assert_allclose(sample[s], alone[0], rtol=1e-5, atol=1e-6)
+            assert single.flops[0] == report.flops[s]
+        written |= plans == C
+
+
+def test_the_report_says_what_was_done(runtime: Runtime, toy_artifact: Artifact) -> None:
+    manifest = toy_artifact.manifest
+    plans = np.stack([dense_plan(5, 5), uniform_plan(5, 5, 2)])
+    obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), 2)
+    _, report = runtime.predict(obs, noise, plans, plan_name="mine")
+    assert np.array_equal(report.plan, plans)
+    assert not report.plan.flags.writeable
+    assert (report.plan_name, report.computed, report.legalised) == ("mine", (25, 10), (0, 0))
+    loop = 5 * (manifest.flops.stem + manifest.flops.tail)
+    dense, sparse = report.flops
+    assert dense == manifest.flops.prologue + loop + 5 * sum(manifest.flops.blocks)
+    assert dense - sparse == 3 * sum(manifest.flops.blocks) > 0
+    timings = report.timings
+    assert timings.pruner == timings.wait_pruner == 0
+    assert 0 < timings.prologue < timings.total
+    assert timings.total == pytest.approx(timings.prologue + timings.decode, rel=0.05)
+
+
+def test_the_pruners_plan_is_legalised_and_counted(runtime: Runtime, toy_artifact: Artifact) -> None:
+    reference = ReferenceRuntime(toy_artifact)
+    manifest = toy_artifact.manifest
+    rng = np.random.default_rng(1)
+    written = np.zeros((2, 5, 5), np.bool_)
+    repaired = []
+    for _ in range(3):
+        obs, noise = random_inputs(toy_artifact, rng, 2)
+        _, report = runtime.predict(obs, noise)
+        reference.predict(obs, noise, report.plan)  # refuses an illegal plan
+        model = reference.model
+        import torch
+
+        wanted = model.logits(model.prologue({"obs": torch.from_numpy(obs["obs"])})).argmax(-1).numpy().astype(np.int8)
+        expected, _ = legalize(wanted, manifest.groups, written)
+        assert np.array_equal(report.plan, expected)
+        assert report.legalised == tuple((wanted != expected).sum(axis=(1, 2)))
+        assert report.plan_name == "pruner"
+        assert report.flops == tuple(manifest.flops.call(plan, True) for plan in expected)
+        assert 0 < report.timings.pruner <= report.timings.total
+        repaired.append(sum(report.legalised))
+        written |= expected == C
+    assert repaired[0] > 0
+    assert set(np.unique(expected)) == {0, 1, 2, 3}
+
+
+def test_a_plan_is_repaired_only_if_asked(runtime: Runtime, toy_artifact: Artifact) -> None:
+    plan = np.full((5, 5), R, np.int8)
+    obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), 2)
+    with pytest.raises(IllegalPlanError, match="stream 0 is illegal at step 0"):
+        runtime.predict(obs, noise, plan)
+    _, report = runtime.predict(obs, noise, plan, repair=True)
+    assert report.legalised == (25, 25)
+    assert report.computed == (5, 5)
+
+
+def test_an_illegal_plan_names_its_stream_and_changes_nothing(runtime: Runtime, toy_artifact: Artifact) -> None:
+    obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), 2)
+    first, _ = runtime.predict(obs, noise, dense_plan(5, 5))
+    bad = np.stack([dense_plan(5, 5), np.full((5, 5), T, np.int8)])
+    with pytest.raises(IllegalPlanError, match="stream 1 is illegal at step 0"):
+        runtime.predict(obs, noise, bad)
+    for plan, message in [
+        (np.zeros((5, 4), np.int8), r"\(5, 4\); expected"),
+        (np.zeros((5, 5)), "dtype float64"),
+        (np.full((5, 5), 4), r"0\.\.3|4\.\.4"),
+    ]:
+        with pytest.raises(IllegalPlanError, match=message):
+            runtime.predict(obs, noise, plan)
+    reuse = dense_plan(5, 5)
+    reuse[1:] = R
+    again, _ = runtime.predict(obs, noise, reuse)  # the first call's residuals are still there
+    np.testing.assert_allclose(again, first, rtol=1e-5)
+
+
+def test_streams_may_change_after_reset_only(runtime: Runtime, toy_artifact: Artifact) -> None:
+    rng = np.random.default_rng(0)
+    assert runtime.streams is None
+    runtime.predict(*random_inputs(toy_artifact, rng, 2), dense_plan(5, 5))
+    assert runtime.streams == 2
+    with pytest.raises(ObservationError, match=r"3 streams.*has 2.*reset"):
+        runtime.predict(*random_inputs(toy_artifact, rng, 3), dense_plan(5, 5))
+    runtime.reset()
+    assert runtime.streams is None
+    sample, _ = runtime.predict(*random_inputs(toy_artifact, rng, 3), dense_plan(5, 5))
+    assert len(sample) == 3
+
+
+def test_noise_of_the_wrong_shape_is_refused(runtime: Runtime, toy_artifact: Artifact) -> None:
+    obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), 2)
+    with pytest.raises(ObservationError, match=r"noise\.initial has shape \(2, 3, 1\)"):
+        runtime.predict(obs, Noise(noise.initial[..., :1], noise.steps), dense_plan(5, 5))
+    assert noise.steps is not None
+    with pytest.raises(ObservationError, match=r"noise\.steps has shape \(4, 2, 3, 2\)"):
+        runtime.predict(obs, Noise(noise.initial, noise.steps[1:]), dense_plan(5, 5))
+
+
+def test_what_a_call_gave_stays_as_it_was(runtime: Runtime, toy_artifact: Artifact) -> None:
+    rng = np.random.default_rng(0)
+    sample, report = runtime.predict(*random_inputs(toy_artifact, rng, 2))
+    kept, plan = sample.copy(), report.plan.copy()
+    runtime.predict(*random_inputs(toy_artifact, rng, 2))
+    assert np.array_equal(sample, kept)
+    assert np.array_equal(report.plan, plan)
+
+
+def test_a_call_that_fails_half_way_ends_the_episode(toy_artifact: Artifact, monkeypatch: pytest.MonkeyPatch) -> None:
+    runtime = open_runtime(toy_artifact)
+    obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), 2)
+    first, _ = runtime.predict(obs, noise, dense_plan(5, 5))
+
+    def interrupted(self: Workspace) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Workspace, "begin", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            runtime.predict(obs, noise, dense_plan(5, 5))
+    assert runtime.streams is None
+    rollout = dense_plan(5, 5)
+    rollout[1:] = R
+    with pytest.raises(IllegalPlanError, match="never computed"):
+        runtime.predict(obs, noise, rollout)
+    assert np.array_equal(runtime.predict(obs, noise, dense_plan(5, 5))[0], first)
+
+
+def test_without_a_pruner_a_plan_is_needed(make_artifact: MakeArtifact) -> None:
+    artifact = make_artifact(toy_program(pruner=False))
+    for name in ("onnxruntime", "reference"):
+        runtime = open_runtime(artifact, name)
+        with pytest.raises(IllegalPlanError, match="no pruner"):
+            runtime.predict(*random_inputs(artifact, np.random.default_rng(0), 1))
+
+
+def test_a_pruner_that_gives_nan_is_refused(make_artifact: MakeArtifact) -> None:
+    program = toy_program()
+    program.weights["pruner.b"][-1] = np.nan
+    artifact = make_artifact(program)
+    for name in ("onnxruntime", "reference"):
+        with pytest.raises(IllegalPlanError, match="NaN"):
+            open_runtime(artifact, name).predict(*random_inputs(artifact, np.random.default_rng(0), 1))
+
+
+@pytest.mark.parametrize(("runtime_name", "threads"), [("tensorrt", 1), ("onnxruntime", 0), ("onnxruntime", True)])
+def test_what_cannot_be_had_is_refused(toy_artifact: Artifact, runtime_name: str, threads: int) -> None:
+    with pytest.raises(RuntimeUnavailableError, match="expected one of|at least 1"):
+        open_runtime(toy_artifact, runtime_name, threads)
+
+
+@pytest.mark.parametrize(("name", "package"), [("onnxruntime", "onnxruntime"), ("reference", "torch")])
+def test_a_missing_package_is_named(toy_artifact: Artifact, name: str, package: str) -> None:
+    code = f"""
+import sys
+sys.modules[{package!r}] = None
+from ttscompile.artifact import load_artifact
+from ttscompile.errors import RuntimeUnavailableError
+from ttscompile.runtimes import open_runtime
+try:
+    open_runtime(load_artifact({str(toy_artifact.path)!r}), {name!r})
+except RuntimeUnavailableError as error:
+    print(error)
+"""
+    assert f"{name!r} needs" in python(code)
+
+
+def test_a_graph_that_onnxruntime_refuses_is_an_artifact_error(
+    make_artifact: MakeArtifact, capfd: pytest.CaptureFixture[str]
+) -> None:
+    artifact = make_artifact(toy_program())
+    artifact.onnx_path("block_02").write_bytes(b"no graph")
+    with pytest.raises(ArtifactError, match=r"block_02\.onnx.*cannot load"):
+        open_runtime(artifact)
+    assert capfd.readouterr().out == ""
+
+
+def python(code: str) -> str:
+    """Standard output of a fresh interpreter."""
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=Path(__file__).parents[2],
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+THREADS = """
+import os, sys
+from ttscompile.artifact import load_artifact
+from ttscompile.errors import RuntimeUnavailableError
+from ttscompile.runtimes import open_runtime
+artifact = load_artifact({path!r})
+import onnxruntime
+def count():
+    return len(os.listdir("/proc/self/task"))
+before = count()
+{body}
+assert "torch" not in sys.modules
+"""
+
+
+def test_policies_of_a_process_share_one_pool(toy_artifact: Artifact) -> None:
+    body = """
+first = open_runtime(artifact, threads=1)
+print(count() - before)
+pools = [open_runtime(artifact, threads=3) for _ in range(3)]
+print(count() - before)
+for threads in (2, 1):
+    try:
+        open_runtime(artifact, threads=threads)
+    except RuntimeUnavailableError as error:
+        print(error)
+"""
+    alone, pool, *messages = python(THREADS.format(path=str(toy_artifact.path), body=body)).splitlines()
+    assert (alone, pool) == ("0", "2")  # with the caller, three
+    for threads, message in zip((2, 1), messages, strict=True):
+        assert f"threads={threads} was asked for" in message
+        assert "Use threads=3, or load policies with threads=1 before the others" in message
+
+
+def test_a_pool_of_somebody_else_is_reported(toy_artifact: Artifact) -> None:
+    body = """
+onnxruntime.set_global_thread_pool_sizes(2, 1)
+for threads in (1, 2):
+    try:
+        open_runtime(artifact, threads=threads)
+    except RuntimeUnavailableError as error:
+        print(error)
+"""
+    messages = python(THREADS.format(path=str(toy_artifact.path), body=body)).splitlines()
+    assert len(messages) == 2
+    assert all("other code of this process has made onnxruntime's global thread pool" in one for one in messages)
+
+
+def test_two_threads_give_the_same_answer(toy_artifact: Artifact) -> None:
+    body = """
+import numpy as np
+from ttscompile import Noise
+rng = np.random.default_rng(0)
+shape = (2, 3, 2)
+noise = Noise(rng.standard_normal(shape, dtype=np.float32), rng.standard_normal((5, *shape), dtype=np.float32))
+obs = {"obs": rng.standard_normal((2, 2), dtype=np.float32)}
+samples = [open_runtime(artifact, threads=n).predict(obs, noise, np.zeros((5, 5), np.int8))[0] for n in (1, 2)]
+print(np.abs(samples[0] - samples[1]).max() < 1e-5)
+"""
+    assert python(THREADS.format(path=str(toy_artifact.path), body=body)) == "True\n"

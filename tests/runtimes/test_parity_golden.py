@@ -1,0 +1,113 @@
+"""Compiled golden checkpoints against what the original implementations gave, and both runtimes against each other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+import ttscompile
+from ttscompile import Noise
+from ttscompile.artifact import load_artifact
+from ttscompile.lattice import Source
+from ttscompile.runtimes import open_runtime
+from ttscompile.runtimes.policy import CompiledPolicy, PolicyInfo
+
+from .agreement import largest_difference, random_inputs
+from .plans import random_plan
+
+CHECKPOINTS = ("bert", "ddim8", "inpainting", "mlp_encoder_causal", "transformer_encoder_causal")
+EPISODES = ("timestep_95", "mixed_95", "mixed_80")
+RUNTIMES = ("onnxruntime", "reference")
+
+Compiled = Callable[[str], Path]
+
+
+@pytest.fixture(scope="module")
+def compiled(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Compiled:
+    """Artifact of a golden checkpoint by name, or of the Push-T policy; each is compiled once."""
+
+    @cache
+    def compile_once(name: str) -> Path:
+        folder = "policies" if name == "pusht_dpt" else "golden/diffusion_policy"
+        directory = tmp_path_factory.mktemp("golden") / name
+        ttscompile.convert(shared / folder / f"{name}.ckpt", directory)
+        return directory
+
+    return compile_once
+
+
+def worst_of_range(found: npt.NDArray[np.float32], expected: npt.NDArray[np.float32], info: PolicyInfo) -> float:
+    """Largest error of an action in units of its range: a normaliser maps the range to -1..1."""
+    assert info.action.normalizer is not None
+    assert found.shape == expected.shape
+    return float((np.abs(found - expected) * np.abs(info.action.normalizer.scale) / 2).max())
+
+
+def call(policy: CompiledPolicy, recorded: dict[str, npt.NDArray[np.float32]], **more: object) -> dict[str, np.ndarray]:
+    noise = Noise(recorded["noise_initial"], recorded["noise_steps"])
+    result: dict[str, np.ndarray] = policy.predict_action({"obs": recorded["obs"]}, noise=noise, **more)  # type: ignore[arg-type]
+    return result
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("runtime", RUNTIMES)
+@pytest.mark.parametrize("name", CHECKPOINTS)
+def test_dense_is_the_original(compiled: Compiled, shared: Path, name: str, runtime: str) -> None:
+    recorded = dict(np.load(shared / "golden" / "diffusion_policy" / f"{name}.npz"))
+    policy = ttscompile.load(compiled(name), runtime)
+    out = call(policy, recorded, plan="dense")
+    assert worst_of_range(out["action_pred"], recorded["action_pred"], policy.info) < 1e-5
+    assert worst_of_range(out["action"], recorded["action"], policy.info) < 1e-5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("runtime", RUNTIMES)
+@pytest.mark.parametrize("name", EPISODES)
+def test_an_episode_with_their_plans_is_what_the_authors_code_gives(
+    compiled: Compiled, shared: Path, name: str, runtime: str
+) -> None:
+    recorded = np.load(shared / "golden" / "tts" / f"{name}.npz")
+    policy = ttscompile.load(compiled("pusht_dpt"), runtime)
+    policy.reset()
+    for r, plan in enumerate(recorded["plans"]):
+        one = {key: recorded[key][r] for key in ("obs", "noise_initial", "noise_steps")}
+        out = call(policy, one, plan=plan)
+        assert worst_of_range(out["action_pred"], recorded["action_pred"][r], policy.info) < 1e-4
+        report = policy.last_report
+        assert report is not None
+        assert report.computed == (np.count_nonzero(plan == Source.COMPUTE),)
+        assert report.legalised == (0,)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CHECKPOINTS)
+def test_both_runtimes_agree_on_random_plans(compiled: Compiled, name: str) -> None:
+    """Over all checkpoints 5 x 4 episodes of 3 calls, of one to three streams: 60 calls, 112 random legal plans."""
+    artifact = load_artifact(compiled(name))
+    runtimes = open_runtime(artifact, "onnxruntime"), open_runtime(artifact, "reference")
+    for seed, streams in enumerate((1, 2, 3, 2)):
+        assert largest_difference(artifact, *runtimes, np.random.default_rng(seed), streams, calls=3) < 1e-5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["transformer_encoder_causal", "inpainting"])
+def test_a_batch_of_streams_is_its_streams_one_by_one(compiled: Compiled, name: str) -> None:
+    artifact = load_artifact(compiled(name))
+    rng = np.random.default_rng(0)
+    together, alone = open_runtime(artifact), [open_runtime(artifact) for _ in range(3)]
+    written = np.zeros((3, artifact.manifest.steps, len(artifact.manifest.groups)), np.bool_)
+    for _ in range(3):
+        plans = np.stack([random_plan(rng, artifact.manifest.steps, artifact.manifest.groups, one) for one in written])
+        obs, noise = random_inputs(artifact, rng, 3)
+        assert noise.steps is not None
+        batch, _ = together.predict(obs, noise, plans)
+        for s, runtime in enumerate(alone):
+            own = Noise(noise.initial[s : s + 1], noise.steps[:, s : s + 1])
+            single, _ = runtime.predict({key: value[s : s + 1] for key, value in obs.items()}, own, plans[s])
+            assert np.abs(batch[s] - single[0]).max() < 1e-5 * np.abs(single).max()
+        written |= plans == Source.COMPUTE

@@ -1,0 +1,273 @@
+"""The object that users hold: what it gives, what it checks, what it remembers."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import ttscompile
+from ttscompile import Noise, Source
+from ttscompile.artifact import Artifact
+from ttscompile.artifact.write import update_calibration
+from ttscompile.config import Affine
+from ttscompile.errors import IllegalPlanError, ObservationError, TtscompileError
+from ttscompile.lattice import dense_plan, uniform_plan
+from ttscompile.runtimes import open_runtime
+from ttscompile.runtimes.policy import CompiledPolicy, load
+
+from .conftest import MakeArtifact
+from .toys import toy_program
+
+R = Source.ROLLOUT
+OBS = np.array([[0.3, -1.2], [0.7, 0.1]], np.float32)
+
+
+@pytest.fixture(params=["onnxruntime", "reference"])
+def policy(request: pytest.FixtureRequest, toy_artifact: Artifact) -> CompiledPolicy:
+    return load(toy_artifact.path, runtime=request.param, seed=0)
+
+
+@pytest.fixture
+def quick(toy_artifact: Artifact) -> CompiledPolicy:
+    return load(toy_artifact.path, seed=0)
+
+
+def some_noise(streams: int = 2, seed: int = 0) -> Noise:
+    rng = np.random.default_rng(seed)
+    shape = (streams, 3, 2)
+    return Noise(rng.standard_normal(shape, dtype=np.float32), rng.standard_normal((5, *shape), dtype=np.float32))
+
+
+def test_load_is_what_the_package_offers() -> None:
+    assert ttscompile.load is load
+
+
+def test_actions_are_normalised_in_and_out_and_cut(policy: CompiledPolicy, toy_artifact: Artifact) -> None:
+    out = policy.predict_action({"obs": OBS}, noise=some_noise(), plan="dense")
+    runtime = open_runtime(toy_artifact)
+    normalized = OBS * np.array([2, 0.5], np.float32) + np.array([0.1, -0.2], np.float32)
+    sample, _ = runtime.predict({"obs": normalized}, some_noise(), dense_plan(5, 5))
+    expected = (sample - np.array([1, -1])) / np.array([0.5, 4])
+    assert set(out) == {"action", "action_pred"}
+    np.testing.assert_allclose(out["action_pred"], expected, rtol=1e-4, atol=1e-5)
+    assert np.array_equal(out["action"], out["action_pred"][:, 1:3])
+    assert out["action"].dtype == np.float32
+    assert out["action"].flags.owndata
+
+
+def test_info_is_the_artifacts(quick: CompiledPolicy, toy_artifact: Artifact) -> None:
+    info = quick.info
+    assert (info.K, info.sample, info.stochastic, info.dense_flops) == (5, (3, 2), True, 1000)
+    assert [block.kind for block in info.blocks][:2] == ["self_attention", "feed_forward"]
+    assert {block.shape for block in info.blocks} == {(3, 4)}
+    assert all(block.flops == 2 * 3 * 4 * 4 for block in info.blocks)
+    assert info.observation["obs"].shape == (2,)
+    assert (info.action.action_dim, info.action.start, info.action.stop) == (2, 1, 3)
+    assert info.identity == toy_artifact.manifest.identity
+    assert (info.plans, info.default_plan) == (("dense",), "dense")
+
+
+def test_the_default_plan_is_dense_until_calibration(quick: CompiledPolicy) -> None:
+    assert quick.last_report is None
+    quick.predict_action({"obs": OBS})
+    report = quick.last_report
+    assert report is not None
+    assert (report.plan_name, report.computed, report.legalised) == ("dense", (25, 25), (0, 0))
+
+
+def test_plans_of_the_artifact_by_name(make_artifact: MakeArtifact) -> None:
+    artifact = make_artifact(toy_program())
+    mixed = uniform_plan(5, 5, 2)
+    mixed[1] = R
+    update_calibration(artifact.path, dict(artifact.pruner), {"mixed": mixed}, "tts", {"strategy": "tts"})
+    for runtime in ("onnxruntime", "reference"):
+        policy = load(artifact.path, runtime)
+        assert set(policy.info.plans) == {"dense", "mixed", "tts"}
+        assert policy.info.default_plan == "tts"
+        names = []
+        for plan in ("mixed", "mixed", None, "tts", "dense"):
+            policy.predict_action({"obs": OBS}, plan=plan)
+            report = policy.last_report
+            assert report is not None
+            names.append((report.plan_name, report.timings.pruner > 0))
+            if plan == "mixed":  # its rollout reads are repaired: these cells are computed in steps 0 and 2 alone
+                assert report.legalised == (5, 5)
+                assert (report.plan[:, 1] == Source.TIMESTEP).all()
+        assert names == [("mixed", False), ("mixed", False), ("tts", True), ("tts", True), ("dense", False)]
+        with pytest.raises(IllegalPlanError, match=r"no plan 'uniform'; it has \['dense', .*'mixed'"):
+            policy.predict_action({"obs": OBS}, plan="uniform")
+
+
+def test_a_matrix_is_executed_as_it_is_or_refused(policy: CompiledPolicy) -> None:
+    rollout = np.full((5, 5), R)
+    rollout[0] = Source.COMPUTE
+    with pytest.raises(IllegalPlanError, match="ROLLOUT residual was never computed"):
+        policy.predict_action({"obs": OBS}, plan=rollout)
+    policy.predict_action({"obs": OBS}, plan=[[Source.COMPUTE] * 5] * 5)
+    both = np.stack([rollout, dense_plan(5, 5)])
+    policy.predict_action({"obs": OBS}, plan=torch.from_numpy(both))
+    report = policy.last_report
+    assert report is not None
+    assert np.array_equal(report.plan, both)
+    assert (report.plan_name, report.computed, report.legalised) == ("given", (5, 25), (0, 0))
+    policy.reset()
+    with pytest.raises(IllegalPlanError, match="never computed"):
+        policy.predict_action({"obs": OBS}, plan=both)
+
+
+def test_torch_in_gives_torch_out(policy: CompiledPolicy) -> None:
+    plain = policy.predict_action({"obs": OBS}, noise=some_noise())
+    policy.reset()
+    noise = some_noise()
+    assert noise.steps is not None
+    tensors = Noise(torch.from_numpy(noise.initial), torch.from_numpy(noise.steps))  # type: ignore[arg-type]
+    out = policy.predict_action({"obs": torch.from_numpy(OBS).requires_grad_()}, noise=tensors)
+    for key, value in out.items():
+        assert isinstance(value, torch.Tensor)
+        assert value.device == torch.device("cpu")
+        assert not value.requires_grad
+        assert np.array_equal(value.numpy(), plain[key])
+
+
+def test_a_seed_decides_the_noise(toy_artifact: Artifact) -> None:
+    def actions(policy: CompiledPolicy, calls: int = 2) -> np.ndarray:
+        return np.stack([policy.predict_action({"obs": OBS})["action"] for _ in range(calls)])
+
+    first, second = load(toy_artifact.path, seed=5), load(toy_artifact.path, seed=5)
+    drawn = actions(first)
+    assert np.array_equal(drawn, actions(second))
+    assert not np.array_equal(drawn[0], drawn[1])
+    assert not np.array_equal(actions(load(toy_artifact.path, seed=6)), drawn)
+    first.reset()
+    assert not np.array_equal(actions(first), drawn)
+    first.reset(seed=5)
+    assert np.array_equal(actions(first), drawn)
+    assert not np.array_equal(actions(load(toy_artifact.path)), actions(load(toy_artifact.path)))
+
+
+def with_value(value: float) -> np.ndarray:
+    obs = OBS.copy()
+    obs[1, 0] = value
+    return obs
+
+
+@pytest.mark.parametrize(
+    ("obs", "message"),
+    [
+        ({}, r"expected the observation keys \['obs'\]; found \[\] \(missing: \['obs'\], unexpected: \[\]\)"),
+        ({"obs": OBS, "image": OBS}, r"unexpected: \['image'\]"),
+        (OBS, r"a ndarray; expected a dictionary with the keys \['obs'\]"),
+        ({"obs": OBS[0]}, r"'obs' has the wrong shape: expected float32 \[B, 2\]; found float32 \[2\].*obs\[None\]"),
+        ({"obs": OBS[:, :1]}, r"wrong shape: expected float32 \[B, 2\]; found float32 \[2, 1\]"),
+        ({"obs": OBS[:0]}, r"wrong shape: .*found float32 \[0, 2\]"),
+        ({"obs": OBS.astype(np.float64)}, r"wrong dtype: expected float32 .*found float64 .*astype\(np.float32\)"),
+        ({"obs": OBS.astype(np.int32)}, "wrong dtype"),
+        ({"obs": torch.from_numpy(OBS).double()}, "wrong dtype: .*found float64"),
+        ({"obs": torch.from_numpy(OBS).bfloat16()}, r"dtype torch.bfloat16, which numpy does not have.*\.float\(\)"),
+        ({"obs": OBS.tolist()}, r"a list; expected a numpy array or a torch tensor.*np.asarray"),
+        ({"obs": with_value(np.nan)}, r"'obs' must be finite; found nan at index \(1, 0\), 1 such values in all"),
+        ({"obs": with_value(-np.inf)}, r"found -inf at index \(1, 0\)"),
+    ],
+)
+def test_an_observation_that_does_not_fit_is_refused(quick: CompiledPolicy, obs: Any, message: str) -> None:
+    quick.predict_action({"obs": OBS})
+    with pytest.raises(ObservationError, match=message):
+        quick.predict_action(obs)
+    rollout = dense_plan(5, 5)
+    rollout[1:] = R
+    quick.predict_action({"obs": OBS}, plan=rollout)  # the episode goes on
+
+
+def wrong_noise() -> list[tuple[Any, str]]:
+    noise = some_noise()
+    assert noise.steps is not None
+    initial, steps = noise.initial, noise.steps
+    broken = steps.copy()
+    broken[4, 1, 2, 1] = np.nan
+    return [
+        (
+            Noise(initial[:1], steps),
+            r"noise.initial must be float32 \[B, T, D\] = \[2, 3, 2\]; found float32 \[1, 3, 2\]",
+        ),
+        (Noise(initial.astype(np.float64), steps), "noise.initial must be float32 .*found float64"),
+        (Noise(initial, None), r"noise.steps is missing.*\(5, 2, 3, 2\)"),
+        (Noise(initial, steps[:4]), r"noise.steps must be .*= \[5, 2, 3, 2\]; found float32 \[4, 2, 3, 2\]"),
+        (Noise(initial, broken), r"noise.steps must be finite; found nan at index \(4, 1, 2, 1\)"),
+        (Noise(initial * np.inf, steps), "noise.initial must be finite"),
+        (initial, "a ndarray; expected ttscompile.Noise"),
+    ]
+
+
+@pytest.mark.parametrize("case", range(7))
+def test_noise_that_does_not_fit_is_refused(quick: CompiledPolicy, case: int) -> None:
+    noise, message = wrong_noise()[case]
+    with pytest.raises(ObservationError, match=message):
+        quick.predict_action({"obs": OBS}, noise=noise)
+
+
+def test_a_deterministic_sampler_needs_no_noise_of_steps(make_artifact: MakeArtifact) -> None:
+    policy = load(make_artifact(toy_program(noise=0.0)).path)
+    assert not policy.info.stochastic
+    initial, steps = some_noise().initial, some_noise().steps
+    out = [policy.predict_action({"obs": OBS}, noise=Noise(initial, draws))["action"] for draws in (None, steps)]
+    assert np.array_equal(*out)
+    assert policy.predict_action({"obs": OBS})["action"].shape == (2, 2, 2)
+
+
+def test_the_number_of_streams_changes_with_reset_only(policy: CompiledPolicy) -> None:
+    policy.predict_action({"obs": OBS})
+    with pytest.raises(ObservationError, match=r"holds 1 streams, and the episode under way 2.*reset\(\)"):
+        policy.predict_action({"obs": OBS[:1]})
+    policy.reset()
+    assert policy.predict_action({"obs": OBS[:1]})["action"].shape == (1, 2, 2)
+
+
+def test_observations_that_disagree_about_the_streams_are_refused() -> None:
+    from ttscompile import ObservationSpec
+    from ttscompile.runtimes.arrays import check_observation
+
+    specs = {"a": ObservationSpec((2,)), "b": ObservationSpec((1, 2), dtype="int64")}
+    fits = {"a": OBS, "b": np.zeros((2, 1, 2), np.int64)}
+    assert list(check_observation(fits, specs)) == ["a", "b"]
+    with pytest.raises(ObservationError, match=r"\{'a': 1, 'b': 2\}"):
+        check_observation(fits | {"a": OBS[:1]}, specs)
+
+
+def test_a_second_caller_gets_an_error(quick: CompiledPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
+    inside, leave = threading.Event(), threading.Event()
+    normalize: Callable[..., Any] = Affine.normalize
+
+    def slow(self: Affine, x: np.ndarray) -> np.ndarray:
+        inside.set()
+        assert leave.wait(30)
+        return normalize(self, x)
+
+    monkeypatch.setattr(Affine, "normalize", slow)
+    results: list[Any] = []
+    first = threading.Thread(target=lambda: results.append(quick.predict_action({"obs": OBS})))
+    first.start()
+    assert inside.wait(30)
+    for second in (quick.reset, lambda: quick.predict_action({"obs": OBS})):
+        with pytest.raises(TtscompileError, match="in the middle of a call on another thread"):
+            second()
+    leave.set()
+    first.join(30)
+    assert results[0]["action"].shape == (2, 2, 2)
+    quick.reset()
+
+
+def test_a_call_that_was_refused_does_not_keep_the_lock(quick: CompiledPolicy) -> None:
+    with pytest.raises(ObservationError):
+        quick.predict_action({})
+    quick.predict_action({"obs": OBS})
+
+
+def test_a_path_without_an_artifact(tmp_path: Path) -> None:
+    with pytest.raises(TtscompileError, match=r"manifest\.json"):
+        load(tmp_path)

@@ -1,0 +1,206 @@
+"""The reference runtime against the pencil and section 2 executed literally; its gradients against calculus."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ttscompile import Noise, Source
+from ttscompile.artifact import Artifact
+from ttscompile.errors import IllegalPlanError, PassError
+from ttscompile.ir.program import Program
+from ttscompile.lattice import PlanArray
+from ttscompile.runtimes.reference import Contexts, ReferenceModel, RolloutCache
+
+from .literal import Episode
+from .plans import random_plan
+from .toys import as_functions, pencil_program, toy_program
+
+C, F, T, R = Source.COMPUTE, Source.FORWARD, Source.TIMESTEP, Source.ROLLOUT
+TOY = toy_program()
+MODEL = ReferenceModel.from_program(TOY)
+
+
+def pencil(
+    model: ReferenceModel, x: float, plan: list[Source], cache: RolloutCache | None
+) -> tuple[float, RolloutCache]:
+    """One call of ``pencil_program``, whose block is ``f(h) = h - 32``."""
+    contexts = model.prologue({"obs": torch.tensor([[-32.0]])})
+    result = model.rollout(contexts, torch.full((1, 1, 1), float(x)), None, np.array(plan, np.int8)[:, None], cache)
+    return float(result.sample), result.cache
+
+
+def test_reuse_gives_41_and_compute_gives_44() -> None:
+    model = ReferenceModel.from_program(pencil_program())
+    assert pencil(model, 35, [C, T], None)[0] == 41
+    assert pencil(model, 35, [C, F], None)[0] == 41
+    assert pencil(model, 35, [C, C], None)[0] == 44
+
+
+def test_rollout_is_the_last_call_in_which_the_cell_was_computed() -> None:
+    model = ReferenceModel.from_program(pencil_program())
+    _, cache = pencil(model, 35, [C, C], None)  # writes f(38) = 6 at step 1
+    reused, cache = pencil(model, 40, [C, T], cache)  # 40 + 8 + 8, and writes nothing at step 1
+    assert reused == 56
+    assert pencil(model, 33, [C, R], cache)[0] == 33 + 1 + 6
+
+
+def test_a_rollout_that_was_never_written_is_refused() -> None:
+    model = ReferenceModel.from_program(pencil_program())
+    _, cache = pencil(model, 35, [C, T], None)
+    with pytest.raises(IllegalPlanError, match="step 1, block 0"):
+        pencil(model, 35, [C, R], cache)
+
+
+def inputs(rng: np.random.Generator, streams: int, program: Program = TOY) -> tuple[dict[str, torch.Tensor], Noise]:
+    shape = (streams, *program.spec.sample)
+    initial = rng.standard_normal(shape).astype(np.float32)
+    steps = rng.standard_normal((program.spec.sampler.steps, *shape)).astype(np.float32)
+    return {"obs": torch.from_numpy(rng.standard_normal((streams, 2)).astype(np.float32))}, Noise(initial, steps)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), streams=st.integers(1, 3), computed=st.floats(0, 0.6))
+def test_every_stream_does_what_section_2_says(seed: int, streams: int, computed: float) -> None:
+    rng = np.random.default_rng(seed)
+    cache = None
+    literal: list[dict[tuple[int, int], np.ndarray]] = [{} for _ in range(streams)]
+    for _ in range(3):
+        obs, noise = inputs(rng, streams)
+        assert noise.steps is not None
+        written = MODEL.empty_cache(streams).written if cache is None else cache.written
+        plans = np.stack([random_plan(rng, MODEL.steps, MODEL.groups, cells, computed) for cells in written])
+        expected = []
+        for s in range(streams):
+            toy = as_functions(TOY, obs["obs"][s].numpy(), noise.steps[:, s])
+            expected.append(Episode(toy, literal[s]).call(noise.initial[s].astype(np.float64), plans[s]))
+        with torch.no_grad():
+            result = MODEL.rollout(
+                MODEL.prologue(obs), torch.from_numpy(noise.initial), torch.from_numpy(noise.steps), plans, cache
+            )
+        cache = result.cache
+        np.testing.assert_allclose(result.sample.numpy(), np.stack(expected), rtol=2e-5, atol=2e-5)
+        assert [set(map(tuple, np.argwhere(w))) for w in cache.written] == [set(one) for one in literal]
+
+
+def one_hot(plan: PlanArray) -> torch.Tensor:
+    return torch.nn.functional.one_hot(torch.from_numpy(plan.astype(np.int64)), 4).float()
+
+
+def everything_recorded(
+    contexts: Contexts, noise: Noise, gates: torch.Tensor, cache: RolloutCache | None, write_gradients: bool
+) -> torch.Tensor:
+    """The call as one differentiable formula: all candidates of all cells, recorded, mixed by the gates."""
+    assert noise.steps is not None
+    x, steps = torch.from_numpy(noise.initial), torch.from_numpy(noise.steps)
+    forward: dict[int, torch.Tensor] = {}
+    timestep: dict[int, torch.Tensor] = {}
+    zero = torch.zeros(())
+    for k in range(MODEL.steps):
+        h = MODEL.stem(x, k, contexts)
+        for b, group in enumerate(MODEL.groups):
+            g = [gates[:, k, b, source].reshape(-1, 1, 1) for source in Source]
+            computed = MODEL.block(b, k, h, contexts)
+            rollout = zero if cache is None else cache.residuals.get((k, b), zero)
+            old_forward, old_timestep = forward.get(group, zero), timestep.get(b, zero)
+            h = h + g[0] * computed + g[1] * old_forward + g[2] * old_timestep + g[3] * rollout
+            write = g[0] if write_gradients else g[0].detach()
+            forward[group] = write * computed + (1 - write) * old_forward
+            timestep[b] = write * computed + (1 - write) * old_timestep
+        x = MODEL.advance(x, MODEL.tail(h, k, contexts), steps[k], k)
+    return x
+
+
+@pytest.mark.parametrize("write_gradients", [True, False])
+def test_gradients_are_those_of_the_whole_formula(write_gradients: bool) -> None:
+    rng = np.random.default_rng(7)
+    obs, noise = inputs(rng, 2)
+    assert noise.steps is not None
+    contexts = MODEL.prologue(obs)
+    dense = np.zeros((2, MODEL.steps, MODEL.blocks), np.int8)
+    initial, steps = torch.from_numpy(noise.initial), torch.from_numpy(noise.steps)
+    cache = MODEL.rollout(contexts, initial, steps, dense).cache
+    plans = np.stack([random_plan(rng, MODEL.steps, MODEL.groups, cells) for cells in cache.written])
+    assert len(set(map(int, plans[:, 1:].reshape(-1)))) == 4
+
+    gates = one_hot(plans).requires_grad_()
+    result = MODEL.rollout(contexts, initial, steps, gates, cache, write_gradients=write_gradients, keep_samples=True)
+    result.sample.square().sum().backward()
+    whole = one_hot(plans).requires_grad_()
+    sample = everything_recorded(contexts, noise, whole, cache, write_gradients)
+    sample.square().sum().backward()
+
+    assert torch.allclose(result.sample, sample, atol=1e-6)
+    assert gates.grad is not None
+    assert whole.grad is not None
+    # Before step 0 nothing is cached, and the gates of what is not cached are never asked for.
+    assert torch.allclose(gates.grad[:, 1:], whole.grad[:, 1:], rtol=1e-4, atol=1e-5)
+    assert gates.grad[:, 1:].abs().min(0).values.max() > 1e-3
+    assert len(result.samples) == MODEL.steps
+    assert torch.equal(result.samples[-1], result.sample)
+    assert not any(residual.requires_grad for residual in result.cache.residuals.values())
+
+
+def test_without_gradients_only_computed_blocks_are_evaluated(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(3)
+    obs, noise = inputs(rng, 2)
+    plans = np.full((2, MODEL.steps, MODEL.blocks), T, np.int8)
+    plans[:, 0] = C
+    plans[1, 2, 3] = C
+    evaluated: list[tuple[int, int, int]] = []
+    block = ReferenceModel.block
+
+    def counting(self, b, k, stream, contexts, streams=None):  # type: ignore[no-untyped-def]
+        evaluated.append((k, b, len(stream) if streams is None else len(streams)))
+        return block(self, b, k, stream, contexts, streams)
+
+    monkeypatch.setattr(ReferenceModel, "block", counting)
+    MODEL.rollout(MODEL.prologue(obs), torch.from_numpy(noise.initial), None, plans)
+    assert evaluated == [*((0, b, 2) for b in range(MODEL.blocks)), (2, 3, 1)]
+
+
+def test_the_pruners_logits_are_differentiable_in_given_weights() -> None:
+    contexts = MODEL.prologue(inputs(np.random.default_rng(0), 2)[0])
+    weights = {name: value.clone().requires_grad_() for name, value in MODEL.pruner_weights.items()}
+    assert set(weights) == {"pruner.w", "pruner.b", "pruner.mask"}
+    logits = MODEL.logits(contexts, weights)
+    assert logits.shape == (2, MODEL.steps, MODEL.blocks, 4)
+    assert torch.equal(logits.detach(), MODEL.logits(contexts))
+    logits[:, 1:].sum().backward()
+    assert weights["pruner.b"].grad is not None
+    assert torch.equal(weights["pruner.b"].grad, torch.tensor([0.0, 2.0])[(torch.arange(100) >= 20).long()])
+
+
+def test_gates_that_are_not_one_hot_are_refused() -> None:
+    contexts = MODEL.prologue(inputs(np.random.default_rng(0), 1)[0])
+    initial = torch.zeros(1, *TOY.spec.sample)
+    gates = one_hot(np.zeros((1, MODEL.steps, MODEL.blocks), np.int8))
+    soft = gates.clone()
+    soft[0, 2, 1] = torch.tensor([0.5, 0, 0.5, 0])
+    with pytest.raises(IllegalPlanError, match="one-hot"):
+        MODEL.rollout(contexts, initial, None, soft)
+    with pytest.raises(IllegalPlanError, match=r"\(1, 4, 5, 4\); expected"):
+        MODEL.rollout(contexts, initial, None, gates[:, :-1])
+
+
+def test_a_program_without_pieces_or_pruner_is_refused() -> None:
+    program = toy_program(pruner=False)
+    model = ReferenceModel.from_program(program)
+    assert model.pruner_weights == {}
+    with pytest.raises(IllegalPlanError, match="no pruner"):
+        model.logits(model.prologue(inputs(np.random.default_rng(0), 1)[0]))
+    with pytest.raises(PassError, match="no pieces"):
+        ReferenceModel.from_program(Program(program.spec, program.denoiser, program.weights))
+
+
+def test_an_artifact_gives_the_model_of_its_program(toy_artifact: Artifact) -> None:
+    obs, noise = inputs(np.random.default_rng(0), 2)
+    plan = np.full((MODEL.steps, MODEL.blocks), T, np.int8)
+    plan[0] = C
+    stored = ReferenceModel.from_artifact(toy_artifact)
+    samples = [m.rollout(m.prologue(obs), torch.from_numpy(noise.initial), None, plan).sample for m in (stored, MODEL)]
+    assert torch.equal(*samples)
+    assert torch.equal(stored.logits(stored.prologue(obs)), MODEL.logits(MODEL.prologue(obs)))
