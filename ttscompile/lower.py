@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import islice
 from typing import Any
 
 import onnx
@@ -24,7 +25,7 @@ from .ir.graph import Argument, Batch, Enum, Graph, Node, Ref, TensorType
 from .ir.layout import sink_layout
 from .ir.program import Pieces, Program
 from .lower_attention import flatten_attention
-from .lower_onnx import name_model
+from .lower_onnx import name_model, only
 
 OPSET = 23
 """Has Gelu (20) and Attention (23). Measured with onnxruntime 1.31, 1 thread, blocks of width 256, 16 tokens, 4 heads:
@@ -46,7 +47,7 @@ def lower_graph(graph: Graph, name: str) -> onnx.ModelProto:
     Raises:
         LoweringError: an operation has no translation, or the batch size cannot vary.
     """
-    return _lower(graph, name, {})
+    return _lower({name: graph})[name]
 
 
 def lower_program(program: Program) -> dict[str, onnx.ModelProto]:
@@ -62,10 +63,8 @@ def lower_program(program: Program) -> dict[str, onnx.ModelProto]:
     """
     if program.pieces is None:
         raise LoweringError("the program has no pieces to lower: run the passes up to insert_reuse first.")
-    exported: dict[str, onnx.ModelProto] = {}
     advance = fuse_advance(program.pieces.tail, program.pieces.stem, program.spec)
-    graphs = {**_pieces(program.pieces), "advance": advance}
-    return {name: _lower(graph, name, exported) for name, graph in graphs.items()}
+    return _lower({**_pieces(program.pieces), "advance": advance})
 
 
 def structural_key(graph: Graph) -> str:
@@ -91,17 +90,24 @@ def _pieces(pieces: Pieces) -> dict[str, Graph]:
     }
 
 
-def _lower(graph: Graph, name: str, exported: dict[str, onnx.ModelProto]) -> onnx.ModelProto:
-    """Lower, taking the export from ``exported`` if a graph of this structure was exported before."""
-    if len(set(graph.outputs)) != len(graph.outputs):
-        raise LoweringError(f"{name}: the outputs {graph.outputs} hold a value twice; each needs a name of its own.")
-    types = graph.types()
-    sunk = _in_order_of_use(sink_layout(graph))
-    key = structural_key(sunk)
-    if key not in exported:
-        exported[key] = _export(sunk, name)
-    outputs = [(output, types[output]) for output in graph.outputs]
-    return name_model(exported[key], name, list(sunk.inputs.items()), list(sunk.constants.items()), outputs)
+def _lower(graphs: dict[str, Graph]) -> dict[str, onnx.ModelProto]:
+    """Lower graphs, those of one structure with one export."""
+    for name, graph in graphs.items():
+        if len(set(graph.outputs)) != len(graph.outputs):
+            raise LoweringError(
+                f"{name}: the outputs {graph.outputs} hold a value twice; each needs a name of its own."
+            )
+    sunk = {name: _in_order_of_use(sink_layout(graph)) for name, graph in graphs.items()}
+    keys = {name: structural_key(graph) for name, graph in sunk.items()}
+    first = {keys[name]: name for name in reversed(sunk)}
+    exported = _export({name: sunk[name] for name in sorted(first.values())})
+    models = {}
+    for name, graph in graphs.items():
+        types = graph.types()
+        inputs, constants = list(sunk[name].inputs.items()), list(sunk[name].constants.items())
+        outputs = [(output, types[output]) for output in graph.outputs]
+        models[name] = name_model(exported[first[keys[name]]], name, inputs, constants, outputs)
+    return models
 
 
 def _in_order_of_use(graph: Graph) -> Graph:
@@ -125,25 +131,18 @@ def _canonical(graph: Graph) -> Graph:
     )
 
 
-def _export(graph: Graph, name: str) -> onnx.ModelProto:
-    """What torch's exporter makes of the graph, its inputs and then its constants as inputs."""
-    streams = torch.export.Dim("B", min=1)
-    values = {**graph.inputs, **graph.constants}
-    examples = tuple(_example(type_) for type_ in values.values())
-    dynamic = tuple(
-        {
-            axis: n.multiple * streams if n.multiple > 1 else streams
-            for axis, n in enumerate(t.shape)
-            if isinstance(n, Batch)
-        }
-        for t in values.values()
-    )
-    module = _build(graph)
+def _export(graphs: dict[str, Graph]) -> dict[str, onnx.ModelProto]:
+    """What torch's exporter makes of each graph, its inputs and then its constants as inputs.
+
+    The graphs go through the exporter side by side, as one module: most of what an export takes does not depend on
+    its size. If that fails they go one by one, so that the message can name the piece.
+    """
     try:
-        with _quiet(), torch.no_grad():
-            program = torch.export.export(module, examples, dynamic_shapes=dynamic, strict=False)
-            result = torch.onnx.export(program, (), dynamo=True, opset_version=OPSET, verbose=False)
+        joint = flatten_attention(_run_exporter(list(graphs.values())))
     except Exception as error:  # torch.export and the exporter raise whatever their machinery raises
+        if len(graphs) > 1:
+            return {name: _export({name: graph})[name] for name, graph in graphs.items()}
+        ((name, graph),) = graphs.items()
         operations = ", ".join(sorted({node.op for node in graph.nodes}))
         cause: BaseException = error
         while cause.__cause__ is not None:
@@ -152,21 +151,53 @@ def _export(graph: Graph, name: str) -> onnx.ModelProto:
             f"piece {name!r} could not be exported to ONNX opset {OPSET}: {str(cause).strip().splitlines()[0]}"
             f" Its operations are {operations}. Write the one that has no ONNX form as plain tensor code in the module."
         ) from error
+    inputs, outputs = iter(joint.graph.input), iter(joint.graph.output)
+    return {
+        name: only(joint, list(islice(inputs, len(g.inputs) + len(g.constants))), list(islice(outputs, len(g.outputs))))
+        for name, g in graphs.items()
+    }
+
+
+def _run_exporter(graphs: list[Graph]) -> onnx.ModelProto:
+    """One model of several graphs that have nothing in common but the file; each has a batch size of its own."""
+    examples: list[torch.Tensor] = []
+    dynamic: list[dict[int, Any]] = []
+    for i, graph in enumerate(graphs):
+        streams = torch.export.Dim(f"B{i}", min=1)
+        for type_ in (*graph.inputs.values(), *graph.constants.values()):
+            examples.append(_example(type_))
+            sizes = [(axis, n.multiple) for axis, n in enumerate(type_.shape) if isinstance(n, Batch)]
+            dynamic.append({axis: multiple * streams if multiple > 1 else streams for axis, multiple in sizes})
+    with _quiet(), torch.no_grad():
+        module, shapes = _build(graphs), tuple(dynamic)
+        program = torch.export.export(module, tuple(examples), dynamic_shapes=shapes, strict=False)
+        result = torch.onnx.export(program, (), dynamo=True, opset_version=OPSET, verbose=False)
     assert result is not None
-    return flatten_attention(result.model_proto)
+    return result.model_proto
 
 
 def _example(type_: TensorType) -> torch.Tensor:
     return torch.zeros(type_.at(EXAMPLE_STREAMS), dtype=getattr(torch, type_.dtype))
 
 
-def _build(graph: Graph) -> torch.fx.GraphModule:
-    """An fx module whose arguments are the graph's inputs and then its constants."""
-    types = graph.types()
+def _build(graphs: list[Graph]) -> torch.fx.GraphModule:
+    """An fx module whose arguments are each graph's inputs and then its constants, graph after graph."""
     fx_graph = torch.fx.Graph()
-    values: dict[str, torch.fx.Node] = {}
-    for name in (*graph.inputs, *graph.constants):
-        values[name] = fx_graph.placeholder(f"v{len(values)}")
+    arguments: list[dict[str, torch.fx.Node]] = []
+    for i, graph in enumerate(graphs):
+        names = (*graph.inputs, *graph.constants)
+        arguments.append({name: fx_graph.placeholder(f"g{i}v{j}") for j, name in enumerate(names)})
+    results: list[torch.fx.Node] = []
+    for graph, values in zip(graphs, arguments, strict=True):
+        _inline(graph, fx_graph, values)
+        results += [values[name] for name in graph.outputs]
+    fx_graph.output(tuple(results))
+    return torch.fx.GraphModule(torch.nn.Module(), fx_graph)
+
+
+def _inline(graph: Graph, fx_graph: torch.fx.Graph, values: dict[str, torch.fx.Node]) -> None:
+    """Append the nodes of a graph; ``values`` has its inputs and constants, and gets the results."""
+    types = graph.types()
     streams = _streams(graph, fx_graph, values)
 
     def convert(argument: Argument) -> Any:
@@ -182,8 +213,6 @@ def _build(graph: Graph) -> torch.fx.GraphModule:
     for node in graph.nodes:
         args = tuple(convert(a) for a in _without_symbols(node, types))
         values[node.name] = fx_graph.call_function(resolve_op(node), args, {k: convert(a) for k, a in node.kwargs})
-    fx_graph.output(tuple(values[name] for name in graph.outputs))
-    return torch.fx.GraphModule(torch.nn.Module(), fx_graph)
 
 
 def _streams(graph: Graph, fx_graph: torch.fx.Graph, values: dict[str, torch.fx.Node]) -> torch.fx.Node | int:

@@ -85,6 +85,26 @@ def name_model(exported: ModelProto, name: str, inputs: Values, constants: Value
     )
 
 
+def only(model: ModelProto, inputs: Sequence[ValueInfoProto], outputs: Sequence[ValueInfoProto]) -> ModelProto:
+    """The part of a model that computes ``outputs`` from ``inputs``; both are the model's own.
+
+    Raises:
+        LoweringError: the outputs depend on another input.
+    """
+    part = ModelProto()
+    part.CopyFrom(model)
+    nodes = _live(list(model.graph.node), {value.name for value in outputs})
+    own = {value.name for value in inputs}
+    foreign = {value.name for value in model.graph.input} - own
+    for node in nodes:
+        if crossed := foreign.intersection(node.input):
+            raise LoweringError(f"{node.op_type} {node.name!r} reads {sorted(crossed)}, the input of another piece.")
+    for field, kept in (("node", nodes), ("input", inputs), ("output", outputs)):
+        part.graph.ClearField(field)
+        getattr(part.graph, field).extend(kept)
+    return part
+
+
 def _live(nodes: Sequence[NodeProto], outputs: set[str]) -> list[NodeProto]:
     """The nodes that outputs depend on."""
     needed = set(outputs)

@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -165,7 +166,7 @@ def program() -> Program:
 
 
 def test_program(monkeypatch: pytest.MonkeyPatch) -> None:
-    exports: list[object] = []
+    exports: list[Any] = []
     original = torch.onnx.export
 
     def counting(*args: Any, **kwargs: Any) -> Any:
@@ -178,7 +179,9 @@ def test_program(monkeypatch: pytest.MonkeyPatch) -> None:
     assert pieces is not None
     models = lower_program(compiled)
     assert list(models) == ["condition", "stem", "block_00", "block_01", "block_02", "advance"]
-    assert len(exports) == 5  # block_02 is block_00 with other names
+    (export,) = exports  # of everything at once
+    linear = [node for node in export.graph.nodes if node.target is torch.ops.aten.linear.default]
+    assert len(linear) == 7  # stem, 2 in block_00, 2 in block_01, tail and stem; block_02 is block_00 with other names
     graphs = dict(zip(models, [pieces.condition, pieces.stem, *pieces.blocks], strict=False))
     graphs["advance"] = fuse_advance(pieces.tail, pieces.stem, compiled.spec)
     for name, graph in graphs.items():
@@ -208,6 +211,11 @@ def test_what_cannot_be_lowered() -> None:
     )
     with pytest.raises(LoweringError, match=r"piece 'block_03' could not be exported.*No ONNX function.*linalg_eigh"):
         lower_graph(Graph({"x": type_}, {}, nodes, ("z",)), "block_03")
+    broken = program()
+    assert broken.pieces is not None
+    broken = replace(broken, pieces=replace(broken.pieces, condition=Graph({"x": type_}, {}, nodes, ("z",))))
+    with pytest.raises(LoweringError, match=r"piece 'condition' could not be exported"):  # named among all pieces
+        lower_program(broken)
     with pytest.raises(LoweringError, match="twice"):
         lower_graph(Graph({"x": type_}, {}, (), ("x", "x")), "stem")
     with pytest.raises(LoweringError, match="no pieces"):
