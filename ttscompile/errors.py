@@ -55,5 +55,9 @@ class CalibrationError(TtscompileError):
     """Calibration cannot start, cannot resume, or did not reach its target."""
 
 
+class CalibrationFailedError(CalibrationError):
+    """Calibration ran, and its plan is not what was asked for; a failed check (exit status 1), not bad input."""
+
+
 class RuntimeUnavailableError(TtscompileError):
     """A runtime was asked for whose packages or providers are not installed."""

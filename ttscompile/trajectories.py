@@ -27,7 +27,17 @@ Array = npt.NDArray[Any]
 
 ENDS, META = "episode_ends", "meta"
 
-_UNREADABLE = (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error, lzma.LZMAError, NotImplementedError)
+_UNREADABLE = (
+    OSError,
+    EOFError,
+    ValueError,
+    KeyError,
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+    NotImplementedError,
+    MemoryError,
+)
 
 
 @dataclass(frozen=True)
@@ -124,10 +134,14 @@ def _open(path: Path) -> dict[str, Array]:
     if not path.is_file():
         raise TrajectoryError(f"{path}: expected an .npz file; found something else.")
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as handle:  # numpy leaves it open where it finds no archive
+            file = np.load(handle, allow_pickle=False)
             if not isinstance(file, np.lib.npyio.NpzFile):
-                raise TrajectoryError(f"{path}: expected an .npz with several arrays; found a single one. Use np.savez.")
-            return {name: np.asarray(file[name]) for name in file.files}
+                raise TrajectoryError(
+                    f"{path}: expected an .npz with several arrays; found a single one. Use np.savez."
+                )
+            with file:
+                return {name: np.asarray(file[name]) for name in file.files}
     except _UNREADABLE as error:
         raise TrajectoryError(
             f"{path}: cannot be read as .npz ({error}): no such file, truncated, or with Python objects in it, which"
@@ -181,9 +195,10 @@ def _checked(path: Path, key: str, array: Array, spec: ObservationSpec, frames: 
     if array.shape[1:] != shape:
         hint = ""
         if array.shape[1:] == spec.shape[1:] and not frames:
-            hint = ' If its rows are frames, say so: np.savez(..., meta=np.array(\'{"frames": true}\')).'
+            hint = " If its rows are frames, say so: np.savez(..., meta=np.array('{\"frames\": true}'))."
         raise TrajectoryError(
-            f"{path}: {key!r} has shape {list(array.shape)}; expected {what} = [.., {', '.join(map(str, shape))}].{hint}"
+            f"{path}: {key!r} has shape {list(array.shape)};"
+            f" expected {what} = [.., {', '.join(map(str, shape))}].{hint}"
         )
     wanted = np.dtype(spec.dtype)
     allowed = "fiu" if wanted.kind == "f" else wanted.kind if wanted.kind not in "iu" else "iu"
@@ -207,4 +222,5 @@ def _windows(frames: Array, length: int, stride: int) -> Array:
     At the start of an episode the first frame stands for those before it, as in Diffusion Policy's environments.
     """
     calls = np.arange(0, len(frames), stride)
-    return frames[np.maximum(calls[:, None] + np.arange(1 - length, 1), 0)]
+    windows: Array = frames[np.maximum(calls[:, None] + np.arange(1 - length, 1), 0)]
+    return windows

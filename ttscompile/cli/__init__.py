@@ -15,7 +15,7 @@ from ttscompile.cli.bench import bench
 from ttscompile.cli.calibrate import calibrate
 from ttscompile.cli.convert import convert
 from ttscompile.cli.inspect import inspect
-from ttscompile.errors import TtscompileError
+from ttscompile.errors import CalibrationFailedError, TtscompileError
 
 
 class _Commands(click.Group):
@@ -25,8 +25,9 @@ class _Commands(click.Group):
         try:
             return super().invoke(ctx)
         except TtscompileError as error:
-            click.echo(f"error: {error}", err=True)
-            ctx.exit(2)
+            failed_check = isinstance(error, CalibrationFailedError)
+            click.echo(f"{'failed' if failed_check else 'error'}: {error}", err=True)
+            ctx.exit(1 if failed_check else 2)
 
 
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})

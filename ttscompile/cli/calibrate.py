@@ -44,8 +44,21 @@ class _FilesCommand(click.Command):
     show_default=True,
     help="Share of the cells to reuse.",
 )
-@click.option("--strategy", type=click.Choice(["tts"]), default="tts", show_default=True, help="How to find the plan.")
+@click.option(
+    "--strategy",
+    type=click.Choice(["tts", "interval"]),
+    default="tts",
+    show_default=True,
+    help="tts learns; interval computes whole steps at even distances.",
+)
 @click.option("--seed", type=int, default=0, show_default=True, help="Of the split, the noise and the training.")
+@click.option(
+    "--max-minutes",
+    type=click.FloatRange(min=0, min_open=True),
+    default=15.0,
+    show_default=True,
+    help="Then the best plan so far is taken; also decides how many calls are used.",
+)
 @click.option("--resume", is_flag=True, help="Go on where a calibration that was interrupted stopped.")
 @json_option
 def calibrate(
@@ -54,6 +67,7 @@ def calibrate(
     target_sparsity: float,
     strategy: str,
     seed: int,
+    max_minutes: float,
     resume: bool,
     as_json: bool,
 ) -> None:
@@ -69,6 +83,7 @@ def calibrate(
             strategy=strategy,
             seed=seed,
             resume=resume,
+            max_minutes=max_minutes,
         )
     summary = document(directory)
     if as_json:

@@ -155,8 +155,16 @@ def _print_calibration(record: dict[str, Any] | None, console: Console) -> None:
     if record is None:
         console.print("Not calibrated: every call is dense. Run 'ttscompile calibrate' to give it a plan.")
         return
+    scores = table("held-out episodes", "mean action error", "90th percentile", "cells reused", "FLOPs saved")
+    for name, score in record.get("plans", {}).items():
+        errors = (f"{score[key]:.4g}" for key in ("error", "error_p90"))
+        scores.add_row(name, *errors, *(share(score[key]) for key in ("sparsity", "flops_saved")))
+    if scores.row_count:
+        console.print(scores)
     made = table("calibration", "")
     for name, value in record.items():
+        if name in ("plans", "sparsity", "flops_sparsity"):
+            continue  # told above
         if isinstance(value, list | dict) and len(str(value)) > 60:
             value = f"{len(value)} entries; see --json"
         made.add_row(name.replace("_", " "), f"{value:.4g}" if isinstance(value, float) else str(value))

@@ -1,0 +1,293 @@
+"""Calibration from end to end on a small policy: what it promises, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ttscompile
+from ttscompile.artifact.load import load_artifact
+from ttscompile.calibration import CalibrationResult, calibrate, strategies
+from ttscompile.calibration.calls import split_episodes
+from ttscompile.calibration.state import FILE, StateFile
+from ttscompile.calibration.strategies import tts
+from ttscompile.errors import ArtifactError, CalibrationError, CalibrationFailedError
+from ttscompile.lattice import Source, uniform_plan
+
+from . import policies
+
+INTERVALS = 6
+TARGET = 0.7
+
+
+def quick(artifact: Path, recording: Path, **changes: Any) -> CalibrationResult:
+    arguments: dict[str, Any] = {"target_sparsity": TARGET, "max_intervals": INTERVALS, "progress": False, **changes}
+    return calibrate(artifact, [recording], **arguments)
+
+
+@pytest.fixture(autouse=True)
+def short_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So few intervals that all phases are gone through."""
+    monkeypatch.setattr(tts, "SEARCH", 4)
+
+
+@pytest.fixture(scope="session")
+def calibrated(
+    compiled: Path, recording: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, CalibrationResult]:
+    """A calibrated artifact and the result; not to be changed."""
+    directory = tmp_path_factory.mktemp("calibrated") / "compiled"
+    shutil.copytree(compiled, directory)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tts, "SEARCH", 4)
+        return directory, quick(directory, recording, max_intervals=None)
+
+
+def contents(directory: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(directory.iterdir())}
+
+
+def test_the_plan_reaches_the_target_and_beats_the_uniform_schedule(calibrated: tuple[Path, CalibrationResult]) -> None:
+    directory, result = calibrated
+    artifact = load_artifact(directory)
+    steps, blocks = artifact.manifest.steps, len(artifact.manifest.blocks)
+    budget = int((1 - TARGET) * steps * blocks + 1e-6)
+    schedule = artifact.schedule("schedule")
+    assert np.count_nonzero(schedule == Source.COMPUTE) == budget
+    assert (schedule[0] == Source.COMPUTE).all()
+    np.testing.assert_array_equal(artifact.schedule("uniform"), uniform_plan(steps, blocks, 3))
+    assert result.sparsity >= TARGET
+    assert result.plans["uniform"].sparsity == pytest.approx(TARGET)
+    assert result.plans["schedule"].error < 0.7 * result.plans["uniform"].error
+    assert result.validation_error <= result.plans["schedule"].error
+    assert artifact.manifest.default_plan == result.default_plan
+
+
+def test_what_it_measured_is_what_the_artifact_does(
+    calibrated: tuple[Path, CalibrationResult], recording: Path
+) -> None:
+    """The errors again, through the public interface and onnxruntime; with other noise, so about the same."""
+    directory, result = calibrated
+    policy = ttscompile.load(directory)
+    with np.load(recording) as file:
+        rows, ends = file["obs"], [0, *file["episode_ends"]]
+    obs = {"obs": np.concatenate([rows[ends[i] : ends[i + 1]] for i in result.episodes["validation"]] * 8)}
+    draw = np.random.default_rng(5)
+    shape = (len(obs["obs"]), policies.HORIZON, policies.CHANNELS)
+    noise = ttscompile.Noise(
+        draw.standard_normal(shape, dtype=np.float32),
+        draw.standard_normal((policies.STEPS, *shape), dtype=np.float32),
+    )
+    actions = {}
+    for plan in ("dense", "schedule", "uniform"):
+        policy.reset()
+        actions[plan] = policy.predict_action(obs, noise=noise, plan=plan)["action"]
+    for plan in ("schedule", "uniform"):
+        error = np.abs(actions[plan] - actions["dense"]).mean()
+        assert error == pytest.approx(result.plans[plan].error, rel=0.35)
+
+
+def test_the_record_is_in_the_artifact(calibrated: tuple[Path, CalibrationResult]) -> None:
+    directory, result = calibrated
+    manifest = load_artifact(directory).manifest
+    assert manifest.calibration is not None
+    record = json.loads(json.dumps(dict(manifest.calibration)))
+    assert record["plans"]["schedule"]["error"] == pytest.approx(result.plans["schedule"].error)
+    assert record["sparsity"] == pytest.approx(result.sparsity)
+    assert record["stopped"] == result.stopped == "converged"
+    assert set(manifest.plans) == set(result.plans)
+    assert not (directory / FILE).exists()
+
+
+def test_the_same_seed_gives_the_same_bytes(
+    calibrated: tuple[Path, CalibrationResult], artifact: Path, recording: Path
+) -> None:
+    quick(artifact, recording, max_intervals=None)
+    assert contents(artifact) == contents(calibrated[0])
+
+
+def test_another_seed_gives_another_split(
+    calibrated: tuple[Path, CalibrationResult], artifact: Path, recording: Path
+) -> None:
+    other = quick(artifact, recording, max_intervals=1, seed=3)
+    assert other.episodes != calibrated[1].episodes
+
+
+class _Killed(Exception):
+    """Stands for a kill: nothing of the package catches it."""
+
+
+@pytest.mark.parametrize("saves", [1, 5, 7])  # during targets, search and adaptation
+def test_resuming_after_a_kill_ends_where_it_would_have_ended(
+    calibrated: tuple[Path, CalibrationResult],
+    artifact: Path,
+    recording: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    saves: int,
+) -> None:
+    save = StateFile.save
+    done = 0
+
+    def dying(self: StateFile) -> None:
+        nonlocal done
+        save(self)
+        done += 1
+        if done == saves:
+            raise _Killed
+
+    before = load_artifact(artifact).manifest.identity
+    with monkeypatch.context() as patch:
+        patch.setattr(StateFile, "save", dying)
+        with pytest.raises(_Killed):
+            quick(artifact, recording, max_intervals=None)
+    assert load_artifact(artifact).manifest.identity == before  # the artifact works as it did
+    counted = _count_targets(monkeypatch)
+    quick(artifact, recording, max_intervals=None, resume=True)
+    assert contents(artifact) == contents(calibrated[0])
+    assert counted() < 40  # some were known
+
+
+def _count_targets(monkeypatch: pytest.MonkeyPatch) -> Callable[[], int]:
+    from ttscompile.calibration.execute import Executor
+
+    count = 0
+    run_dense = Executor.run_dense
+
+    def counting(self: Executor, calls: Any) -> Any:
+        nonlocal count
+        count += calls.count
+        return run_dense(self, calls)
+
+    monkeypatch.setattr(Executor, "run_dense", counting)
+    return lambda: count
+
+
+def test_without_resume_it_begins_anew(
+    calibrated: tuple[Path, CalibrationResult], artifact: Path, recording: Path
+) -> None:
+    (artifact / FILE).write_bytes(b"left by something else")
+    quick(artifact, recording, max_intervals=None)
+    assert contents(artifact) == contents(calibrated[0])
+
+
+def test_a_damaged_state_is_refused(artifact: Path, recording: Path) -> None:
+    (artifact / FILE).write_bytes(b"no state")
+    with pytest.raises(CalibrationError, match="without --resume"):
+        quick(artifact, recording, resume=True)
+
+
+@pytest.mark.parametrize("change", [{"seed": 1}, {"target_sparsity": 0.6}, {"max_minutes": 2.5}])
+def test_a_state_of_other_settings_is_refused(
+    artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch, change: dict[str, Any]
+) -> None:
+    def dying(self: StateFile) -> None:
+        save(self)
+        raise _Killed
+
+    save = StateFile.save
+    with monkeypatch.context() as patch:
+        patch.setattr(StateFile, "save", dying)
+        with pytest.raises(_Killed):
+            quick(artifact, recording)
+    with pytest.raises(CalibrationError, match=r"other settings: \w+ was .*, now"):
+        quick(artifact, recording, resume=True, **change)
+
+
+def test_the_time_limit_ends_the_search_with_the_best_plan_so_far(artifact: Path, recording: Path) -> None:
+    result = quick(artifact, recording, max_intervals=None, max_minutes=1e-6)
+    assert result.stopped == "time limit"
+    assert result.intervals == 1
+    assert result.sparsity >= TARGET
+
+
+def test_the_interval_strategy_is_the_uniform_schedule(artifact: Path, recording: Path) -> None:
+    result = quick(artifact, recording, strategy="interval")
+    loaded = load_artifact(artifact)
+    np.testing.assert_array_equal(loaded.schedule("schedule"), loaded.schedule("uniform"))
+    assert result.default_plan == "schedule"
+    assert "tts" not in loaded.manifest.plans
+
+
+def test_no_better_than_uniform_is_a_failure_that_changes_nothing(
+    artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = contents(artifact)
+
+    class Useless(strategies.Interval):
+        def found(self) -> strategies.Found:
+            return strategies.Found(self.plan, None, {})
+
+    monkeypatch.setattr(strategies, "Interval", Useless)
+    with pytest.raises(CalibrationFailedError, match="no better than the uniform schedule"):
+        quick(artifact, recording, strategy="interval")
+    assert {n: c for n, c in contents(artifact).items() if n != FILE} == before
+
+
+@pytest.mark.parametrize("target", [0.95, 1.0, -0.1, float("nan")])
+def test_a_target_out_of_reach_is_refused(artifact: Path, recording: Path, target: float) -> None:
+    with pytest.raises(CalibrationError, match=r"at most 0\.9 of the 10 x 6 cells"):
+        quick(artifact, recording, target_sparsity=target)
+
+
+def test_the_highest_target_leaves_step_0(artifact: Path, recording: Path) -> None:
+    result = quick(artifact, recording, target_sparsity=0.9, strategy="interval")
+    assert result.sparsity == pytest.approx(0.9)
+
+
+@pytest.mark.parametrize("arguments", [{"validation_fraction": 0.0}, {"validation_fraction": 1.0}, {"max_minutes": 0}])
+def test_bad_settings_are_refused(artifact: Path, recording: Path, arguments: dict[str, Any]) -> None:
+    with pytest.raises(CalibrationError, match="between 0 and 1"):
+        quick(artifact, recording, **arguments)
+
+
+def test_an_unknown_strategy_is_refused_before_any_work(
+    artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counted = _count_targets(monkeypatch)
+    with pytest.raises(CalibrationError, match="'magic'; expected one of tts, interval"):
+        quick(artifact, recording, strategy="magic")
+    assert counted() == 0
+
+
+def test_one_episode_is_refused(artifact: Path, tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match="one episode; expected at least two"):
+        quick(artifact, policies.record(tmp_path / "one.npz", episodes=1))
+
+
+def test_two_short_episodes_are_enough(artifact: Path, tmp_path: Path) -> None:
+    draw = np.random.default_rng(0)
+    path = tmp_path / "short.npz"
+    np.savez(path, obs=draw.standard_normal((2, 2, 3)).astype(np.float32), episode_ends=[1, 2])
+    result = quick(artifact, path, strategy="interval")
+    assert result.calls == {"calibration": 1, "validation": 1}
+
+
+def test_constant_observations_are_fine(artifact: Path, tmp_path: Path) -> None:
+    path = tmp_path / "constant.npz"
+    np.savez(path, obs=np.ones((24, 2, 3), np.float32), episode_ends=[6, 12, 18, 24])
+    result = quick(artifact, path, max_intervals=None)
+    assert result.default_plan == "schedule"
+
+
+def test_not_an_artifact_is_refused(tmp_path: Path, recording: Path) -> None:
+    with pytest.raises(ArtifactError):
+        quick(tmp_path, recording)
+
+
+@pytest.mark.parametrize("count", [2, 3, 8, 100])
+@pytest.mark.parametrize("fraction", [0.01, 0.25, 0.99])
+def test_the_split_is_by_episode(count: int, fraction: float) -> None:
+    split = split_episodes(count, fraction, seed=0)
+    assert sorted(split.calibration + split.validation) == list(range(count))
+    assert split.calibration
+    assert split.validation
+    assert split == split_episodes(count, fraction, seed=0)
+    if count == 100:
+        assert split != split_episodes(count, fraction, seed=1)
+        assert len(split.validation) == round(100 * fraction)

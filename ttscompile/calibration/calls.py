@@ -1,0 +1,197 @@
+"""The calls that calibration works on: observation, noise, and what the dense policy answers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from ..config import PolicySpec
+from ..ir.graph import Graph
+from ..runtimes.reference import Contexts, ReferenceModel
+from ..trajectories import Episode
+
+IntArray = npt.NDArray[np.int64]
+FloatArray = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Split:
+    """Calls by episode: what plans are learned from, and what they are judged on.
+
+    Attributes:
+        calibration: numbers of the episodes to learn from.
+        validation: numbers of the episodes to judge on; none of them is in ``calibration``.
+    """
+
+    calibration: tuple[int, ...]
+    validation: tuple[int, ...]
+
+
+def split_episodes(count: int, fraction: float, seed: int) -> Split:
+    """Divide episodes at random.
+
+    Args:
+        count: number of episodes, at least two.
+        fraction: of them for validation; at least one, and at least one is left to learn from.
+        seed: of the division.
+    """
+    order = np.random.default_rng((seed, 0)).permutation(count)
+    held_out = min(max(round(count * fraction), 1), count - 1)
+    return Split(
+        calibration=tuple(sorted(int(i) for i in order[held_out:])),
+        validation=tuple(sorted(int(i) for i in order[:held_out])),
+    )
+
+
+@dataclass(frozen=True)
+class Calls:
+    """N calls, independent of each other.
+
+    Attributes:
+        contexts: what the loop reads beside the stream.
+        initial: the sample at step 0, ``[N, T, D]``.
+        noise: the draw used at each step, ``[K, N, T, D]``; None if the sampler is deterministic.
+        targets: the denoised sample of the dense policy with the same noise, ``[N, T, D]``; empty before it is known.
+        episodes: number of the episode that each call is from, ``[N]``.
+    """
+
+    contexts: Contexts
+    initial: Tensor
+    noise: Tensor | None
+    targets: Tensor
+    episodes: IntArray
+
+    @property
+    def count(self) -> int:
+        """N."""
+        return len(self.initial)
+
+
+def sample_calls(episodes: Sequence[Episode], numbers: Sequence[int], limit: int, seed: int) -> list[tuple[int, int]]:
+    """At most ``limit`` calls, drawn at random from some episodes: number of the episode, and row in it.
+
+    Args:
+        episodes: all of them.
+        numbers: which to draw from.
+        limit: number of calls.
+        seed: of the draw.
+    """
+    draw = np.random.default_rng((seed, 1, *numbers))
+    places = [(n, row) for n in numbers for row in range(episodes[n].calls)]
+    return [places[i] for i in draw.permutation(len(places))[:limit]]
+
+
+def prepare_calls(
+    model: ReferenceModel,
+    spec: PolicySpec,
+    episodes: Sequence[Episode],
+    chosen: Sequence[tuple[int, int]],
+    seed: tuple[int, ...],
+) -> Calls:
+    """Draw the noise of calls and run the prologue.
+
+    Args:
+        model: of the policy.
+        spec: of the policy.
+        episodes: all of them.
+        chosen: number of the episode, and row in it, of each call.
+        seed: of the noise.
+
+    Returns:
+        The calls, without targets.
+    """
+    draw = np.random.default_rng(seed)
+    shape = (len(chosen), *spec.sample)
+    initial = torch.from_numpy(draw.standard_normal(shape, dtype=np.float32))
+    noise = None
+    if spec.sampler.stochastic:
+        noise = torch.from_numpy(draw.standard_normal((spec.sampler.steps, *shape), dtype=np.float32))
+    normalized = {}
+    for key, one in spec.observations.items():
+        array = np.stack([episodes[n].observations[key][row] for n, row in chosen])
+        normalized[key] = torch.from_numpy(array if one.normalizer is None else one.normalizer.normalize(array))
+    with torch.no_grad():
+        contexts = model.prologue(normalized)
+    numbers = np.array([n for n, _ in chosen], np.int64)
+    return Calls(contexts, initial, noise, torch.empty(0, *spec.sample), numbers)
+
+
+class Selector:
+    """Takes streams out of what the loop reads, whatever the layout of the values.
+
+    Args:
+        graphs: the pieces whose outputs the loop reads: ``condition``, and ``step`` if there is one.
+    """
+
+    def __init__(self, graphs: Iterable[Graph]) -> None:
+        self._axes = {name: graph.types()[name].batch_axis for graph in graphs for name in graph.outputs}
+
+    def contexts(self, contexts: Contexts, streams: Sequence[int] | IntArray) -> Contexts:
+        """Contexts of these streams, in this order; a stream may be taken several times."""
+        index = torch.as_tensor(np.asarray(streams, dtype=np.int64))
+        first, *_ = contexts.steps
+        steps = tuple(self._take(row, index) for row in contexts.steps) if first else contexts.steps
+        return Contexts(len(index), self._take(contexts.condition, index), steps)
+
+    def calls(self, calls: Calls, streams: Sequence[int] | IntArray) -> Calls:
+        """These calls, in this order; a call may be taken several times."""
+        index = torch.as_tensor(np.asarray(streams, dtype=np.int64))
+        return Calls(
+            contexts=self.contexts(calls.contexts, streams),
+            initial=calls.initial[index],
+            noise=None if calls.noise is None else calls.noise[:, index],
+            targets=calls.targets[index] if len(calls.targets) else calls.targets,
+            episodes=calls.episodes[index.numpy()],
+        )
+
+    def _take(self, values: Mapping[str, Tensor], index: Tensor) -> dict[str, Tensor]:
+        taken = {}
+        for name, value in values.items():
+            axis = self._axes[name]
+            taken[name] = value if axis is None else value.index_select(axis, index)
+        return taken
+
+
+class Actions:
+    """From denoised samples to what is executed, and how far two of them are apart.
+
+    Args:
+        spec: of the policy.
+
+    Attributes:
+        size: number of executed action numbers of a call.
+    """
+
+    def __init__(self, spec: PolicySpec) -> None:
+        self._chunk = spec.chunk
+        self.size = (spec.chunk.stop - spec.chunk.start) * spec.chunk.action_dim
+        scale = np.ones(spec.chunk.action_dim, np.float32)
+        if spec.chunk.normalizer is not None:
+            scale = np.abs(spec.chunk.normalizer.scale)
+        self._scale = torch.from_numpy(np.array(scale))
+
+    def executed(self, samples: Tensor) -> Tensor:
+        """The executed part of samples ``[..., T, D]`` as ``[..., size]``, as the network has it: normalised."""
+        part = samples[..., self._chunk.start : self._chunk.stop, : self._chunk.action_dim]
+        return part.reshape(*part.shape[:-2], self.size)
+
+    def errors(self, samples: Tensor, targets: Tensor, units: bool) -> FloatArray:
+        """Mean absolute difference of the executed actions of each call.
+
+        Args:
+            samples: ``[..., N, T, D]``.
+            targets: ``[N, T, D]``.
+            units: in the units of the actions, rather than normalised.
+
+        Returns:
+            ``[..., N]``.
+        """
+        difference = (self.executed(samples) - self.executed(targets)).abs()
+        if units:
+            difference = (difference.reshape(*difference.shape[:-1], -1, len(self._scale)) / self._scale).flatten(-2)
+        return np.asarray(difference.mean(-1).numpy(), dtype=np.float32)

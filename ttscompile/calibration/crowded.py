@@ -1,0 +1,38 @@
+"""Where a search starts: whole steps, crowded where the policy needs them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..lattice import PlanArray, Source
+
+CROWDING = (0.4, 0.6, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0)
+"""1 is even, above it the steps crowd towards the end, below it towards the start."""
+
+
+def crowded_plan(steps: int, blocks: int, full_steps: int, crowding: float) -> PlanArray:
+    """Every block computed at ``full_steps`` steps, TIMESTEP elsewhere.
+
+    Args:
+        steps: K.
+        blocks: number of blocks.
+        full_steps: how many steps are computed; step 0 is one of them.
+        crowding: the i-th of m is at ``K * (1 - (1 - i/m) ** crowding)``.
+
+    Returns:
+        int8 ``[K, blocks]``.
+    """
+    plan = np.full((steps, blocks), Source.TIMESTEP, dtype=np.int8)
+    wished = steps * (1 - (1 - np.arange(full_steps) / full_steps) ** crowding)
+    chosen: list[int] = []
+    for i, wish in enumerate(wished):  # distinct, in order, and leaving room for those that follow
+        earliest = chosen[-1] + 1 if chosen else 0
+        chosen.append(int(np.clip(np.floor(wish), earliest, steps - full_steps + i)))
+    plan[chosen] = Source.COMPUTE
+    return plan
+
+
+def crowded_plans(steps: int, blocks: int, full_steps: int) -> list[PlanArray]:
+    """The different plans of all ``CROWDING``."""
+    plans = [crowded_plan(steps, blocks, full_steps, crowding) for crowding in CROWDING]
+    return list({plan.tobytes(): plan for plan in plans}.values())

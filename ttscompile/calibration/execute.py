@@ -1,0 +1,219 @@
+"""Many plans at once: the meaning of the reference runtime for calls that are independent of each other.
+
+A search tries thousands of plans, most of them alike. So plans go through the loop together, in one batch of
+``plans x calls`` streams; a step in which no plan computes anything costs one addition; and what plans have in common
+with a plan that was executed before is taken from there. No plan here reads the rollout cache: what one call leaves
+for the next is the reference runtime's business. Tests hold this against ``ReferenceModel.rollout``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from ..artifact.load import Artifact
+from ..errors import IllegalPlanError
+from ..lattice import BoolArray, PlanArray, Source
+from ..runtimes.reference import ReferenceModel
+from .calls import Calls, Selector
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """The loop before a step: the sample and both caches, for all streams."""
+
+    sample: Tensor
+    forward: dict[int, Tensor]
+    timestep: tuple[Tensor | None, ...]
+
+
+class Executor:
+    """Runs plans without gradients.
+
+    Args:
+        artifact: the policy.
+        streams: how many streams go through the loop at once, about.
+
+    Attributes:
+        model: of the policy.
+        selector: takes calls apart.
+        types: of each block's residual.
+        axes: of the streams in each block's residual.
+        alike: whether all blocks have residuals of one type.
+        pruner_graph: the pruner; None if the artifact has none.
+    """
+
+    def __init__(self, artifact: Artifact, streams: int = 256) -> None:
+        blocks = artifact.manifest.blocks
+        self.model = ReferenceModel.from_artifact(artifact)
+        self.selector = Selector(graph for name, graph in artifact.graphs.items() if name in ("condition", "step"))
+        self.types = [block.type for block in blocks]
+        self.axes = [block.type.batch_axis or 0 for block in blocks]
+        self._group_axes = {block.group: block.type.batch_axis or 0 for block in blocks}
+        self.alike = len({block.type for block in blocks}) == 1
+        self.pruner_graph = artifact.graphs.get("pruner")
+        self._streams = streams
+
+    def run(self, plans: Sequence[PlanArray] | PlanArray, calls: Calls, base: PlanArray | None = None) -> Tensor:
+        """The denoised samples of every plan on every call.
+
+        Args:
+            plans: ``[C, K, blocks]``, legal without a rollout cache.
+            calls: N of them.
+            base: a plan that the others resemble: the steps before their first difference are executed once.
+
+        Returns:
+            ``[C, N, T, D]``.
+
+        Raises:
+            IllegalPlanError: a plan reads the rollout cache, or step 0 is not dense.
+        """
+        stacked = np.stack(list(plans))
+        self._check(stacked)
+        results: list[Tensor | None] = [None] * len(stacked)
+        differs = np.full(len(stacked), 0)
+        if base is not None:
+            changed = (stacked != base).any(-1)
+            differs = np.where(changed.any(1), changed.argmax(1), len(base) - 1)
+        order = np.argsort(differs, kind="stable")
+        rows = max(1, self._streams // calls.count)
+        groups = [order[i : i + rows] for i in range(0, len(order), rows)]
+        with torch.no_grad():
+            starts = {int(differs[group[0]]) for group in groups} - {0}
+            snapshots: dict[int, Snapshot] = {}
+            if base is not None and starts:
+                self._loop(base[None], calls, 0, None, snapshots, starts, max(starts) + 1)
+            for group in groups:
+                start = int(differs[group[0]])
+                many = self.selector.calls(calls, np.tile(np.arange(calls.count), len(group)))
+                samples = self._loop(stacked[group], many, start, snapshots.get(start), {})
+                for i, sample in zip(group, samples.reshape(len(group), calls.count, *samples.shape[1:]), strict=True):
+                    results[i] = sample
+        return torch.stack([sample for sample in results if sample is not None])
+
+    def run_each(self, plans: PlanArray, calls: Calls) -> Tensor:
+        """The denoised sample of every call with a plan of its own.
+
+        Args:
+            plans: ``[N, K, blocks]``, legal without a rollout cache.
+            calls: N of them.
+
+        Returns:
+            ``[N, T, D]``.
+
+        Raises:
+            IllegalPlanError: see ``run``.
+        """
+        self._check(plans)
+        parts = [np.arange(i, min(i + self._streams, len(plans))) for i in range(0, len(plans), self._streams)]
+        with torch.no_grad():
+            return torch.cat([self._loop(plans[p], self.selector.calls(calls, p), 0, None, {}) for p in parts])
+
+    def run_dense(self, calls: Calls) -> Tensor:
+        """What the dense policy answers, ``[N, T, D]``."""
+        return self.run(np.zeros((1, self.model.steps, self.model.blocks), np.int8), calls)[0]
+
+    def logits(self, calls: Calls, weights: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[np.float32]:
+        """What the pruner says with these constants, ``[N, K, blocks, 4]``."""
+        tensors = {name: torch.from_numpy(np.array(value)) for name, value in weights.items()}
+        with torch.no_grad():
+            return np.asarray(self.model.logits(calls.contexts, tensors).numpy(), dtype=np.float32)
+
+    @staticmethod
+    def _check(plans: PlanArray) -> None:
+        if (plans == Source.ROLLOUT).any() or (plans[:, 0] != Source.COMPUTE).any():
+            raise IllegalPlanError("expected plans with a dense step 0 that read nothing of an earlier call.")
+
+    def _loop(
+        self,
+        plans: PlanArray,
+        calls: Calls,
+        start: int,
+        snapshot: Snapshot | None,
+        taken: dict[int, Snapshot],
+        take: Collection[int] = (),
+        stop: int | None = None,
+    ) -> Tensor:
+        """Steps ``start`` to ``stop`` of streams, plan by plan; fills ``taken`` before the steps ``take``."""
+        state = _State(calls, len(plans), snapshot, self.axes, self._group_axes)
+        sample = state.sample
+        total: Tensor | None = None  # what all blocks add together, as long as nothing is computed
+        previous: PlanArray | None = None
+        for k in range(start, self.model.steps if stop is None else stop):
+            if k in take:
+                taken[k] = Snapshot(sample, dict(state.forward), tuple(state.timestep))
+            row = plans[:, k]
+            stem = self.model.stem(sample, k, calls.contexts)
+            if total is not None and previous is not None and np.array_equal(row, previous):
+                stream = stem + total
+            else:
+                stream = self._step(row, k, stem, calls, state)
+                computes = bool((row == Source.COMPUTE).any())
+                total = None if computes or not self.alike else stream - stem
+                previous = None if computes else row
+            prediction = self.model.tail(stream, k, calls.contexts)
+            sample = self.model.advance(sample, prediction, None if calls.noise is None else calls.noise[k], k)
+        return sample
+
+    def _step(self, row: PlanArray, k: int, stream: Tensor, calls: Calls, state: _State) -> Tensor:
+        """All blocks of one step, where ``row [C, blocks]`` says what each plan does."""
+        for b, axis in enumerate(self.axes):
+            group, column = self.model.groups[b], row[:, b]
+            computing, forwarding = column == Source.COMPUTE, column == Source.FORWARD
+            if computing.all():
+                residual = self.model.block(b, k, stream, calls.contexts)
+                state.timestep[b] = state.forward[group] = residual
+            else:
+                residual = state.reused(b, group, forwarding, axis)
+                if computing.any():
+                    streams = state.streams(computing)
+                    part = self.model.block(b, k, stream, calls.contexts, streams.tolist())
+                    residual = residual.index_copy(axis, streams, part)
+                    state.write(b, group, axis, streams, part)
+            stream = stream + residual
+        return stream
+
+
+class _State:
+    """Sample and caches of ``plans x calls`` streams."""
+
+    def __init__(
+        self, calls: Calls, plans: int, snapshot: Snapshot | None, axes: list[int], group_axes: dict[int, int]
+    ) -> None:
+        self._plans, self._each = plans, calls.count // plans
+        self.forward: dict[int, Tensor] = {}
+        self.timestep: list[Tensor | None] = [None] * len(axes)
+        self.sample = calls.initial
+        if snapshot is not None:
+            self.sample = torch.cat([snapshot.sample] * plans)
+            pairs = zip(snapshot.timestep, axes, strict=True)
+            self.timestep = [None if t is None else torch.cat([t] * plans, axis) for t, axis in pairs]
+            self.forward = {g: torch.cat([t] * plans, group_axes[g]) for g, t in snapshot.forward.items()}
+
+    def streams(self, plans: BoolArray) -> Tensor:
+        """Numbers of the streams of these plans."""
+        return torch.from_numpy(np.flatnonzero(np.repeat(plans, self._each)))
+
+    def reused(self, b: int, group: int, forwarding: BoolArray, axis: int) -> Tensor:
+        """What block b adds where it is not computed."""
+        own, other = self.timestep[b], self.forward[group]
+        assert own is not None  # step 0 is dense
+        if not forwarding.any():
+            return own
+        if forwarding.all():
+            return other
+        streams = self.streams(forwarding)
+        return own.index_copy(axis, streams, other.index_select(axis, streams))
+
+    def write(self, b: int, group: int, axis: int, streams: Tensor, residual: Tensor) -> None:
+        """Put computed residuals of some streams into the caches."""
+        own = self.timestep[b]
+        assert own is not None
+        self.timestep[b] = own.index_copy(axis, streams, residual)
+        self.forward[group] = self.forward[group].index_copy(axis, streams, residual)

@@ -1,0 +1,79 @@
+"""How good plans are on calls that they were not learned from, and whether that is good enough."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..artifact.load import Artifact
+from ..errors import CalibrationFailedError
+from ..lattice import PlanArray, uniform_plan
+from ..runtimes.base import pruner_plan
+from .calls import Actions, Calls
+from .execute import Executor
+from .result import CalibrationResult, PlanScore
+from .strategies import Found
+
+PRUNED, SCHEDULE, UNIFORM = "tts", "schedule", "uniform"
+"""Names of plans in the artifact: the pruner's, the best that does not depend on the observation, and the baseline."""
+
+BETTER = 0.9
+"""A plan has to bring the error below this share of the uniform schedule's."""
+
+
+def uniform_of(artifact: Artifact, budget: int) -> PlanArray:
+    """The baseline: whole steps, evenly spaced; the last cells of the budget are rounded up to one, in its favour."""
+    manifest = artifact.manifest
+    blocks = len(manifest.blocks)
+    return uniform_plan(manifest.steps, blocks, -(-budget // blocks))
+
+
+def judge(artifact: Artifact, executor: Executor, found: Found, calls: Calls, budget: int) -> dict[str, PlanScore]:
+    """Scores of the plans that a strategy found and of the baseline.
+
+    Args:
+        artifact: the policy.
+        executor: of the policy.
+        found: by the strategy.
+        calls: of episodes that it did not learn from, with targets.
+        budget: computed cells.
+
+    Returns:
+        By the name of the plan.
+    """
+    manifest, actions = artifact.manifest, Actions(artifact.manifest.spec)
+    scores = {}
+    for name, plan in ((SCHEDULE, found.schedule), (UNIFORM, uniform_of(artifact, budget))):
+        errors = actions.errors(executor.run([plan], calls)[0], calls.targets, units=True)
+        scores[name] = PlanScore.of(errors, plan[None], manifest.flops, pruned=False)
+    if found.pruner is not None:
+        plans = pruner_plan(executor.logits(calls, found.pruner))
+        errors = actions.errors(executor.run_each(plans, calls), calls.targets, units=True)
+        scores[PRUNED] = PlanScore.of(errors, plans, manifest.flops, pruned=True)
+    return scores
+
+
+def require_success(result: CalibrationResult, is_baseline: bool) -> None:
+    """Raise unless the default plan is what was asked for.
+
+    Args:
+        result: of the calibration.
+        is_baseline: the strategy is the baseline, and need not be better than it.
+
+    Raises:
+        CalibrationFailedError: says which of its promises it breaks.
+    """
+    chosen, baseline = result.plans[result.default_plan], result.plans[UNIFORM]
+    what = f"plan {result.default_plan!r} of strategy {result.strategy!r}"
+    if not np.isfinite(chosen.error):
+        raise CalibrationFailedError(f"the actions of {what} are not numbers. The artifact is as it was.")
+    if chosen.sparsity < result.target_sparsity - 1e-9:
+        raise CalibrationFailedError(
+            f"{what} reaches a sparsity of {chosen.sparsity:.4f} on the validation calls; the target is"
+            f" {result.target_sparsity:g}. The artifact is as it was. Calibrate with more episodes or more time."
+        )
+    if not is_baseline and not chosen.error < BETTER * baseline.error:
+        raise CalibrationFailedError(
+            f"{what} is no better than the uniform schedule: on the validation calls its actions are {chosen.error:.4g}"
+            f" off on average, the uniform schedule's {baseline.error:.4g} (expected below {BETTER:.0%} of that). The"
+            " artifact is as it was. Calibrate with more episodes or more time, or lower the target."
+        )

@@ -1,0 +1,46 @@
+"""The progress bar of a calibration, on standard error."""
+
+from __future__ import annotations
+
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+
+class Bar:
+    """One line: what is being done, how far it is, error, sparsity and time left. A context manager.
+
+    Args:
+        shown: False for silence.
+    """
+
+    def __init__(self, shown: bool) -> None:
+        columns = (
+            TextColumn("{task.description:<22}"),
+            BarColumn(bar_width=24),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[note]}"),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[left]}"),
+        )
+        self._progress = Progress(*columns, console=Console(stderr=True), disable=not shown)
+        self._task = self._progress.add_task("", total=None, note="", left="")
+
+    def __enter__(self) -> Bar:
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._progress.stop()
+
+    def stage(self, what: str, total: int, done: int = 0) -> None:
+        """Begin something of ``total`` parts, ``done`` of which were done before."""
+        self._progress.update(self._task, description=what, total=total, completed=done, note="", left="")
+
+    def update(self, done: int, note: str, seconds_left: float | None) -> None:
+        """Say how far it is."""
+        left = "" if seconds_left is None else f"at most {max(seconds_left, 0) / 60:.1f} min left"
+        self._progress.update(self._task, completed=done, note=note, left=left)

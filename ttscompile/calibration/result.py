@@ -1,0 +1,104 @@
+"""What a calibration achieved, on episodes that it did not learn from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from ..artifact.manifest import FlopsRecord
+from ..lattice import PlanArray, plan_flops, sparsity
+from .calls import FloatArray
+
+
+@dataclass(frozen=True)
+class PlanScore:
+    """One plan on the validation calls.
+
+    Attributes:
+        error: mean absolute difference between its executed actions and those of the dense policy with the same
+            noise, in the units of the actions.
+        error_p90: 90th percentile over the calls.
+        sparsity: share of the cells that are reused, mean over the calls.
+        flops_sparsity: the same with each cell weighed by its FLOPs.
+        flops_saved: share of the FLOPs of a dense call of the policy as it was that are saved; prologue, stem, tail and
+            (where it runs) pruner are counted.
+    """
+
+    error: float
+    error_p90: float
+    sparsity: float
+    flops_sparsity: float
+    flops_saved: float
+
+    @classmethod
+    def of(cls, errors: FloatArray, plans: PlanArray, flops: FlopsRecord, pruned: bool) -> PlanScore:
+        """From the error of each call and its plan.
+
+        Args:
+            errors: ``[N]``.
+            plans: ``[N, K, blocks]``, or ``[1, K, blocks]`` for all calls.
+            flops: of the policy.
+            pruned: whether the pruner makes the plan.
+        """
+        total = plans.shape[1] * sum(flops.blocks)
+        return cls(
+            error=float(errors.mean()),
+            error_p90=float(np.quantile(errors, 0.9)),
+            sparsity=sparsity(plans),
+            flops_sparsity=1 - float(np.mean([plan_flops(plan, flops.blocks) for plan in plans])) / total,
+            flops_saved=1 - float(np.mean([flops.call(plan, pruned) for plan in plans])) / flops.dense,
+        )
+
+
+@dataclass(frozen=True)
+class CalibrationResult:
+    """The outcome of a calibration.
+
+    Attributes:
+        strategy: how the plan was found.
+        seed: of everything random.
+        target_sparsity: what was asked for.
+        default_plan: the plan that the artifact now uses; a key of ``plans``.
+        plans: every plan that was judged, by name; ``uniform`` is the baseline that computes as much.
+        episodes: numbers of the episodes in the order of the files, learned from and judged on.
+        calls: how many calls of these were used.
+        intervals: how many intervals the search took.
+        stopped: why it ended: ``converged``, ``finished`` or ``time limit``.
+        seconds: of work, the parts before an interruption included.
+    """
+
+    strategy: str
+    seed: int
+    target_sparsity: float
+    default_plan: str
+    plans: Mapping[str, PlanScore]
+    episodes: Mapping[str, tuple[int, ...]]
+    calls: Mapping[str, int]
+    intervals: int
+    stopped: str
+    seconds: float
+
+    @property
+    def sparsity(self) -> float:
+        """Of the default plan."""
+        return self.plans[self.default_plan].sparsity
+
+    @property
+    def flops_sparsity(self) -> float:
+        """Of the default plan."""
+        return self.plans[self.default_plan].flops_sparsity
+
+    @property
+    def validation_error(self) -> float:
+        """Of the default plan, in the units of the actions."""
+        return self.plans[self.default_plan].error
+
+    def record(self) -> dict[str, Any]:
+        """As JSON, for the artifact. Without the time it took: the same calibration gives the same bytes."""
+        record = asdict(self)
+        del record["seconds"]
+        record["episodes"] = {name: list(numbers) for name, numbers in self.episodes.items()}
+        return {**record, "sparsity": self.sparsity, "flops_sparsity": self.flops_sparsity}

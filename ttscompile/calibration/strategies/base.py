@@ -1,0 +1,101 @@
+"""What a strategy is given, what it gives, and how it can be interrupted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from ...lattice import PlanArray
+from ..calls import Actions, Calls
+from ..execute import Executor
+
+Array = npt.NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Task:
+    """What to find a plan for.
+
+    Attributes:
+        executor: runs plans.
+        actions: which part of the sample counts.
+        calls: to learn from, with targets; never those that the plan is judged on.
+        budget: cells that a plan may compute, step 0 included.
+        seed: of all that is random.
+        pruner: constants of the pruner by name; empty if the artifact has none.
+    """
+
+    executor: Executor
+    actions: Actions
+    calls: Calls
+    budget: int
+    seed: int
+    pruner: Mapping[str, Array]
+
+    def draw(self, *stage: int) -> np.random.Generator:
+        """Random numbers that belong to a stage, whatever was drawn before: so that going on equals not stopping."""
+        return np.random.default_rng((self.seed, 3, *stage))
+
+
+@dataclass(frozen=True)
+class Found:
+    """The outcome of a strategy.
+
+    Attributes:
+        schedule: int8 ``[K, blocks]``, within the budget.
+        pruner: all constants of the pruner, by name, for plans that depend on the observation; None for none.
+        notes: what is worth keeping about how it was found; JSON.
+        is_baseline: it is no better than the uniform schedule, and need not be.
+    """
+
+    schedule: PlanArray
+    pruner: Mapping[str, Array] | None
+    notes: Mapping[str, Any]
+    is_baseline: bool = False
+
+
+class Strategy(Protocol):
+    """A search in intervals. What it knows between two of them is ``state``: it can be stopped there and go on later.
+
+    Attributes:
+        intervals: how many there are at most.
+        closing: how many are still to be done after ``close``.
+    """
+
+    intervals: int
+    closing: int
+
+    def advance(self, interval: int) -> None:
+        """Do interval number ``interval``, of ``intervals``; they are done in order."""
+
+    def close(self) -> None:
+        """The time is running out: do what is still to be done at the end, and be done."""
+
+    @property
+    def done(self) -> bool:
+        """Whether further intervals would change nothing."""
+
+    @property
+    def loss(self) -> float:
+        """Error of the best plan so far, normalised; NaN before any."""
+
+    @property
+    def plan(self) -> PlanArray:
+        """The best schedule so far."""
+
+    def state(self) -> dict[str, Array]:
+        """Everything that ``restore`` needs."""
+
+    def restore(self, state: Mapping[str, Array]) -> None:
+        """Go back to where ``state`` was taken.
+
+        Raises:
+            KeyError: not the state of this strategy.
+        """
+
+    def found(self) -> Found:
+        """The outcome."""
