@@ -1,0 +1,172 @@
+"""Evaluate policies on numbered seeds of Push-T, all on the same initial states and with the same noise.
+
+    python examples/pusht/evaluate.py build/pusht/compiled:dense build/pusht/compiled --episodes 48
+
+The score of an episode is the original's reward: the best coverage of the goal, divided by the 0.95 that counts as
+success, at most 1. Differences are taken episode by episode, against the first variant.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import click
+import numpy as np
+from bootstrap import Estimate, estimate, paired_difference
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+from rollout import Rollout, run_episodes
+from variants import Variant, first_seed_option, open_variant, results_console, runtime_option, threads_option
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Figures of one variant.
+
+    Attributes:
+        label: of the variant.
+        score: best coverage / 0.95, at most 1.
+        coverage: best coverage as it is.
+        success: share of the episodes that covered more than 0.95.
+        score_difference: against the first variant; None for the first itself.
+        success_difference: likewise.
+        sparsity: share of the cells that were reused, mean of all calls; None when the policy makes no reports.
+        flops: mean of all calls; likewise.
+        legalised: cells that had to be replaced, in all calls together.
+        rollout: the episodes.
+    """
+
+    label: str
+    score: Estimate
+    coverage: Estimate
+    success: Estimate
+    score_difference: Estimate | None
+    success_difference: Estimate | None
+    sparsity: float | None
+    flops: float | None
+    legalised: int
+    rollout: Rollout
+
+    def to_json(self) -> dict[str, Any]:
+        """The figures, and the score of every seed."""
+        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "rollout"}
+        figures = {k: dataclasses.asdict(v) if isinstance(v, Estimate) else v for k, v in fields.items()}
+        episodes = [
+            {"seed": e.seed, "score": e.score, "best_coverage": e.best_coverage, "calls": len(e.windows)}
+            for e in self.rollout.episodes
+        ]
+        return figures | {"episodes": episodes}
+
+
+def evaluate(
+    variants: Sequence[Variant],
+    seeds: Sequence[int],
+    batch: int,
+    on_done: Callable[[str, int], None] | None = None,
+) -> list[Evaluation]:
+    """Run every variant on every seed.
+
+    Args:
+        variants: the first is the baseline.
+        seeds: one an episode.
+        batch: episodes in lockstep.
+        on_done: told the variant's label and its number of finished episodes.
+
+    Returns:
+        One evaluation a variant.
+    """
+    rollouts = []
+    for variant in variants:
+
+        def finished(episodes: int, label: str = variant.label) -> None:
+            if on_done is not None:
+                on_done(label, episodes)
+
+        rollouts.append(run_episodes(variant.policy, seeds, variant.noise, batch, variant.plan, finished))
+    return [summarise(variant.label, rollout, rollouts[0]) for variant, rollout in zip(variants, rollouts, strict=True)]
+
+
+def summarise(label: str, rollout: Rollout, baseline: Rollout) -> Evaluation:
+    """Figures of one variant's episodes, and their differences from the baseline's on the same seeds."""
+    if [e.seed for e in rollout.episodes] != [e.seed for e in baseline.episodes]:
+        raise ValueError(f"{label} ran other seeds than the baseline: their episodes are not paired.")
+    score, coverage, success = _columns(rollout)
+    base_score, _, base_success = _columns(baseline)
+    first = rollout is baseline
+    return Evaluation(
+        label=label,
+        score=estimate(score),
+        coverage=estimate(coverage),
+        success=estimate(success),
+        score_difference=None if first else paired_difference(score, base_score),
+        success_difference=None if first else paired_difference(success, base_success),
+        sparsity=float(np.mean(rollout.sparsity)) if rollout.sparsity else None,
+        flops=float(np.mean(rollout.flops)) if rollout.flops else None,
+        legalised=sum(rollout.legalised),
+        rollout=rollout,
+    )
+
+
+def _columns(rollout: Rollout) -> tuple[list[float], list[float], list[float]]:
+    episodes = rollout.episodes
+    return [e.score for e in episodes], [e.best_coverage for e in episodes], [float(e.success) for e in episodes]
+
+
+def evaluation_table(evaluations: Sequence[Evaluation], seeds: Sequence[int]) -> Table:
+    """The figures as a table, with 95 % intervals."""
+    table = Table(title=f"Push-T, {len(seeds)} episodes, seeds {seeds[0]}..{seeds[-1]}, mean and 95 % interval")
+    table.add_column("variant")
+    for column in ("score", "best coverage", "success", "score, difference", "success, difference", "sparsity"):
+        table.add_column(column, justify="right")
+    for e in evaluations:
+        table.add_row(
+            e.label,
+            str(e.score),
+            f"{e.coverage.mean:.3f}",
+            str(e.success),
+            "" if e.score_difference is None else str(e.score_difference),
+            "" if e.success_difference is None else str(e.success_difference),
+            "" if e.sparsity is None else f"{e.sparsity:.1%}",
+        )
+    return table
+
+
+@click.command()
+@click.argument("variants", nargs=-1, required=True, metavar="DIR[:PLAN]...")
+@click.option("--episodes", default=48, show_default=True, type=click.IntRange(1))
+@first_seed_option
+@click.option("--batch", default=16, show_default=True, type=click.IntRange(1), help="Episodes in lockstep.")
+@runtime_option
+@threads_option
+@click.option("--json", "as_json", is_flag=True, help="One JSON document instead of a table.")
+def main(
+    variants: tuple[str, ...],
+    episodes: int,
+    first_seed: int,
+    batch: int,
+    runtime: str,
+    threads: int,
+    as_json: bool,
+) -> None:
+    """Compare artifacts and plans: DIR takes the artifact's own plan, DIR:dense computes everything."""
+    opened = [open_variant(text, runtime, threads) for text in variants]
+    seeds = range(first_seed, first_seed + episodes)
+    with Progress(console=Console(stderr=True)) as progress:
+        tasks = {v.label: progress.add_task(v.label, total=episodes) for v in opened}
+        evaluations = evaluate(opened, seeds, batch, lambda label, n: progress.update(tasks[label], completed=n))
+    if as_json:
+        click.echo(json.dumps([e.to_json() for e in evaluations], indent=2))
+    else:
+        results_console().print(evaluation_table(evaluations, seeds))
+    for e in evaluations:
+        if e.legalised:
+            click.echo(f"warning: {e.label}: {e.legalised} cells of its plans were illegal and were replaced", err=True)
+
+
+if __name__ == "__main__":
+    main()

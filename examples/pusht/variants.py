@@ -1,0 +1,64 @@
+"""Policies as the command line names them: ``DIR`` or ``DIR:PLAN``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import click
+from rich.console import Console
+from rollout import NoiseShape, Policy
+
+import ttscompile
+from ttscompile.runtimes.policy import PolicyInfo
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way to drive the robot.
+
+    Attributes:
+        label: for tables.
+        policy: a policy of its own; its caches are shared with no other variant.
+        plan: as in ``predict_action``; None for the policy's default.
+        noise: sizes of the policy's noise.
+    """
+
+    label: str
+    policy: Policy
+    plan: str | None
+    noise: NoiseShape
+
+
+def results_console() -> Console:
+    """Standard output; wide enough for the tables where it is no terminal."""
+    console = Console()
+    return console if console.is_terminal else Console(width=160)
+
+
+def noise_shape(info: PolicyInfo) -> NoiseShape:
+    """Sizes of the noise that a compiled policy takes."""
+    return NoiseShape(info.K, info.sample, info.stochastic)
+
+
+def open_variant(text: str, runtime: str, threads: int) -> Variant:
+    """Load what one argument names.
+
+    Args:
+        text: ``DIR`` for the artifact's default plan, ``DIR:dense``, or ``DIR:NAME`` for a plan that it holds.
+        runtime: of ``ttscompile.load``.
+        threads: of ``ttscompile.load``.
+
+    Returns:
+        The variant, its label being the text.
+    """
+    directory, colon, plan = text.partition(":")
+    policy = ttscompile.load(Path(directory), runtime=runtime, threads=threads)
+    return Variant(text, policy, plan if colon else None, noise_shape(policy.info))
+
+
+runtime_option = click.option("--runtime", default="onnxruntime", show_default=True, help="onnxruntime or reference.")
+threads_option = click.option("--threads", default=2, show_default=True, type=click.IntRange(1))
+first_seed_option = click.option(
+    "--first-seed", default=100_000, show_default=True, type=click.IntRange(0), help="Seeds count up from here."
+)

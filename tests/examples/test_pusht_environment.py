@@ -1,0 +1,149 @@
+"""The adapter sees and does what the demonstrations' environment saw and did."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from environment import KEYPOINTS, MAX_STEPS, PushT, keypoints, observation, place
+
+
+@pytest.fixture(scope="session")
+def demonstrations(shared: Path) -> dict[str, np.ndarray]:
+    with np.load(shared / "data" / "pusht_demonstrations.npz", allow_pickle=False) as file:
+        return {name: file[name] for name in file.files}
+
+
+def test_keypoints_turn_and_move_with_the_block():
+    quarter = keypoints([100.0, 200.0], np.pi / 2)
+    np.testing.assert_allclose(quarter, np.stack([100 - KEYPOINTS[:, 1], 200 + KEYPOINTS[:, 0]], axis=-1))
+
+
+def test_embedded_keypoints_are_the_published_ones(shared):
+    published = np.load(shared / "data" / "pusht_keypoints_local.npy", allow_pickle=False)
+    np.testing.assert_allclose(KEYPOINTS, published, rtol=1e-7)
+
+
+def test_keypoints_are_those_of_the_demonstrations(demonstrations):
+    state = demonstrations["state"].astype(np.float64)
+    error = np.abs(keypoints(state[:, 2:4], state[:, 4]) - demonstrations["keypoint"]).max(axis=(1, 2))
+    # 58 of the 25,650 frames, where the block is pressed into a wall or the agent, were recorded with keypoints of
+    # another pose than their state's.
+    assert np.count_nonzero(error > 0.1) == 58
+    assert error.max() < 2.1
+
+
+def test_every_demonstrated_keypoint_set_is_a_rigid_motion_of_ours(demonstrations):
+    world = demonstrations["keypoint"].astype(np.float64)
+    centred = world - world.mean(axis=1, keepdims=True)
+    local = KEYPOINTS - KEYPOINTS.mean(axis=0)
+    # The best angle in the plane: atan2 of the summed cross and dot products.
+    cross = (local[:, 0] * centred[..., 1] - local[:, 1] * centred[..., 0]).sum(axis=1)
+    dot = (local * centred).sum(axis=(1, 2))
+    turned = keypoints(np.zeros((len(world), 2)), np.arctan2(cross, dot))
+    residual = turned - turned.mean(axis=1, keepdims=True) - centred
+    assert np.abs(residual).max() < 0.1
+
+
+def test_observation_is_keypoints_then_agent():
+    state = [10.0, 20.0, 100.0, 200.0, 0.0]
+    seen = observation(state)
+    assert seen.shape == (20,)
+    assert seen.dtype == np.float32
+    np.testing.assert_allclose(seen[:2], [100 + 9.268611, 200 + 90.022804], rtol=1e-6)
+    np.testing.assert_array_equal(seen[18:], [10, 20])
+    np.testing.assert_array_equal(observation([state, state]), [seen, seen])
+
+
+def test_placed_block_has_its_vertices_where_the_state_says():
+    environment = PushT()
+    environment.reset(seed=0)
+    world = environment._gym.unwrapped
+    place(world, [30.0, 40.0, 200.0, 300.0, np.pi / 2])
+    # A quarter turn takes the stem's end (15, 120) to (-120, 15).
+    corners = [tuple(world.block.local_to_world(v)) for shape in world.block.shapes for v in shape.get_vertices()]
+    assert any(np.allclose(corner, (200 - 120, 300 + 15)) for corner in corners)
+    np.testing.assert_allclose(world.get_obs(), [30, 40, 200, 300, np.pi / 2])
+
+
+def test_keypoints_lie_on_the_block_of_the_simulator():
+    environment = PushT()
+    environment.reset(seed=3)
+    world = environment._gym.unwrapped
+    for point in keypoints(world.block.position, world.block.angle):
+        # They were picked from a drawing with a border: up to 3 px outside.
+        assert min(shape.point_query(tuple(point)).distance for shape in world.block.shapes) < 3
+
+
+def replay_error(states: np.ndarray, actions: np.ndarray) -> tuple[float, float, float]:
+    """Worst differences of agent (px), block (px) and angle over one replayed demonstration."""
+    environment = PushT()
+    environment.reset(seed=0, state=states[0])
+    for start in range(0, len(actions), 8):
+        window = environment.execute(actions[start : start + 8])
+    np.testing.assert_array_equal(window, observation(environment.states[-2:]))
+    reached = np.stack(environment.states)
+    assert len(reached) == len(states) + 1
+    error = np.abs(reached[:-1] - states)
+    error[:, 4] = np.minimum(error[:, 4], 2 * np.pi - error[:, 4])
+    return error[:, :2].max(), error[:, 2:4].max(), error[:, 4].max()
+
+
+def test_demonstrated_actions_lead_to_the_demonstrated_states(demonstrations):
+    ends = demonstrations["episode_ends"]
+    errors = []
+    for episode in range(0, len(ends), 15):
+        rows = slice(ends[episode - 1] if episode else 0, ends[episode])
+        errors.append(replay_error(demonstrations["state"][rows].astype(np.float64), demonstrations["action"][rows]))
+    agent, block, angle = np.array(errors).T
+    assert len(errors) == 14
+    assert agent.max() < 1e-3
+    # The solver's memory of contacts is not part of the state: an episode that starts in touch is off by a little.
+    assert np.count_nonzero(block < 1e-3) >= 10
+    assert np.count_nonzero(angle < 1e-4) >= 10
+    assert block.max() < 1
+    assert angle.max() < 0.01
+
+
+def test_first_window_is_the_first_frame_twice():
+    environment = PushT()
+    window = environment.reset(seed=5)
+    assert window.shape == (2, 20)
+    np.testing.assert_array_equal(window[0], window[1])
+    np.testing.assert_array_equal(window[1], observation(environment.states[0]))
+
+
+def test_a_seed_is_an_initial_state():
+    first, second = PushT(), PushT()
+    np.testing.assert_array_equal(first.reset(seed=7), second.reset(seed=7))
+    assert (first.reset(seed=7) != second.reset(seed=8)).any()
+
+
+def test_an_episode_ends_after_the_original_number_of_steps():
+    environment = PushT()
+    environment.reset(seed=0)
+    agent = environment.states[0][:2]
+    calls = 0
+    while not environment.done:
+        environment.execute(np.repeat([agent], 8, axis=0))
+        calls += 1
+    assert calls == 38  # 37 chunks of 8, and 4 actions of the last
+    assert len(environment.targets) == len(environment.coverages) == MAX_STEPS == 300
+    assert len(environment.states) == MAX_STEPS + 1
+
+
+def test_an_episode_ends_at_success_within_a_chunk():
+    environment = PushT()
+    environment.reset(seed=0, state=[60.0, 60.0, 256.0, 256.0, np.pi / 4])
+    environment.execute(np.full((8, 2), 60.0))
+    assert environment.done
+    assert len(environment.targets) == 1
+    assert environment.coverages[0] == pytest.approx(1.0)
+
+
+def test_reset_forgets_the_episode_before():
+    environment = PushT()
+    environment.reset(seed=1)
+    environment.execute([[100.0, 100.0]] * 3)
+    environment.reset(seed=2)
+    assert len(environment.states) == 1
+    assert environment.targets == environment.coverages == []

@@ -1,0 +1,90 @@
+"""Figures of an evaluation, against numbers worked out by hand."""
+
+import io
+import json
+
+import numpy as np
+import pytest
+from bootstrap import estimate, paired_difference
+from evaluate import evaluation_table, summarise
+from rich.console import Console
+from rollout import Episode, Rollout
+
+
+def rollout(best, first_seed=100):
+    episodes = tuple(
+        Episode(
+            seed=first_seed + i,
+            windows=np.zeros((3, 2, 20), np.float32),
+            states=np.zeros((2, 5)),
+            targets=np.zeros((1, 2)),
+            coverages=np.array([coverage]),
+        )
+        for i, coverage in enumerate(best)
+    )
+    return Rollout(episodes, sparsity=(0.5, 0.7), flops=(1e9, 3e9), legalised=(0, 2), call_ms=(1.0,))
+
+
+def test_estimate_of_equal_values_has_no_width():
+    result = estimate([0.25, 0.25, 0.25])
+    assert (result.mean, result.low, result.high) == (0.25, 0.25, 0.25)
+
+
+def test_interval_of_many_values_is_the_normal_one():
+    values = np.random.default_rng(1).normal(2.0, 1.0, size=400)
+    result = estimate(values)
+    half = 1.96 * values.std() / np.sqrt(400)
+    assert result.mean == pytest.approx(values.mean())
+    assert result.low == pytest.approx(values.mean() - half, abs=0.02)
+    assert result.high == pytest.approx(values.mean() + half, abs=0.02)
+    assert estimate(values) == result
+
+
+def test_paired_difference_is_narrower_than_what_it_is_the_difference_of():
+    hard = np.random.default_rng(2).uniform(0, 1, size=60)
+    difference = paired_difference(hard + 0.1, hard)
+    assert difference.mean == pytest.approx(0.1)
+    assert difference.high - difference.low < 1e-9 < estimate(hard).high - estimate(hard).low
+
+
+def test_paired_values_must_have_the_same_length():
+    with pytest.raises(ValueError, match="zip"):
+        paired_difference([1.0], [1.0, 2.0])
+
+
+def test_figures_of_a_variant():
+    dense = rollout([0.97, 0.76, 0.19])  # scores 1, 0.8, 0.2
+    sparse = rollout([0.96, 0.38, 0.19])  # scores 1, 0.4, 0.2
+    base = summarise("dense", dense, dense)
+    other = summarise("sparse", sparse, dense)
+    assert base.score.mean == pytest.approx(2 / 3)
+    assert base.success.mean == pytest.approx(1 / 3)
+    assert base.coverage.mean == pytest.approx(0.64)
+    assert base.score_difference is None
+    assert other.score_difference.mean == pytest.approx(-0.4 / 3)
+    assert other.score_difference.high == pytest.approx(0.0)
+    assert other.success_difference.mean == 0.0
+    assert other.sparsity == pytest.approx(0.6)
+    assert other.flops == pytest.approx(2e9)
+    assert other.legalised == 2
+
+
+def test_other_seeds_are_not_paired():
+    with pytest.raises(ValueError, match="other seeds"):
+        summarise("sparse", rollout([0.5], first_seed=7), rollout([0.5]))
+
+
+def test_table_and_json_say_the_same():
+    dense, sparse = rollout([0.97, 0.76]), rollout([0.96, 0.38])
+    evaluations = [summarise("dense", dense, dense), summarise("sparse", sparse, dense)]
+    console = Console(file=io.StringIO(), width=200)
+    console.print(evaluation_table(evaluations, range(100, 102)))
+    text = console.file.getvalue()
+    assert "seeds 100..101" in text
+    assert "0.700" in text
+    assert "-0.200" in text
+    document = json.loads(json.dumps([e.to_json() for e in evaluations]))
+    assert document[1]["score"]["mean"] == pytest.approx(0.7)
+    assert document[1]["score_difference"]["mean"] == pytest.approx(-0.2)
+    assert [e["seed"] for e in document[1]["episodes"]] == [100, 101]
+    assert document[0]["score_difference"] is None

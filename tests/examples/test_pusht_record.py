@@ -1,0 +1,27 @@
+"""The recorded file is a trajectory file."""
+
+import numpy as np
+from record import save_trajectories
+from rollout import Episode
+
+
+def episode(calls, start):
+    windows = np.arange(start, start + calls * 40, dtype=np.float32).reshape(calls, 2, 20)
+    return Episode(0, windows, np.zeros((2, 5)), np.zeros((1, 2)), np.zeros(1))
+
+
+def test_rows_are_calls_in_order_and_ends_are_counted(tmp_path):
+    path = tmp_path / "new" / "calls.npz"
+    episodes = [episode(3, 0), episode(1, 1000), episode(2, 2000)]
+    save_trajectories(path, episodes)
+    with np.load(path, allow_pickle=False) as file:
+        assert sorted(file.files) == ["episode_ends", "obs"]
+        assert file["episode_ends"].tolist() == [3, 4, 6]
+        assert file["obs"].dtype == np.float32
+        np.testing.assert_array_equal(file["obs"], np.concatenate([e.windows for e in episodes]))
+
+
+def test_the_same_episodes_give_the_same_bytes(tmp_path):
+    for name in ("a.npz", "b.npz"):
+        save_trajectories(tmp_path / name, [episode(2, 5)])
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
