@@ -42,7 +42,7 @@ class OnnxRuntime:
         threads: threads of arithmetic; one runs on the caller's thread.
 
     Raises:
-        RuntimeUnavailableError: onnxruntime is missing, or its thread pool has another size.
+        RuntimeUnavailableError: onnxruntime is missing, or other code has made its global thread pool.
         ArtifactError: onnxruntime refuses a graph.
     """
 

@@ -1,13 +1,13 @@
-"""Sessions of onnxruntime for the pieces of an artifact, on one thread pool for the whole process.
+"""Sessions of onnxruntime for the pieces of an artifact; their threads sleep when there is nothing to do.
 
-A session for each block is only affordable if they share their threads: 25 spinning pools made a call ten times
-slower than one. onnxruntime has one global pool a process, whose size is set once, and from then on it refuses every
-session that wants threads of its own, other code's included. One thread needs no pool.
+onnxruntime's global thread pool would be shared by all sessions, but it is a fact of the process: once made, its size
+cannot change, its workers spin, and every other session of the process that wants threads of its own is refused. A
+robot runs other things beside the policy. So each session has its own threads, which do not spin; ``docs/decisions.md`` has
+what that costs.
 """
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -22,44 +22,8 @@ if TYPE_CHECKING:
 Array: TypeAlias = npt.NDArray[Any]
 
 
-class _Pool:
-    """What this module knows about onnxruntime's global thread pool: a fact of the process, not of a policy."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._threads: int | None = None
-
-    def ensure(self, ort: Any, threads: int) -> None:
-        """See that sessions will run on this many threads: make the pool if it takes one and there is none.
-
-        Raises:
-            RuntimeUnavailableError: there is a pool of another size, which cannot be changed.
-        """
-        with self._lock:
-            if threads > 1 and self._threads is None:
-                try:
-                    ort.set_global_thread_pool_sizes(threads, 1)
-                except Exception as error:  # its class Fail is derived from Exception
-                    raise foreign_pool(threads) from error
-                self._threads = threads
-            if self._threads not in (None, threads):
-                raise RuntimeUnavailableError(
-                    f"threads={threads} was asked for, but this process has a pool of {self._threads} threads, made"
-                    " for the first policy with more than one. onnxruntime cannot change its size, and with it every"
-                    f" session has to use it. Use threads={self._threads}, or load policies with threads=1 before the"
-                    " others, or use another process."
-                )
-
-
-def foreign_pool(threads: int) -> RuntimeUnavailableError:
-    """The error of a process whose pool was made by somebody else."""
-    return RuntimeUnavailableError(
-        f"threads={threads} was asked for, but other code of this process has made onnxruntime's global thread pool,"
-        " whose size is unknown and cannot be changed. Load the policy before that code runs, or in another process."
-    )
-
-
-_POOL = _Pool()
+SINGLE_THREADED = frozenset({"stem", "advance", "pruner"})
+"""Pieces too small for a second thread."""
 
 
 def import_onnxruntime() -> Any:
@@ -81,39 +45,43 @@ def import_onnxruntime() -> Any:
 def open_sessions(artifact: Artifact, threads: int) -> dict[str, Any]:
     """An ``InferenceSession`` for each ONNX piece of the artifact, by name.
 
-    With one thread a session runs on the caller's thread and needs no pool. With more, all share the global pool, whose
-    idle workers spin for some tens of milliseconds after a run before they sleep: onnxruntime 1.31 offers no way to
-    change that from Python.
+    With one thread a session runs on the caller's thread and makes none.
 
     Raises:
-        RuntimeUnavailableError: onnxruntime is missing, or the thread pool has another size.
+        RuntimeUnavailableError: onnxruntime is missing, or other code has made its global thread pool.
         ArtifactError: onnxruntime refuses a graph.
     """
     ort = import_onnxruntime()
-    _POOL.ensure(ort, threads)
-    options = ort.SessionOptions()
-    options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
-    options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_ALL
-    if threads == 1:
-        options.intra_op_num_threads = 1
-        options.inter_op_num_threads = 1
-    else:
-        options.use_per_session_threads = False
     sessions = {}
     for piece in artifact.manifest.pieces:
         path = artifact.onnx_path(piece)
+        options = _options(ort, 1 if piece in SINGLE_THREADED else threads)
         try:
             sessions[piece] = ort.InferenceSession(
                 str(path), options, providers=["CPUExecutionProvider"], enable_fallback=0
             )
         except Exception as error:  # onnxruntime's own classes are derived from Exception
             if "global thread pool" in str(error):
-                raise foreign_pool(threads) from error
+                raise RuntimeUnavailableError(
+                    "other code of this process has made onnxruntime's global thread pool, and with it onnxruntime"
+                    " refuses sessions with threads of their own. Load the policy in another process."
+                ) from error
             raise ArtifactError(
                 f"{path}: onnxruntime {ort.__version__} cannot load this graph: {error} Install the version that the"
                 f" artifact asks for (>= {artifact.manifest.requires.onnxruntime}), or convert the checkpoint again."
             ) from error
     return sessions
+
+
+def _options(ort: Any, threads: int) -> Any:
+    options = ort.SessionOptions()
+    options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
+    options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_ALL
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    # Twenty-odd pools that spin made a call ten times slower, and would take the processor from everything else.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    return options
 
 
 class Bound:

@@ -68,12 +68,12 @@ def load(path: str | Path, runtime: str = "onnxruntime", threads: int = 1, seed:
     Args:
         path: the directory that ``convert`` wrote, or the same zipped.
         runtime: ``onnxruntime``; or ``reference``, which is slow and needs torch.
-        threads: threads of arithmetic, shared by all policies of the process.
+        threads: threads of arithmetic, of this policy alone; 1 computes on the caller's thread.
         seed: of the noise that is drawn when none is given; None for another sequence every time.
 
     Raises:
         ArtifactError: the artifact is missing, damaged, or of another version.
-        RuntimeUnavailableError: the runtime cannot be had on this machine, or not with this number of threads.
+        RuntimeUnavailableError: the runtime cannot be had on this machine.
     """
     artifact = load_artifact(path)
     return CompiledPolicy(artifact, open_runtime(artifact, runtime, threads), seed)

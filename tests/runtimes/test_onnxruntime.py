@@ -280,26 +280,18 @@ assert "torch" not in sys.modules
 """
 
 
-def test_policies_of_a_process_share_one_pool(toy_artifact: Artifact) -> None:
+def test_policies_of_a_process_choose_their_threads_on_their_own(toy_artifact: Artifact) -> None:
     body = """
-first = open_runtime(artifact, threads=1)
+one = open_runtime(artifact, threads=1)
 print(count() - before)
-pools = [open_runtime(artifact, threads=3) for _ in range(3)]
-print(count() - before)
-for threads in (2, 1):
-    try:
-        open_runtime(artifact, threads=threads)
-    except RuntimeUnavailableError as error:
-        print(error)
+several = [open_runtime(artifact, threads=n) for n in (3, 2, 1)]
+print(count() - before > 0)
+onnxruntime.InferenceSession(str(artifact.onnx_path("stem")))  # other code may have any session it likes
 """
-    alone, pool, *messages = python(THREADS.format(path=str(toy_artifact.path), body=body)).splitlines()
-    assert (alone, pool) == ("0", "2")  # with the caller, three
-    for threads, message in zip((2, 1), messages, strict=True):
-        assert f"threads={threads} was asked for" in message
-        assert "Use threads=3, or load policies with threads=1 before the others" in message
+    assert python(THREADS.format(path=str(toy_artifact.path), body=body)).split() == ["0", "True"]
 
 
-def test_a_pool_of_somebody_else_is_reported(toy_artifact: Artifact) -> None:
+def test_a_global_pool_of_somebody_else_is_reported(toy_artifact: Artifact) -> None:
     body = """
 onnxruntime.set_global_thread_pool_sizes(2, 1)
 for threads in (1, 2):
