@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from ttscompile.cli import main
-from ttscompile.errors import CalibrationError
+from ttscompile.errors import CalibrationError, CalibrationFailedError
 
 
 @pytest.fixture
@@ -45,4 +45,15 @@ def test_every_file_up_to_the_next_option_is_taken(arguments: list[str], asked: 
         "strategy": "tts",
         "seed": 3,
         "resume": False,
+        "max_minutes": 15.0,
     }
+
+
+def test_a_plan_that_is_not_what_was_asked_for_is_a_failed_check(monkeypatch: pytest.MonkeyPatch) -> None:
+    def calibrate(*args: Any, **kwargs: Any) -> None:
+        raise CalibrationFailedError("no better than the uniform schedule")
+
+    monkeypatch.setattr("ttscompile.calibrate", calibrate, raising=False)
+    result = CliRunner().invoke(main, ["calibrate", "out", "--trajectories", "a.npz"])
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert result.stderr == "failed: no better than the uniform schedule\n"
