@@ -16,7 +16,7 @@ from PIL import Image, ImageDraw, ImageFont
 from rich.console import Console
 from rich.progress import Progress
 from rollout import Episode, run_batch
-from variants import first_seed_option, open_variant, runtime_option, threads_option
+from variants import first_seed_option, open_variant, run, runtime_option, threads_option
 
 NATIVE = 512
 """Pixels of gym-pusht's own drawing: one a unit of the world."""
@@ -127,4 +127,4 @@ def main(variants: tuple[str, ...], output: Path, first_seed: int, runtime: str,
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -3,7 +3,9 @@
     python examples/pusht/benchmark.py build/pusht/compiled --threads 1
 
 One stream, warm calls of one episode. The contestants take turns, call by call, on the same observation and noise, so
-that whatever else the machine does hits all of them; the table has medians and the quartiles around them.
+that whatever else the machine does hits all of them; the table has medians and the quartiles around them. One thread
+is the fair comparison on a machine that has anything else to do: PyTorch's threads wait for each other after every
+small operation, and where they have to share cores an eager call can take ten times as long as with one thread.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 from rollout import NoiseShape, Plan, Policy, seeded_noise
-from variants import noise_shape, results_console, threads_option
+from variants import noise_shape, results_console, run
 
 import ttscompile
 from ttscompile import Source
@@ -233,6 +235,14 @@ def contestants_for(
     return [eager, *others], info
 
 
+def time_calls(artifact: Path, checkpoint: Path, runs: int, threads: int) -> list[Measurement]:
+    """Time eager, dense and compiled, with a progress bar on standard error."""
+    contestants, info = contestants_for(artifact, checkpoint, threads, None)
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("timing", total=WARM_UP + runs)
+        return measure(contestants, noise_shape(info), runs, lambda: progress.advance(task))
+
+
 def fixed_shares(artifact: Path) -> dict[str, float]:
     """FLOPs of prologue and pruner, as shares of a dense call."""
     flops = load_artifact(artifact).manifest.flops
@@ -254,7 +264,7 @@ def to_json(measurements: Sequence[Measurement], shares: dict[str, float], threa
 @click.argument("artifact", type=click.Path(exists=True, path_type=Path))
 @click.option("--checkpoint", default=CHECKPOINT, show_default=True, type=click.Path(exists=True, path_type=Path))
 @click.option("--runs", default=15, show_default=True, type=click.IntRange(1), help="Counted calls of each.")
-@threads_option
+@click.option("--threads", default=1, show_default=True, type=click.IntRange(1))
 @click.option("--plan", "plan_file", type=click.Path(exists=True, path_type=Path), help="An .npy, int8 [K, blocks].")
 @click.option("--computed", default=0.05, show_default=True, help="Share of computed cells of the random plan.")
 @click.option("--seed", default=0, show_default=True, help="Of the random plan.")
@@ -290,4 +300,4 @@ def main(
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

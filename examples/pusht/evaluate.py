@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 from rollout import Rollout, run_episodes
-from variants import Variant, first_seed_option, open_variant, results_console, runtime_option, threads_option
+from variants import Variant, first_seed_option, open_variant, results_console, run, runtime_option, threads_option
 
 
 @dataclass(frozen=True)
@@ -169,4 +169,4 @@ def main(
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

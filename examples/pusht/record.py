@@ -15,7 +15,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 from rollout import Episode, run_episodes
-from variants import open_variant, runtime_option, threads_option
+from variants import open_variant, run, runtime_option, threads_option
 
 
 def save_trajectories(path: Path, episodes: Sequence[Episode]) -> None:
@@ -58,4 +58,4 @@ def main(artifact: str, output: Path, episodes: int, first_seed: int, batch: int
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

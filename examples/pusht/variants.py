@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,6 +29,15 @@ class Variant:
     policy: Policy
     plan: str | None
     noise: NoiseShape
+
+
+def run(command: click.Command) -> None:
+    """Run a script's command; an error of ttscompile is its message and exit status 2."""
+    try:
+        command()
+    except ttscompile.TtscompileError as error:
+        click.echo(f"error: {error}", err=True)
+        sys.exit(2)
 
 
 def results_console() -> Console:

@@ -1,0 +1,77 @@
+"""The tables that the demo ends with; ``make demo`` runs the rest."""
+
+import io
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+from benchmark import Measurement
+from demo import calibration_table, final_table
+from evaluate import summarise
+from rich.console import Console
+from rollout import Episode, Rollout
+
+from ttscompile.calibration import CalibrationResult, PlanScore
+
+
+def printed(table):
+    console = Console(file=io.StringIO(), width=160)
+    console.print(table)
+    return [[cell.strip() for cell in line.split("│")[1:-1]] for line in console.file.getvalue().splitlines()]
+
+
+def rollout(coverage):
+    one = Episode(0, np.zeros((1, 2, 20), np.float32), np.zeros((2, 5)), np.zeros((1, 2)), np.array([coverage]))
+    return Rollout((one,), (0.95,), (1e9,), (0,), (1.0,))
+
+
+def test_final_table_has_speed_and_score_of_each():
+    speeds = [
+        Measurement("eager PyTorch", (1000.0,), None, None, 25e9, 0.0, None),
+        Measurement("dense onnxruntime", (500.0,), 1.0, 0.0, 24e9, 0.0, None),
+        Measurement("compiled", (25.0,), 1.0, 0.1, 1.2e9, 0.95, None),
+    ]
+    dense, sparse = rollout(0.97), rollout(0.76)
+    rows = printed(final_table(speeds, [summarise("dense", dense, dense), summarise("compiled", sparse, dense)]))
+    assert ["ms a call, 1 thread", "1000.0", "500.0", "25.0"] in rows
+    assert ["calls a second", "1.0", "2.0", "40.0"] in rows
+    assert ["times faster than eager", "1.0", "2.0", "40.0"] in rows
+    assert ["GFLOP a call", "25.00", "24.00", "1.20"] in rows
+    assert ["cells reused", "0.0%", "0.0%", "95.0%"] in rows
+    assert ["success", "as dense", "100%", "0%"] in rows
+    assert ["score, 95 % interval", "as dense", "1.000 [1.000, 1.000]", "0.800 [0.800, 0.800]"] in rows
+
+
+def test_calibration_table_names_the_default_and_the_baseline():
+    result = CalibrationResult(
+        strategy="tts",
+        seed=0,
+        target_sparsity=0.95,
+        default_plan="schedule",
+        plans={
+            "schedule": PlanScore(11.04, 47.0, 0.95, 0.94, 0.93),
+            "uniform": PlanScore(91.0, 288.0, 0.95, 0.95, 0.94),
+        },
+        episodes={"calibration": (0, 1), "validation": (2,)},
+        calls={"calibration": 20, "validation": 10},
+        intervals=3,
+        stopped="finished",
+        seconds=60.0,
+    )
+    rows = printed(calibration_table(result))
+    assert ["schedule (default)", "11.0", "47.0", "95.0%", "93.0%"] in rows
+    assert ["uniform", "91.0", "288.0", "95.0%", "94.0%"] in rows
+
+
+def test_a_bad_checkpoint_is_one_clear_error(tmp_path):
+    bad = tmp_path / "not-a-policy.ckpt"
+    bad.write_text("nothing of the kind")
+    script = Path(__file__).parents[2] / "examples" / "pusht" / "demo.py"
+    command = [sys.executable, str(script), "--checkpoint", str(bad), "--directory", str(tmp_path / "out")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: ")
+    assert "not-a-policy.ckpt" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not list((tmp_path / "out").iterdir())
