@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.config import FloatArray, Noise
+from ttscompile.config import FloatArray, Noise, SamplerTable
 from ttscompile.errors import IllegalPlanError, ObservationError, RuntimeUnavailableError
 from ttscompile.lattice import BoolArray, PlanArray, Source, check_plan, legalize, require_legal
 
@@ -86,7 +86,7 @@ class Runtime(Protocol):
         plan_name: str | None = None,
         repair: bool = False,
     ) -> tuple[FloatArray, CallReport]:
-        """Denoise one chunk.
+        """Denoise one chunk. A call that fails while decoding ends the episode, as ``reset`` does.
 
         Args:
             obs: normalised observation by key, ``[B, ...]`` each, of the dtype of its specification.
@@ -183,28 +183,32 @@ def no_pruner() -> IllegalPlanError:
     )
 
 
-def check_call(
-    streams: int | None, initial: tuple[int, ...], steps: tuple[int, ...] | None, sample: tuple[int, int], count: int
-) -> int:
+def check_call(streams: int | None, noise: Noise, sample: tuple[int, int], sampler: SamplerTable) -> int:
     """Number of streams of a call whose noise fits it.
 
     Args:
         streams: B of the episode under way, or None.
-        initial: shape of ``Noise.initial``.
-        steps: shape of ``Noise.steps`` that the sampler will read, or None.
+        noise: of the call.
         sample: ``(T, D)``.
-        count: K.
+        sampler: says whether the draws of the steps are read.
 
     Raises:
         ObservationError: see ``Runtime.predict``.
     """
+    initial = np.shape(noise.initial)
     if len(initial) != 3 or initial[1:] != sample or initial[0] < 1:
         raise ObservationError(
             f"noise.initial has shape {initial}; expected [B, T, D] = (B, {sample[0]}, {sample[1]})."
         )
     found = initial[0]
-    if steps is not None and steps != (count, *initial):
-        raise ObservationError(f"noise.steps has shape {steps}; expected [K, B, T, D] = {(count, *initial)}.")
+    expected = (sampler.steps, *initial)
+    if sampler.stochastic and noise.steps is None:
+        raise ObservationError(
+            f"noise.steps is None, and the sampler {sampler.name!r} draws noise at its steps; expected float32"
+            f" [K, B, T, D] = {expected}."
+        )
+    if sampler.stochastic and np.shape(noise.steps) != expected:
+        raise ObservationError(f"noise.steps has shape {np.shape(noise.steps)}; expected [K, B, T, D] = {expected}.")
     if streams is not None and streams != found:
         raise ObservationError(
             f"the call has {found} streams, and the episode under way has {streams}: the rollout cache is kept for"
@@ -219,8 +223,8 @@ def computed_cells(plans: PlanArray) -> tuple[int, ...]:
 
 
 def frozen(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """The array, made read-only: what a report holds must not change after the call."""
-    array = array.copy() if array.base is not None or array.flags.writeable is False else array
+    """A read-only copy: what a report holds must not change after the call, and the caller's plan is the caller's."""
+    array = array.copy()
     array.flags.writeable = False
     return array
 

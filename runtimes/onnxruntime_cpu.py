@@ -73,13 +73,9 @@ class OnnxRuntime:
         plan_name: str | None = None,
         repair: bool = False,
     ) -> tuple[FloatArray, CallReport]:
-        """Denoise one chunk; see ``base.Runtime.predict``.
-
-        A call that fails half way ends the episode: the runtime is left as after ``reset``.
-        """
+        """Denoise one chunk; see ``base.Runtime.predict``."""
         spec = self._manifest.spec
-        draws = np.shape(noise.steps) if spec.sampler.stochastic and noise.steps is not None else None
-        streams = check_call(self.streams, np.shape(noise.initial), draws, spec.sample, spec.sampler.steps)
+        streams = check_call(self.streams, noise, spec.sample, spec.sampler)
         written = self._written
         if written is None:
             written = np.zeros((streams, spec.sampler.steps, len(self._groups)), dtype=np.bool_)

@@ -2,8 +2,8 @@
 
 onnxruntime's global thread pool would be shared by all sessions, but it is a fact of the process: once made, its size
 cannot change, its workers spin, and every other session of the process that wants threads of its own is refused. A
-robot runs other things beside the policy. So each session has its own threads, which do not spin; ``docs/decisions.md`` has
-what that costs.
+robot runs other things beside the policy. So each session has its own threads, which do not spin;
+``docs/decisions.md`` has what that costs.
 """
 
 from __future__ import annotations

@@ -16,8 +16,9 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import DENSE
 from ttscompile.config import ChunkSpec, FloatArray, Noise, ObservationSpec
 from ttscompile.errors import IllegalPlanError, ObservationError, TtscompileError
+from ttscompile.ir.graph import TensorType
 
-from .arrays import as_array, check_noise, check_observation, is_tensor, like
+from .arrays import check_noise, check_observation, is_tensor, like
 from .base import GIVEN, CallReport, Runtime, open_runtime
 
 if TYPE_CHECKING:
@@ -108,7 +109,7 @@ class CompiledPolicy:
         manifest = self._manifest
         return PolicyInfo(
             K=manifest.steps,
-            blocks=tuple(BlockInfo(b.kind, b.type.at(1)[1:], b.flops) for b in manifest.blocks),
+            blocks=tuple(BlockInfo(b.kind, _of_one_stream(b.type), b.flops) for b in manifest.blocks),
             dense_flops=manifest.flops.dense,
             observation=manifest.spec.observations,
             action=manifest.spec.chunk,
@@ -164,6 +165,7 @@ class CompiledPolicy:
             else:
                 noise = check_noise(noise, streams, self._manifest.steps, spec.sample, spec.sampler.stochastic)
             matrix, name, repair = self._plan(plan)
+            self._report = None
             normalized = {key: _normalized(array, spec.observations[key]) for key, array in obs.items()}
             sample, self._report = self._runtime.predict(normalized, noise, matrix, plan_name=name, repair=repair)
             predicted = sample[..., : spec.chunk.action_dim]
@@ -185,7 +187,13 @@ class CompiledPolicy:
         if plan is None:
             plan = self._manifest.default_plan
         if not isinstance(plan, str):
-            return as_array(plan, "plan") if is_tensor(plan) else np.asarray(plan), GIVEN, False
+            try:
+                return np.asarray(plan.numpy(force=True) if is_tensor(plan) else plan), GIVEN, False
+            except (TypeError, ValueError) as error:
+                raise IllegalPlanError(
+                    f"the plan is no matrix of integers ({error}); expected int8 [K, blocks] or [B, K, blocks] of"
+                    " ttscompile.Source."
+                ) from error
         if plan == DENSE:
             return self._artifact.schedule(DENSE), DENSE, False
         record = self._manifest.plans.get(plan)
@@ -207,6 +215,11 @@ class CompiledPolicy:
             yield
         finally:
             self._lock.release()
+
+
+def _of_one_stream(type_: TensorType) -> tuple[int, ...]:
+    axis = type_.batch_axis
+    return tuple(n for i, n in enumerate(type_.at(1)) if i != axis)
 
 
 def _normalized(array: npt.NDArray[Any], spec: ObservationSpec) -> FloatArray:

@@ -63,9 +63,7 @@ class ReferenceRuntime:
     ) -> tuple[FloatArray, CallReport]:
         """Denoise one chunk; see ``base.Runtime.predict``."""
         spec = self._manifest.spec
-        draws = noise.steps if spec.sampler.stochastic else None
-        shape = None if draws is None else np.shape(draws)
-        streams = check_call(self.streams, np.shape(noise.initial), shape, spec.sample, spec.sampler.steps)
+        streams = check_call(self.streams, noise, spec.sample, spec.sampler)
         cache = self._cache if self._cache is not None else self.model.empty_cache(streams)
         start = time.perf_counter()
         with torch.no_grad():
@@ -77,6 +75,7 @@ class ReferenceRuntime:
             pruner = time.perf_counter()
             plans, legalised = settle_plan(plan, self.model.groups, cache.written, repair)
             initial, steps = noise_tensors(noise, spec.sampler.stochastic)
+            self.reset()  # a call that fails while decoding ends the episode
             result = self.model.rollout(contexts, initial, steps, plans, cache)
         self._cache = result.cache
         stop = time.perf_counter()

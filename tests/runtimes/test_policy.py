@@ -121,6 +121,34 @@ def test_a_matrix_is_executed_as_it_is_or_refused(policy: CompiledPolicy) -> Non
         policy.predict_action({"obs": OBS}, plan=both)
 
 
+def test_the_callers_plan_stays_the_callers(policy: CompiledPolicy) -> None:
+    plan = np.zeros((2, 5, 5), np.int8)
+    policy.predict_action({"obs": OBS}, plan=plan)
+    plan[:, 1:] = Source.TIMESTEP
+    report = policy.last_report
+    assert report is not None
+    assert not report.plan.any()
+
+
+def test_plans_that_are_no_matrix_are_refused(policy: CompiledPolicy) -> None:
+    for plan in ([[0, 0], [0]], torch.zeros(5, 5, dtype=torch.bfloat16), torch.zeros(5, 5), object()):
+        with pytest.raises(IllegalPlanError, match="int8|integer"):
+            policy.predict_action({"obs": OBS}, plan=plan)
+
+
+@pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
+def test_a_stochastic_sampler_needs_its_draws(toy_artifact: Artifact, runtime: str) -> None:
+    with pytest.raises(ObservationError, match=r"noise.steps is None.*\[K, B, T, D\] = \(5, 2, 3, 2\)"):
+        open_runtime(toy_artifact, runtime).predict({"obs": OBS}, Noise(some_noise().initial), dense_plan(5, 5))
+
+
+def test_a_refused_call_leaves_no_report_of_the_one_before(policy: CompiledPolicy) -> None:
+    policy.predict_action({"obs": OBS}, plan="dense")
+    with pytest.raises(IllegalPlanError):
+        policy.predict_action({"obs": OBS}, plan=np.full((5, 5), Source.TIMESTEP))
+    assert policy.last_report is None
+
+
 def test_torch_in_gives_torch_out(policy: CompiledPolicy) -> None:
     plain = policy.predict_action({"obs": OBS}, noise=some_noise())
     policy.reset()
@@ -130,7 +158,7 @@ def test_torch_in_gives_torch_out(policy: CompiledPolicy) -> None:
     out = policy.predict_action({"obs": torch.from_numpy(OBS).requires_grad_()}, noise=tensors)
     for key, value in out.items():
         assert isinstance(value, torch.Tensor)
-        assert value.device == torch.device("cpu")
+        assert value.device == tensors.initial.device  # type: ignore[attr-defined]
         assert not value.requires_grad
         assert np.array_equal(value.numpy(), plain[key])
 

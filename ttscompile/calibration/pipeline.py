@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from .calls import Actions, Calls, prepare_calls, sample_calls, split_episodes
 from .execute import Executor
 from .judge import PRUNED, SCHEDULE, UNIFORM, judge, require_success, uniform_of
 from .progress import Bar
-from .result import CalibrationResult
+from .result import CalibrationResult, PlanScore
 from .state import StateFile
 from .strategies import Found, Strategy, Task, open_strategy, require_strategy
 
@@ -129,7 +129,7 @@ def calibrate(
         strategy=strategy,
         seed=seed,
         target_sparsity=target_sparsity,
-        default_plan=PRUNED if PRUNED in scores and scores[PRUNED].error <= scores[SCHEDULE].error else SCHEDULE,
+        default_plan=_default(scores, target_sparsity),
         plans=scores,
         episodes={"calibration": split.calibration, "validation": split.validation},
         calls={name: calls.count for name, calls in sets.items()},
@@ -148,6 +148,14 @@ def calibrate(
     )
     state.remove()
     return result
+
+
+def _default(scores: Mapping[str, PlanScore], target: float) -> str:
+    """The pruner's plans if they are no worse than the schedule on the held-out calls, and as sparse as was asked."""
+    pruned = scores.get(PRUNED)
+    if pruned is None or pruned.sparsity < target - 1e-9 or pruned.error > scores[SCHEDULE].error:
+        return SCHEDULE
+    return PRUNED
 
 
 class _Clock:
