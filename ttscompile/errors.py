@@ -59,5 +59,9 @@ class CalibrationFailedError(CalibrationError):
     """Calibration ran, and its plan is not what was asked for; a failed check (exit status 1), not bad input."""
 
 
+class OutputError(TtscompileError):
+    """A result that cannot be written where it was asked for."""
+
+
 class RuntimeUnavailableError(TtscompileError):
     """A runtime was asked for whose packages or providers are not installed."""

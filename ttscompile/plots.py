@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .errors import IllegalPlanError, RuntimeUnavailableError
+from .errors import IllegalPlanError, OutputError, RuntimeUnavailableError
 from .lattice import PlanArray, Source, sparsity
 
 COLOURS = {
@@ -81,4 +81,9 @@ def plot_plan(plan: PlanArray, kinds: Sequence[str], path: str | Path, title: st
     metadata = (
         {"Software": None} if Path(path).suffix == ".png" else {"Date": None} if Path(path).suffix == ".svg" else None
     )
-    figure.savefig(path, dpi=150, metadata=metadata)
+    try:
+        figure.savefig(path, dpi=150, metadata=metadata)
+    except (OSError, ValueError) as error:  # no such folder; no such format
+        raise OutputError(
+            f"{path}: the picture cannot be written: {error}. Give a .png, .svg or .pdf in a folder that exists."
+        ) from error

@@ -83,7 +83,7 @@ def load_trajectories(
 
 def _read(path: Path, observations: Mapping[str, ObservationSpec], action_steps: int) -> list[Episode]:
     """Episodes of one file."""
-    arrays = _open(path)
+    arrays = read_npz(path)
     frames = _meta(path, arrays.pop(META, None))
     if ENDS not in arrays:
         raise TrajectoryError(f"{path}: has no array {ENDS!r}; it has {sorted(arrays)}. Add {ENDS} [E]: {_ENDS_ARE}.")
@@ -121,8 +121,12 @@ def _read(path: Path, observations: Mapping[str, ObservationSpec], action_steps:
 _ENDS_ARE = "for each episode the row after its last, increasing"
 
 
-def _open(path: Path) -> dict[str, Array]:
-    """All arrays of a file, without unpickling anything."""
+def read_npz(path: Path) -> dict[str, Array]:
+    """All arrays of an ``.npz``, without unpickling anything.
+
+    Raises:
+        TrajectoryError: it is missing, truncated, of another format, or holds Python objects.
+    """
     if not path.exists():
         raise TrajectoryError(f"{path}: does not exist. Give the .npz file of a recording.")
     other = _other_format(path)

@@ -5,10 +5,13 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from ttscompile.cli import main
+from ttscompile.errors import TrajectoryError
+from ttscompile.trajectories import read_npz
 
 
 @pytest.fixture
@@ -65,6 +68,21 @@ def test_bad_usage(arguments: list[str], reason: str) -> None:
     assert result.stdout == ""
     assert reason in result.stderr
     assert "Traceback" not in result.stderr
+
+
+@pytest.mark.slow
+def test_pictures_that_cannot_be_drawn(compiled_pusht: Path, tmp_path: Path) -> None:
+    corrupt, single = tmp_path / "corrupt.npz", tmp_path / "single.npy"
+    corrupt.write_bytes(b"PK\x03\x04 and nothing else")
+    np.save(single, np.zeros(3))
+    plots = [["--plot", str(tmp_path / "no folder" / "x.png")], ["--plot", str(tmp_path / "x.foo")]]
+    for arguments in plots:
+        result = CliRunner().invoke(main, ["inspect", str(compiled_pusht), *arguments])
+        assert (result.exit_code, result.stdout) == (2, "")
+        assert "the picture cannot be written" in result.stderr
+    for path in (corrupt, single):
+        with pytest.raises(TrajectoryError, match=path.name):
+            read_npz(path)
 
 
 def test_an_error_that_is_nobodys_fault_is_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,6 +16,10 @@ from ttscompile.cli.summary import document, print_summary
 from ttscompile.errors import ArtifactError, ObservationError
 from ttscompile.lattice import PlanArray
 from ttscompile.plots import plot_plan
+from ttscompile.trajectories import read_npz
+
+SCHEDULE = "schedule"
+"""Name that calibration gives to its best plan that does not depend on the observation."""
 
 
 @click.command()
@@ -38,7 +42,7 @@ def inspect(directory: Path, picture: Path | None, name: str | None, observation
     artifact = load_artifact(directory)
     summary = document(directory, artifact)
     if picture is not None:
-        name = name or artifact.manifest.default_plan
+        name = name or _drawn_by_default(artifact, observation)
         plan = _plan(artifact, name, observation)
         plot_plan(plan, [block.kind for block in artifact.manifest.blocks], picture, f"plan {name!r}")
         progress().print(f"wrote {picture}", markup=False, soft_wrap=True)
@@ -46,6 +50,21 @@ def inspect(directory: Path, picture: Path | None, name: str | None, observation
         print_json(summary)
     else:
         print_summary(summary, results())
+
+
+def _drawn_by_default(artifact: Artifact, observation: Path | None) -> str:
+    """The default plan; without an observation the best schedule in place of plans that depend on one."""
+    default = artifact.manifest.default_plan
+    record = artifact.manifest.plans.get(default)
+    if record is None or record.kind == "schedule" or observation is not None or SCHEDULE not in artifact.schedules:
+        return default
+    progress().print(
+        f"plan {default!r} is made for each observation, and none was given: drawing {SCHEDULE!r}, the schedule that"
+        " it departs from",
+        markup=False,
+        soft_wrap=True,
+    )
+    return SCHEDULE
 
 
 def _plan(artifact: Artifact, name: str, observation: Path | None) -> PlanArray:
@@ -79,20 +98,15 @@ def _calls(path: Path, artifact: Artifact) -> list[dict[str, npt.NDArray[np.gene
     """The observations of consecutive calls, ``[1, ...]`` an array; the policy checks all but their number.
 
     Raises:
-        ObservationError: not an npz, a key is missing, or the arrays do not hold the same number of calls.
+        TrajectoryError: not an npz.
+        ObservationError: a key is missing, or the arrays do not hold the same number of calls.
     """
     specs = artifact.manifest.spec.observations
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            arrays = {key: stored[key] for key in specs if key in stored.files}
-            found = stored.files
-    except (OSError, ValueError) as error:
-        raise ObservationError(
-            f"{path}: cannot be read as .npz: {error}. Give an .npz with the keys {list(specs)}."
-        ) from error
-    missing = [key for key in specs if key not in arrays]
+    stored = read_npz(path)
+    missing = [key for key in specs if key not in stored]
     if missing:
-        raise ObservationError(f"{path}: has no array {missing[0]!r}; expected {list(specs)}, found {found}.")
+        raise ObservationError(f"{path}: has no array {missing[0]!r}; expected {list(specs)}, found {list(stored)}.")
+    arrays = {key: stored[key] for key in specs}
     rows = {k: a if a.ndim > len(specs[k].shape) else a[None] for k, a in arrays.items()}
     counts = {k: len(a) for k, a in rows.items()}
     if len(set(counts.values())) != 1 or 0 in counts.values():
