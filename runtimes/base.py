@@ -195,20 +195,21 @@ def check_call(streams: int | None, noise: Noise, sample: tuple[int, int], sampl
     Raises:
         ObservationError: see ``Runtime.predict``.
     """
-    initial = np.shape(noise.initial)
+    initial: tuple[int, ...] = np.shape(noise.initial)
     if len(initial) != 3 or initial[1:] != sample or initial[0] < 1:
         raise ObservationError(
             f"noise.initial has shape {initial}; expected [B, T, D] = (B, {sample[0]}, {sample[1]})."
         )
     found = initial[0]
     expected = (sampler.steps, *initial)
-    if sampler.stochastic and noise.steps is None:
+    draws = noise.steps if sampler.stochastic else None
+    if sampler.stochastic and draws is None:
         raise ObservationError(
             f"noise.steps is None, and the sampler {sampler.name!r} draws noise at its steps; expected float32"
             f" [K, B, T, D] = {expected}."
         )
-    if sampler.stochastic and np.shape(noise.steps) != expected:
-        raise ObservationError(f"noise.steps has shape {np.shape(noise.steps)}; expected [K, B, T, D] = {expected}.")
+    if draws is not None and np.shape(draws) != expected:
+        raise ObservationError(f"noise.steps has shape {np.shape(draws)}; expected [K, B, T, D] = {expected}.")
     if streams is not None and streams != found:
         raise ObservationError(
             f"the call has {found} streams, and the episode under way has {streams}: the rollout cache is kept for"

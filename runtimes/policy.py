@@ -187,8 +187,9 @@ class CompiledPolicy:
         if plan is None:
             plan = self._manifest.default_plan
         if not isinstance(plan, str):
+            given: Any = plan
             try:
-                return np.asarray(plan.numpy(force=True) if is_tensor(plan) else plan), GIVEN, False
+                return np.asarray(given.numpy(force=True) if is_tensor(given) else given), GIVEN, False
             except (TypeError, ValueError) as error:
                 raise IllegalPlanError(
                     f"the plan is no matrix of integers ({error}); expected int8 [K, blocks] or [B, K, blocks] of"
