@@ -152,6 +152,7 @@ class CompiledPolicy:
             IllegalPlanError: a plan that is unknown, malformed or illegal; nothing was executed.
         """
         with self._alone():
+            self._report = None
             spec = self._manifest.spec
             obs = check_observation(obs_dict, spec.observations)
             streams = len(next(iter(obs.values())))
@@ -165,7 +166,6 @@ class CompiledPolicy:
             else:
                 noise = check_noise(noise, streams, self._manifest.steps, spec.sample, spec.sampler.stochastic)
             matrix, name, repair = self._plan(plan)
-            self._report = None
             normalized = {key: _normalized(array, spec.observations[key]) for key, array in obs.items()}
             sample, self._report = self._runtime.predict(normalized, noise, matrix, plan_name=name, repair=repair)
             predicted = sample[..., : spec.chunk.action_dim]

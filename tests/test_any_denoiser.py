@@ -17,6 +17,11 @@ from ttscompile.runtimes import open_runtime
 STREAMS = 3
 
 
+def policy_stream(name: str) -> tuple[int, ...]:
+    """Shape of one stream's residuals, wherever the module keeps its streams: four tokens of the module's width."""
+    return (4, 2) if name == "bare observation" else (4, 16)
+
+
 @pytest.mark.parametrize("name", MODULES)
 def test_from_a_module_to_both_runtimes(name: str, tmp_path: Path) -> None:
     torch.manual_seed(0)
@@ -32,6 +37,7 @@ def test_from_a_module_to_both_runtimes(name: str, tmp_path: Path) -> None:
             sample = sample - 0.1 * module(sample, torch.full((STREAMS,), int(t)), torch.from_numpy(obs))
     for runtime in ("reference", "onnxruntime"):
         policy = ttscompile.load(tmp_path / "compiled", runtime=runtime)
+        assert {block.shape for block in policy.info.blocks} == {policy_stream(name)}
         found = policy.predict_action({"obs": obs}, noise=noise, plan="dense")["action_pred"]
         np.testing.assert_allclose(found, sample.numpy(), rtol=1e-5, atol=1e-6)
 

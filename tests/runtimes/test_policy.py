@@ -144,8 +144,8 @@ def test_a_stochastic_sampler_needs_its_draws(toy_artifact: Artifact, runtime: s
 
 def test_a_refused_call_leaves_no_report_of_the_one_before(policy: CompiledPolicy) -> None:
     policy.predict_action({"obs": OBS}, plan="dense")
-    with pytest.raises(IllegalPlanError):
-        policy.predict_action({"obs": OBS}, plan=np.full((5, 5), Source.TIMESTEP))
+    with pytest.raises(ObservationError):
+        policy.predict_action({"obs": OBS * np.float32(np.nan)}, plan="dense")
     assert policy.last_report is None
 
 
