@@ -210,6 +210,8 @@ def _checked(path: Path, key: str, array: Array, spec: ObservationSpec, frames: 
         raise TrajectoryError(f"{path}: {key!r} has dtype {array.dtype}; expected {wanted}. Convert it with astype.")
     with np.errstate(over="ignore"):
         cast = array.astype(wanted)
+    if wanted.kind != "f" and not np.array_equal(cast, array):
+        raise TrajectoryError(f"{path}: {key!r} holds numbers that {wanted} cannot; expected values of that dtype.")
     if wanted.kind == "f":
         bad = np.flatnonzero(~np.isfinite(cast.reshape(len(cast), -1)).all(1))
         if len(bad):

@@ -213,3 +213,14 @@ def test_formats_of_other_tools_are_named(tmp_path: Path, make: Any, name: str) 
     (path,) = tmp_path.iterdir()
     with pytest.raises(TrajectoryError, match=rf"is an? {name}.*does not read yet\. Save the observations as an \.npz"):
         load(path)
+
+
+def test_integers_that_would_wrap_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "calls.npz"
+    specs = {"goal": ObservationSpec((2,), dtype="uint8")}
+    np.savez(path, goal=np.array([[1, 2], [3, 300]]), episode_ends=np.array([2]))
+    with pytest.raises(TrajectoryError, match="'goal' holds numbers that uint8 cannot"):
+        load_trajectories([path], specs, 2)
+    np.savez(path, goal=np.array([[1, 2], [3, 255]]), episode_ends=np.array([2]))
+    (episode,) = load_trajectories([path], specs, 2)
+    assert episode.observations["goal"].dtype == np.uint8

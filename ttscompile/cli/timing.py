@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 import ttscompile
 from ttscompile.artifact.load import load_artifact
-from ttscompile.config import Noise, PolicySpec
+from ttscompile.config import Affine, Noise, PolicySpec
 from ttscompile.errors import RuntimeUnavailableError, SpecError
 from ttscompile.lattice import Source
 
@@ -184,6 +184,11 @@ def _eager(checkpoint: Path, threads: int, spec: PolicySpec, dense_flops: float)
             f"{checkpoint}: expected the policy that the artifact was made from, {_interface(spec)}; found"
             f" {_interface(original)}. Give that policy's checkpoint."
         )
+    if different := _different_statistics(original, spec):
+        raise SpecError(
+            f"{checkpoint}: expected the policy that the artifact was made from; found another one of the same shapes:"
+            f" the normaliser of {', '.join(different)} differs. Give that policy's checkpoint."
+        )
     torch.set_num_threads(threads)
     run = eager_policy(module, spec)
 
@@ -200,6 +205,21 @@ def _eager(checkpoint: Path, threads: int, spec: PolicySpec, dense_flops: float)
 def _interface(spec: PolicySpec) -> str:
     observations = ", ".join(f"{key} {observation.shape}" for key, observation in spec.observations.items())
     return f"sample {spec.sample}, observations {observations}"
+
+
+def _different_statistics(found: PolicySpec, expected: PolicySpec) -> list[str]:
+    """What is normalised with other numbers: the statistics of the training data tell policies of one task apart."""
+    pairs = {
+        f"observation {k!r}": (o.normalizer, expected.observations[k].normalizer) for k, o in found.observations.items()
+    }
+    pairs["the action"] = (found.chunk.normalizer, expected.chunk.normalizer)
+    return [name for name, (left, right) in pairs.items() if not _same(left, right)]
+
+
+def _same(left: Affine | None, right: Affine | None) -> bool:
+    if left is None or right is None:
+        return left is right
+    return np.array_equal(left.scale, right.scale) and np.array_equal(left.offset, right.offset)
 
 
 def _summary(contestant: Contestant, times: Sequence[float], reports: Sequence[Any]) -> Measurement:
