@@ -52,7 +52,7 @@ def name_model(exported: ModelProto, name: str, inputs: Values, constants: Value
             aliases.append(helper.make_node("Identity", [value.name], [result]))
         names[result] = own
         needed.add(result)
-    live = _live([*graph.node, *aliases], needed)
+    live = live_nodes([*graph.node, *aliases], needed)
     taken = bound | {own for own, _ in outputs}
     counter = _fresh_names("v", taken)
     for node in live:
@@ -93,7 +93,7 @@ def only(model: ModelProto, inputs: Sequence[ValueInfoProto], outputs: Sequence[
     """
     part = ModelProto()
     part.CopyFrom(model)
-    nodes = _live(list(model.graph.node), {value.name for value in outputs})
+    nodes = live_nodes(list(model.graph.node), {value.name for value in outputs})
     own = {value.name for value in inputs}
     foreign = {value.name for value in model.graph.input} - own
     for node in nodes:
@@ -105,7 +105,7 @@ def only(model: ModelProto, inputs: Sequence[ValueInfoProto], outputs: Sequence[
     return part
 
 
-def _live(nodes: Sequence[NodeProto], outputs: set[str]) -> list[NodeProto]:
+def live_nodes(nodes: Sequence[NodeProto], outputs: set[str]) -> list[NodeProto]:
     """The nodes that outputs depend on."""
     needed = set(outputs)
     live = []

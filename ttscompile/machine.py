@@ -8,7 +8,10 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+CPUINFO = Path("/proc/cpuinfo")
 PACKAGES = ("ttscompile", "numpy", "onnxruntime", "torch")
+_DOT_PRODUCTS = ("avx512_vnni", "avx_vnni", "amx_int8")
+_X86 = ("x86_64", "amd64", "i386", "i686")
 _INSTRUCTIONS = ("avx2", "avx512f", "avx512_vnni", "amx_int8", "asimd", "sve")
 
 
@@ -31,6 +34,18 @@ def fingerprint() -> dict[str, Any]:
     }
 
 
+def has_integer_dot_product() -> bool | None:
+    """Whether the processor multiplies eight-bit integers and sums in 32 bits.
+
+    On x86 that takes VNNI or AMX: without, onnxruntime's fastest kernels sum pairs of products in 16 bits, which
+    saturate. ARM processors have such sums in one form or another. None: nothing says what the processor has.
+    """
+    if platform.machine().lower() not in _X86:
+        return True
+    flags = _cpuinfo().get("flags", "").split()
+    return any(name in flags for name in _DOT_PRODUCTS) if flags else None
+
+
 def one_line(machine: dict[str, Any]) -> str:
     """The fingerprint for people."""
     versions = ", ".join(f"{name} {machine[name]}" for name in ("python", *PACKAGES) if name in machine)
@@ -42,10 +57,9 @@ def one_line(machine: dict[str, Any]) -> str:
 
 def _cpuinfo() -> dict[str, str]:
     """The first processor's fields of ``/proc/cpuinfo``; empty where there is no such file."""
-    path = Path("/proc/cpuinfo")
-    if not path.exists():
+    if not CPUINFO.exists():
         return {}
-    first = path.read_text().split("\n\n", 1)[0]
+    first = CPUINFO.read_text().split("\n\n", 1)[0]
     pairs = (line.split(":", 1) for line in first.splitlines() if ":" in line)
     return {name.strip(): value.strip() for name, value in pairs}
 

@@ -1,0 +1,128 @@
+"""Residual blocks in eight bits: what the processor must have, and what they do to the actions."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from ttscompile.artifact.manifest import DENSE, PrecisionError
+from ttscompile.config import FP32, ChunkSpec, FloatArray, Noise, PolicySpec
+from ttscompile.errors import ObservationError
+from ttscompile.machine import has_integer_dot_product
+
+from .base import open_runtime
+
+if TYPE_CHECKING:
+    from ttscompile.artifact.load import Artifact
+
+EXACT_INTEGERS = "session.x64quantprecision"
+"""Option of onnxruntime's sessions: sum products of integers exactly, slower than in fp32, rather than in 16 bits that
+saturate. It takes processors with VNNI for such that saturate, and costs them their speed; so it is only set where it
+is needed."""
+
+CALLS = 8
+"""Random observations that a precision is measured on. On Push-T at K = 100 that takes some seconds."""
+
+MARGIN = 4.0
+"""Tolerance over the largest difference that was measured."""
+
+Call = tuple[Mapping[str, FloatArray], Noise]
+
+
+def needs_care(precision: str) -> bool:
+    """Whether sessions need ``EXACT_INTEGERS`` for blocks of this precision to be right; warns that they are slow then.
+
+    Args:
+        precision: of the artifact's blocks.
+    """
+    if precision == FP32:
+        return False
+    found = has_integer_dot_product()
+    if found:
+        return False
+    what = "nothing that says what this one has" if found is None else "one without them"
+    warnings.warn(
+        f"precision {precision!r} is fast on a processor with integer dot products (on x86 avx512_vnni, avx_vnni or"
+        f" amx_int8 among the flags in /proc/cpuinfo); found {what}. The actions are right, and take about as long as"
+        " in fp32. Load the policy with precision='fp32', or convert the checkpoint with --precision fp32.",
+        RuntimeWarning,
+        stacklevel=2,
+    )
+    return True
+
+
+def measure_precision(artifact: Artifact) -> PrecisionError:
+    """Dense calls in the artifact's precision against dense calls in fp32, on random observations, with equal noise.
+
+    Observations are uniform within the range of the normaliser, or in -1..1 where there is none. Figures are rounded
+    to four digits, so that they rarely depend on the processor.
+    """
+    spec = artifact.manifest.spec
+    differences = compare(artifact, artifact.schedule(DENSE), random_calls(spec, CALLS))
+    errors = np.array([action_errors(spec.chunk, one, other) for one, other in differences])
+    shares = [float(np.abs(one - other).max() / np.abs(other).max()) for one, other in differences]
+    return PrecisionError(
+        calls=CALLS,
+        mean=_rounded(errors.mean()),
+        p90=_rounded(np.quantile(errors.mean(axis=1), 0.9)),
+        largest=_rounded(errors.max()),
+        tolerance=_rounded(MARGIN * max(shares)),
+    )
+
+
+def compare(
+    artifact: Artifact, plan: npt.NDArray[np.int8], calls: Iterable[Call]
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Denoised samples ``[T, D]`` of each call in the artifact's precision, and in fp32.
+
+    Each call is an episode of one stream: the scale of activations is that of the whole batch.
+
+    Args:
+        artifact: with blocks of another precision.
+        plan: ``[K, blocks]``, without reads of earlier calls.
+        calls: normalised observation and noise of one stream each.
+    """
+    runtimes = open_runtime(artifact), open_runtime(artifact.at_precision(FP32))
+    pairs = []
+    for obs, noise in calls:
+        samples = []
+        for runtime in runtimes:
+            runtime.reset()
+            samples.append(runtime.predict(obs, noise, plan)[0][0])
+        if not np.isfinite(samples).all():
+            raise ObservationError(
+                "the policy's dense action on a random observation within the range of its normaliser is not a number."
+                " Convert with precision 'fp32', and look for NaN in the checkpoint."
+            )
+        pairs.append((samples[0], samples[1]))
+    return pairs
+
+
+def action_errors(chunk: ChunkSpec, one: FloatArray, other: FloatArray) -> npt.NDArray[np.float64]:
+    """Absolute differences of the executed actions of two samples ``[T, D]``, in the units of the actions, flat."""
+    part = (slice(chunk.start, chunk.stop), slice(chunk.action_dim))
+    difference = np.abs(one[part].astype(np.float64) - other[part])
+    if chunk.normalizer is not None:
+        difference /= np.abs(chunk.normalizer.scale)
+    return difference.ravel()
+
+
+def random_calls(spec: PolicySpec, count: int) -> Iterator[Call]:
+    """Normalised observations and noise, the same at every time."""
+    for number in range(count):
+        rng = np.random.default_rng((number, 8))
+        obs = {
+            key: rng.uniform(-1, 1, (1, *one.shape)).astype(np.float32 if one.normalizer is not None else one.dtype)
+            for key, one in spec.observations.items()
+        }
+        initial = rng.standard_normal((1, *spec.sample), dtype=np.float32)
+        draws = rng.standard_normal((spec.sampler.steps, *initial.shape), dtype=np.float32)
+        yield obs, Noise(initial, draws if spec.sampler.stochastic else None)
+
+
+def _rounded(number: float) -> float:
+    return float(f"{number:.4g}")

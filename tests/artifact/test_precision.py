@@ -1,0 +1,177 @@
+"""Blocks of another precision in an artifact: beside fp32, hashed, chosen by ``at_precision``; hostile manifests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+import pytest
+
+from tests.artifact.folders import contents, flip
+from tests.artifact.tiny import HORIZON, WIDTH, tiny_models, tiny_program
+from ttscompile.artifact import codec
+from ttscompile.artifact.load import load_artifact, read_manifest
+from ttscompile.artifact.manifest import Manifest, PrecisionError
+from ttscompile.artifact.precision import LoweredBlocks
+from ttscompile.artifact.strict_json import Value
+from ttscompile.artifact.write import update_calibration, write_artifact
+from ttscompile.errors import ArtifactError
+from ttscompile.lattice import uniform_plan
+from ttscompile.lower_precision import lower_precision
+
+ERROR = PrecisionError(calls=8, mean=0.25, p90=0.5, largest=1.5, tolerance=0.03)
+
+
+def lowered(seed: int = 0) -> LoweredBlocks:
+    program = tiny_program(seed)
+    models, weights, _ = lower_precision(tiny_models(program), program.weights, "int8")
+    return LoweredBlocks("int8", models, weights, ERROR)
+
+
+def write(directory: Path, blocks: LoweredBlocks | None) -> Path:
+    program = tiny_program()
+    write_artifact(program, tiny_models(program), directory, blocks)
+    return directory
+
+
+@pytest.fixture
+def int8(tmp_path: Path) -> Path:
+    return write(tmp_path / "int8", lowered())
+
+
+def test_fp32_stays_and_the_rest_comes_beside_it(int8: Path, tmp_path: Path) -> None:
+    plain, both = contents(write(tmp_path / "fp32", None)), contents(int8)
+    own = {"weights_int8.safetensors", "block_00_int8.onnx", "block_01_int8.onnx"}
+    assert set(both) - set(plain) == own
+    assert {name for name in plain if plain[name] != both[name]} == {"manifest.json"}
+    assert b'"precision"' not in plain["manifest.json"], "an fp32 artifact is what it was before there was another"
+    assert len(both["weights_int8.safetensors"]) < 0.5 * 2 * 4 * WIDTH * WIDTH + 1024
+
+
+def test_the_same_input_gives_the_same_bytes(int8: Path, tmp_path: Path) -> None:
+    assert contents(write(tmp_path / "again", lowered())) == contents(int8)
+
+
+def test_the_identity_tells_the_precision_and_a_calibration_belongs_to_both(int8: Path, tmp_path: Path) -> None:
+    plain, both = read_manifest(write(tmp_path / "fp32", None)), read_manifest(int8)
+    other = read_manifest(write(tmp_path / "other", lowered(seed=1)))
+    assert len({plain.identity, both.identity, other.identity}) == 3
+    assert plain.model_identity == both.model_identity == other.model_identity
+    unmeasured = read_manifest(write(tmp_path / "unmeasured", replace(lowered(), error=None)))
+    assert unmeasured.identity == both.identity, "figures about an artifact are not what it computes"
+
+
+def test_blocks_are_opened_in_the_precision_that_was_asked_for(int8: Path) -> None:
+    artifact = load_artifact(int8)
+    assert artifact.manifest.precision is not None and artifact.manifest.precision.error == ERROR
+    assert artifact.at_precision("int8") is artifact
+    plain = artifact.at_precision("fp32")
+    assert plain.manifest.precision_name == "fp32" and artifact.manifest.precision_name == "int8"
+    x = np.random.default_rng(0).standard_normal((2, HORIZON, WIDTH)).astype(np.float32)
+    feed = {"stream_0": x, "modulation": np.zeros((2, 1, WIDTH), np.float32)}
+    results = []
+    for one in (artifact, plain):
+        session = onnxruntime.InferenceSession(str(one.onnx_path("block_00")), providers=["CPUExecutionProvider"])
+        results.append(session.run(None, feed)[0])
+        assert one.onnx_path("stem").name == "stem.onnx"
+    expected = x @ artifact.weights["block.0.weight"].T
+    np.testing.assert_allclose(results[1], expected, rtol=1e-5, atol=1e-4)
+    assert 0 < np.linalg.norm(results[0] - expected) / np.linalg.norm(expected) < 0.02
+    with pytest.raises(ArtifactError, match=r"'bf16': expected one that the artifact holds, \['fp32', 'int8'\]"):
+        artifact.at_precision("bf16")
+    with pytest.raises(ArtifactError, match=r"holds, \['fp32'\]. Convert .* --precision int8"):
+        plain.at_precision("int8")
+
+
+def test_a_calibration_keeps_the_precision(int8: Path) -> None:
+    before = read_manifest(int8)
+    update_calibration(int8, None, {"uniform": uniform_plan(3, 2, 1)}, "uniform", {})
+    after = load_artifact(int8).manifest
+    assert after.precision == before.precision
+    assert after.identity != before.identity
+
+
+@pytest.mark.parametrize("name", ["weights_int8.safetensors", "block_01_int8.onnx"])
+def test_changed_and_missing_files_are_found(int8: Path, name: str) -> None:
+    flip(int8 / name, (int8 / name).stat().st_size - 1)
+    with pytest.raises(ArtifactError, match=f"{name}: expected sha256"):
+        load_artifact(int8)
+    (int8 / name).unlink()
+    with pytest.raises(ArtifactError, match=f"{name}: the file is missing"):
+        load_artifact(int8)
+
+
+def test_an_int8_artifact_is_replaced_by_an_fp32_one(int8: Path, tmp_path: Path) -> None:
+    write(int8, None)
+    assert contents(int8) == contents(write(tmp_path / "fp32", None))
+
+
+def test_constants_of_the_programs_names_and_models_of_other_interfaces_are_refused(tmp_path: Path) -> None:
+    blocks = lowered()
+    clash = replace(blocks, weights={**blocks.weights, "block.0.weight": np.zeros((2, 2), np.int8)})
+    with pytest.raises(ArtifactError, match=r"new names; found 'block\.0\.weight'"):
+        write(tmp_path / "a", clash)
+    swapped = replace(blocks, models={"block_01": blocks.models["block_00"]})
+    with pytest.raises(ArtifactError, match=r"'block_01' reads \['stream_0', 'modulation'\].*expected"):
+        write(tmp_path / "b", swapped)
+    with pytest.raises(ArtifactError, match="expected no such piece"):
+        write(tmp_path / "c", replace(blocks, models={"block_07": blocks.models["block_00"]}))
+    with pytest.raises(ArtifactError, match="has no data and is no constant"):
+        write(tmp_path / "d", replace(blocks, weights={"unread": np.zeros(3, np.int8)}))
+    assert list(tmp_path.iterdir()) == []
+
+
+Change = Callable[[dict[str, Any]], object]
+
+
+def decoded(manifest: Manifest, change: Change) -> Manifest:
+    document = codec.to_json(manifest)
+    change(document["precision"])
+    return codec.from_json(Value(document, "manifest.json"))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda p: p.update(name="int4"), "precision.name: expected one of 'int8'"),
+        (lambda p: p.update(name=8), "precision.name: expected one of 'int8'"),
+        (lambda p: p.update(weights="../weights"), "precision.weights: expected a plain file name"),
+        (lambda p: p.update(weights="weights.safetensors"), "which nothing else uses"),
+        (lambda p: p.update(weights="block_00_int8.onnx"), "which nothing else uses"),
+        (lambda p: p.update(models={}), "expected models of some of the blocks block_00, block_01"),
+        (
+            lambda p: p["models"].update(blocks="blocks_int8.onnx"),
+            "a model called 'blocks' exactly when there is a piece",
+        ),
+        (lambda p: p.update(models=[]), "precision.models: expected an object"),
+        (lambda p: p["models"].update(stem="stem_int8.onnx"), "expected models of some of the blocks"),
+        (lambda p: p["models"].update(block_00="block_01_int8.onnx"), "which nothing else uses"),
+        (lambda p: p["models"].update(block_00="/etc/passwd"), "models.block_00: expected a plain file name"),
+        (lambda p: p["models"].update(block_00="advance.onnx"), "which nothing else uses"),
+        (lambda p: p["models"].update(block_00="block_00_int9.onnx"), "files: expected exactly the files"),
+        (lambda p: p["models"].pop("block_00"), "files: expected exactly the files"),
+        (lambda p: p.pop("error"), "missing: ..error"),
+        (lambda p: p.update(more=1), "unknown: ..more"),
+        (lambda p: p.update(error=0), "precision.error: expected an object"),
+        (lambda p: p["error"].update(mean=-1), "error.mean: expected a number that is not negative"),
+        (lambda p: p["error"].update(tolerance=float("nan")), "error.tolerance: expected a finite number"),
+        (lambda p: p["error"].update(largest="1"), "error.largest: expected a number"),
+        (lambda p: p["error"].update(calls=0), "error.calls: expected a 64-bit integer of at least 1"),
+        (lambda p: p["error"].pop("p90"), "missing: ..p90"),
+    ],
+)
+def test_a_hostile_record_is_refused(int8: Path, change: Change, message: str) -> None:
+    manifest = read_manifest(int8)
+    assert decoded(manifest, lambda p: None).precision == manifest.precision
+    with pytest.raises(ArtifactError, match=message):
+        decoded(manifest, change)
+
+
+def test_a_precision_of_null_is_refused(int8: Path) -> None:
+    document = codec.to_json(read_manifest(int8)) | {"precision": None}
+    with pytest.raises(ArtifactError, match="precision: expected an object"):
+        codec.from_json(Value(document, "manifest.json"))

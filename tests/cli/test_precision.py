@@ -1,0 +1,92 @@
+"""``convert --precision``: what the command says about it, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import ttscompile
+from ttscompile import Noise
+from ttscompile.cli import main
+from ttscompile.cli.timing import contestants, random_calls
+
+STEPS = 4
+
+
+def run(*arguments: object) -> Any:
+    return CliRunner().invoke(main, [str(a) for a in arguments], catch_exceptions=False)
+
+
+@pytest.fixture(scope="module")
+def converted(pusht_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """The Push-T policy with eight-bit weights and few steps, and what the command said."""
+    directory = tmp_path_factory.mktemp("int8") / "compiled"
+    options = ("--sampler", "ddim", "--steps", STEPS, "--precision", "int8", "--json")
+    result = run("convert", pusht_checkpoint, "-o", directory, *options)
+    assert result.exit_code == 0, result.stderr
+    return directory, json.loads(result.stdout)
+
+
+def test_convert_and_inspect_say_the_precision_and_its_error(converted: tuple[Path, dict[str, Any]]) -> None:
+    directory, told = converted
+    stage = next(stage for stage in told.pop("stages") if stage["stage"] == "lower_precision")
+    assert stage["notes"][0].startswith("int8: 48 matrices of 24 of 24 blocks")
+    assert json.loads(run("inspect", directory, "--json").stdout) == told
+    record = told["precision"]
+    assert (record["name"], record["blocks"]) == ("int8", 24)
+    assert 7.0e6 < record["bytes"] < 8.0e6
+    assert 0.02 < record["error"]["mean"] < 2.0, "of 512 pixels"
+    text = " ".join(run("inspect", directory).stdout.split())
+    assert "int8 weights in 24 of 24 blocks" in text and "random observations" in text
+
+
+def test_pusht_is_the_reference_within_the_stated_tolerance(converted: tuple[Path, dict[str, Any]]) -> None:
+    directory, told = converted
+    rng = np.random.default_rng(100)
+    obs = {"obs": rng.uniform(100, 400, (1, 2, 20)).astype(np.float32)}
+    noise = Noise(rng.standard_normal((1, 16, 2), dtype=np.float32))
+    compiled, reference = (ttscompile.load(directory, runtime) for runtime in ("onnxruntime", "reference"))
+    found, expected = (p.predict_action(obs, noise=noise, plan="dense")["action"] for p in (compiled, reference))
+    normalizer = compiled.info.action.normalizer
+    assert normalizer is not None
+    largest = np.abs(normalizer.normalize(expected)).max()
+    difference = np.abs(normalizer.normalize(found) - normalizer.normalize(expected)).max()
+    assert 1e-5 < difference / largest < told["precision"]["error"]["tolerance"]
+
+
+def test_fp32_is_the_default_and_inspect_says_so(compiled_pusht: Path) -> None:
+    told = json.loads(run("inspect", compiled_pusht, "--json").stdout)
+    assert told["precision"] == {"name": "fp32", "blocks": 0, "bytes": 0, "error": None}
+    assert "fp32" in run("inspect", compiled_pusht).stdout
+
+
+def test_bf16_is_refused_with_the_reason_before_the_checkpoint_is_read(tmp_path: Path) -> None:
+    result = run("convert", tmp_path / "missing.ckpt", "-o", tmp_path / "compiled", "--precision", "bf16")
+    assert result.exit_code == 2
+    message = " ".join(result.stderr.split())
+    assert "precision 'bf16': expected an onnxruntime whose CPU provider" in message
+    assert "Convert with precision 'int8'" in message
+    assert not (tmp_path / "compiled").exists()
+
+
+def test_a_precision_that_there_is_not_is_a_usage_error(tmp_path: Path) -> None:
+    result = run("convert", tmp_path / "missing.ckpt", "-o", tmp_path / "compiled", "--precision", "int4")
+    assert result.exit_code == 2
+    assert "'int4' is not one of 'fp32', 'bf16', 'int8'" in result.stderr
+
+
+def test_bench_times_the_rival_in_fp32_and_names_the_precision(converted: tuple[Path, dict[str, Any]]) -> None:
+    result = run("bench", converted[0], "--runs", 2, "--plan", "dense", "--json")
+    labels = [contestant["label"] for contestant in json.loads(result.stdout)["contestants"]]
+    assert labels == ["compiled, int8", "dense onnxruntime"]
+    entered = contestants(converted[0], 1, "dense", ["onnxruntime-dense"], None)
+    ((obs, noise),) = random_calls(entered[0].spec, 1, 0)
+    answers = [one.call(obs, noise)["action"] for one in entered]  # type: ignore[index]
+    expected = ttscompile.load(converted[0], precision="fp32").predict_action(obs, noise=noise, plan="dense")["action"]
+    np.testing.assert_array_equal(answers[1], expected)
+    assert not np.array_equal(answers[0], expected)

@@ -1,0 +1,207 @@
+"""``lower_precision``: integer products that are what they replace, within what eight bits allow."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import onnx
+import onnxruntime
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from onnx import ModelProto, NodeProto, TensorProto
+from onnx.helper import make_graph, make_model, make_node, make_opsetid, make_tensor_value_info
+
+from tests.lower.modules import captured, random_values
+from ttscompile.errors import LoweringError
+from ttscompile.ir.evaluate import evaluate
+from ttscompile.lower import lower_graph
+from ttscompile.lower_precision import lower_precision, quantize_matrix, quantize_model
+from ttscompile.machine import has_integer_dot_product
+from ttscompile.runtimes.precision import EXACT_INTEGERS
+
+Array = npt.NDArray[Any]
+
+
+def session(model: ModelProto, constants: Mapping[str, Array], exact: bool = True) -> onnxruntime.InferenceSession:
+    filled = ModelProto()
+    filled.CopyFrom(model)
+    for tensor in filled.graph.initializer:
+        if not tensor.raw_data:
+            value = constants[tensor.name]
+            assert (tuple(tensor.dims), onnx.helper.tensor_dtype_to_np_dtype(tensor.data_type)) == (
+                value.shape,
+                value.dtype,
+            )
+            tensor.raw_data = np.ascontiguousarray(value).tobytes()
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    options.add_session_config_entry(EXACT_INTEGERS, str(int(exact)))
+    return onnxruntime.InferenceSession(filled.SerializeToString(), options, providers=["CPUExecutionProvider"])
+
+
+def by_hand(nodes: list[NodeProto], weights: Mapping[str, Array], rows: int, columns: int) -> ModelProto:
+    """A model from ``x [N, rows]`` to ``y [N, columns]``."""
+    empty = [
+        TensorProto(name=name, dims=value.shape, data_type=onnx.helper.np_dtype_to_tensor_dtype(value.dtype))
+        for name, value in weights.items()
+    ]
+    ends = [make_tensor_value_info(n, TensorProto.FLOAT, ["N", size]) for n, size in (("x", rows), ("y", columns))]
+    graph = make_graph(nodes, "g", ends[:1], ends[1:], empty)
+    return make_model(graph, opset_imports=[make_opsetid("", 23)], ir_version=10)
+
+
+def quantized_product(x: Array, matrix: Array) -> Array:
+    """What the integer product should give, in float64: activations uint8 with one scale, weights as quantised."""
+    low, high = min(0.0, float(x.min())), max(0.0, float(x.max()))
+    scale = np.float32((np.float32(high) - np.float32(low)) / np.float32(255))
+    zero = np.clip(np.rint(-low / scale), 0, 255)
+    integers = np.clip(np.rint(x / scale) + zero, 0, 255)
+    values, scales = quantize_matrix(matrix)
+    product: Array = (integers - zero) @ values.astype(np.float64) * scale * scales
+    return product
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**32 - 1), st.integers(-30, 30))
+def test_a_matrix_is_within_half_a_step_of_its_column(rows: int, columns: int, seed: int, exponent: int) -> None:
+    rng = np.random.default_rng(seed)
+    matrix = (rng.standard_normal((rows, columns)) * 10.0 ** rng.uniform(exponent - 3, exponent, columns)).astype("f4")
+    matrix[:, rng.random(columns) < 0.2] = 0
+    values, scales = quantize_matrix(matrix)
+    assert values.dtype == np.int8 and scales.dtype == np.float32 and scales.shape == (columns,)
+    assert values.min() >= -127 and np.isfinite(scales).all() and (scales > 0).all()
+    assert (np.abs(values * scales.astype("f8") - matrix) <= 0.5001 * scales).all()
+    used = np.abs(matrix).max(axis=0) > 0
+    assert (np.abs(values).max(axis=0)[used] == 127).all(), "a column does not use its range"
+
+
+@pytest.mark.parametrize("name", ["SelfAttention", "CrossAttention", "FeedForward", "AdaptiveNorm", "SequenceFirst"])
+def test_real_modules_stay_what_they_were(name: str) -> None:
+    _, graph, tensors = captured(name)
+    weights = {key: value.numpy() for key, value in tensors.items()}
+    exact = lower_graph(graph, "block_00")
+    model, constants = quantize_model(exact, weights)
+    assert [v.name for v in model.graph.input] == [v.name for v in exact.graph.input]
+    assert list(model.graph.output) == list(exact.graph.output)
+    products = [node for node in model.graph.node if node.op_type == "DynamicQuantizeMatMul"]
+    assert len(products) == sum(n.op_type == "Gemm" and n.input[1] in weights for n in exact.graph.node) > 0
+    assert not any(tensor.raw_data for tensor in model.graph.initializer if tensor.name in constants)
+    running = session(model, {**weights, **constants})
+    for streams in (1, 2, 5):
+        inputs = random_values(graph.inputs, streams)
+        found = running.run(None, {key: value.numpy() for key, value in inputs.items()})[0]
+        (expected,) = (value.numpy() for value in evaluate(graph, tensors, inputs))
+        difference = np.linalg.norm(found - expected) / np.linalg.norm(expected)
+        assert 0 < difference < 0.02, "as float32, or further off than eight bits explain"
+
+
+@pytest.mark.parametrize("rows", [1, 7, 256, 1024])
+@pytest.mark.parametrize("bias", [True, False])
+def test_the_product_is_exactly_the_quantised_one(rows: int, bias: bool) -> None:
+    """A wrong scale, a swapped axis or a saturated sum is far beyond this tolerance, which is rounding of float32."""
+    rng = np.random.default_rng(rows)
+    weights = {"w": (rng.standard_normal((24, rows)) * 10.0 ** rng.uniform(-2, 2, (24, 1))).astype(np.float32)}
+    if bias:
+        weights["b"] = rng.standard_normal(24).astype(np.float32)
+    model = by_hand([make_node("Gemm", ["x", *weights], ["y"], transB=1)], weights, rows, 24)
+    x = (rng.standard_normal((16, rows)) + 0.7).astype(np.float32)
+    quantised, constants = quantize_model(model, weights)
+    found = session(quantised, {**weights, **constants}).run(None, {"x": x})[0]
+    expected = quantized_product(x, weights["w"].T) + weights.get("b", 0)
+    np.testing.assert_allclose(found, expected, rtol=2e-5, atol=1e-4 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_nothing_saturates(exact: bool) -> None:
+    """The largest sums there are: sixteen bits hold 32767, and two of these products are 64770."""
+    if not exact and not has_integer_dot_product():
+        pytest.skip("this processor has no integer dot product: runtimes do not use it without the exact sums")
+    weights = {"w": np.full((1024, 32), 3.0, np.float32)}
+    model = by_hand([make_node("MatMul", ["x", "w"], ["y"])], weights, 1024, 32)
+    quantised, constants = quantize_model(model, weights)
+    x = np.full((16, 1024), 5.0, np.float32)
+    found = session(quantised, {**weights, **constants}, exact).run(None, {"x": x})[0]
+    np.testing.assert_allclose(found, 1024 * 15.0, rtol=1e-5)
+
+
+def test_a_transposed_constant_is_found_behind_its_transposition_and_shared_by_two_products() -> None:
+    rng = np.random.default_rng(0)
+    weights = {"w": rng.standard_normal((8, 8)).astype(np.float32)}
+    nodes = [
+        make_node("Transpose", ["w"], ["wt"], perm=[1, 0]),
+        make_node("MatMul", ["x", "wt"], ["h"]),
+        make_node("MatMul", ["h", "wt"], ["i"]),
+        make_node("MatMul", ["i", "w"], ["y"]),
+    ]
+    quantised, constants = quantize_model(by_hand(nodes, weights, 8, 8), weights)
+    assert [node.op_type for node in quantised.graph.node] == ["DynamicQuantizeMatMul"] * 3
+    assert {tensor.name for tensor in quantised.graph.initializer} == set(constants), "the float32 matrix is not read"
+    assert len(constants) == 6, "onnxruntime refuses shared integers where it makes them unsigned"
+    x = rng.standard_normal((5, 8)).astype(np.float32)
+    found = session(quantised, constants).run(None, {"x": x})[0]
+    expected = x @ weights["w"].T @ weights["w"].T @ weights["w"]
+    assert np.linalg.norm(found - expected) < 0.03 * np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize(
+    "nodes",
+    [
+        [make_node("Gemm", ["x", "w"], ["y"], alpha=0.5)],
+        [make_node("Gemm", ["x", "w", "b"], ["y"], beta=2.0)],
+        [make_node("Gemm", ["x", "w"], ["t"], transA=1), make_node("MatMul", ["x", "t"], ["y"])],
+        [make_node("Gemm", ["x", "w", "row"], ["y"])],
+        [make_node("MatMul", ["w", "x"], ["y"])],
+        [make_node("Add", ["x", "x"], ["d"]), make_node("MatMul", ["x", "d"], ["y"])],
+        [make_node("MatMul", ["w", "w"], ["y"])],
+        [make_node("MatMul", ["x", "stack"], ["y"])],
+    ],
+)
+def test_what_is_no_plain_product_by_a_constant_stays_as_it_is(nodes: list[NodeProto]) -> None:
+    weights = {name: np.ones((4, 4), np.float32) for name in ("w",)}
+    weights |= {
+        "b": np.ones(4, np.float32),
+        "row": np.ones((1, 4), np.float32),
+        "stack": np.ones((2, 4, 4), np.float32),
+    }
+    model = by_hand(nodes, weights, 4, 4)
+    same, constants = quantize_model(model, weights)
+    assert constants == {}
+    assert same.SerializeToString() == model.SerializeToString()
+    with pytest.raises(LoweringError, match="none of the 1 residual blocks multiplies"):
+        lower_precision({"block_00": model, "stem": model}, weights, "int8")
+
+
+def test_a_matrix_that_something_else_reads_stays_beside_the_integers() -> None:
+    weights = {"w": np.eye(4, dtype=np.float32)}
+    nodes = [make_node("MatMul", ["x", "w"], ["h"]), make_node("Gemm", ["h", "w", "w"], ["y"])]
+    quantised, constants = quantize_model(by_hand(nodes, weights, 4, 4), weights)
+    assert {tensor.name for tensor in quantised.graph.initializer} == {"w", *constants}
+
+
+def test_only_blocks_are_lowered_and_the_notes_say_which() -> None:
+    weights = {"w": np.ones((4, 4), np.float32)}
+    product = by_hand([make_node("MatMul", ["x", "w"], ["y"])], weights, 4, 4)
+    other = by_hand([make_node("Add", ["x", "x"], ["y"])], {}, 4, 4)
+    models = {"stem": product, "block_00": product, "block_01": other, "advance": product, "condition": product}
+    made, constants, notes = lower_precision(models, weights, "int8")
+    assert list(made) == ["block_00"]
+    assert {name: (value.dtype, value.shape) for name, value in constants.items()} == {
+        "w.int8": (np.int8, (4, 4)),
+        "w.int8.scale": (np.float32, (4,)),
+    }
+    assert notes[0].startswith("int8: 1 matrices of 1 of 2 blocks") and "block_01 stays fp32" in notes[1]
+    again = lower_precision(models, weights, "int8")[0]
+    assert again["block_00"].SerializeToString(deterministic=True) == made["block_00"].SerializeToString(
+        deterministic=True
+    )
+
+
+def test_a_precision_that_cannot_be_had_is_refused_with_what_can() -> None:
+    with pytest.raises(LoweringError, match="bf16.*expected an onnxruntime.*found none.*Convert with precision 'int8'"):
+        lower_precision({}, {}, "bf16")
+    with pytest.raises(LoweringError, match="'int4': expected one of 'fp32', 'bf16', 'int8'"):
+        lower_precision({}, {}, "int4")

@@ -1,0 +1,208 @@
+"""Weights of residual blocks in eight bits: each matrix product with constant weights becomes an integer product.
+
+Blocks of a policy stream their weights from memory once a step, which is what they wait for; a quarter of the bytes,
+and the processor's integer dot product, make them faster. Everything beside these products stays in float32: layer
+norms, attention, activations, biases, and the residual itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from onnx import AttributeProto, ModelProto, NodeProto, TensorProto, helper
+
+from .config import BF16, FP32, INT8, PRECISIONS
+from .errors import LoweringError
+from .lower_onnx import live_nodes
+
+Array = npt.NDArray[Any]
+
+_DOMAIN, _DOMAIN_VERSION = "com.microsoft", 1
+_PRODUCT = "DynamicQuantizeMatMul"
+"""Reads float32, quantises it to uint8 with one scale and zero point for the whole tensor, multiplies with int8 weights
+into int32, scales by column and adds the bias. Fastest of what onnxruntime 1.31 has; see ``docs/decisions.md``."""
+
+LARGEST = 127
+"""Weights are in -127..127: symmetric, so that a zero point never enters the product."""
+
+MOST_ROWS = 2**31 // (255 * LARGEST) - 1
+"""Terms of a sum of products that an int32 holds whatever their values."""
+
+
+@dataclass(frozen=True)
+class _Product:
+    """``x @ w + bias`` with a constant ``w``.
+
+    Attributes:
+        x: name of the float32 input.
+        weight: name of the constant.
+        transposed: whether the constant is ``w.T``.
+        bias: name of a constant ``[columns]``; empty if there is none.
+    """
+
+    x: str
+    weight: str
+    transposed: bool
+    bias: str
+
+
+def lower_precision(
+    models: Mapping[str, ModelProto], weights: Mapping[str, Array], precision: str
+) -> tuple[dict[str, ModelProto], dict[str, Array], tuple[str, ...]]:
+    """The models of residual blocks again, with weights of another precision.
+
+    Args:
+        models: from ``lower_program``; those called ``block_..`` are taken.
+        weights: constants of the program, by name.
+        precision: ``int8``; the models have ``fp32`` already.
+
+    Returns:
+        By name, the models in which a product was replaced; the new constants of these models, by name; and notes on
+        what was replaced and what was not.
+
+    Raises:
+        LoweringError: ``precision`` is none of onnxruntime's CPU provider, or no block has a product to replace.
+    """
+    require_precision(precision)
+    made: dict[str, ModelProto] = {}
+    constants: dict[str, Array] = {}
+    blocks = [name for name in models if name.startswith("block_")]
+    replaced = 0
+    for name in blocks:
+        model, new = quantize_model(models[name], weights)
+        if new:
+            made[name] = model
+            constants.update(new)
+            replaced += sum(node.op_type == _PRODUCT for node in model.graph.node)
+    if not made:
+        raise LoweringError(
+            f"precision {precision!r}: none of the {len(blocks)} residual blocks multiplies by a constant float32"
+            " matrix, so there is nothing to store in eight bits. Convert with precision 'fp32'."
+        )
+    megabytes = sum(value.nbytes for value in constants.values()) / 1e6
+    note = f"{precision}: {replaced} matrices of {len(made)} of {len(blocks)} blocks, {megabytes:.1f} MB"
+    left = [name for name in blocks if name not in made]
+    return made, constants, (note, *(f"{name} stays fp32: no product with constant weights" for name in left))
+
+
+def require_precision(precision: str) -> None:
+    """Raise unless weights of blocks can be lowered to this precision.
+
+    Raises:
+        LoweringError: says why not.
+    """
+    if precision == BF16:
+        raise LoweringError(
+            "precision 'bf16': expected an onnxruntime whose CPU provider multiplies bfloat16 matrices; found none:"
+            " on x86 it has no such kernel even where the processor has the instructions (avx512_bf16, amx_bf16), on"
+            " ARM ttscompile has not been tried with it, and storing bfloat16 to compute in float32 saves no time."
+            " Convert with precision 'int8', which is faster and whose action error is measured, or 'fp32'."
+        )
+    if precision not in (FP32, INT8):
+        raise LoweringError(f"precision {precision!r}: expected one of {', '.join(map(repr, PRECISIONS))}.")
+
+
+def quantize_model(model: ModelProto, weights: Mapping[str, Array]) -> tuple[ModelProto, dict[str, Array]]:
+    """One model with its products by constant matrices in integers; inputs and outputs stay as they are.
+
+    Args:
+        model: from ``lower``: constants are initializers without data.
+        weights: values of constants, by name. Only these are quantised.
+
+    Returns:
+        A new model, and the constants that it has and ``model`` has not, by name: int8 ``[rows, columns]`` and
+        float32 ``[columns]``. No constants if there was nothing to replace.
+    """
+    declared = {tensor.name for tensor in model.graph.initializer}
+    known = {name: value for name, value in weights.items() if name in declared}
+    flipped = {
+        node.output[0]: node.input[0]
+        for node in model.graph.node
+        if node.op_type == "Transpose" and node.input[0] in known and _attributes(node).get("perm", [1, 0]) == [1, 0]
+    }
+    constants: dict[str, Array] = {}
+    nodes = []
+    for node in model.graph.node:
+        product = _product(node, known, flipped)
+        nodes.append(node if product is None else _integer_product(node, product, known[product.weight], constants))
+    nodes = live_nodes(nodes, {value.name for value in model.graph.output})
+    quantized = ModelProto()
+    quantized.CopyFrom(model)
+    if not constants:
+        return quantized, {}
+    read = {name for node in nodes for name in node.input} | {value.name for value in model.graph.output}
+    kept = [tensor for tensor in model.graph.initializer if tensor.name in read]
+    added = [
+        TensorProto(name=name, dims=value.shape, data_type=helper.np_dtype_to_tensor_dtype(value.dtype))
+        for name, value in constants.items()
+    ]
+    for field, values in (("node", nodes), ("initializer", [*added, *kept])):
+        quantized.graph.ClearField(field)
+        getattr(quantized.graph, field).extend(values)
+    quantized.opset_import.append(helper.make_opsetid(_DOMAIN, _DOMAIN_VERSION))
+    return quantized, constants
+
+
+def quantize_matrix(matrix: Array) -> tuple[npt.NDArray[np.int8], npt.NDArray[np.float32]]:
+    """A matrix as integers times a scale for each column.
+
+    Args:
+        matrix: float32 ``[rows, columns]``.
+
+    Returns:
+        int8 ``[rows, columns]`` in -127..127, and float32 ``[columns]``; their product is within half a scale of the
+        matrix.
+    """
+    largest = np.abs(matrix).max(axis=0)
+    scale = np.where(largest < LARGEST * np.finfo(np.float32).tiny, 1.0, largest / LARGEST).astype(np.float32)
+    return np.clip(np.rint(matrix / scale), -LARGEST, LARGEST).astype(np.int8), scale
+
+
+def _product(node: NodeProto, known: Mapping[str, Array], flipped: Mapping[str, str]) -> _Product | None:
+    """What a node multiplies, if it is a product by a constant matrix that can be done in integers."""
+    attributes = _attributes(node)
+    if node.op_type == "Gemm":
+        if attributes.get("transA", 0) or attributes.get("alpha", 1.0) != 1 or attributes.get("beta", 1.0) != 1:
+            return None
+        flip, bias = bool(attributes.get("transB", 0)), node.input[2] if len(node.input) > 2 else ""
+    elif node.op_type == "MatMul":
+        flip, bias = False, ""
+    else:
+        return None
+    x, w = node.input[0], node.input[1]
+    product = _Product(x, flipped.get(w, w), flip != (w in flipped), bias)
+    matrix = known.get(product.weight)
+    if x in known or x in flipped or matrix is None or matrix.ndim != 2 or matrix.dtype != np.float32:
+        return None
+    rows, columns = matrix.shape[::-1] if product.transposed else matrix.shape
+    if not 0 < rows <= MOST_ROWS or (bias and (bias not in known or known[bias].shape != (columns,))):
+        return None
+    return product
+
+
+def _integer_product(node: NodeProto, product: _Product, matrix: Array, constants: dict[str, Array]) -> NodeProto:
+    """The node that takes the place of ``node``; its constants go into ``constants``.
+
+    No two products share them: onnxruntime 1.31 cannot load such a model where it has to make the integers unsigned
+    ("Attempt to replace the existing tensor"), which is on processors whose sums saturate.
+    """
+    name = f"{product.weight}.{INT8}"
+    while name in constants:
+        name += "_"
+    scale = f"{name}.scale"
+    values, scales = quantize_matrix(matrix.T if product.transposed else matrix)
+    constants[name], constants[scale] = np.ascontiguousarray(values), scales
+    inputs = [product.x, name, scale, "", product.bias] if product.bias else [product.x, name, scale]
+    return NodeProto(name=node.name, op_type=_PRODUCT, domain=_DOMAIN, input=inputs, output=node.output)
+
+
+def _attributes(node: NodeProto) -> dict[str, Any]:
+    attributes = {}
+    for attribute in node.attribute:
+        value = helper.get_attribute_value(attribute)
+        attributes[attribute.name] = list(value) if attribute.type == AttributeProto.INTS else value
+    return attributes
