@@ -2,19 +2,28 @@
 
 onnxruntime's global thread pool would be shared by all sessions, but it is a fact of the process: once made, its size
 cannot change, its workers spin, and every other session of the process that wants threads of its own is refused. A
-robot runs other things beside the policy. So each session has its own threads, which do not spin;
-``docs/decisions.md`` has what that costs.
+robot runs other things beside the policy. So threads belong to sessions.
+
+With one thread there is a session a block, on the caller's thread. With more, one session holds all blocks
+(``ir.joint``) and its threads, ``threads - 1`` of them, stay awake from one block to the next: they look for work for
+``SPIN_US`` after each, and then sleep. Between calls nothing runs. ``docs/decisions.md`` has the figures.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from ttscompile.artifact.manifest import PieceRecord, block_name
 from ttscompile.errors import ArtifactError, RuntimeUnavailableError
+from ttscompile.ir.graph import TensorType
+from ttscompile.ir.joint import JOINT, RESIDUAL, STREAM, Joint, join
+
+from .precision import EXACT_INTEGERS, needs_care
 
 if TYPE_CHECKING:
     from ttscompile.artifact.load import Artifact
@@ -24,6 +33,11 @@ Array: TypeAlias = npt.NDArray[Any]
 
 SINGLE_THREADED = frozenset({"stem", "advance", "pruner"})
 """Pieces too small for a second thread."""
+
+SPIN_US = 50
+"""How long a thread of the blocks' session looks for work before it sleeps: longer than what lies between most blocks
+of a step, shorter than the end of a call. Push-T at 4 threads: 38.7 ms a call with 0, 27.7 with 50, 27.2 with 1000; and
+the processor time that threads take after the call: none, none, 20 ms; 94 ms with onnxruntime's own setting."""
 
 
 def import_onnxruntime() -> Any:
@@ -43,19 +57,23 @@ def import_onnxruntime() -> Any:
 
 
 def open_sessions(artifact: Artifact, threads: int) -> dict[str, Any]:
-    """An ``InferenceSession`` for each ONNX piece of the artifact, by name.
+    """What runs each ONNX piece of the artifact, by name: an ``InferenceSession``, or a ``JointBlock``.
 
-    With one thread a session runs on the caller's thread and makes none.
+    With one thread all run on the caller's thread and make none. With more, all blocks are in one session, unless the
+    artifact was written before there was a piece for that: then each has threads of its own, which do not spin.
 
     Raises:
         RuntimeUnavailableError: onnxruntime is missing, or other code has made its global thread pool.
         ArtifactError: onnxruntime refuses a graph.
     """
     ort = import_onnxruntime()
-    sessions = {}
-    for piece in artifact.manifest.pieces:
+    sessions: dict[str, Any] = {}
+    careful = needs_care(artifact.manifest.precision_name)
+    pieces = set(artifact.manifest.pieces)
+    blocks = {block_name(b) for b in range(len(artifact.manifest.blocks))}
+    for piece in sorted(pieces - (blocks if threads > 1 and JOINT in pieces else {JOINT})):
         path = artifact.onnx_path(piece)
-        options = _options(ort, 1 if piece in SINGLE_THREADED else threads)
+        options = _options(ort, 1 if piece in SINGLE_THREADED else threads, piece == JOINT, careful)
         try:
             sessions[piece] = ort.InferenceSession(
                 str(path), options, providers=["CPUExecutionProvider"], enable_fallback=0
@@ -70,18 +88,74 @@ def open_sessions(artifact: Artifact, threads: int) -> dict[str, Any]:
                 f"{path}: onnxruntime {ort.__version__} cannot load this graph: {error} Install the version that the"
                 f" artifact asks for (>= {artifact.manifest.requires.onnxruntime}), or convert the checkpoint again."
             ) from error
-    return sessions
+    joint = sessions.pop(JOINT, None)
+    return sessions if joint is None else sessions | _joint_blocks(artifact, joint)
 
 
-def _options(ort: Any, threads: int) -> Any:
+def _options(ort: Any, threads: int, spin: bool, careful: bool) -> Any:
     options = ort.SessionOptions()
     options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
     options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_ALL
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
-    # Twenty-odd pools that spin made a call ten times slower, and would take the processor from everything else.
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    if spin:
+        options.add_session_config_entry("session.intra_op.spin_duration_us", str(SPIN_US))
+    else:  # twenty-odd pools that spin made a call ten times slower, and would take the processor from everything else
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    if careful:
+        options.add_session_config_entry(EXACT_INTEGERS, "1")
     return options
+
+
+_TURNS = (np.array(False), np.array(True))
+
+
+@dataclass(frozen=True)
+class JointBlock:
+    """One block of the session that holds all blocks; takes and gives what the block's own session would.
+
+    Attributes:
+        session: an ``InferenceSession`` of the piece ``blocks``.
+        joint: its interface.
+        index: of the block.
+        piece: of the block.
+        stream: type of the residual stream.
+        blanks: by number of streams, zeros for the contexts that a block does not read; shared by all blocks.
+    """
+
+    session: Any
+    joint: Joint
+    index: int
+    piece: PieceRecord
+    stream: TensorType
+    blanks: dict[int, dict[str, Array]]
+
+    def feeds(self, inputs: Mapping[str, Array]) -> dict[str, Array]:
+        """The inputs of the joint session for the inputs of the block; those that it does not read are zeros."""
+        assert self.piece.stream is not None
+        stream, turns = inputs[self.piece.stream], self.joint.turns[self.index]
+        axis = self.stream.batch_axis
+        streams = 1 if axis is None else stream.shape[axis]
+        if streams not in self.blanks:
+            self.blanks[streams] = {name: np.zeros(type_.at(streams), type_.dtype) for name, type_ in self.joint.slots}
+        places = zip(self.piece.contexts, self.joint.places[self.index], strict=True)
+        return {
+            **{name: _TURNS[turn] for name, turn in zip(self.joint.switches, turns, strict=True)},
+            STREAM: stream,
+            **self.blanks[streams],
+            **{slot: inputs[name] for name, slot in places},
+        }
+
+
+def _joint_blocks(artifact: Artifact, session: Any) -> dict[str, JointBlock]:
+    manifest = artifact.manifest
+    pieces = [manifest.pieces[block_name(b)] for b in range(len(manifest.blocks))]
+    joint = join([tuple(manifest.contexts[name].type for name in piece.contexts) for piece in pieces])
+    blanks: dict[int, dict[str, Array]] = {}
+    return {
+        block_name(b): JointBlock(session, joint, b, piece, manifest.blocks[b].type, blanks)
+        for b, piece in enumerate(pieces)
+    }
 
 
 class Bound:
@@ -90,7 +164,7 @@ class Bound:
     Binding costs as much as several runs' overhead, and saves it in every run; so bindings are made once and kept.
 
     Args:
-        session: an ``InferenceSession``.
+        session: an ``InferenceSession`` or ``JointBlock``.
         inputs: by name; contiguous.
         outputs: by name; contiguous.
     """
@@ -98,6 +172,9 @@ class Bound:
     __slots__ = ("_arrays", "_binding", "_session")
 
     def __init__(self, session: Any, inputs: Mapping[str, Array], outputs: Mapping[str, Array]) -> None:
+        if isinstance(session, JointBlock):
+            (residual,) = outputs.values()
+            session, inputs, outputs = session.session, session.feeds(inputs), {RESIDUAL: residual}
         self._arrays = (*inputs.values(), *outputs.values())  # the binding holds bare addresses
         assert all(array.flags.c_contiguous for array in self._arrays)
         self._session = session

@@ -22,9 +22,11 @@ from .errors import LoweringError
 from .ir.advance import fuse_advance
 from .ir.evaluate import resolve_op
 from .ir.graph import Argument, Batch, Enum, Graph, Node, Ref, TensorType
+from .ir.joint import JOINT
 from .ir.layout import sink_layout
 from .ir.program import Pieces, Program
 from .lower_attention import flatten_attention
+from .lower_joint import join_blocks
 from .lower_onnx import name_model, only
 
 OPSET = 23
@@ -54,9 +56,9 @@ def lower_program(program: Program) -> dict[str, onnx.ModelProto]:
     """The models of all pieces of a program.
 
     Returns:
-        By name: ``condition``, ``step`` (if any), ``pruner`` (if any), ``stem``, ``block_00``, ``block_01``.. and
-        ``advance`` (tail, sampler update and stem in one; see ``ir.advance``). Graphs of the same structure are
-        exported once.
+        By name: ``condition``, ``step`` (if any), ``pruner`` (if any), ``stem``, ``block_00``, ``block_01``..,
+        ``advance`` (tail, sampler update and stem in one; see ``ir.advance``) and ``blocks`` (all blocks in one; see
+        ``ir.joint``). Graphs of the same structure are exported once.
 
     Raises:
         LoweringError: as ``lower_graph``; or the program has not been partitioned.
@@ -64,7 +66,8 @@ def lower_program(program: Program) -> dict[str, onnx.ModelProto]:
     if program.pieces is None:
         raise LoweringError("the program has no pieces to lower: run the passes up to insert_reuse first.")
     advance = fuse_advance(program.pieces.tail, program.pieces.stem, program.spec)
-    return _lower({**_pieces(program.pieces), "advance": advance})
+    models = _lower({**_pieces(program.pieces), "advance": advance})
+    return {**models, JOINT: join_blocks(program.pieces.blocks, models)}
 
 
 def structural_key(graph: Graph) -> str:

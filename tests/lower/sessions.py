@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,7 @@ def session(model: onnx.ModelProto, weights: Mapping[str, torch.Tensor]) -> onnx
     """A session on the model with these weights; every initializer without data must be among them."""
     filled = onnx.ModelProto()
     filled.CopyFrom(model)
-    for tensor in filled.graph.initializer:
+    for tensor in _initializers(filled.graph):
         if not tensor.raw_data:
             value = weights[tensor.name]
             assert tuple(tensor.dims) == tuple(value.shape)
@@ -24,6 +24,14 @@ def session(model: onnx.ModelProto, weights: Mapping[str, torch.Tensor]) -> onnx
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     return onnxruntime.InferenceSession(filled.SerializeToString(), options, providers=["CPUExecutionProvider"])
+
+
+def _initializers(graph: onnx.GraphProto) -> Iterator[onnx.TensorProto]:
+    """Of the graph and of the branches in it."""
+    yield from graph.initializer
+    for node in graph.node:
+        for attribute in node.attribute:
+            yield from _initializers(attribute.g)
 
 
 def run(

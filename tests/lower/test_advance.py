@@ -44,6 +44,20 @@ def update(sampler: SamplerTable, x: torch.Tensor, out: torch.Tensor, noise: tor
     return row["x0_to_next"] * x0 + rest
 
 
+def correction(inputs: dict[str, torch.Tensor], out: torch.Tensor) -> torch.Tensor:
+    """What the correction adds, one number at a time."""
+    weights, bias = inputs["correction"], inputs["correction_bias"]
+    streams, horizon, dimensions = out.shape
+    result = torch.zeros_like(out)
+    for s in range(streams):
+        for d in range(dimensions):
+            features = torch.cat([inputs["sample"][s, :, d], out[s, :, d], inputs["history"][s, :, d]])
+            group = min(d, len(weights) - 1)
+            for t in range(horizon):
+                result[s, t, d] = features @ weights[group, :, t] + bias[group, 0, t]
+    return result
+
+
 @pytest.mark.parametrize(
     ("sampler", "sums"),
     [
@@ -59,8 +73,18 @@ def update(sampler: SamplerTable, x: torch.Tensor, out: torch.Tensor, noise: tor
 def test_equals_the_parts_one_by_one(sampler: SamplerTable, sums: int) -> None:
     tail, stem = pieces()
     fused = fuse_advance(tail, stem, spec(sampler))
-    assert list(fused.inputs) == ["stream", "sample", "noise", "coefficients", "tail.time", "stem.time"]
-    assert fused.outputs == ("sample_next", "stream_next")
+    assert list(fused.inputs) == [
+        "stream",
+        "sample",
+        "noise",
+        "coefficients",
+        "history",
+        "correction",
+        "correction_bias",
+        "tail.time",
+        "stem.time",
+    ]
+    assert fused.outputs == ("sample_next", "stream_next", "prediction")
     assert set(fused.constants) == {"head", "bias", "embed"}
     assert sum(node.name.startswith("sampler.sum") for node in fused.nodes) == sums  # terms of zero are left out
     torch.manual_seed(0)
@@ -68,9 +92,11 @@ def test_equals_the_parts_one_by_one(sampler: SamplerTable, sums: int) -> None:
     for streams in (1, 3):
         inputs = {name: torch.randn(type_.at(streams)) for name, type_ in fused.inputs.items()}
         inputs["coefficients"] = torch.tensor([float(getattr(sampler, name)[0]) for name in SamplerTable.COLUMNS])
-        sample_next, stream_next = evaluate(fused, weights, inputs)
+        inputs["correction"] *= 0.1  # so that float32 is exact to the tolerance
+        sample_next, stream_next, prediction = evaluate(fused, weights, inputs)
         (out,) = evaluate(tail, weights, {"a9": inputs["stream"], "time": inputs["tail.time"]})
-        expected = update(sampler, inputs["sample"], out, inputs["noise"])
+        torch.testing.assert_close(prediction, out)
+        expected = update(sampler, inputs["sample"], out, inputs["noise"]) + correction(inputs, out)
         torch.testing.assert_close(sample_next, expected)
         (expected,) = evaluate(stem, weights, {"sample": expected, "time": inputs["stem.time"]})
         torch.testing.assert_close(stream_next, expected)
@@ -82,7 +108,7 @@ def test_a_stem_that_does_nothing() -> None:
     fused = fuse_advance(tail, stem.graph(stem.input("sample", *SHAPE)), spec(table(**DDPM)))
     weights = {name: torch.randn(type_.at(1)) for name, type_ in fused.constants.items()}
     inputs = {name: torch.randn(type_.at(2)) for name, type_ in fused.inputs.items()}
-    sample_next, stream_next = evaluate(fused, weights, inputs)
+    sample_next, stream_next, _ = evaluate(fused, weights, inputs)
     torch.testing.assert_close(sample_next, stream_next)
 
 

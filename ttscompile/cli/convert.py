@@ -9,6 +9,7 @@ import click
 import ttscompile
 from ttscompile.cli.output import json_option, only_results_on_stdout, print_json, progress, results
 from ttscompile.cli.summary import document, print_summary
+from ttscompile.config import FP32, PRECISIONS
 
 
 @click.command()
@@ -28,6 +29,18 @@ from ttscompile.cli.summary import document, print_summary
     type=click.Choice(["leading", "trailing", "linspace"]),
     help="Timesteps that fewer steps visit, in place of the checkpoint's own.",
 )
+@click.option(
+    "--precision",
+    type=click.Choice(PRECISIONS),
+    default=FP32,
+    show_default=True,
+    help="Of the weights of residual blocks. int8 is faster on processors with VNNI; its error is measured and shown.",
+)
+@click.option(
+    "--single-file",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Write one ONNX file of the whole call too, for programs that have onnxruntime and no ttscompile.",
+)
 @click.option("--explain", is_flag=True, help="Say on standard error what each pass did.")
 @json_option
 def convert(
@@ -37,6 +50,8 @@ def convert(
     sampler: str | None,
     steps: int | None,
     spacing: str | None,
+    precision: str,
+    single_file: Path | None,
     explain: bool,
     as_json: bool,
 ) -> None:
@@ -56,7 +71,15 @@ def convert(
                     console.print(f"{name if i == 0 else '':<22}{note}", markup=False, soft_wrap=True)
 
         ttscompile.convert(
-            checkpoint, directory, format=format, sampler=sampler, steps=steps, spacing=spacing, explain=on_stage
+            checkpoint,
+            directory,
+            format=format,
+            sampler=sampler,
+            steps=steps,
+            spacing=spacing,
+            precision=precision,
+            single_file=single_file,
+            explain=on_stage,
         )
     summary = document(directory)
     if as_json:

@@ -1,0 +1,81 @@
+"""The C++ example: built and run where there are a compiler and onnxruntime's headers."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import pytest
+
+from tests.lower.test_single_file import Episode, groups, inputs, make
+from tests.runtimes.plans import random_plan
+from tests.runtimes.toys import toy_program
+from ttscompile.lattice import Source
+
+SOURCE = Path(__file__).resolve().parents[2] / "examples" / "cpp" / "main.cpp"
+CALLS = 5
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The example, linked against the library of Python's onnxruntime."""
+    compiler = shutil.which("g++") or shutil.which("clang++")
+    if compiler is None:
+        pytest.skip("NO C++ COMPILER: neither g++ nor clang++; the C++ example was not built")
+    folder = tmp_path_factory.mktemp("cpp")
+    header = subprocess.run([compiler, "-E", "-x", "c++", "-"], input="#include <onnxruntime_c_api.h>", text=True,
+                            capture_output=True)  # fmt: skip
+    if header.returncode != 0:
+        pytest.skip("NO ONNXRUNTIME HEADERS: set CPATH to their folder (examples/cpp/README.md); example not built")
+    libraries = list((Path(onnxruntime.__file__).parent / "capi").glob("libonnxruntime.so.*.*.*"))
+    if not libraries:
+        pytest.skip("NO LIBONNXRUNTIME in Python's onnxruntime; the C++ example was not built")
+    (folder / "libonnxruntime.so.1").symlink_to(libraries[0])
+    flags = ["-std=c++17", "-O2", "-Wall", "-Wextra", "-Werror"]
+    paths = [str(SOURCE), "-o", str(folder / "episode"), str(folder / "libonnxruntime.so.1"), f"-Wl,-rpath,{folder}"]
+    subprocess.run([compiler, *flags, *paths], check=True)
+    return folder / "episode"
+
+
+@pytest.mark.parametrize("streams", [1, 2])
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_an_episode_is_what_python_computes(program: Path, tmp_path: Path, streams: int, noise: float) -> None:
+    toy = toy_program(steps=8, blocks=7, noise=noise)
+    policy, model = make(toy, tmp_path)
+    (tmp_path / "call.onnx").write_bytes(model)
+    rng = np.random.default_rng(streams)
+    episode, written, expected = Episode(model, streams), np.zeros((8, 7), np.bool_), []
+    reads = np.zeros(4, int)
+    for r in range(CALLS):
+        plan = random_plan(rng, 8, groups(toy), written, 0.3)
+        obs, drawn = inputs(policy, rng, streams)
+        expected.append(episode.call(obs, drawn, plan)["action"].ravel())
+        written |= plan == Source.COMPUTE
+        reads += np.bincount(plan.ravel(), minlength=4)
+        given = {**obs, "initial_noise": drawn.initial, "plan": plan, "rollout_keep": np.ones((8, 7), np.bool_)}
+        if drawn.steps is not None:
+            given["step_noise"] = drawn.steps
+        (tmp_path / str(r)).mkdir()
+        for name, value in given.items():
+            value.tofile(tmp_path / str(r) / f"{name}.bin")
+    assert (reads > 0).all()
+    command = [str(program), str(tmp_path / "call.onnx"), str(tmp_path), str(CALLS)]
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
+    found = np.array([[float(number) for number in line.split()] for line in result.stdout.splitlines()])
+    np.testing.assert_allclose(found, np.stack(expected), rtol=1e-6)
+    assert re.fullmatch(r"(call \d: [\d.]+ ms\n){5}", result.stderr)
+
+
+def test_what_is_wrong_is_said(program: Path, tmp_path: Path) -> None:
+    _, model = make(toy_program(), tmp_path)
+    (tmp_path / "call.onnx").write_bytes(model)
+    result = subprocess.run(
+        [str(program), str(tmp_path / "call.onnx"), str(tmp_path), "1"], capture_output=True, text=True
+    )
+    assert result.returncode == 1
+    assert "cannot read" in result.stderr
+    assert subprocess.run([str(program)], capture_output=True).returncode == 2

@@ -1,0 +1,357 @@
+"""The single file of the whole call against the policy that it was made of, and in a process without ttscompile."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+
+import ttscompile
+from tests.passes.test_pipeline import MODULES, spec
+from tests.runtimes.plans import random_plan
+from tests.runtimes.toys import pencil_program, toy_program
+from ttscompile import Noise, legalize
+from ttscompile.artifact import load_artifact
+from ttscompile.artifact.precision import LoweredBlocks
+from ttscompile.artifact.write import write_artifact
+from ttscompile.correction import Correction, no_correction
+from ttscompile.driver import compile_denoiser
+from ttscompile.errors import ArtifactError, LoweringError
+from ttscompile.ir.graph import Batch
+from ttscompile.ir.joint import JOINT
+from ttscompile.ir.program import Program
+from ttscompile.lattice import Source
+from ttscompile.lower import lower_program
+from ttscompile.lower_joint import join_blocks
+from ttscompile.lower_precision import lower_precision
+from ttscompile.lower_single_file import lower_single_file
+from ttscompile.runtimes import open_runtime
+from ttscompile.runtimes.policy import CompiledPolicy
+
+Arrays = dict[str, np.ndarray]
+
+
+class Episode:
+    """Calls of the single file that hand the rollout cache on, as its user would."""
+
+    def __init__(self, model: str | bytes, streams: int) -> None:
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = 1
+        options.log_severity_level = 3  # optional inputs have values in the model, which is worth a warning to it
+        self.session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+        shapes = {value.name: value.shape for value in self.session.get_inputs()}
+        self.takes_noise = "step_noise" in shapes
+        row = [streams if n == "B" else n for n in shapes["rollout_rows"][1:]]
+        self.rows = np.zeros((0, *row), np.float32)
+        self.index = np.full(shapes["rollout_index"], -1, np.int64)
+
+    def call(self, obs: Arrays, noise: Noise, plan: np.ndarray, keep: bool = True, **more: Any) -> Arrays:
+        feeds = {**obs, **more, "initial_noise": noise.initial, "plan": plan.astype(np.int8)}
+        if self.takes_noise:
+            feeds["step_noise"] = noise.steps
+        feeds |= {"rollout_rows": self.rows, "rollout_index": self.index}
+        feeds["rollout_keep"] = np.full(self.index.shape, keep)
+        names = [value.name for value in self.session.get_outputs()]
+        out = dict(zip(names, self.session.run(names, feeds), strict=True))
+        self.rows, self.index = out["rollout_rows_next"], out["rollout_index_next"]
+        return out
+
+
+def make(program: Program, folder: Path) -> tuple[CompiledPolicy, bytes]:
+    models = lower_program(program)
+    write_artifact(program, models, folder / "artifact")
+    model = lower_single_file(program, models, program.weights)
+    onnx.checker.check_model(model, full_check=True)
+    return ttscompile.load(folder / "artifact", "reference"), model.SerializeToString(deterministic=True)
+
+
+def inputs(policy: CompiledPolicy, rng: np.random.Generator, streams: int) -> tuple[Arrays, Noise]:
+    info = policy.info
+    obs = {k: rng.standard_normal((streams, *o.shape)).astype(o.dtype) for k, o in info.observation.items()}
+    draws = rng.standard_normal((info.K, streams, *info.sample), dtype=np.float32) if info.stochastic else None
+    return obs, Noise(rng.standard_normal((streams, *info.sample), dtype=np.float32), draws)
+
+
+def policy_groups(artifact: Path) -> tuple[int, ...]:
+    return load_artifact(artifact).manifest.groups
+
+
+def groups(program: Program) -> list[int]:
+    return [block.group for block in program.blocks]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"noise": 0.0},  # deterministic: there is no step_noise
+        {"sequence_first": True, "steps": 12, "blocks": 13},  # several groups of blocks, the last one smaller
+        {"blocks": 2, "pruner": False},  # no step values
+        {"steps": 1},
+        {"steps": 9, "blocks": 1},
+        {"steps": 7, "blocks": 7, "seed": 3},
+    ],
+)
+def test_random_plans_of_all_sources(tmp_path: Path, options: dict[str, Any]) -> None:
+    """Each with 9 episodes of 5 calls, of one to three streams."""
+    program = toy_program(**options)
+    policy, model = make(program, tmp_path)
+    rng = np.random.default_rng(0)
+    reads = np.zeros(4, int)
+    for streams in (1, 2, 3) * 3:
+        policy.reset()
+        episode = Episode(model, streams)
+        written = np.zeros((program.spec.sampler.steps, len(program.blocks)), np.bool_)
+        for _ in range(5):
+            plan = random_plan(rng, *written.shape[:1], groups(program), written, rng.uniform(0.05, 0.6))
+            obs, noise = inputs(policy, rng, streams)
+            expected = policy.predict_action(obs, noise=noise, plan=plan)
+            found = episode.call(obs, noise, plan)
+            for name in ("action", "action_pred"):
+                scale = np.abs(expected[name]).max()
+                np.testing.assert_allclose(found[name], expected[name], atol=2e-6 * scale, rtol=1e-5)
+            np.testing.assert_array_equal(found["executed_plan"], plan)
+            written |= plan == Source.COMPUTE
+            np.testing.assert_array_equal(episode.index >= 0, written)
+            assert len(episode.rows) == written.sum()
+            reads += np.bincount(plan.ravel(), minlength=4)
+    if len(program.blocks) > 2 and program.spec.sampler.steps > 1:
+        assert (reads > 0).all()
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_a_schedule_with_a_correction(tmp_path: Path, noise: float) -> None:
+    program = toy_program(steps=7, noise=noise)
+    policy, model = make(program, tmp_path)
+    empty = no_correction(7, program.spec.sample)
+    rng = np.random.default_rng(0)
+    weights, bias = (rng.normal(0, 0.1, each.shape).astype(np.float32) for each in (empty.weights, empty.bias))
+    correction = Correction(np.array([True, False, True, True, False, True, False]), weights, bias)
+    feeds = {"correction_anchors": correction.anchors, "correction": weights, "correction_bias": bias}
+    reference = open_runtime(load_artifact(tmp_path / "artifact"), "reference")
+    plan = np.zeros((7, 5), np.int8)
+    plan[[2, 3, 5]] = Source.TIMESTEP
+    for streams in (1, 2):
+        reference.reset()
+        obs, drawn = inputs(policy, rng, streams)
+        normalizer, actions = program.spec.observations["obs"].normalizer, program.spec.chunk.normalizer
+        assert normalizer is not None
+        assert actions is not None
+        normalized = {"obs": normalizer.normalize(obs["obs"])}
+        sample, _ = reference.predict(normalized, drawn, plan, correction=correction)
+        found = Episode(model, streams).call(obs, drawn, plan, **feeds)["action_pred"]
+        np.testing.assert_allclose(found, actions.unnormalize(sample), rtol=1e-4, atol=1e-5)
+        without = Episode(model, streams).call(obs, drawn, plan)["action_pred"]
+        assert np.abs(found - without).max() > 1e-2
+
+
+def test_with_a_pencil(tmp_path: Path) -> None:
+    _, model = make(pencil_program(), tmp_path)
+    obs, noise = {"obs": np.full((1, 1), -32, np.float32)}, Noise(np.full((1, 1, 1), 35, np.float32))
+    for second, result in ((Source.TIMESTEP, 41), (Source.FORWARD, 41), (Source.COMPUTE, 44), (Source.ROLLOUT, 41)):
+        out = Episode(model, 1).call(obs, noise, np.array([[0], [second]]))
+        assert out["action_pred"].item() == result  # a ROLLOUT of nothing is a TIMESTEP
+    episode = Episode(model, 1)
+    episode.call(obs, noise, np.array([[0], [0]]))  # computes 3 and 6
+    assert episode.call(obs, noise, np.array([[0], [3]]))["action_pred"].item() == 44
+
+
+def test_it_repairs_what_legalize_repairs(tmp_path: Path) -> None:
+    program = toy_program()
+    policy, model = make(program, tmp_path)
+    rng = np.random.default_rng(0)
+    episode = Episode(model, 1)
+    written = np.zeros((5, 5), np.bool_)
+    repaired = 0
+    for _ in range(6):
+        plan = rng.integers(0, 4, (5, 5), np.int8)
+        legal, _ = legalize(np.where(np.arange(5)[:, None] == 0, 0, plan).astype(np.int8), groups(program), written)
+        obs, noise = inputs(policy, rng, 1)
+        out = episode.call(obs, noise, plan)
+        np.testing.assert_array_equal(out["executed_plan"], legal)
+        repaired += int((legal != plan).sum())
+        expected = policy.predict_action(obs, noise=noise, plan=legal)["action"]
+        np.testing.assert_allclose(out["action"], expected, rtol=1e-5, atol=1e-5)
+        written |= legal == Source.COMPUTE
+    assert repaired > 20
+
+
+def test_what_is_not_kept_is_not_there(tmp_path: Path) -> None:
+    program = toy_program()
+    policy, model = make(program, tmp_path)
+    obs, noise = inputs(policy, np.random.default_rng(0), 1)
+    episode = Episode(model, 1)
+    dense = np.zeros((5, 5), np.int8)
+    out = episode.call(obs, noise, dense, keep=False)
+    assert episode.rows.shape == (0, 1, 3, 4)
+    assert (episode.index == -1).all()
+    reads = np.full((5, 5), Source.ROLLOUT, np.int8)
+    reads[0] = 0
+    again = episode.call(obs, noise, reads)
+    assert (again["executed_plan"][1:] == Source.TIMESTEP).all()
+    assert np.abs(again["action"] - out["action"]).max() > 1e-3
+
+
+def test_blocks_of_another_precision(tmp_path: Path) -> None:
+    program = toy_program(blocks=6)
+    models = lower_program(program)
+    lowered, weights, _ = lower_precision(models, program.weights, "int8")
+    assert program.pieces is not None
+    lowered[JOINT] = join_blocks(program.pieces.blocks, {**models, **lowered})
+    write_artifact(program, models, tmp_path / "artifact", LoweredBlocks("int8", lowered, weights))
+    model = lower_single_file(program, {**models, **lowered}, {**program.weights, **weights})
+    policy = ttscompile.load(tmp_path / "artifact", precision="int8")
+    obs, noise = inputs(policy, np.random.default_rng(0), 2)
+    dense = np.zeros((5, 6), np.int8)
+    out = Episode(model.SerializeToString(), 2).call(obs, noise, dense)
+    expected = policy.predict_action(obs, noise=noise, plan="dense")
+    np.testing.assert_allclose(out["action"], expected["action"], rtol=1e-4, atol=1e-4)
+    fp32 = ttscompile.load(tmp_path / "artifact", precision="fp32").predict_action(obs, noise=noise, plan="dense")
+    assert np.abs(fp32["action"] - expected["action"]).max() > 1e-3
+
+
+def test_the_same_program_gives_the_same_bytes(tmp_path: Path) -> None:
+    program = toy_program()
+    models = lower_program(program)
+    first, second = (lower_single_file(program, models, program.weights) for _ in range(2))
+    assert first.SerializeToString(deterministic=True) == second.SerializeToString(deterministic=True)
+
+
+def renamed(key: str) -> Callable[[Program], Program]:
+    def change(program: Program) -> Program:
+        spec = program.spec
+        return replace(program, spec=replace(spec, observations={key: spec.observations["obs"]}))
+
+    return change
+
+
+def wider(program: Program) -> Program:
+    other = replace(program.blocks[1].type, shape=(Batch(), 3, 5))
+    blocks = (program.blocks[0], replace(program.blocks[1], type=other), *program.blocks[2:])
+    return replace(program, blocks=blocks)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (renamed("plan"), r"observations \['plan'\] have names of the single file's own"),
+        (renamed("action_pred"), r"observations \['action_pred'\]"),
+        (wider, "the residual stream changes its type"),
+        (lambda p: replace(p, pieces=None), "no pieces to lower"),
+        (lambda p: replace(p, weights={k: v for k, v in p.weights.items() if k != "stem.w"}), "'stem.w' .* no value"),
+    ],
+)
+def test_programs_without_a_single_file(change: Callable[[Program], Program], message: str) -> None:
+    program = toy_program()
+    models = lower_program(program)
+    with pytest.raises(LoweringError, match=message):
+        lower_single_file(change(program), models, change(program).weights)
+
+
+def test_two_gigabytes_are_too_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    program = toy_program()
+    monkeypatch.setattr("ttscompile.lower_single_file.LARGEST", 1000)
+    with pytest.raises(LoweringError, match="an ONNX file holds at most 2"):
+        lower_single_file(program, lower_program(program), program.weights)
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_the_compiler_writes_it(name: str, tmp_path: Path) -> None:
+    """Of modules that nobody prepared."""
+    path = tmp_path / "new" / "call.onnx"
+    compile_denoiser(MODULES[name]().eval(), spec(), tmp_path / "artifact", single_file=path)
+    policy = ttscompile.load(tmp_path / "artifact")
+    rng = np.random.default_rng(0)
+    episode = Episode(str(path), 2)
+    written = np.zeros(episode.index.shape, np.bool_)
+    for _ in range(3):
+        plan = random_plan(rng, *written.shape[:1], policy_groups(tmp_path / "artifact"), written, 0.3)
+        obs, noise = inputs(policy, rng, 2)
+        expected = policy.predict_action(obs, noise=noise, plan=plan)
+        found = episode.call(obs, noise, plan)
+        np.testing.assert_allclose(found["action"], expected["action"], rtol=1e-4, atol=1e-5)
+        written |= plan == Source.COMPUTE
+
+
+def test_a_place_where_nothing_can_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ArtifactError, match="single file cannot be written"):
+        compile_denoiser(next(iter(MODULES.values()))().eval(), spec(), single_file=tmp_path / "file" / "call.onnx")
+
+
+PLAIN = textwrap.dedent(
+    """
+    import sys
+    import numpy as np, onnxruntime
+
+    given = dict(np.load(sys.argv[2]))
+    session = onnxruntime.InferenceSession(sys.argv[1], providers=["CPUExecutionProvider"])
+    shapes = {value.name: value.shape for value in session.get_inputs()}
+    rows = np.zeros((0, *(given["obs"].shape[1] if n == "B" else n for n in shapes["rollout_rows"][1:])), np.float32)
+    index = np.full(shapes["rollout_index"], -1, np.int64)
+    keep = np.full(shapes["rollout_index"], True)
+    actions = []
+    for r in range(len(given["plan"])):
+        feeds = {name: given[name][r] for name in ("obs", "initial_noise", "step_noise", "plan")}
+        feeds |= {"rollout_rows": rows, "rollout_index": index, "rollout_keep": keep}
+        action, rows, index = session.run(["action", "rollout_rows_next", "rollout_index_next"], feeds)
+        actions.append(action)
+    assert not [name for name in sys.modules if name.split(".")[0] in ("ttscompile", "torch", "onnx")]
+    np.save(sys.argv[3], np.stack(actions))
+    """
+)
+
+
+@pytest.fixture(scope="module")
+def pusht_single_file(pusht_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Artifact and single file of the Push-T policy."""
+    folder = tmp_path_factory.mktemp("pusht")
+    ttscompile.convert(pusht_checkpoint, folder / "compiled", single_file=folder / "pusht.onnx")
+    return folder / "compiled", folder / "pusht.onnx"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("streams", [1, 2])
+def test_the_real_policy_in_a_process_that_never_heard_of_us(
+    pusht_single_file: tuple[Path, Path], tmp_path: Path, streams: int
+) -> None:
+    artifact, model = pusht_single_file
+    policy = ttscompile.load(artifact)
+    recorded, expected = recorded_episode(policy, streams)
+    np.savez(tmp_path / "given.npz", **recorded)
+    command = [sys.executable, "-c", PLAIN, str(model), str(tmp_path / "given.npz"), str(tmp_path / "actions.npy")]
+    subprocess.run(command, check=True, cwd=tmp_path)
+    found = np.load(tmp_path / "actions.npy")
+    assert found.shape == expected.shape == (4, streams, 8, 2)
+    # In units of the range of the actions, of which the normaliser makes -1..1; rounding of the first steps is
+    # amplified by the sampler, whatever the order of the additions.
+    normalizer = policy.info.action.normalizer
+    assert normalizer is not None
+    assert (np.abs(found - expected) * np.abs(normalizer.scale) / 2).max() < 1e-3
+
+
+def recorded_episode(policy: CompiledPolicy, streams: int) -> tuple[Arrays, np.ndarray]:
+    """Four calls: dense, and three plans of all sources; inputs with one row a call, and the actions."""
+    rng = np.random.default_rng(streams)
+    program_groups = [0, 1, 2] * 8
+    written = np.zeros((100, 24), np.bool_)
+    rows: dict[str, list[np.ndarray]] = {name: [] for name in ("obs", "initial_noise", "step_noise", "plan")}
+    actions = []
+    for r in range(4):
+        plan = random_plan(rng, 100, program_groups, written, 0.1 if r else 1.0)
+        _, noise = inputs(policy, rng, streams)
+        obs = rng.uniform(100, 400, (streams, 2, 20)).astype(np.float32)
+        actions.append(policy.predict_action({"obs": obs}, noise=noise, plan=plan)["action"])
+        for name, value in zip(rows, (obs, noise.initial, noise.steps, plan), strict=True):
+            rows[name].append(np.asarray(value))
+        written |= plan == Source.COMPUTE
+    return {name: np.stack(values) for name, values in rows.items()}, np.stack(actions)

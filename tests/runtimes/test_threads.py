@@ -1,0 +1,60 @@
+"""Several threads: all blocks in one session, the same results, and nothing running between calls."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ttscompile.artifact import Artifact
+from ttscompile.ir.joint import JOINT
+from ttscompile.ir.program import Program
+from ttscompile.runtimes import open_runtime
+from ttscompile.runtimes.onnxruntime_sessions import SINGLE_THREADED, JointBlock, open_sessions
+
+from .agreement import largest_difference
+from .toys import toy_program
+
+MakeArtifact = Callable[[Program], Artifact]
+
+
+@pytest.mark.parametrize("sequence_first", [False, True])
+def test_threads_give_the_same_as_the_reference(make_artifact: MakeArtifact, sequence_first: bool) -> None:
+    artifact = make_artifact(toy_program(blocks=7, sequence_first=sequence_first))
+    runtimes = open_runtime(artifact, "onnxruntime", threads=2), open_runtime(artifact, "reference")
+    rng = np.random.default_rng(0)
+    for streams in (1, 3, 2):  # the zeros that stand in for other blocks' contexts follow the number of streams
+        assert largest_difference(artifact, *runtimes, rng, streams, calls=4) < 1e-5
+
+
+def test_one_thread_has_a_session_a_block_and_more_have_one_for_all(toy_artifact: Artifact) -> None:
+    blocks = [f"block_{b:02d}" for b in range(len(toy_artifact.manifest.blocks))]
+    alone, together = open_sessions(toy_artifact, 1), open_sessions(toy_artifact, 2)
+    assert alone.keys() == together.keys() == set(toy_artifact.manifest.pieces) - {JOINT}
+    assert not any(isinstance(session, JointBlock) for session in alone.values())
+    joint = [together[name] for name in blocks]
+    assert all(isinstance(block, JointBlock) and block.session is joint[0].session for block in joint)
+    for name in SINGLE_THREADED:
+        assert alone[name].get_session_options().intra_op_num_threads == 1
+
+
+def test_an_artifact_without_the_joint_piece_has_a_session_a_block(toy_artifact: Artifact) -> None:
+    manifest = toy_artifact.manifest
+    pieces = {name: piece for name, piece in manifest.pieces.items() if name != JOINT}
+    before = replace(toy_artifact, manifest=replace(manifest, pieces=pieces))
+    runtimes = open_runtime(before, "onnxruntime", threads=2), open_runtime(before, "reference")
+    assert not any(isinstance(session, JointBlock) for session in open_sessions(before, 2).values())
+    assert largest_difference(before, *runtimes, np.random.default_rng(0), streams=2, calls=3) < 1e-5
+
+
+def test_threads_sleep_between_calls(toy_artifact: Artifact) -> None:
+    runtime = open_runtime(toy_artifact, "onnxruntime", threads=4)
+    other = open_runtime(toy_artifact, "reference")
+    assert largest_difference(toy_artifact, runtime, other, np.random.default_rng(0), streams=1, calls=2) < 1e-5
+    time.sleep(0.05)
+    before = time.process_time()
+    time.sleep(0.5)
+    assert time.process_time() - before < 0.05  # three threads that spun would have taken 1.5 s

@@ -1,0 +1,129 @@
+"""Write ONNX graphs node by node: values get fresh names, and whole models can be laid inside."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import count
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from onnx import GraphProto, ModelProto, NodeProto, TensorProto, ValueInfoProto, helper, numpy_helper
+
+from .errors import LoweringError
+
+Array = npt.NDArray[Any]
+Weights = Mapping[str, npt.NDArray[Any]]
+
+
+class GraphWriter:
+    """Nodes and constants of one graph; ``inner`` opens a graph for the body of an If or a Loop.
+
+    Names are unique over all graphs of a model, since a body sees the values of the graphs around it.
+
+    Args:
+        names: numbers that no other graph of the model uses.
+    """
+
+    def __init__(self, names: Iterator[int] | None = None) -> None:
+        self._names = count() if names is None else names
+        self._nodes: list[NodeProto] = []
+        self._initializers: list[TensorProto] = []
+        self._constants: dict[tuple[str, tuple[int, ...], bytes], str] = {}
+
+    def inner(self) -> GraphWriter:
+        """A writer for a body."""
+        return GraphWriter(self._names)
+
+    def fresh(self, hint: str) -> str:
+        """A name that no value has."""
+        return f"{hint}.{next(self._names)}"
+
+    def constant(self, value: npt.ArrayLike, dtype: npt.DTypeLike = np.int64) -> str:
+        """A constant; equal ones of a graph are one."""
+        array = np.asarray(value, dtype=dtype)
+        key = (array.dtype.str, array.shape, array.tobytes())
+        if key not in self._constants:
+            self._constants[key] = name = self.fresh("constant")
+            self._initializers.append(numpy_helper.from_array(np.ascontiguousarray(array).reshape(array.shape), name))
+        return self._constants[key]
+
+    def default(self, name: str, value: Array) -> None:
+        """What an input of the model is if it is not given."""
+        self._initializers.append(numpy_helper.from_array(value, name))
+
+    def op(self, kind: str, *inputs: str, **attributes: Any) -> str:
+        """A node of one output; its name."""
+        return self.ops(kind, inputs, 1, **attributes)[0]
+
+    def ops(self, kind: str, inputs: Sequence[str], outputs: int, **attributes: Any) -> list[str]:
+        """A node; the names of its outputs."""
+        made = [self.fresh(kind) for _ in range(outputs)]
+        self._nodes.append(helper.make_node(kind, list(inputs), made, name=self.fresh("node"), **attributes))
+        return made
+
+    def rename(self, value: str, name: str) -> str:
+        """The value under a name of our choice, for an output of the model."""
+        self._nodes.append(helper.make_node("Identity", [value], [name], name=self.fresh("node")))
+        return name
+
+    def choose(self, condition: str, then: GraphProto, otherwise: GraphProto) -> list[str]:
+        """An If; the names of its outputs."""
+        return self.ops("If", [condition], len(then.output), then_branch=then, else_branch=otherwise)
+
+    def inline(self, model: ModelProto, inputs: Mapping[str, str], weights: Weights) -> list[str]:
+        """Lay a model inside this graph, its weights too: onnxruntime packs only weights of the graph that reads them.
+
+        Args:
+            model: from ``lower_program``; initializers without data are constants of the program.
+            inputs: a value for each of its inputs.
+            weights: values of the constants.
+
+        Returns:
+            The names of its outputs.
+        """
+        graph = model.graph
+        names = dict(inputs)
+        for tensor in graph.initializer:
+            names[tensor.name] = self._weight(tensor, weights)
+        for node in graph.node:
+            for output in node.output:
+                names[output] = self.fresh("value") if output else ""
+            copy = NodeProto()
+            copy.CopyFrom(node)
+            copy.name = self.fresh("node")
+            copy.input[:] = [names[value] if value else "" for value in node.input]
+            copy.output[:] = [names[value] for value in node.output]
+            self._nodes.append(copy)
+        return [names[value.name] for value in graph.output]
+
+    def _weight(self, tensor: TensorProto, weights: Weights) -> str:
+        if tensor.raw_data or not _has_elements(tensor):
+            return self.constant(numpy_helper.to_array(tensor), numpy_helper.to_array(tensor).dtype)
+        value = weights.get(tensor.name)
+        if value is None or value.shape != tuple(tensor.dims):
+            raise LoweringError(
+                f"the model's initializer {tensor.name!r} {list(tensor.dims)} has no value among the program's weights."
+                " This is an error in ttscompile; please report it."
+            )
+        name = self.fresh(tensor.name)
+        self._initializers.append(numpy_helper.from_array(np.ascontiguousarray(value), name))
+        return name
+
+    def graph(self, name: str, outputs: Sequence[ValueInfoProto], inputs: Sequence[ValueInfoProto] = ()) -> GraphProto:
+        """What was written, as a graph."""
+        return helper.make_graph(self._nodes, name, list(inputs), list(outputs), self._initializers)
+
+
+def tensor(name: str, dtype: npt.DTypeLike, shape: Sequence[int | str] | None = None) -> ValueInfoProto:
+    """A value's name and type; shape None where it may be anything."""
+    return helper.make_tensor_value_info(name, helper.np_dtype_to_tensor_dtype(np.dtype(dtype)), shape)
+
+
+def sequence(name: str) -> ValueInfoProto:
+    """A sequence of float32 tensors."""
+    return helper.make_tensor_sequence_value_info(name, TensorProto.FLOAT, None)
+
+
+def _has_elements(tensor: TensorProto) -> bool:
+    return 0 not in tensor.dims

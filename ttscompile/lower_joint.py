@@ -1,0 +1,83 @@
+"""One ONNX model that holds all residual blocks and runs one of them; see ``ir.joint``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from onnx import GraphProto, ModelProto, NodeProto, ValueInfoProto, helper
+
+from .ir.graph import Batch, Graph, TensorType
+from .ir.joint import JOINT, RESIDUAL, STREAM, halves, join
+
+
+def join_blocks(blocks: Sequence[Graph], models: Mapping[str, ModelProto]) -> ModelProto:
+    """The model of all blocks.
+
+    Weights stay in the branch that reads them: onnxruntime packs them only there, and without it a block takes twice
+    as long. They are initializers without data, as in ``models``, and of the same names.
+
+    Args:
+        blocks: their graphs, in order; the stream is the first input, contexts the others.
+        models: of the blocks, by name; others are not looked at.
+    """
+    joint = join([tuple(graph.inputs.values())[1:] for graph in blocks])
+    own = [models[f"block_{i:02d}"] for i in range(len(blocks))]
+    # Runtimes refuse a stream that changes its type; the sizes that are declared here then are those of every block.
+    stream = next(iter(blocks[0].inputs.values()))
+
+    result = _tensor(RESIDUAL, stream)
+
+    def branch(first: int, stop: int, depth: int) -> GraphProto:
+        name = f"{RESIDUAL}.{first}.{stop}" if depth else RESIDUAL
+        output = _tensor(name, stream)
+        if stop - first == 1:
+            return _leaf(own[first], tuple(blocks[first].inputs), [STREAM, *joint.places[first]], output, f"b{first}")
+        middle = halves(first, stop)
+        node = helper.make_node(
+            "If",
+            [joint.switches[depth]],
+            [name],
+            name=f"if.{first}.{stop}",
+            then_branch=branch(first, middle, depth + 1),
+            else_branch=branch(middle, stop, depth + 1),
+        )
+        return GraphProto(name=f"blocks.{first}.{stop}", node=[node], output=[output])
+
+    root = branch(0, len(own), 0)
+    inputs = [_tensor(name, TensorType((), "bool")) for name in joint.switches]
+    inputs += [_tensor(name, type_) for name, type_ in ((STREAM, stream), *joint.slots)]
+    domains: dict[str, int] = {}
+    for entry in (entry for model in own for entry in model.opset_import):
+        domains[entry.domain] = max(entry.version, domains.get(entry.domain, 0))
+    return ModelProto(
+        ir_version=max(model.ir_version for model in own),
+        producer_name="ttscompile",
+        opset_import=[helper.make_opsetid(domain, version) for domain, version in sorted(domains.items())],
+        graph=GraphProto(name=JOINT, node=root.node, input=inputs, output=[result], initializer=root.initializer),
+    )
+
+
+def _leaf(
+    model: ModelProto, own: Sequence[str], inputs: Sequence[str], output: ValueInfoProto, prefix: str
+) -> GraphProto:
+    """A block as a branch: in place of its own inputs it reads those of the graph around it."""
+    graph = model.graph
+    weights = {tensor.name for tensor in graph.initializer}
+    names = {"": "", **dict(zip(own, inputs, strict=True)), **{name: name for name in weights}}
+    names[graph.output[0].name] = output.name
+    nodes = []
+    for node in graph.node:
+        copy = NodeProto()
+        copy.CopyFrom(node)
+        copy.name = f"{prefix}.{node.name}"
+        del copy.input[:], copy.output[:]
+        copy.input.extend(names.get(value, f"{prefix}.{value}") for value in node.input)
+        copy.output.extend(names.get(value, f"{prefix}.{value}") for value in node.output)
+        nodes.append(copy)
+    return GraphProto(name=model.graph.name, node=nodes, initializer=graph.initializer, output=[output])
+
+
+def _tensor(name: str, type_: TensorType) -> ValueInfoProto:
+    sizes = [str(n) if isinstance(n, Batch) else n for n in type_.shape]
+    return helper.make_tensor_value_info(name, helper.np_dtype_to_tensor_dtype(np.dtype(type_.dtype)), sizes)

@@ -1,0 +1,333 @@
+"""The denoising loop in ONNX: two loops, one in the other, and a question for every block that might be computed.
+
+    for each step with a computed block:                                     Loop
+        sums = coefficients @ residuals, one row a gap between computed blocks
+        for each group of blocks, if any of it is computed:                  If
+            for each block, if it is computed:                               If
+                stream += its gap's sum;  stream += block(stream)
+        stream += the last gap's sum;  advance
+        for each step that follows without a computed block:                 Loop
+            stream += the step's sum, made again if it is another;  advance
+
+Each block is in the model once. Weights lie in the branch that reads them, where onnxruntime packs them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from onnx import GraphProto, ModelProto
+
+from .ir.program import Program
+from .lower_contexts import Contexts
+from .lower_graph_writer import GraphWriter, Weights, sequence, tensor
+from .lower_plan import LoweredPlan
+
+CORRECTION, CORRECTION_BIAS, ANCHORS = "correction", "correction_bias", "correction_anchors"
+"""Inputs of the whole call that carry a schedule's correction; the first two are ``advance``'s, with a row a step."""
+
+GROUP = 6
+"""Blocks that are skipped with one question where none of them is computed."""
+
+
+@dataclass(frozen=True)
+class CorrectionInputs:
+    """Names of values of a correction (``ttscompile.correction``).
+
+    Attributes:
+        anchors: bool ``[K]``.
+        weights: ``[K, ...]``.
+        bias: ``[K, ...]``.
+        history: before step 0.
+    """
+
+    anchors: str
+    weights: str
+    bias: str
+    history: str
+
+
+@dataclass(frozen=True)
+class LoopInputs:
+    """Names of values that the loop reads.
+
+    Attributes:
+        initial: sample at step 0.
+        noise: of all steps; None for a deterministic sampler.
+        rows: rollout cache ``[R, E]``, with a residual as a row of E numbers.
+        index: int64 ``[K, N]``; which row is the residual of a cell.
+        correction: of the sampler's steps; None if ``advance`` reads none.
+    """
+
+    initial: str
+    noise: str | None
+    rows: str
+    index: str
+    correction: CorrectionInputs | None
+
+
+@dataclass(frozen=True)
+class _State:
+    """What a step hands to the next; the history of the correction if there is one."""
+
+    sample: str
+    stream: str
+    history: str | None = None
+
+    @property
+    def values(self) -> tuple[str, ...]:
+        return (self.sample, self.stream) if self.history is None else (self.sample, self.stream, self.history)
+
+
+@dataclass(frozen=True)
+class _Step:
+    """Values of one step with computed blocks: its row of the members of ``LoweredPlan``, and ``sums [gaps, E]``."""
+
+    k: str
+    computed: str
+    position: str
+    in_step: str
+    first_row: str
+    sums: str
+
+
+class DenoisingLoop:
+    """Writes the loop.
+
+    Args:
+        main: writer of the main graph.
+        program: after all passes.
+        models: from ``lower_program``.
+        weights: values of their constants.
+        contexts: values that the pieces read beside the stream.
+    """
+
+    def __init__(
+        self,
+        main: GraphWriter,
+        program: Program,
+        models: Mapping[str, ModelProto],
+        weights: Weights,
+        contexts: Contexts,
+    ) -> None:
+        assert program.pieces is not None
+        self._main, self._models, self._weights, self._contexts = main, models, weights, contexts
+        self._pieces, self._sampler = program.pieces, program.spec.sampler
+        self._groups = [block.group for block in program.blocks]
+
+    def write(self, plan: LoweredPlan, inputs: LoopInputs) -> tuple[str, str]:
+        """Write stem and loop.
+
+        Returns:
+            The sample after the last step, and the computed residuals ``[computed cells, E]`` in order.
+        """
+        main = self._main
+        self._plan, self._inputs = plan, inputs
+        columns = [getattr(self._sampler, name) for name in self._sampler.COLUMNS]
+        self._coefficients = main.constant(np.stack(columns, axis=1), np.float32)
+        stem = self._feeds(main, "stem", inputs.initial, main.constant(0))
+        (stream,) = main.inline(self._models["stem"], stem, self._weights)
+        self._shape = main.op("Shape", stream)
+        width = main.op("ReduceProd", self._shape, keepdims=1)
+        self._none = main.op("ConstantOfShape", main.op("Concat", main.constant([0]), width, axis=0))
+        count = main.constant([len(self._groups)])
+        table = main.op("ConstantOfShape", main.op("Concat", count, width, axis=0))
+        first = _State(inputs.initial, stream, inputs.correction.history if inputs.correction else None)
+        carried = [*first.values, table, main.op("SequenceEmpty")]
+        body = self._computed_step()
+        state = main.ops("Loop", [plan.computed_steps, "", *carried], len(carried), body=body)
+        return state[0], main.op("ConcatFromSequence", state[-1], axis=0)
+
+    def _computed_step(self) -> GraphProto:
+        """Body of the outer loop: carries sample, stream, every block's last computed residual, and all computed."""
+        w, plan = self._main.inner(), self._plan
+        i, on, table, done = (w.fresh(n) for n in ("i", "on", "table", "done"))
+        state = self._fresh_state(w)
+        k = w.op("Gather", plan.steps, i)
+        step = _Step(
+            k=k,
+            computed=w.op("Gather", plan.computed, k),
+            position=w.op("Gather", plan.position, k),
+            in_step=w.op("Gather", plan.in_step, k),
+            first_row=w.op("Gather", plan.first_row, k),
+            sums=self._sums(w, k, table),
+        )
+        value, made = state.stream, list[str]()
+        starts = range(0, len(self._groups), GROUP)
+        for start, flag in zip(
+            starts, _flags(w, w.op("Gather", plan.any_of_group, k), range(len(starts))), strict=True
+        ):
+            members = range(start, min(start + GROUP, len(self._groups)))
+            value, residuals = w.choose(flag, self._group(step, value, made, members), self._skipped(w, value))
+            made.append(residuals)
+        last = w.op("Gather", step.sums, w.constant(-1))
+        value = w.op("Add", value, w.op("Reshape", last, self._shape))
+        value = self._add_in_step(w, step, value, made, len(self._groups))
+        arrays = [tensor(name, np.float32) for name in (*state.values, table)]
+        state = self._advance(w, replace(state, stream=value), k)
+        fresh = _joined(w, made)
+        renewed = w.op("ScatterND", table, w.op("Transpose", w.op("NonZero", step.computed), perm=[1, 0]), fresh)
+        idle = self._idle_step(w, k, renewed)
+        after = w.ops("Loop", [w.op("Gather", plan.idle, i), "", *state.values, last], len(state.values) + 1, body=idle)
+        more, all_made = w.op("Identity", on), w.op("SequenceInsert", done, fresh)
+        results = [tensor(name, np.float32) for name in (*after[:-1], renewed)]
+        return w.graph(
+            "computed_step",
+            [tensor(more, np.bool_), *results, sequence(all_made)],
+            [tensor(i, np.int64, []), tensor(on, np.bool_, []), *arrays, sequence(done)],
+        )
+
+    def _idle_step(self, outer: GraphWriter, before: str, table: str) -> GraphProto:
+        """Body of the inner loop: carries sample, stream, and what the step before added."""
+        w, plan = outer.inner(), self._plan
+        j, on, last = (w.fresh(n) for n in ("j", "on", "last"))
+        state = self._fresh_state(w)
+        arrays = [tensor(name, np.float32) for name in (*state.values, last)]
+        k = w.op("Add", w.op("Add", before, j), w.constant(1))
+        again, anew = w.inner(), w.inner()
+        same = again.op("Identity", last)
+        made = anew.op("Reshape", self._sums(anew, k, table), anew.constant([-1]))
+        (total,) = w.choose(
+            w.op("Gather", plan.same, k),
+            again.graph("again", [tensor(same, np.float32)]),
+            anew.graph("anew", [tensor(made, np.float32)]),
+        )
+        value = w.op("Add", state.stream, w.op("Reshape", total, self._shape))
+        state = self._advance(w, replace(state, stream=value), k)
+        out = [w.op("Identity", on), *state.values, total]
+        return w.graph(
+            "idle_step",
+            [tensor(out[0], np.bool_), *(tensor(name, np.float32) for name in out[1:])],
+            [tensor(j, np.int64, []), tensor(on, np.bool_, []), *arrays],
+        )
+
+    def _sums(self, w: GraphWriter, k: str, table: str) -> str:
+        """What the gaps of step k add, ``[gaps, E]``, without reads of residuals of the step itself."""
+        plan, plain, mixed = self._plan, w.inner(), w.inner()
+        bounds = [w.op("Unsqueeze", w.op("Gather", row, k), w.constant([0])) for row in (plan.first_row, plan.stop_row)]
+        coefficients = w.op("Slice", plan.from_table, *bounds)
+        total = plain.op("MatMul", coefficients, table)
+        reads = mixed.op("Gather", plan.rollout, k)
+        cells = mixed.op("Compress", mixed.op("Gather", self._inputs.index, k), reads)
+        share = mixed.op("Compress", mixed.op("Slice", plan.from_rollout, *bounds), reads, axis=1)
+        older = mixed.op("MatMul", share, mixed.op("Gather", self._inputs.rows, cells))
+        both = mixed.op("Add", mixed.op("MatMul", coefficients, table), older)
+        return w.choose(
+            w.op("Gather", plan.any_rollout, k),
+            mixed.graph("mixed", [tensor(both, np.float32)]),
+            plain.graph("plain", [tensor(total, np.float32)]),
+        )[0]
+
+    def _group(self, step: _Step, stream: str, before: Sequence[str], members: range) -> GraphProto:
+        """Neighbouring blocks of which some are computed; gives the stream and the computed residuals."""
+        w = self._main.inner()
+        value, made = stream, list[str]()
+        for b, flag in zip(members, _flags(w, step.computed, members), strict=True):
+            value, residual = w.choose(flag, self._block(step, value, [*before, *made], b), self._skipped(w, value))
+            made.append(residual)
+        return w.graph(f"group_{members.start}", [tensor(n, np.float32) for n in (value, _joined(w, made))])
+
+    def _block(self, step: _Step, stream: str, before: Sequence[str], b: int) -> GraphProto:
+        """The gap before a computed block, and the block; gives the stream and the residual as a row."""
+        w = self._main.inner()
+        gap = w.op("Gather", step.sums, w.op("Gather", step.position, w.constant(b)))
+        value = w.op("Add", stream, w.op("Reshape", gap, self._shape))
+        value = self._add_in_step(w, step, value, before, b)
+        name = f"block_{b:02d}"
+        (residual,) = w.inline(self._models[name], self._feeds(w, name, value, step.k), self._weights)
+        value = w.op("Add", value, residual)
+        row = w.op("Reshape", residual, w.constant([1, -1]))
+        return w.graph(name, [tensor(n, np.float32) for n in (value, row)])
+
+    def _skipped(self, w: GraphWriter, stream: str) -> GraphProto:
+        """Nothing computed: the stream as it is, and no residuals."""
+        inner = w.inner()
+        results = [inner.op("Identity", value) for value in (stream, self._none)]
+        return inner.graph("skipped", [tensor(n, np.float32) for n in results])
+
+    def _add_in_step(self, w: GraphWriter, step: _Step, stream: str, before: Sequence[str], b: int) -> str:
+        """Add FORWARD reads, in the gap before block b, of residuals that the step itself has computed.
+
+        Args:
+            w: where.
+            step: of the gap.
+            stream: to add to.
+            before: residuals of the blocks before b, rows of those that were computed.
+            b: number of the block, or of blocks for the step's last gap.
+        """
+        if not any(group in self._groups[:c] for c, group in enumerate(self._groups[:b])):
+            return stream  # no block before b has one of its group before it
+        plain, reads = w.inner(), w.inner()
+        same = plain.op("Identity", stream)
+        gap = reads.op("Add", step.first_row, reads.op("Gather", step.position, reads.constant(b)))
+        bounds = reads.constant([0]), reads.constant([b])
+        row = reads.op("Slice", reads.op("Gather", self._plan.from_step, gap), *bounds)
+        share = reads.op("Compress", row, reads.op("Slice", step.computed, *bounds))
+        total = reads.op("MatMul", reads.op("Unsqueeze", share, reads.constant([0])), _joined(reads, before))
+        added = reads.op("Add", stream, reads.op("Reshape", total, self._shape))
+        return w.choose(
+            w.op("Gather", step.in_step, w.constant(b)),
+            reads.graph("in_step", [tensor(added, np.float32)]),
+            plain.graph("plain", [tensor(same, np.float32)]),
+        )[0]
+
+    def _fresh_state(self, w: GraphWriter) -> _State:
+        """Names for what a body carries."""
+        return _State(w.fresh("sample"), w.fresh("stream"), w.fresh("history") if self._inputs.correction else None)
+
+    def _advance(self, w: GraphWriter, state: _State, k: str) -> _State:
+        """Tail, sampler and the next step's stem."""
+        row = w.op("Gather", self._coefficients, k)
+        feeds = {"stream": state.stream, "sample": state.sample, "coefficients": row}
+        # A deterministic sampler has the input too, and does not read it.
+        feeds["noise"] = state.sample if self._inputs.noise is None else w.op("Gather", self._inputs.noise, k)
+        correction = self._inputs.correction
+        if correction is not None and state.history is not None:
+            feeds["history"] = state.history
+            feeds[CORRECTION] = w.op("Gather", correction.weights, k)
+            feeds[CORRECTION_BIAS] = w.op("Gather", correction.bias, k)
+        for value in self._models["advance"].graph.input:
+            if value.name not in feeds:
+                where, _, name = value.name.partition(".")
+                graph, at = (self._pieces.tail, k) if where == "tail" else (self._pieces.stem, self._following(w, k))
+                feeds[value.name] = self._contexts.value(w, name, at, graph.inputs[name])
+        sample, stream, *prediction = w.inline(self._models["advance"], feeds, self._weights)
+        if correction is None or state.history is None:
+            return _State(sample, stream)
+        anchors = w.op("Gather", correction.anchors, k)
+        return _State(sample, stream, self._remembered(w, anchors, state.sample, prediction[0], state.history))
+
+    def _remembered(self, w: GraphWriter, is_anchor: str, sample: str, prediction: str, history: str) -> str:
+        """The history after a step: sample and prediction enter it if the step is an anchor, and the oldest leave."""
+        anchor, other = w.inner(), w.inner()
+        length = anchor.op("Mul", anchor.op("Shape", sample, start=1, end=2), anchor.constant([2]))
+        kept = anchor.op("Slice", history, anchor.constant([0]), length, anchor.constant([1]))
+        longer = anchor.op("Concat", sample, prediction, kept, axis=1)
+        same = other.op("Identity", history)
+        return w.choose(
+            is_anchor,
+            anchor.graph("anchor", [tensor(longer, np.float32)]),
+            other.graph("other", [tensor(same, np.float32)]),
+        )[0]
+
+    def _following(self, w: GraphWriter, k: str) -> str:
+        """The next step; of the last one itself, whose stream nobody reads."""
+        return w.op("Min", w.op("Add", k, w.constant(1)), w.constant(self._sampler.steps - 1))
+
+    def _feeds(self, w: GraphWriter, piece: str, stream: str, k: str) -> dict[str, str]:
+        """A value for each input of the stem or a block: the sample or stream, then contexts."""
+        graph = self._pieces.stem if piece == "stem" else self._pieces.blocks[int(piece.removeprefix("block_"))]
+        first, *contexts = graph.inputs
+        return {first: stream, **{name: self._contexts.value(w, name, k, graph.inputs[name]) for name in contexts}}
+
+
+def _flags(w: GraphWriter, vector: str, which: range) -> list[str]:
+    """Elements of a vector, as conditions."""
+    part = w.op("Slice", vector, w.constant([which.start]), w.constant([which.stop]))
+    return w.ops("Split", [part], len(which), axis=0, num_outputs=len(which))
+
+
+def _joined(w: GraphWriter, rows: Sequence[str]) -> str:
+    return w.op("Concat", *rows, axis=0)

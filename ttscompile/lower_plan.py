@@ -1,0 +1,180 @@
+"""A plan to matrices that a loop can multiply with, in ONNX: what ``runtimes.lowering`` does in numpy.
+
+Blocks that are reused between two computed ones make a *gap*; what a gap adds is a row of coefficients times residuals
+that are there when the step begins (``from_table``, ``from_rollout``), plus FORWARD reads of residuals computed in the
+same step (``from_step``). A step has one gap more than it has computed blocks. Rows are in order of execution.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .lower_graph_writer import GraphWriter
+
+INT64, INT8 = 7, 3
+"""ONNX's numbers of these dtypes."""
+
+
+@dataclass(frozen=True)
+class LoweredPlan:
+    """Names of values; K steps, N blocks, G gaps.
+
+    Attributes:
+        executed: int8 [K, N]; the plan after making step 0 dense and ROLLOUT of the never computed TIMESTEP.
+        computed: bool [K, N].
+        position: int64 [K, N + 1]; how many blocks of the step are computed before this one.
+        computed_steps: int64 scalar; S, how many steps have a computed block.
+        steps: int64 [S]; which.
+        idle: int64 [S]; how many steps without one follow.
+        first_row: int64 [K]; first gap of each step.
+        stop_row: int64 [K]; one past its last.
+        from_table: float32 [G, N]; how often the gap adds each block's last computed residual.
+        from_step: float32 [G, N]; the same of blocks computed earlier in the step.
+        from_rollout: float32 [G, N]; the same of the step's entries of the rollout cache.
+        in_step: bool [K, N + 1]; whether the gap before a block, or the step's last, reads ``from_step``.
+        rollout: bool [K, N].
+        any_rollout: bool [K].
+        same: bool [K]; the step is idle, and adds what the idle step before added.
+        any_of_group: bool [K, groups of blocks]; any block of it is computed.
+    """
+
+    executed: str
+    computed: str
+    position: str
+    computed_steps: str
+    steps: str
+    idle: str
+    first_row: str
+    stop_row: str
+    from_table: str
+    from_step: str
+    from_rollout: str
+    in_step: str
+    rollout: str
+    any_rollout: str
+    same: str
+    any_of_group: str
+
+
+def lower_plan(w: GraphWriter, plan: str, index: str, groups: Sequence[int], steps: int, together: int) -> LoweredPlan:
+    """Write the nodes that lower a plan.
+
+    Args:
+        w: of the main graph.
+        plan: int8 [K, N].
+        index: int64 [K, N]; negative where the rollout cache has no residual of the cell.
+        groups: FORWARD group of each block.
+        steps: K.
+        together: how many neighbouring blocks make a group of ``any_of_group``.
+    """
+    count = len(groups)
+    # Which cells are what. Booleans and int64 throughout: onnxruntime has kernels for all of these.
+    after_first = np.ones((steps, 1), np.int64)
+    after_first[0] = 0
+    source = w.op("Mul", w.op("Cast", plan, to=INT64), w.constant(after_first))
+    missing = w.op("And", w.op("Equal", source, w.constant(3)), w.op("Less", index, w.constant(0)))
+    source = w.op("Where", missing, w.constant(2), source)
+    computed = w.op("Equal", source, w.constant(0))
+    ones = w.op("Cast", computed, to=INT64)
+    per_step = w.op("ReduceSum", ones, w.constant([1]), keepdims=0)
+    busy = w.op("Greater", per_step, w.constant(0))
+    rollout = w.op("Equal", source, w.constant(3))
+    any_rollout = w.op("ReduceMax", rollout, w.constant([1]), keepdims=0)
+
+    # Gaps.
+    position = w.op("CumSum", w.op("Pad", ones, w.constant([0, 0, 0, 1])), w.constant(1), exclusive=1)
+    ends = w.op("CumSum", w.op("Add", per_step, w.constant(1)), w.constant(0))
+    starts = w.op("Sub", w.op("Sub", ends, per_step), w.constant(1))
+    gap = w.op("Add", w.op("Unsqueeze", starts, w.constant([1])), position)  # [K, N + 1]
+    own_gap = w.op("Slice", gap, w.constant([0]), w.constant([count]), w.constant([1]))
+
+    # FORWARD reads the last computed block of its group: of this step, or the last of an earlier one.
+    before = np.array(
+        [[c + 1 if c < b and groups[c] == groups[b] else 0 for c in range(count)] for b in range(count)], np.int64
+    )
+    wide = w.op("Unsqueeze", ones, w.constant([1]))
+    nearest = w.op("ReduceMax", w.op("Mul", wide, w.constant(before)), w.constant([2]), keepdims=0)  # [K, N], + 1
+    earlier = w.op("Gather", _last_of_earlier_steps(w, ones, groups, steps), w.constant(_ranks(groups)), axis=1)
+    here = w.op("Greater", nearest, w.constant(0))
+    forward = w.op("Where", here, w.op("Add", nearest, w.constant(count - 1)), earlier)
+    itself = w.constant(np.broadcast_to(np.arange(count), (steps, count)))
+    column = w.op("Where", w.op("Equal", source, w.constant(1)), forward, itself)
+    column = w.op("Where", rollout, w.op("Add", itself, w.constant(2 * count)), column)
+
+    # Coefficients: one for each reused cell, at its gap and what it reads.
+    reused = w.op("Not", computed)
+    flat = w.constant([-1])
+    chosen = w.op("Reshape", reused, flat)
+    rows = w.op("Compress", w.op("Reshape", own_gap, flat), chosen)
+    columns = w.op("Compress", w.op("Reshape", column, flat), chosen)
+    places = w.op("Concat", *(w.op("Unsqueeze", n, w.constant([1])) for n in (rows, columns)), axis=1)
+    gaps = w.op("Slice", ends, w.constant([-1]), w.constant([steps]))
+    nothing = w.op("ConstantOfShape", w.op("Concat", gaps, w.constant([3 * count]), axis=0))
+    units = w.op("Expand", w.constant(1, np.float32), w.op("Shape", rows))
+    matrix = w.op("ScatterND", nothing, places, units, reduction="add")
+    parts = w.ops("Split", [matrix], 3, axis=1, num_outputs=3)
+    in_step = w.op("Greater", w.op("ReduceMax", parts[1], w.constant([1]), keepdims=0), w.constant(0, np.float32))
+
+    # Steps in a row that add the same.
+    idle = w.op("Not", busy)
+    plain = w.op("And", idle, w.op("Not", any_rollout))
+    row = w.op("Gather", parts[0], starts)
+    change = w.op("ReduceMax", w.op("Abs", w.op("Sub", row, _shifted(w, row, steps))), w.constant([1]), keepdims=0)
+    same = w.op("And", w.op("And", plain, _shifted(w, plain, steps)), w.op("Equal", change, w.constant(0, np.float32)))
+    which = w.op("Reshape", w.op("NonZero", busy), flat)
+    number = w.op("Shape", which)
+    following = w.op("Concat", w.op("Slice", which, w.constant([1]), number), w.constant([steps]), axis=0)
+    groups_of = -(-count // together)
+    padded = w.op("Pad", ones, w.constant([0, 0, 0, groups_of * together - count]))
+    folded = w.op("Reshape", padded, w.constant([steps, groups_of, together]))
+    return LoweredPlan(
+        executed=w.op("Cast", source, to=INT8),
+        computed=computed,
+        position=position,
+        computed_steps=w.op("Reshape", number, w.constant(np.zeros(0))),
+        steps=which,
+        idle=w.op("Sub", w.op("Sub", following, which), w.constant(1)),
+        first_row=starts,
+        stop_row=ends,
+        from_table=parts[0],
+        from_step=parts[1],
+        from_rollout=parts[2],
+        in_step=w.op("Gather", in_step, gap),
+        rollout=rollout,
+        any_rollout=any_rollout,
+        same=same,
+        any_of_group=w.op("Greater", w.op("ReduceMax", folded, w.constant([2]), keepdims=0), w.constant(0)),
+    )
+
+
+def _last_of_earlier_steps(w: GraphWriter, ones: str, groups: Sequence[int], steps: int) -> str:
+    """For each step and FORWARD group its last block that was computed in an earlier step: int64 [K, groups].
+
+    Step 0 is dense, so that every group has one from step 1 on; row 0 is not read.
+    """
+    ranks = _ranks(groups)
+    members = np.zeros((max(ranks) + 1, 1, len(groups)), np.int64)
+    for b, rank in enumerate(ranks):
+        members[rank, 0, b] = b + 1
+    last = w.op("ReduceMax", w.op("Mul", ones, w.constant(members)), w.constant([2]), keepdims=0)  # [groups, K], + 1
+    flat = w.op("Reshape", last, w.constant([-1]))
+    some = w.op("Greater", flat, w.constant(0))
+    known = w.op("Compress", flat, some)
+    seen = w.op("CumSum", w.op("Cast", some, to=INT64), w.constant(0), exclusive=1)
+    latest = w.op("Gather", known, w.op("Max", w.op("Sub", seen, w.constant(1)), w.constant(0)))
+    table = w.op("Reshape", w.op("Sub", latest, w.constant(1)), w.constant([max(ranks) + 1, steps]))
+    return w.op("Transpose", table, perm=[1, 0])
+
+
+def _ranks(groups: Sequence[int]) -> list[int]:
+    """Groups numbered from zero."""
+    numbers = {group: rank for rank, group in enumerate(dict.fromkeys(groups))}
+    return [numbers[group] for group in groups]
+
+
+def _shifted(w: GraphWriter, rows: str, steps: int) -> str:
+    """Each row's predecessor; the first row's is itself."""
+    return w.op("Gather", rows, w.constant(np.maximum(np.arange(steps) - 1, 0)))

@@ -1,0 +1,211 @@
+"""One ONNX model that is the whole sparse call, for programs that have onnxruntime and nothing of ours.
+
+    observation -> normalise -> condition and step values -.
+    plan, rollout_index -> coefficients --------------------+-> loop over steps -> unnormalise -> action, action_pred
+    initial_noise, step_noise, rollout_rows ----------------'                  '-> rollout_rows_next, .._index_next
+
+All B streams of a batch follow one plan. For K steps and N blocks the inputs are, with the shapes of the policy:
+
+======================= =================== ==========================================================================
+(keys of observations)  ``[B, ...]``        as the policy's user has them, not normalised
+``initial_noise``       float32 [B,T,D]     the sample at step 0
+``step_noise``          float32 [K,B,T,D]   only if the sampler is stochastic
+``plan``                int8 [K,N]          0 COMPUTE, 1 FORWARD, 2 TIMESTEP, 3 ROLLOUT; a plan that is no schedule of
+                                            the artifact's comes from its pruner, which is not in the file
+``rollout_rows``        float32 [R,...]     residuals of earlier calls of the episode; R = 0 in its first call
+``rollout_index``       int64 [K,N]         which row is the residual of a cell; -1 where there is none
+``rollout_keep``        bool [K,N]          residuals that later calls of the episode may read; none for plans without
+                                            ROLLOUT, and the cache stays empty
+======================= =================== ==========================================================================
+
+For a schedule that has a correction (``ttscompile.correction``), its anchors, weights and bias may be given as
+``correction_anchors``, ``correction`` and ``correction_bias``; inputs that are left out correct nothing. onnxruntime
+warns, when it loads the file, that these three have values and can be overridden. The outputs are
+
+======================= =================== ==========================================================================
+``action``              float32 [B,Ta,Da]   what to execute
+``action_pred``         float32 [B,T,Da]    the whole chunk
+``executed_plan``       int8 [K,N]          the plan with a dense step 0, and with TIMESTEP for every ROLLOUT of what
+                                            the cache does not have: ``legalize`` in ONNX
+``rollout_rows_next``   float32 [R',...]    the next call's ``rollout_rows``
+``rollout_index_next``  int64 [K,N]         the next call's ``rollout_index``
+======================= =================== ==========================================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from onnx import ModelProto, ValueInfoProto, helper
+
+from .config import PolicySpec
+from .errors import LoweringError
+from .ir.graph import TensorType
+from .ir.program import Program
+from .lower_contexts import Contexts
+from .lower_graph_writer import Array, GraphWriter, Weights, tensor
+from .lower_loop import ANCHORS, CORRECTION, CORRECTION_BIAS, GROUP, CorrectionInputs, DenoisingLoop, LoopInputs
+from .lower_plan import LoweredPlan, lower_plan
+
+IR_VERSION = 10
+LARGEST = 2**31 - 1
+"""Bytes of a file that protobuf reads."""
+
+
+def lower_single_file(program: Program, models: Mapping[str, ModelProto], weights: Weights) -> ModelProto:
+    """The model of the whole call, with its weights inside.
+
+    Args:
+        program: after all passes.
+        models: from ``lower_program``; blocks may be of another precision.
+        weights: values of the constants of these models.
+
+    Raises:
+        LoweringError: an observation has the name of another input or output; the residual stream changes its type; a
+            context cannot be repeated for a batch; or the file would have 2 GB.
+    """
+    if program.pieces is None:
+        raise LoweringError("the program has no pieces to lower: run the passes up to insert_reuse first.")
+    spec, types = program.spec, sorted({str(block.type) for block in program.blocks})
+    if len(types) != 1 or program.blocks[0].type.dtype != "float32":
+        raise LoweringError(f"the residual stream changes its type, or is not float32: {types}. Convert without it.")
+    inputs, outputs = _interface(spec, program.blocks[0].type, len(program.blocks))
+    main = GraphWriter()
+    streams = main.op("Shape", "initial_noise", start=0, end=1)
+    observations = {key: _normalized(main, key, spec) for key in spec.observations}
+    contexts = Contexts(main, program.pieces, models, weights, observations, streams, spec.sampler.steps)
+    groups = [block.group for block in program.blocks]
+    plan = lower_plan(main, "plan", "rollout_index", groups, spec.sampler.steps, GROUP)
+    one = main.op("Concat", main.op("Shape", "rollout_rows", start=0, end=1), _width(main), axis=0)
+    stored = main.op("Reshape", "rollout_rows", one, allowzero=1)
+    noise = "step_noise" if spec.sampler.stochastic else None
+    defaults = _no_correction(models["advance"], spec.sampler.steps)
+    inputs += [tensor(name, array.dtype, array.shape) for name, array in defaults.items()]
+    correction = _correction(main, models["advance"], defaults) if defaults else None
+    loop = DenoisingLoop(main, program, models, weights, contexts)
+    sample, residuals = loop.write(plan, LoopInputs("initial_noise", noise, stored, "rollout_index", correction))
+    _write_actions(main, sample, spec)
+    main.rename(plan.executed, "executed_plan")
+    _write_cache(main, plan, stored, residuals, (spec.sampler.steps, len(groups)))
+    domains: dict[str, int] = {}
+    for entry in (entry for model in models.values() for entry in model.opset_import):
+        domains[entry.domain] = max(entry.version, domains.get(entry.domain, 0))
+    model = ModelProto(
+        ir_version=IR_VERSION,
+        producer_name="ttscompile",
+        opset_import=[helper.make_opsetid(domain, version) for domain, version in sorted(domains.items())],
+        graph=main.graph("ttscompile", outputs, inputs),
+    )
+    if model.ByteSize() > LARGEST:
+        raise LoweringError(
+            f"the single file would have {model.ByteSize() / 1e9:.1f} GB; an ONNX file holds at most 2."
+            " Convert without the single file and use the artifact."
+        )
+    return model
+
+
+def _interface(spec: PolicySpec, stream: TensorType, count: int) -> tuple[list[ValueInfoProto], list[ValueInfoProto]]:
+    """Inputs and outputs; see the top of the file."""
+    (horizon, channels), chunk, steps = spec.sample, spec.chunk, spec.sampler.steps
+    row = [n if isinstance(n, int) else str(n) for n in stream.shape]
+    inputs = [tensor(key, each.dtype, ["B", *each.shape]) for key, each in spec.observations.items()]
+    own = [tensor("initial_noise", np.float32, ["B", horizon, channels])]
+    if spec.sampler.stochastic:
+        own.append(tensor("step_noise", np.float32, [steps, "B", horizon, channels]))
+    own += [
+        tensor("plan", np.int8, [steps, count]),
+        tensor("rollout_rows", np.float32, ["R", *row]),
+        tensor("rollout_index", np.int64, [steps, count]),
+        tensor("rollout_keep", np.bool_, [steps, count]),
+    ]
+    outputs = [
+        tensor("action", np.float32, ["B", chunk.stop - chunk.start, chunk.action_dim]),
+        tensor("action_pred", np.float32, ["B", horizon, chunk.action_dim]),
+        tensor("executed_plan", np.int8, [steps, count]),
+        tensor("rollout_rows_next", np.float32, ["R_next", *row]),
+        tensor("rollout_index_next", np.int64, [steps, count]),
+    ]
+    if clash := sorted(set(spec.observations) & {value.name for value in (*own, *outputs)}):
+        raise LoweringError(
+            f"the observations {clash} have names of the single file's own inputs or outputs. Rename them, or convert"
+            " without the single file."
+        )
+    return [*inputs, *own], outputs
+
+
+def _normalized(main: GraphWriter, key: str, spec: PolicySpec) -> str:
+    """An observation as the network wants it."""
+    each = spec.observations[key]
+    if each.normalizer is None:
+        return key
+    value = key if each.dtype == "float32" else main.op("Cast", key, to=helper.np_dtype_to_tensor_dtype(np.dtype("f4")))
+    scaled = main.op("Mul", value, main.constant(each.normalizer.scale, np.float32))
+    return main.op("Add", scaled, main.constant(each.normalizer.offset, np.float32))
+
+
+def _no_correction(advance: ModelProto, steps: int) -> dict[str, Array]:
+    """Inputs of the correction, and what they are if they are not given; none if ``advance`` reads none."""
+    shapes = {value.name: [d.dim_value for d in value.type.tensor_type.shape.dim] for value in advance.graph.input}
+    if CORRECTION not in shapes:
+        return {}
+    zeros = {name: np.zeros((steps, *shapes[name]), np.float32) for name in (CORRECTION, CORRECTION_BIAS)}
+    return {ANCHORS: np.zeros(steps, np.bool_), **zeros}
+
+
+def _correction(main: GraphWriter, advance: ModelProto, defaults: Mapping[str, Array]) -> CorrectionInputs:
+    """The correction, with an empty history."""
+    for name, array in defaults.items():
+        main.default(name, array)
+    (history,) = (value for value in advance.graph.input if value.name == "history")
+    sizes = [main.constant([d.dim_value]) for d in list(history.type.tensor_type.shape.dim)[1:]]
+    shape = main.op("Concat", main.op("Shape", "initial_noise", start=0, end=1), *sizes, axis=0)
+    return CorrectionInputs(ANCHORS, CORRECTION, CORRECTION_BIAS, main.op("ConstantOfShape", shape))
+
+
+def _width(main: GraphWriter) -> str:
+    """E, int64 ``[1]``: how many numbers a residual has."""
+    return main.op("ReduceProd", main.op("Shape", "rollout_rows", start=1), keepdims=1)
+
+
+def _write_actions(main: GraphWriter, sample: str, spec: PolicySpec) -> None:
+    chunk = spec.chunk
+    predicted = main.op("Slice", sample, *(main.constant([n]) for n in (0, chunk.action_dim, 2)))
+    if chunk.normalizer is not None:
+        predicted = main.op("Sub", predicted, main.constant(chunk.normalizer.offset, np.float32))
+        predicted = main.op("Div", predicted, main.constant(chunk.normalizer.scale, np.float32))
+    main.rename(predicted, "action_pred")
+    main.rename(main.op("Slice", predicted, *(main.constant([n]) for n in (chunk.start, chunk.stop, 1))), "action")
+
+
+def _write_cache(main: GraphWriter, plan: LoweredPlan, stored: str, computed: str, lattice: tuple[int, int]) -> None:
+    """The next call's rollout cache: rows that were there and were not computed anew, then those computed.
+
+    Args:
+        main: writer of the main graph.
+        plan: as lowered.
+        stored: rows that were there.
+        computed: residuals of the computed cells, in order.
+        lattice: K and N.
+    """
+    keep, index, anew = (
+        main.op("Reshape", value, main.constant([-1])) for value in ("rollout_keep", "rollout_index", plan.computed)
+    )
+    known = main.op("And", main.op("GreaterOrEqual", index, main.constant(0)), main.op("Not", anew))
+    old_cells = _true(main, main.op("And", known, keep))
+    new_cells = _true(main, main.op("And", anew, keep))
+    old_rows = main.op("Gather", stored, main.op("Gather", index, old_cells))
+    new_rows = main.op("Compress", computed, main.op("Compress", keep, anew), axis=0)
+    rows = main.op("Concat", old_rows, new_rows, axis=0)
+    shape = main.op("Concat", main.op("Shape", rows, start=0, end=1), main.op("Shape", "rollout_rows", start=1), axis=0)
+    main.rename(main.op("Reshape", rows, shape, allowzero=1), "rollout_rows_next")
+    cells = main.op("Concat", old_cells, new_cells, axis=0)
+    numbers = main.op("Range", main.constant(0), main.op("Size", cells), main.constant(1))
+    nothing = main.constant(np.full(lattice[0] * lattice[1], -1))
+    merged = main.op("ScatterElements", nothing, cells, numbers, axis=0)
+    main.rename(main.op("Reshape", merged, main.constant(lattice)), "rollout_index_next")
+
+
+def _true(main: GraphWriter, flags: str) -> str:
+    """Indices of what is true in a vector."""
+    return main.op("Reshape", main.op("NonZero", flags), main.constant([-1]))
