@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ttscompile.config import FloatArray, Noise, SamplerTable
+from ttscompile.correction import Correction
 from ttscompile.errors import IllegalPlanError, ObservationError, RuntimeUnavailableError
 from ttscompile.lattice import BoolArray, PlanArray, Source, check_plan, legalize, require_legal
 
@@ -29,10 +30,10 @@ class Timings:
 
     Attributes:
         prologue: condition values and step values from the observation.
-        pruner: the pruner network; 0 if the plan was given.
+        pruner: the pruner network and what makes a plan of its logits; 0 if the plan was given.
         wait_pruner: how long the denoising loop stood still for the plan: all of the pruner unless a runtime overlaps
             it with step 0.
-        decode: the denoising loop, lowering of the plan included.
+        decode: the denoising loop, without that wait.
         total: from the normalised observation to the denoised sample.
     """
 
@@ -85,8 +86,9 @@ class Runtime(Protocol):
         *,
         plan_name: str | None = None,
         repair: bool = False,
+        correction: Correction | None = None,
     ) -> tuple[FloatArray, CallReport]:
-        """Denoise one chunk. A call that fails while decoding ends the episode, as ``reset`` does.
+        """Denoise one chunk. A call that fails after its arguments were checked ends the episode, as ``reset`` does.
 
         Args:
             obs: normalised observation by key, ``[B, ...]`` each, of the dtype of its specification.
@@ -94,6 +96,7 @@ class Runtime(Protocol):
             plan: ``[K, blocks]`` or ``[B, K, blocks]`` of ``Source``; None asks the pruner.
             plan_name: for the report; None for ``pruner`` or ``given``.
             repair: legalise ``plan`` and count it, rather than refuse it when it is illegal.
+            correction: of the sampler's steps, which belongs to this plan; None for none.
 
         Returns:
             The denoised sample, float32 ``[B, T, D]``, and the report.

@@ -1,23 +1,24 @@
 """From a plan to a short list of instructions: run this block; add this sum of residuals.
 
 Every reused cell is resolved to the computed residual that it adds (``lattice.origins``), so that a run of reused
-blocks between two computed ones is one addition of one sum. A sum that adds the same residuals as an earlier one of
-the call is not made again.
+blocks between two computed ones, a gap, is one addition of one sum. A sum that adds the same residuals as an earlier
+one of the call is not made again.
 
     plan            C T T C F T T      instructions   run 0, add sum{(0,1),(0,2)}, run 3, add sum{(1,3),(0,5),(0,6)}
 
-Sums are taken over rows of a table that holds, for each block, the residual that this block adds at the moment. In a
-run of reused blocks these rows are neighbours, so the sum is one pass over contiguous memory; and since most cells add
-what they added the step before, few rows have to be loaded. The result differs from adding block by block in the order
-of the summation only.
+What TIMESTEP and FORWARD read is always the last residual that some block computed in this call, so one row a block
+holds all of it. A plan of TIMESTEP alone sums these rows as they are: the blocks of a gap are neighbours, so a sum is
+one pass over contiguous memory. Other plans sum over a second table, which holds what each block adds at the moment;
+since most cells add what they added the step before, few of its rows have to be loaded. The result differs from adding
+block by block in the order of the summation only.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import repeat
 from typing import NamedTuple
 
 import numpy as np
@@ -25,67 +26,51 @@ import numpy as np
 from ttscompile.lattice import UNWRITTEN, BoolArray, IntArray, PlanArray, Source, origins, require_legal
 
 
-class Segment(NamedTuple):
-    """How to make one sum: of the rows ``start..stop`` of the table, after loading those that changed.
-
-    Attributes:
-        start: first block of the run.
-        stop: one past the last block.
-        load: first entry of ``Lowered.load_blocks`` and ``load_cells`` that belongs to it.
-        load_stop: one past the last.
-    """
-
-    start: int
-    stop: int
-    load: int
-    load_stop: int
-
-
 class Add(NamedTuple):
     """Add a sum to the stream, after making it if it is new.
 
     Attributes:
         slot: where the sum is kept while it is needed.
-        make: how to make it; None if it is in its slot already.
+        start: first row that it sums.
+        stop: one past the last; ``start`` if the sum is in its slot already.
+        due: entries of ``Lowered.load_rows`` and ``load_from`` to load before it is made: first, and one past the last.
     """
 
     slot: int
-    make: Segment | None
+    start: int
+    stop: int
+    due: tuple[int, int]
 
 
-class Step(NamedTuple):
-    """One step: add ``gaps[0]``, run ``blocks[0]``, add ``gaps[1]``, ..., run ``blocks[-1]``, add ``gaps[-1]``.
-
-    Attributes:
-        blocks: computed blocks in order.
-        gaps: one more than blocks; None where no block is reused in between.
-    """
-
-    blocks: tuple[int, ...]
-    gaps: tuple[Add | None, ...]
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Lowered:
     """The instructions of one stream's plan.
 
+    A step with n computed blocks has n + 1 gaps: one before each of them, and one after the last.
+
     Attributes:
-        steps: K of them.
+        counts: computed blocks of each step, K of them.
+        cells: computed cells in order of execution, flat indices ``k * blocks + b``.
+        gaps: of all steps in order; None where no block is reused in between.
         slots: how many sums have to be kept at a time.
         segments: how many sums are made in the call.
-        load_blocks: rows of the table that are loaded, in order, int64 ``[n]``.
-        load_cells: the residual that each of them takes, as a flat index ``k * blocks + b``: of this call, or where
-            the plan says ROLLOUT of an earlier one.
+        table: whether sums are over the table, and not over the last computed residuals as they are.
+        load_rows: rows of the table that are loaded, in order.
+        load_from: what each of them takes: an entry of the rollout cache by its flat index, or ``~b`` for the last
+            residual that block b computed in this call.
         computed: bool ``[K, blocks]``.
         rollout: bool ``[K, blocks]``; entries of the rollout cache that the plan reads, so that it is legal in an
             episode that has written them.
     """
 
-    steps: tuple[Step, ...]
+    counts: tuple[int, ...]
+    cells: tuple[int, ...]
+    gaps: tuple[Add | None, ...]
     slots: int
     segments: int
-    load_blocks: IntArray
-    load_cells: IntArray
+    table: bool
+    load_rows: tuple[int, ...]
+    load_from: tuple[int, ...]
     computed: BoolArray
     rollout: BoolArray
 
@@ -103,102 +88,125 @@ def lower_plan(plan: PlanArray, groups: Sequence[int]) -> Lowered:
     steps, blocks = plan.shape
     resolved = origins(plan, groups)
     computed = plan == Source.COMPUTE
-    if (resolved.cell == UNWRITTEN).any() or not computed[0].all():
+    if not computed[0].all() or resolved.cell.min() == UNWRITTEN:
         require_legal(plan[None], groups, np.ones((1, steps, blocks), dtype=np.bool_))
 
-    # A gap is numbered by its step and by how many blocks are computed before it in the step.
-    gap = np.arange(steps)[:, None] * (blocks + 1) + np.cumsum(computed, axis=1)
-    where = np.flatnonzero(~computed)
-    gaps, cells = gap.reshape(-1)[where], resolved.cell.reshape(-1)[where]
-    starts = np.flatnonzero(np.diff(gaps, prepend=-1))
-    bounds = [*starts.tolist(), len(where)]
-    first = _first_alike(np.sort(gaps * plan.size + cells) % plan.size, bounds)
+    # A gap is a run of reused cells within a step: neighbours in the flat order, too.
+    begins, ends = ~computed, ~computed
+    begins[:, 1:] &= computed[:, :-1]
+    ends[:, :-1] &= computed[:, 1:]
+    starts, stops = np.flatnonzero(begins), np.flatnonzero(ends) + 1
+    borrows = bool((plan == Source.FORWARD).any())
+    cells = resolved.cell.reshape(-1)
+    first = _first_alike(_in_order(cells, begins | computed) if borrows else cells, starts.tolist(), stops.tolist())
+    new = np.asarray(first, dtype=np.int64) == np.arange(len(first))
+    slot, slots = _slots(first)
 
-    made = np.repeat(np.asarray(first) == np.arange(len(first)), np.diff(bounds))
-    loaded = _changed(where % blocks, cells, made)
-    slot_of, slots = _slots(first)
-    load = np.concatenate([[0], np.cumsum(loaded)])[bounds].tolist()
-    begins = (where[starts] % blocks).tolist()
-    adds: dict[int, Add] = {}
-    for n, number in enumerate(gaps[starts].tolist()):
-        segment = None
-        if first[n] == n:
-            segment = Segment(begins[n], begins[n] + bounds[n + 1] - bounds[n], load[n], load[n + 1])
-        adds[number] = Add(slot_of[first[n]], segment)
+    table = borrows or bool(resolved.rollout.any())
+    loaded = load = load_stop = np.zeros(0, dtype=np.int64)
+    if table:
+        loaded = _changed(resolved.cell, starts[new], stops[new])
+        load = np.searchsorted(loaded, starts)
+        load_stop = np.where(new, np.searchsorted(loaded, stops), load)
+    rows = starts % blocks
+    stop = np.where(new, rows + stops - starts, rows)
+    due = zip(load.tolist(), load_stop.tolist(), strict=True) if table else repeat((0, 0))
+    adds = map(Add, slot, rows.tolist(), stop.tolist(), due)
+    done = np.cumsum(computed)
+    gaps: list[Add | None] = [None] * (steps + int(done[-1]))
+    for position, add in zip((done[starts] + starts // blocks).tolist(), adds, strict=True):
+        gaps[position] = add
+    source = np.where(resolved.rollout.reshape(-1)[loaded], cells[loaded], ~(cells[loaded] % blocks))
     return Lowered(
-        steps=_steps(computed, adds),
+        counts=tuple(computed.sum(axis=1).tolist()),
+        cells=tuple(np.flatnonzero(computed).tolist()),
+        gaps=tuple(gaps),
         slots=slots,
-        segments=len(set(first)),
-        load_blocks=where[loaded] % blocks,
-        load_cells=cells[loaded],
+        segments=int(np.count_nonzero(new)),
+        table=table,
+        load_rows=tuple((loaded % blocks).tolist()),
+        load_from=tuple(source.tolist()),
         computed=computed,
         rollout=resolved.rollout,
     )
 
 
-def _steps(computed: BoolArray, adds: Mapping[int, Add]) -> tuple[Step, ...]:
-    """Blocks and gaps of every step; ``adds`` by number of the gap."""
-    width = computed.shape[1] + 1
-    run = np.nonzero(computed)[1].tolist()
-    steps, begin = [], 0
-    for k, count in enumerate(computed.sum(axis=1).tolist()):
-        gaps = tuple([adds.get(number) for number in range(k * width, k * width + count + 1)])
-        steps.append(Step(tuple(run[begin : begin + count]), gaps))
-        begin += count
-    return tuple(steps)
+def _in_order(cells: IntArray, begins: BoolArray) -> IntArray:
+    """The residuals sorted within each gap, so that gaps which add the same ones hold the same numbers.
+
+    Only FORWARD needs it: without it a residual is of the block that adds it, and blocks are in order.
+
+    Args:
+        cells: residual of every cell, flat.
+        begins: cells at which a gap begins, and computed cells.
+    """
+    gap: IntArray = np.cumsum(begins)
+    return np.sort(gap * len(cells) + cells) % len(cells)
 
 
-def _first_alike(keys: IntArray, bounds: list[int]) -> list[int]:
+def _first_alike(keys: IntArray, starts: list[int], stops: list[int]) -> list[int]:
     """For each gap the first gap that adds the same residuals, which may be itself.
 
     Args:
-        keys: residuals of all gaps, sorted within each gap.
-        bounds: where the gaps begin, and the end.
+        keys: residual of every cell, flat.
+        starts: where the gaps begin.
+        stops: where they end.
     """
     content, size = keys.tobytes(), keys.itemsize
     seen: dict[bytes, int] = {}
-    return [seen.setdefault(content[size * i : size * j], n) for n, (i, j) in enumerate(pairwise(bounds))]
+    return [
+        seen.setdefault(content[size * i : size * j], n) for n, (i, j) in enumerate(zip(starts, stops, strict=True))
+    ]
 
 
-def _slots(first: list[int]) -> tuple[dict[int, int], int]:
+def _slots(first: list[int]) -> tuple[list[int], int]:
     """A place for every sum, given to another one after its last use.
 
     Args:
         first: for each gap, the gap that makes its sum.
 
     Returns:
-        Place by the gap that makes the sum, and how many places there are.
+        Place of each gap's sum, and how many places there are.
     """
     last_use = {maker: n for n, maker in enumerate(first)}
-    of: dict[int, int] = {}
+    of: list[int] = []
     free: list[int] = []
     count = 0
     for n, maker in enumerate(first):
-        if maker == n:
-            if not free:
-                free.append(count)
-                count += 1
-            of[n] = free.pop()
+        if maker != n:
+            of.append(of[maker])
+        elif free:
+            of.append(free.pop())
+        else:
+            of.append(count)
+            count += 1
         if last_use[maker] == n:
-            free.append(of[maker])
+            free.append(of[n])
     return of, count
 
 
-def _changed(block: IntArray, cells: IntArray, made: BoolArray) -> BoolArray:
+def _changed(cells: IntArray, starts: IntArray, stops: IntArray) -> IntArray:
     """Reused cells of sums that are made, whose residual is not the one that the table's row holds already.
 
     Args:
-        block: of each reused cell, in order of execution.
-        cells: residual that each adds.
-        made: whether its sum is made; the rows of the others are not looked at.
+        cells: residual of every cell, ``[K, blocks]``.
+        starts: where the gaps begin whose sums are made; the cells of the others are not looked at.
+        stops: where they end.
+
+    Returns:
+        Flat indices, in order.
     """
-    changed = np.zeros_like(made)
-    index = np.flatnonzero(made)
-    order = index[np.argsort(block[index], kind="stable")]
-    new_block = np.diff(block[order], prepend=-1) != 0
-    new_cell = np.diff(cells[order], prepend=-1) != 0
-    changed[order] = new_block | new_cell
-    return changed
+    steps, blocks = cells.shape
+    edges = np.zeros(cells.size + 1, dtype=np.int64)
+    edges[starts] = 1
+    edges[stops] -= 1
+    made = np.cumsum(edges[:-1]).reshape(steps, blocks)
+    by_block = np.flatnonzero(made.T)  # row after row of the table, each in order of time
+    held = cells.T.reshape(-1)[by_block]
+    changed = np.ones(len(by_block), dtype=np.bool_)
+    changed[1:] = (held[1:] != held[:-1]) | (by_block[1:] // steps != by_block[:-1] // steps)
+    taken = by_block[changed]
+    return np.sort(taken % steps * blocks + taken // steps)
 
 
 class LoweringCache:

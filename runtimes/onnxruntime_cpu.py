@@ -1,15 +1,25 @@
-"""The product on the CPU: numpy and onnxruntime, one session a piece, plans lowered to short lists of instructions."""
+"""The product on the CPU: numpy and onnxruntime, one session a piece, plans lowered to short lists of instructions.
+
+    caller's thread    prologue | stem, dense step 0            | steps 1..K-1
+    helper             --------   pruner, its plan, lowering     --------------
+
+The helper is one thread that lives as long as the runtime, and only where a pruner makes the plan; it sleeps on a
+queue. Everything else runs on the caller's thread, beside what onnxruntime does with the threads it was given.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from ttscompile.config import FloatArray, Noise
+from ttscompile.correction import Correction
 from ttscompile.errors import IllegalPlanError
 from ttscompile.lattice import BoolArray, PlanArray, Source, check_plan, require_legal
 
@@ -26,16 +36,41 @@ from .base import (
     pruner_plan,
     settle_plan,
 )
-from .lowering import Add, Lowered, LoweringCache
-from .onnxruntime_sessions import Array, open_sessions
+from .decode import decode_first, decode_rest
+from .liveness import readable_rollout
+from .lowering import Lowered, LoweringCache
+from .onnxruntime_sessions import open_sessions
 from .workspace import Workspace
 
 if TYPE_CHECKING:
     from ttscompile.artifact.load import Artifact
 
+DENSE = "dense"
+
+
+@dataclass(frozen=True, eq=False)
+class _Settled:
+    """The plan that a call executes: of each stream, its instructions, and what it took to have them.
+
+    Attributes:
+        plans: int8 ``[B, K, blocks]``.
+        lowered: of each stream.
+        legalised: replaced cells of each stream.
+        pruner: ms that the pruner took, from the condition values to the instructions; 0 if the plan was given.
+    """
+
+    plans: PlanArray
+    lowered: tuple[Lowered, ...]
+    legalised: tuple[int, ...]
+    pruner: float = 0.0
+
 
 class OnnxRuntime:
     """A ``Runtime`` on onnxruntime; see ``base.Runtime``.
+
+    Which entries of the rollout cache are kept: of a call with a plan of the artifact, those that some plan of the
+    artifact can read. A dense call, and one whose plan is a matrix of the caller's, keeps all that it computes; and
+    from the first such matrix on every call does, since another may read any of it.
 
     Args:
         artifact: loaded and checked.
@@ -52,17 +87,32 @@ class OnnxRuntime:
         self._sessions = open_sessions(artifact, threads)
         self._groups = self._manifest.groups
         self._lowering = LoweringCache(self._groups)
-        self._workspace: Workspace | None = None
+        self._readable = readable_rollout(artifact)
+        self._matrices = False  # whether one was ever given
         self._written: BoolArray | None = None
+        self._dropped: BoolArray | None = None  # computed in this episode, and not kept
+        self._helper = ThreadPoolExecutor(1, "ttscompile-pruner") if "pruner" in self._manifest.pieces else None
+        self._slots = max((self._lowering.lower(plan).slots for plan in artifact.schedules.values()), default=0)
+        self._workspace = self._open_workspace(1)
 
     @property
     def streams(self) -> int | None:
         """B of the episode under way."""
         return None if self._written is None else len(self._written)
 
+    @property
+    def nbytes(self) -> int:
+        """Memory of the buffers of the batch size under way, the rollout cache included; weights are onnxruntime's."""
+        return self._workspace.nbytes
+
+    @property
+    def rollout_nbytes(self) -> int:
+        """Memory of the rollout cache."""
+        return self._workspace.rollout.nbytes
+
     def reset(self) -> None:
         """Forget the rollout cache; its memory is kept for the next episode."""
-        self._written = None
+        self._written = self._dropped = None
 
     def predict(
         self,
@@ -72,58 +122,69 @@ class OnnxRuntime:
         *,
         plan_name: str | None = None,
         repair: bool = False,
+        correction: Correction | None = None,
     ) -> tuple[FloatArray, CallReport]:
         """Denoise one chunk; see ``base.Runtime.predict``."""
         spec = self._manifest.spec
         streams = check_call(self.streams, noise, spec.sample, spec.sampler)
-        written = self._written
-        if written is None:
-            written = np.zeros((streams, spec.sampler.steps, len(self._groups)), dtype=np.bool_)
-        pruned = plan is None
-        if pruned and "pruner" not in self._manifest.pieces:
+        cells = (streams, spec.sampler.steps, len(self._groups))
+        written = np.zeros(cells, dtype=np.bool_) if self._written is None else self._written
+        dropped = np.zeros(cells, dtype=np.bool_) if self._dropped is None else self._dropped
+        if plan is None and self._helper is None:
             raise no_pruner()
-        if plan is not None:
-            plans, lowered, legalised = self._settle(plan, written, repair)
-        if self._workspace is None or self._workspace.streams != streams:
-            self._workspace = None  # give the old memory back first
-            self._workspace = Workspace(self._manifest, self._sessions, self._tables, streams)
+        settled = None if plan is None else self._settle(plan, written, dropped, repair)
+        if plan_name not in (DENSE, *self._manifest.plans):
+            self._matrices = True
+        if self._workspace.streams != streams:
+            del self._workspace  # give the old memory back first
+            self._workspace = self._open_workspace(streams)
         work = self._workspace
+        keep_all = self._matrices or plan_name == DENSE
+        keep = np.ones_like(self._readable) if keep_all else self._readable
 
         start = time.perf_counter()
-        try:
-            work.start(obs, noise)
-            prologue = time.perf_counter()
-            if pruned:
-                plans, lowered, legalised = self._settle(pruner_plan(work.logits()), written, repair=True)
-            pruner = time.perf_counter()
-            work.begin()
-            sample = decode(work, lowered)
-        except BaseException:
-            self.reset()  # residuals of this call stand beside those of earlier ones
-            raise
+        self.reset()  # a call that fails ends the episode: its residuals stand beside those of earlier ones
+        work.start(obs, noise, correction)
+        prologue = time.perf_counter()
+        waited = 0.0
+        if settled is None:
+            settled, waited = self._prune_beside_first_step(work, written, keep)
+        else:
+            decode_first(work, keep)
+        decode_rest(work, settled.lowered, keep)
+        sample = work.sample[spec.sampler.steps % 2].copy()
         stop = time.perf_counter()
-        self._written = written | (plans == Source.COMPUTE)
-        wait = milliseconds(prologue, pruner) if pruned else 0.0
+        computed = settled.plans == Source.COMPUTE
+        self._written, self._dropped = written | (computed & keep), (dropped | computed) & ~keep
         report = CallReport(
-            plan=frozen(plans),
-            plan_name=plan_name or (PRUNER if pruned else GIVEN),
-            computed=computed_cells(plans),
-            legalised=legalised,
-            flops=tuple(self._manifest.flops.call(one, pruned) for one in plans),
+            plan=frozen(settled.plans),
+            plan_name=plan_name or (PRUNER if plan is None else GIVEN),
+            computed=computed_cells(settled.plans),
+            legalised=settled.legalised,
+            flops=tuple(self._manifest.flops.call(one, plan is None) for one in settled.plans),
             timings=Timings(
                 prologue=milliseconds(start, prologue),
-                pruner=wait,
-                wait_pruner=wait,
-                decode=milliseconds(pruner, stop),
+                pruner=settled.pruner,
+                wait_pruner=waited,
+                decode=milliseconds(prologue, stop) - waited,
                 total=milliseconds(start, stop),
             ),
         )
         return sample, report
 
-    def _settle(
-        self, plan: npt.ArrayLike, written: BoolArray, repair: bool
-    ) -> tuple[PlanArray, list[Lowered], tuple[int, ...]]:
-        """The plan of each stream, its instructions, and how many of its cells were replaced.
+    def _prune_beside_first_step(self, work: Workspace, written: BoolArray, keep: BoolArray) -> tuple[_Settled, float]:
+        """Step 0, and meanwhile the plan of the steps after it; ms that the loop stood still for it."""
+        assert self._helper is not None
+        pruning: Future[_Settled] = self._helper.submit(_prune, work, written, self._groups, self._lowering)
+        try:
+            decode_first(work, keep)
+            ready = time.perf_counter()
+            return pruning.result(), milliseconds(ready)
+        finally:
+            wait([pruning])  # it reads the workspace: nobody may go on before it is done, not even with an error
+
+    def _settle(self, plan: npt.ArrayLike, written: BoolArray, dropped: BoolArray, repair: bool) -> _Settled:
+        """The plan of a caller.
 
         Whether a plan that was lowered before is legal depends on its ROLLOUT reads alone, which is quickly checked.
         """
@@ -133,122 +194,48 @@ class OnnxRuntime:
         else:
             plans, legalised = check_plan(plan, steps, blocks, streams), (0,) * streams
         try:
-            lowered = [self._lowering.lower(one) for one in plans]
+            lowered = tuple(self._lowering.lower(one) for one in plans)
         except IllegalPlanError:
             require_legal(plans, self._groups, written)  # says which stream
             raise
-        if any((one.rollout & ~cells).any() for one, cells in zip(lowered, written, strict=True)):
-            require_legal(plans, self._groups, written)
-        return plans, lowered, legalised
+        for one, cells, gone in zip(lowered, written, dropped, strict=True):
+            if (one.rollout & gone & ~cells).any():
+                k, b = np.argwhere(one.rollout & gone & ~cells)[0].tolist()
+                raise IllegalPlanError(
+                    f"the plan reads the ROLLOUT residual of step {k}, block {b}, which an earlier call of this episode"
+                    " computed with a plan of the artifact, and did not keep: no plan of the artifact reads it."
+                    " Begin the episode with plan='dense' or with a matrix: these keep what they compute, and after a"
+                    " first matrix every call does."
+                )
+            if (one.rollout & ~cells).any():
+                require_legal(plans, self._groups, written)
+        return _Settled(plans, lowered, legalised)
+
+    def _open_workspace(self, streams: int) -> Workspace:
+        """The workspace of a batch size, after a step on zeros.
+
+        So the first call costs what the others do: sessions have their memory, pages are committed, and the helper's
+        thread is there.
+        """
+        work = Workspace(self._manifest, self._sessions, self._tables, streams)
+        work.sums(self._slots)
+        for cell in np.flatnonzero(self._readable).tolist():
+            work.rollout.entry(cell)
+        spec = self._manifest.spec
+        obs = {key: np.zeros((streams, *one.shape), one.dtype) for key, one in spec.observations.items()}
+        with np.errstate(all="ignore"):  # zeros need not be in the range of the policy
+            work.start(obs, Noise(np.zeros((streams, *spec.sample), np.float32)), None)
+            decode_first(work, np.zeros_like(self._readable))
+            for k in range(spec.sampler.steps):
+                work.advance(k)
+        if self._helper is not None and any(plan.kind == "pruner" for plan in self._manifest.plans.values()):
+            self._helper.submit(work.logits).result()
+        return work
 
 
-def decode(work: Workspace, lowered: list[Lowered]) -> FloatArray:
-    """The denoising loop, from ``work.stream[0]`` to the sample after the last step.
-
-    Args:
-        work: observation and noise taken in, residual stream of step 0 made.
-        lowered: instructions of each stream.
-
-    Returns:
-        The sample, float32 ``[B, T, D]``.
-    """
-    if all(one is lowered[0] for one in lowered):
-        _decode_together(work, lowered[0])
-    else:
-        _decode_apart(work, lowered)
-    return work.sample[len(lowered[0].steps) % 2].copy()
-
-
-def _decode_together(work: Workspace, lowered: Lowered) -> None:
-    """All streams follow one plan: every instruction is one operation on the whole batch."""
-    lane = _Lane(lowered, work.residuals, work.table, work.stream)
-    blocks = len(work.table)
-    advances, residuals = work.advances(), lane.residuals
-    bound, add = work.block, np.add
-    for k, step in enumerate(lowered.steps):
-        stream = lane.stream[k % 2]
-        gaps = iter(step.gaps)
-        for b in step.blocks:
-            gap = next(gaps)
-            if gap is not None:
-                lane.add(gap, stream)
-            bound(k, b).run()
-            add(stream, residuals[k * blocks + b], stream)
-        gap = next(gaps)
-        if gap is not None:
-            lane.add(gap, stream)
-        advances[k].run()
-
-
-def _decode_apart(work: Workspace, lowered: list[Lowered]) -> None:
-    """Every stream follows its own plan; a block that several compute in a step runs once, on these."""
-    lanes = [_Lane.of_stream(work, s, one) for s, one in enumerate(lowered)]
-    blocks = len(work.table)
-    advances = work.advances()
-    for k, rows in enumerate(np.stack([one.computed for one in lowered], axis=1)):
-        gaps = [iter(one.steps[k].gaps) for one in lowered]
-        for b in np.flatnonzero(rows.any(axis=0)).tolist():
-            takers = np.flatnonzero(rows[:, b]).tolist()
-            for s in takers:
-                lanes[s].add_next(gaps[s], k)
-            if len(takers) == work.streams:
-                work.block(k, b).run()
-            else:
-                work.run_some(k, b, takers)
-            for s in takers:
-                stream = lanes[s].stream[k % 2]
-                np.add(stream, lanes[s].residuals[k * blocks + b], stream)
-        for lane, rest in zip(lanes, gaps, strict=True):
-            lane.add_next(rest, k)
-        advances[k].run()
-
-
-class _Lane:
-    """What the instructions of one plan work on: the whole batch, or one stream of it, as views.
-
-    Args:
-        lowered: the instructions.
-        residuals: ``[K * blocks, ...]``.
-        table: ``[blocks, ...]``.
-        stream: two arrays ``[...]``.
-    """
-
-    def __init__(self, lowered: Lowered, residuals: Array, table: Array, stream: list[Array]) -> None:
-        self.residuals, self.stream = _flat(residuals, 1), [_flat(one, 0) for one in stream]
-        self._table = _flat(table, 1)
-        self._sums = np.empty((lowered.slots, *self._table.shape[1:]), np.float32)
-        self._loads = list(zip(lowered.load_blocks.tolist(), lowered.load_cells.tolist(), strict=True))
-
-    @classmethod
-    def of_stream(cls, work: Workspace, s: int, lowered: Lowered) -> _Lane:
-        """The lane of one stream of the batch."""
-        axis = work.axis
-        return cls(
-            lowered,
-            np.moveaxis(work.residuals, axis + 1, 1)[:, s],
-            np.moveaxis(work.table, axis + 1, 1)[:, s],
-            [np.moveaxis(one, axis, 0)[s] for one in work.stream],
-        )
-
-    def add(self, add: Add, stream: Array) -> None:
-        """Add a sum to the stream, after making it if it is new."""
-        slot, make = add
-        total = self._sums[slot]
-        if make is not None:
-            start, stop, load, load_stop = make
-            for b, cell in self._loads[load:load_stop]:  # faster than numpy's indexing by arrays at any length
-                self._table[b] = self.residuals[cell]
-            np.add.reduce(self._table[start:stop], axis=0, out=total)
-        np.add(stream, total, stream)
-
-    def add_next(self, gaps: Iterator[Add | None], k: int) -> None:
-        """``add`` the next gap of step k, if any block is reused in it."""
-        gap = next(gaps)
-        if gap is not None:
-            self.add(gap, self.stream[k % 2])
-
-
-def _flat(array: Array, keep: int) -> Array:
-    """The array with all axes after the first ``keep`` made one, where that is a view; else as it is."""
-    inner = array[0] if keep else array
-    return array.reshape(*array.shape[:keep], -1) if inner.flags.c_contiguous else array
+def _prune(work: Workspace, written: BoolArray, groups: tuple[int, ...], lowering: LoweringCache) -> _Settled:
+    """The pruner's plan and its instructions. Not a method: the helper must not keep the runtime alive."""
+    start = time.perf_counter()
+    plans, legalised = settle_plan(pruner_plan(work.logits()), groups, written, repair=True)
+    lowered = tuple(lowering.lower(one) for one in plans)
+    return _Settled(plans, lowered, legalised, milliseconds(start))

@@ -1,8 +1,9 @@
 """Memory of one batch size: every buffer that the denoising loop touches, and the sessions bound to them.
 
-Residuals live in one array ``[K * blocks, *stream]``. A cell is computed at most once a call, and a ROLLOUT read is of
-the cell's own entry, so the same array is the cache of this call and the rollout cache of the episode. Pages of it are
-only committed when a cell is computed.
+A block writes its residual to its row of ``current``, and nothing else of the call is kept: what TIMESTEP and FORWARD
+read is always the last residual that some block computed. Entries of the rollout cache are copies, made only of those
+that a later call can read. Sessions are bound once, before the first call: a block always reads the same stream and the
+same context buffers, to which the values of the step are copied.
 """
 
 from __future__ import annotations
@@ -14,10 +15,13 @@ import numpy as np
 
 from ttscompile.artifact.manifest import ContextRecord, Manifest, PieceRecord, block_name
 from ttscompile.config import FloatArray, Noise, SamplerTable
+from ttscompile.correction import HISTORY, Correction, no_correction
 from ttscompile.errors import ArtifactError, ObservationError
+from ttscompile.ir.graph import TensorType
 from ttscompile.ir.program import Binding
 
 from .onnxruntime_sessions import Array, Bound, repeat_streams, run_named
+from .rollout_store import RolloutStore
 
 STEM, ADVANCE = "stem", "advance"
 
@@ -25,8 +29,8 @@ STEM, ADVANCE = "stem", "advance"
 class Workspace:
     """Buffers and bindings for B streams.
 
-    Sample and stream have two buffers each, taken in turn: step k reads those of ``k % 2``, and ``advance`` writes the
-    others.
+    ``stem`` and ``advance`` write the stream of a step to ``fresh``; the blocks and ``advance`` read ``stream``. The
+    sample has two buffers, taken in turn: step k reads that of ``k % 2``, and ``advance`` writes the other.
 
     Args:
         manifest: of the artifact.
@@ -38,144 +42,160 @@ class Workspace:
         streams: B.
         axis: the axis of the streams in the residual stream.
         sample: two arrays ``[B, T, D]``.
-        stream: two arrays of the stream's type.
-        residuals: float32 ``[K * blocks, *stream]``.
+        fresh: the residual stream as a step begins.
+        stream: the residual stream after what was added to it.
+        current: float32 ``[blocks, *stream]``, what each block computed last.
         table: float32 ``[blocks, *stream]``, what each reused block adds at the moment.
+        rollout: entries of the rollout cache.
     """
 
     def __init__(
         self, manifest: Manifest, sessions: Mapping[str, Any], tables: Mapping[str, Array], streams: int
     ) -> None:
-        kind = manifest.blocks[0].type
+        kind = stream_type(manifest, streams)
         shape = kind.at(streams)
-        if any(block.type != kind for block in manifest.blocks) or kind.dtype != "float32":
-            types = sorted({str(block.type) for block in manifest.blocks})
-            raise ArtifactError(
-                f"the residual stream changes its type, or is not float32: {types}. It cannot be executed."
-            )
-        if kind.batch_axis is None and streams > 1:
-            raise ObservationError(
-                f"this policy's residual stream has type {kind}, without an axis for the streams; found {streams}"
-                " streams. Call it with one stream at a time."
-            )
         self.streams = streams
         self.axis = kind.batch_axis or 0
         self._manifest, self._sessions = manifest, sessions
-        self._steps, self._count = manifest.steps, len(manifest.blocks)
+        self._steps, count = manifest.steps, len(manifest.blocks)
         self.sample = [np.zeros((streams, *manifest.spec.sample), np.float32) for _ in range(2)]
-        self.stream = [np.zeros(shape, np.float32) for _ in range(2)]
-        self.residuals = np.empty((self._steps * self._count, *shape), np.float32)
-        self.table = np.empty((self._count, *shape), np.float32)
+        self.fresh, self.stream = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        self.current = np.zeros((count, *shape), np.float32)
+        self.table = np.zeros((count, *shape), np.float32)
+        self.rollout = RolloutStore(shape, self.axis)
+        self._sums = np.zeros((0, *shape), np.float32)
         self._noise = np.zeros((self._steps, streams, *manifest.spec.sample), np.float32)
         sampler = manifest.spec.sampler
         self._coefficients = np.stack([getattr(sampler, name) for name in SamplerTable.COLUMNS], axis=1)
-        self._tables = {
-            name: repeat_streams(table, _row_axis(manifest.contexts[name]), streams) for name, table in tables.items()
-        }
-        self._values: dict[str, Array] = {}  # condition values, and step values [K, ...]
         self._step_inputs: dict[str, Array] = {}
-        self._blocks: dict[int, Bound] = {}
-        self._advances: list[Bound] = []
-        self._stem: Bound | None = None
+        self._values: dict[str, Array] = {  # condition values; step and table values [K, ...]
+            name: repeat_streams(tables[name], _row_axis(context), streams)
+            if context.binding is Binding.TABLE
+            else np.zeros(_shape(context, self._steps, streams), context.type.dtype)
+            for name, context in manifest.contexts.items()
+        }
+        stem = manifest.pieces[STEM]
+        assert stem.stream is not None
+        at_first = {name: self._value(name, 0) for name in stem.inputs if name != stem.stream}
+        self._stem = Bound(sessions[STEM], {stem.stream: self.sample[0], **at_first}, {stem.outputs[0]: self.fresh})
+        self._history = np.zeros((streams, HISTORY * manifest.spec.sample[0], manifest.spec.sample[1]), np.float32)
+        self._prediction = np.zeros_like(self.sample[0])
+        self._no_correction = no_correction(self._steps, manifest.spec.sample)
+        self._advances: dict[int, tuple[Correction, list[Bound]]] = {}  # by identity, which the entry keeps from reuse
+        self._corrected, self._advance = self._advances_with(self._no_correction)
+        self._blocks = [_BoundBlock(self, b, streams, self.stream, self.current[b]) for b in range(count)]
+        self._some: dict[tuple[int, int], _BoundBlock] = {}
 
-    def start(self, obs: Mapping[str, FloatArray], noise: Noise) -> None:
-        """Take in an observation and the noise of a call: everything up to the first residual stream."""
+    def start(self, obs: Mapping[str, FloatArray], noise: Noise, correction: Correction | None) -> None:
+        """Take in an observation and the noise of a call, and run what they decide before the loop."""
         np.copyto(self.sample[0], noise.initial)
+        self._corrected, self._advance = self._advances_with(correction or self._no_correction)
+        self._history.fill(0)
         if self._manifest.spec.sampler.stochastic and noise.steps is not None:
             np.copyto(self._noise, noise.steps)
         piece = self._manifest.pieces["condition"]
         if piece.outputs:
             feed = {name: np.ascontiguousarray(obs[name]) for name in piece.inputs}
-            self._keep(run_named(self._sessions["condition"], piece.outputs, feed))
+            for name, value in run_named(self._sessions["condition"], piece.outputs, feed).items():
+                if name in self._values:
+                    np.copyto(self._values[name], value)
+                else:
+                    self._values[name] = value  # a feature, which only the pruner reads
         if "step" in self._manifest.pieces:
             self._run_step(self._manifest.pieces["step"])
 
     def begin(self) -> None:
-        """The residual stream of step 0; fills ``stream[0]``."""
-        if self._stem is None:
-            piece = self._manifest.pieces[STEM]
-            assert piece.stream is not None
-            inputs = {piece.stream: self.sample[0], **self._contexts(piece, 0)}
-            self._stem = Bound(self._sessions[STEM], inputs, {piece.outputs[0]: self.stream[0]})
+        """The residual stream of step 0; fills ``fresh``."""
         self._stem.run()
 
     def logits(self) -> FloatArray:
-        """The pruner: float32 ``[B, K, blocks, 4]``."""
+        """The pruner: float32 ``[B, K, blocks, 4]``. Reads condition values alone, so the loop may run meanwhile."""
         piece = self._manifest.pieces["pruner"]
         feed = {name: self._values[name] for name in piece.inputs}
         logits = run_named(self._sessions["pruner"], piece.outputs, feed)[piece.outputs[0]]
         return np.asarray(logits, dtype=np.float32)
 
-    def block(self, k: int, b: int) -> Bound:
-        """Block b at step k for all streams: reads ``stream[k % 2]``, writes its row of ``residuals``."""
-        cell = k * self._count + b
-        bound = self._blocks.get(cell)
-        if bound is None:
-            name = block_name(b)
-            piece = self._manifest.pieces[name]
-            assert piece.stream is not None
-            inputs = {piece.stream: self.stream[k % 2], **self._contexts(piece, k)}
-            bound = Bound(self._sessions[name], inputs, {piece.outputs[0]: self.residuals[cell]})
-            self._blocks[cell] = bound
-        return bound
+    def advance(self, k: int) -> None:
+        """Tail, sampler, correction, and the next step's stem: reads ``stream``, writes ``fresh`` and a sample."""
+        self._advance[k].run()
+        if self._corrected.anchors[k]:
+            half, horizon = self._history.shape[1] // 2, self._prediction.shape[1]
+            self._history[:, half:] = self._history[:, :half]
+            self._history[:, :horizon] = self.sample[k % 2]
+            self._history[:, horizon:half] = self._prediction
 
-    def run_some(self, k: int, b: int, streams: Sequence[int]) -> None:
-        """Block b at step k for these streams only; the other streams' residuals stay as they are."""
-        name = block_name(b)
-        piece = self._manifest.pieces[name]
-        assert piece.stream is not None
-        inputs = {piece.stream: np.take(self.stream[k % 2], streams, axis=self.axis)}
-        for context, value in self._contexts(piece, k).items():
-            axis = self._manifest.contexts[context].type.batch_axis
-            inputs[context] = value if axis is None else np.take(value, streams, axis=axis)
-        residual = run_named(self._sessions[name], piece.outputs, inputs)[piece.outputs[0]]
-        row = self.residuals[k * self._count + b]
-        np.moveaxis(row, self.axis, 0)[list(streams)] = np.moveaxis(residual, self.axis, 0)
+    def run(self, k: int, b: int) -> None:
+        """Block b at step k for all streams: reads ``stream``, writes ``current[b]``."""
+        self._blocks[b].run(k)
 
-    def advances(self) -> list[Bound]:
-        """For each step: tail, sampler and the next step's stem; writes the other buffers of sample and stream."""
-        if not self._advances:
-            self._advances = [self._advance(k) for k in range(self._steps)]
-        return self._advances
+    def run_some(self, k: int, b: int, streams: Sequence[int]) -> Array:
+        """Block b at step k for these streams only.
 
-    def _advance(self, k: int) -> Bound:
+        Returns:
+            Their residuals, the streams on axis 0: a view that holds until the next such run. ``current`` is as it was.
+        """
+        key = b, len(streams)
+        some = self._some.get(key)
+        if some is None:
+            assert self._manifest.blocks[b].type.batch_axis is not None
+            shape = self._manifest.blocks[b].type.at(len(streams))
+            stream, residual = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+            some = self._some[key] = _BoundBlock(self, b, len(streams), stream, residual)
+        some.gather(k, streams, self.stream)
+        return some.rows
+
+    def sums(self, count: int) -> Array:
+        """Room for sums, float32 ``[>= count, *stream]``; what was in it is lost when it grows."""
+        if len(self._sums) < count:
+            self._sums = np.zeros((count, *self.stream.shape), np.float32)
+        return self._sums
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of all buffers, the rollout cache included."""
+        own = (*self.sample, self.fresh, self.stream, self.current, self.table, self._sums, self._noise, self._history)
+        kept = (*self._values.values(), *self._step_inputs.values())
+        bound = sum(block.nbytes for block in (*self._blocks, *self._some.values()))
+        return sum(array.nbytes for array in (*own, *kept)) + bound + self.rollout.nbytes
+
+    def _advances_with(self, correction: Correction) -> tuple[Correction, list[Bound]]:
+        """Bindings of all steps to the rows of a correction; made once for each."""
+        known = self._advances.get(id(correction))
+        if known is None:
+            known = correction, [self._bind_advance(k, correction) for k in range(self._steps)]
+            self._advances[id(correction)] = known
+        return known
+
+    def _bind_advance(self, k: int, correction: Correction) -> Bound:
         piece = self._manifest.pieces[ADVANCE]
-        now, then = k % 2, (k + 1) % 2
-        following = min(
-            k + 1, self._steps - 1
-        )  # after the last step there is no stream to make; its result is not read
+        following = min(k + 1, self._steps - 1)  # after the last step there is no stream to make; it is not read
         inputs = {
-            "stream": self.stream[now],
-            "sample": self.sample[now],
+            "stream": self.stream,
+            "sample": self.sample[k % 2],
             "noise": self._noise[k],
             "coefficients": self._coefficients[k],
+            "history": self._history,
+            "correction": correction.weights[k],
+            "correction_bias": correction.bias[k],
         }
         for name in piece.inputs:
             if name not in inputs:
                 where, _, context = name.partition(".")
                 inputs[name] = self._value(context, k if where == "tail" else following)
-        outputs = {"sample_next": self.sample[then], "stream_next": self.stream[then]}
+        outputs = {
+            "sample_next": self.sample[(k + 1) % 2],
+            "stream_next": self.fresh,
+            "prediction": self._prediction,
+        }
         return Bound(self._sessions[ADVANCE], {name: inputs[name] for name in piece.inputs}, outputs)
 
-    def _contexts(self, piece: PieceRecord, k: int) -> dict[str, Array]:
-        return {name: self._value(name, k) for name in piece.inputs if name != piece.stream}
-
     def _value(self, name: str, k: int) -> Array:
-        """The value of a context at step k; an address that stays the same from call to call."""
-        binding = self._manifest.contexts[name].binding
-        if binding is Binding.CONDITION:
-            return self._values[name]
-        rows = self._tables if binding is Binding.TABLE else self._values
-        row: Array = rows[name][k]
+        """The value of a context at step k."""
+        value = self._values[name]
+        if self._manifest.contexts[name].binding is Binding.CONDITION:
+            return value
+        row: Array = value[k]
         return row
-
-    def _keep(self, values: Mapping[str, Array]) -> None:
-        """Copy values to where the bindings expect them."""
-        for name, value in values.items():
-            if name in self._values:
-                np.copyto(self._values[name], value)
-            else:
-                self._values[name] = np.ascontiguousarray(value).copy()
 
     def _run_step(self, piece: PieceRecord) -> None:
         """The step values of all steps in one batch of K * B, step-major."""
@@ -193,10 +213,10 @@ class Workspace:
                         f"table {name!r} : {context.type} of the step piece has no axis for the streams, so that the"
                         " steps cannot run as one batch. Convert the checkpoint again."
                     )
-                self._step_inputs[name] = np.concatenate(list(self._tables[name]), axis=axis)
+                self._step_inputs[name] = np.concatenate(list(self._values[name]), axis=axis)
             feed[name] = self._step_inputs[name]
-        results = run_named(self._sessions["step"], piece.outputs, feed)
-        self._keep({name: self._by_step(name, value) for name, value in results.items()})
+        for name, value in run_named(self._sessions["step"], piece.outputs, feed).items():
+            np.copyto(self._values[name], self._by_step(name, value))
 
     def _by_step(self, name: str, value: Array) -> Array:
         """``[..., K * B, ...]`` as ``[K, ..., B, ...]``."""
@@ -207,8 +227,96 @@ class Workspace:
         split = front.reshape(self._steps, self.streams, *front.shape[1:])
         return np.moveaxis(split, 1, axis + 1)
 
+    def bound_block(self, b: int, stream: Array, residual: Array, contexts: Mapping[str, Array]) -> Bound:
+        """The session of block b on these arrays."""
+        piece = self._manifest.pieces[block_name(b)]
+        assert piece.stream is not None
+        inputs = {name: stream if name == piece.stream else contexts[name] for name in piece.inputs}
+        return Bound(self._sessions[block_name(b)], inputs, {piece.outputs[0]: residual})
+
+    def contexts_of(self, b: int) -> dict[str, tuple[ContextRecord, Array]]:
+        """Contexts that block b reads, and their values: ``[K, ...]`` unless they are of the condition."""
+        piece = self._manifest.pieces[block_name(b)]
+        return {n: (self._manifest.contexts[n], self._values[n]) for n in piece.inputs if n != piece.stream}
+
+
+class _BoundBlock:
+    """A block bound to arrays for n of the streams, and how the contexts of a step get there.
+
+    Args:
+        work: has the values of the contexts.
+        b: the block.
+        count: n.
+        stream: what it reads.
+        residual: what it writes.
+    """
+
+    def __init__(self, work: Workspace, b: int, count: int, stream: Array, residual: Array) -> None:
+        self._stream, self._axis = stream, work.axis  # not the workspace: that has us
+        self.rows = np.moveaxis(residual, work.axis, 0) if work.streams > 1 else residual
+        self._by_step: list[tuple[Array, Array]] = []  # where it is read from, and one value a step
+        self._gathered: list[tuple[Array, Array, int, bool]] = []  # where, value, axis of the streams, one a step
+        whole = count == work.streams
+        arrays: dict[str, Array] = {}
+        for name, (context, value) in work.contexts_of(b).items():
+            axis, stepwise = context.type.batch_axis, context.binding is not Binding.CONDITION
+            if not stepwise and (whole or axis is None):
+                arrays[name] = value
+                continue
+            arrays[name] = np.zeros(context.type.at(count), context.type.dtype)
+            if whole or axis is None:
+                self._by_step.append((arrays[name], value))
+            elif context.binding is Binding.TABLE:  # the same for every stream
+                self._by_step.append((arrays[name], value.take(np.arange(count), axis=axis + 1)))
+            else:
+                self._gathered.append((arrays[name], value, axis, stepwise))
+        self._own = (*arrays.values(), stream, residual) if not whole else tuple(to for to, _ in self._by_step)
+        self._bound = work.bound_block(b, stream, residual, arrays)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the arrays that are its own."""
+        return sum(array.nbytes for array in self._own)
+
+    def run(self, k: int) -> None:
+        """Run at step k on the stream as it is."""
+        for to, values in self._by_step:
+            np.copyto(to, values[k])
+        self._bound.run()
+
+    def gather(self, k: int, streams: Sequence[int], stream: Array) -> None:
+        """Run at step k on these streams of the batch's ``stream``."""
+        np.take(stream, streams, axis=self._axis, out=self._stream, mode="clip")
+        for to, value, axis, stepwise in self._gathered:
+            np.take(value[k] if stepwise else value, streams, axis=axis, out=to, mode="clip")
+        self.run(k)
+
+
+def stream_type(manifest: Manifest, streams: int) -> TensorType:
+    """The type of the residual stream.
+
+    Raises:
+        ArtifactError: it is not one for all blocks, or not float32.
+        ObservationError: it has no axis for as many streams.
+    """
+    kind = manifest.blocks[0].type
+    if any(block.type != kind for block in manifest.blocks) or kind.dtype != "float32":
+        types = sorted({str(block.type) for block in manifest.blocks})
+        raise ArtifactError(f"the residual stream changes its type, or is not float32: {types}. It cannot be executed.")
+    if kind.batch_axis is None and streams > 1:
+        raise ObservationError(
+            f"this policy's residual stream has type {kind}, without an axis for the streams; found {streams}"
+            " streams. Call it with one stream at a time."
+        )
+    return kind
+
 
 def _row_axis(context: ContextRecord) -> int | None:
     """Batch axis of a whole table, whose first axis is the step."""
     axis = context.type.batch_axis
     return None if axis is None else axis + 1
+
+
+def _shape(context: ContextRecord, steps: int, streams: int) -> tuple[int, ...]:
+    one = context.type.at(streams)
+    return one if context.binding is Binding.CONDITION else (steps, *one)

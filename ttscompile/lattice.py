@@ -101,18 +101,17 @@ def origins(plan: PlanArray, groups: Sequence[int]) -> Origins:
     steps, blocks = plan.shape
     own = np.arange(steps * blocks, dtype=np.int64).reshape(steps, blocks)
     computed = plan == Source.COMPUTE
-    timestep = _last_computed(computed, own)
-    forward = np.empty_like(own)
-    group_of = np.asarray(groups)
-    for group in np.unique(group_of):
-        members = np.flatnonzero(group_of == group)
-        flat = _last_computed(computed[:, members].reshape(-1), own[:, members].reshape(-1))
-        forward[:, members] = flat.reshape(steps, len(members))
-    cell = np.where(computed, own, UNWRITTEN)
-    cell = np.where(plan == Source.TIMESTEP, timestep, cell)
-    cell = np.where(plan == Source.FORWARD, forward, cell)
-    rollout = plan == Source.ROLLOUT
-    return Origins(cell=np.where(rollout, own, cell), rollout=rollout)
+    cell = np.where(plan == Source.TIMESTEP, _last_computed(computed, own), own)
+    borrowed = plan == Source.FORWARD
+    if borrowed.any():
+        forward = np.empty_like(own)
+        group_of = np.asarray(groups)
+        for group in set(groups):
+            members = np.flatnonzero(group_of == group)
+            flat = _last_computed(computed[:, members].reshape(-1), own[:, members].reshape(-1))
+            forward[:, members] = flat.reshape(steps, len(members))
+        cell = np.where(borrowed, forward, cell)
+    return Origins(cell=cell, rollout=plan == Source.ROLLOUT)
 
 
 def illegal_cells(plan: PlanArray, groups: Sequence[int], written: BoolArray) -> BoolArray:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -13,8 +10,9 @@ from hypothesis import strategies as st
 from ttscompile import Source
 from ttscompile.errors import IllegalPlanError
 from ttscompile.lattice import PlanArray, dense_plan, uniform_plan
+from ttscompile.runtimes.decode import decode_first, decode_rest
 from ttscompile.runtimes.lowering import Lowered, LoweringCache, lower_plan
-from ttscompile.runtimes.onnxruntime_cpu import decode
+from ttscompile.runtimes.rollout_store import RolloutStore
 
 from .literal import Episode, Toy
 from .plans import random_plan
@@ -36,10 +34,12 @@ class FakeWorkspace:
         self._w = rng.standard_normal((blocks, 4, 4)) / 2
         self._c = rng.standard_normal((steps, blocks, streams, 1, 4))
         shape = (streams, 3, 4) if axis == 0 else (3, streams, 4)
-        self.stream = [np.zeros(shape, np.float32) for _ in range(2)]
+        self.x = np.zeros((streams, 3, 4))
+        self.fresh, self.stream = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
         self.sample = [np.zeros((streams, 3, 4), np.float32) for _ in range(2)]
-        self.residuals = np.full((steps * blocks, *shape), np.nan, np.float32)
+        self.current = np.full((blocks, *shape), np.nan, np.float32)
         self.table = np.full((blocks, *shape), np.nan, np.float32)
+        self.rollout = RolloutStore(shape, axis)
         self.runs: list[tuple[int, int, tuple[int, ...]]] = []
 
     def toy(self, s: int) -> Toy:
@@ -51,28 +51,28 @@ class FakeWorkspace:
             advance=lambda h, x, k: 0.3 * x + np.tanh(h),
         )
 
-    def begin(self, x: np.ndarray) -> None:
-        self.sample[0][:] = x
-        np.moveaxis(self.stream[0], self.axis, 0)[:] = 0.5 * x
+    def begin(self) -> None:
+        self.sample[0][:] = self.x
+        np.moveaxis(self.fresh, self.axis, 0)[:] = 0.5 * self.x
+        self.stream[:] = np.nan
 
-    def block(self, k: int, b: int) -> Any:
-        return SimpleNamespace(run=lambda: self.run_some(k, b, list(range(self.streams))))
+    def sums(self, count: int) -> np.ndarray:
+        return np.full((count, *self.stream.shape), np.nan, np.float32)
 
-    def run_some(self, k: int, b: int, streams: list[int]) -> None:
+    def run(self, k: int, b: int) -> None:
+        everyone = list(range(self.streams))
+        np.moveaxis(self.current[b], self.axis, 0)[:] = self.run_some(k, b, everyone)
+
+    def run_some(self, k: int, b: int, streams: list[int]) -> np.ndarray:
         self.runs.append((k, b, tuple(streams)))
-        h = np.moveaxis(self.stream[k % 2], self.axis, 0)
-        row = np.moveaxis(self.residuals[k * len(self.groups) + b], self.axis, 0)
-        for s in streams:
-            row[s] = self.toy(s).block(h[s], k, b)
+        h = np.moveaxis(self.stream, self.axis, 0)
+        return np.stack([self.toy(s).block(h[s], k, b) for s in streams]).astype(np.float32)
 
-    def advances(self) -> list[Any]:
-        return [SimpleNamespace(run=lambda k=k: self._advance(k)) for k in range(self.steps)]
-
-    def _advance(self, k: int) -> None:
+    def advance(self, k: int) -> None:
         now, then = k % 2, (k + 1) % 2
-        h = np.moveaxis(self.stream[now], self.axis, 0)
+        h = np.moveaxis(self.stream, self.axis, 0)
         self.sample[then][:] = 0.3 * self.sample[now] + np.tanh(h)
-        np.moveaxis(self.stream[then], self.axis, 0)[:] = 0.5 * self.sample[then]
+        np.moveaxis(self.fresh, self.axis, 0)[:] = 0.5 * self.sample[then]
 
 
 @settings(max_examples=150, deadline=None)
@@ -93,42 +93,50 @@ def test_instructions_do_what_section_2_says(
     cache = LoweringCache(groups)
     episodes = [Episode(work.toy(s)) for s in range(streams)]
     written = np.zeros((streams, steps, len(groups)), np.bool_)
+    keep = rng.random((steps, len(groups))) < rng.choice([0.0, 0.5, 1.0])
     for _ in range(3):
         plans = np.stack([random_plan(rng, steps, groups, cells, computed) for cells in written])
         if shared:
             plans = np.repeat(plans[:1], streams, axis=0)
-        x = rng.standard_normal((streams, 3, 4))
-        work.begin(x)
+        work.x = rng.standard_normal((streams, 3, 4))
         work.runs.clear()
-        found = decode(work, [cache.lower(plan) for plan in plans])  # type: ignore[arg-type]
-        expected = [episode.call(x[s], plans[s]) for s, episode in enumerate(episodes)]
-        np.testing.assert_allclose(found, np.stack(expected), rtol=1e-4, atol=1e-4)
+        decode_first(work, keep)  # type: ignore[arg-type]
+        decode_rest(work, [cache.lower(plan) for plan in plans], keep)  # type: ignore[arg-type]
+        expected = [episode.call(work.x[s], plans[s]) for s, episode in enumerate(episodes)]
+        np.testing.assert_allclose(work.sample[steps % 2], np.stack(expected), rtol=1e-4, atol=1e-4)
         ran = sorted((s, k, b) for k, b, some in work.runs for s in some)
         assert ran == sorted(map(tuple, np.argwhere(plans == C).tolist()))  # nothing else, and nothing twice
         assert len(work.runs) == np.count_nonzero((plans == C).any(axis=0))  # together where several compute
-        written |= plans == C
+        written |= (plans == C) & keep
 
 
 def sums(lowered: Lowered) -> list[list[tuple[str, int]]]:
     """Instructions by step, readable: ``("run", b)``, ``("new", slot)``, ``("old", slot)``."""
     listed = []
-    for step in lowered.steps:
+    gaps, cells = iter(lowered.gaps), iter(lowered.cells)
+    blocks = lowered.computed.shape[1]
+    for count in lowered.counts:
         line: list[tuple[str, int]] = []
-        for i, gap in enumerate(step.gaps):
+        for i in range(count + 1):
+            gap = next(gaps)
             if gap is not None:
-                line.append(("new" if gap.make is not None else "old", gap.slot))
-            if i < len(step.blocks):
-                line.append(("run", step.blocks[i]))
+                line.append(("new" if gap.start < gap.stop else "old", gap.slot))
+            if i < count:
+                line.append(("run", next(cells) % blocks))
         listed.append(line)
+    assert next(gaps, "end") == next(cells, "end") == "end"
     return listed
+
+
+def loads(lowered: Lowered) -> list[tuple[int, int]]:
+    return list(zip(lowered.load_rows, lowered.load_from, strict=True))
 
 
 def test_the_docstrings_example() -> None:
     plan = np.array([[C] * 7, [C, T, T, C, F, T, T]], np.int8)
     lowered = lower_plan(plan, [0, 1, 2, 0, 0, 1, 2])
     assert sums(lowered)[1] == [("run", 0), ("new", 0), ("run", 3), ("new", 0)]
-    assert lowered.load_blocks.tolist() == [1, 2, 4, 5, 6]
-    assert lowered.load_cells.tolist() == [1, 2, 7 + 3, 5, 6]
+    assert loads(lowered) == [(1, ~1), (2, ~2), (4, ~3), (5, ~5), (6, ~6)]
     assert (lowered.segments, lowered.slots) == (2, 1)
 
 
@@ -152,13 +160,7 @@ def test_a_sum_is_made_again_when_one_of_its_residuals_is() -> None:
         [("new", 0)],
     ]
     # Rows 1 and 2 of the table are loaded once; row 0 in steps 1, 3 and 4.
-    assert sorted(zip(lowered.load_blocks.tolist(), lowered.load_cells.tolist(), strict=True)) == [
-        (0, 0),
-        (0, 6),
-        (0, 12),
-        (1, 1),
-        (2, 2),
-    ]
+    assert loads(lowered) == [(0, ~0), (1, ~1), (2, ~2), (0, ~0), (0, 4 * 3)]
     assert np.argwhere(lowered.rollout).tolist() == [[4, 0]]
 
 
@@ -182,7 +184,14 @@ def test_slots_are_kept_while_their_sum_is_needed() -> None:
 def test_a_dense_plan_has_no_sums() -> None:
     lowered = lower_plan(dense_plan(3, 2), [0, 1])
     assert sums(lowered) == [[("run", 0), ("run", 1)]] * 3
-    assert (lowered.segments, lowered.slots, len(lowered.load_cells)) == (0, 0, 0)
+    assert (lowered.segments, lowered.slots, loads(lowered)) == (0, 0, [])
+
+
+def test_a_plan_of_timestep_alone_sums_residuals_where_they_are() -> None:
+    plan = np.array([[C, C, C], [T, C, T], [T, T, T]], np.int8)
+    assert (lower_plan(plan, [0, 0, 1]).table, loads(lower_plan(plan, [0, 0, 1]))) == (False, [])
+    plan[2, 1] = F
+    assert lower_plan(plan, [0, 0, 1]).table
 
 
 @pytest.mark.parametrize("plan", [[[T, C], [C, C]], [[C, R], [C, C]], [[F, C], [C, C]]])

@@ -1,0 +1,78 @@
+"""Which entries of the rollout cache a call of an artifact's plans can read, and what keeping them takes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ttscompile.artifact.manifest import Manifest
+from ttscompile.lattice import BoolArray, Source
+
+if TYPE_CHECKING:
+    from ttscompile.artifact.load import Artifact
+
+HEAD = ("pruner.base", "pruner.mask", "pruner.step", "pruner.block")
+"""Constants of a pruner whose logits are ``base + mask + (code * step) @ block`` with a code of -1..1."""
+
+
+@dataclass(frozen=True)
+class RolloutNeeds:
+    """The rollout cache of one stream.
+
+    Attributes:
+        read: entries that the artifact's schedules and pruner can read.
+        bytes_read: what these take.
+        cells: K * blocks, what a plan that the caller gives can read.
+        bytes_most: what these take.
+    """
+
+    read: int
+    bytes_read: int
+    cells: int
+    bytes_most: int
+
+
+def rollout_needs(artifact: Artifact) -> RolloutNeeds:
+    """What keeping the rollout cache of one stream takes."""
+    manifest = artifact.manifest
+    entry = residual_bytes(manifest)
+    readable = readable_rollout(artifact)
+    read = int(np.count_nonzero(readable))
+    return RolloutNeeds(read, read * entry, readable.size, readable.size * entry)
+
+
+def residual_bytes(manifest: Manifest) -> int:
+    """Bytes of one residual of one stream; residuals are float32."""
+    return 4 * math.prod(manifest.blocks[0].type.at(1))
+
+
+def readable_rollout(artifact: Artifact) -> BoolArray:
+    """Entries that some plan of the artifact can read, its schedules' and its pruner's: bool ``[K, blocks]``."""
+    manifest = artifact.manifest
+    readable = np.zeros((manifest.steps, len(manifest.blocks)), dtype=np.bool_)
+    for schedule in artifact.schedules.values():
+        readable |= schedule == Source.ROLLOUT
+    if any(plan.kind == "pruner" for plan in manifest.plans.values()):
+        readable |= _pruner_can_read(artifact)
+    return readable
+
+
+def _pruner_can_read(artifact: Artifact) -> BoolArray:
+    """Cells in which the ROLLOUT logit can be the largest; every cell of a pruner that is not the head we know."""
+    manifest = artifact.manifest
+    shape = (manifest.steps, len(manifest.blocks), len(Source))
+    head = artifact.pruner
+    if not set(HEAD) <= set(head) or head["pruner.base"].shape != shape:
+        return np.ones(shape[:2], dtype=np.bool_)
+    fixed = head["pruner.base"].astype(np.float64) + head["pruner.mask"]
+    by_step = np.abs(head["pruner.step"].astype(np.float64))
+    by_cell = head["pruner.block"].astype(np.float64).reshape(by_step.shape[1], *shape[1:])
+    possible = np.ones(shape[:2], dtype=np.bool_)
+    for other in Source:
+        lead = fixed[..., Source.ROLLOUT] - fixed[..., other]
+        swing = by_step @ np.abs(by_cell[..., Source.ROLLOUT] - by_cell[..., other])
+        possible &= lead + swing >= -1e-4 * (1 + np.abs(lead) + swing)  # the pruner computes in float32
+    return possible

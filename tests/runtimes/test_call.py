@@ -1,0 +1,204 @@
+"""How a call runs: the pruner beside step 0, what a failure leaves, the first call, callers on several threads."""
+
+from __future__ import annotations
+
+import gc
+import subprocess
+import sys
+import textwrap
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ttscompile import Noise, Source
+from ttscompile.artifact import Artifact, load_artifact
+from ttscompile.artifact.write import update_calibration
+from ttscompile.errors import IllegalPlanError
+from ttscompile.lattice import dense_plan
+from ttscompile.runtimes import Runtime, open_runtime
+from ttscompile.runtimes.onnxruntime_cpu import OnnxRuntime
+from ttscompile.runtimes.reference import ReferenceModel
+from ttscompile.runtimes.workspace import Workspace
+
+from .agreement import random_inputs
+from .conftest import MakeArtifact
+from .toys import toy_program
+
+HELPER = "ttscompile-pruner"
+
+
+def helpers() -> list[threading.Thread]:
+    return [thread for thread in threading.enumerate() if thread.name.startswith(HELPER)]
+
+
+@pytest.fixture
+def pruned(make_artifact: MakeArtifact) -> Artifact:
+    """A toy whose default plan is its pruner's."""
+    artifact = make_artifact(toy_program())
+    update_calibration(artifact.path, dict(artifact.pruner), {}, "tts", {"strategy": "tts"})
+    return load_artifact(artifact.path)
+
+
+def call(runtime: Runtime, artifact: Artifact, seed: int, plan: np.ndarray | None = None) -> np.ndarray:
+    return runtime.predict(*random_inputs(artifact, np.random.default_rng(seed), 2), plan)[0]
+
+
+def test_the_pruners_thread_is_made_at_load_and_lives_as_long_as_the_runtime(pruned: Artifact) -> None:
+    before = len(helpers())
+    runtime = open_runtime(pruned)
+    mine = helpers()[before:]
+    assert len(mine) == 1
+    for seed in range(3):
+        call(runtime, pruned, seed)
+    assert helpers()[before:] == mine
+    del runtime
+    gc.collect()
+    mine[0].join(timeout=10)
+    assert not mine[0].is_alive()
+
+
+def test_there_is_no_such_thread_where_no_plan_is_the_pruners(toy_artifact: Artifact) -> None:
+    before = helpers()
+    runtime = open_runtime(toy_artifact)
+    call(runtime, toy_artifact, 0, dense_plan(5, 5))
+    assert helpers() == before
+
+
+def test_step_0_does_not_wait_for_the_pruner(pruned: Artifact, monkeypatch: pytest.MonkeyPatch) -> None:
+    runtime = open_runtime(pruned)
+    expected = call(runtime, pruned, 0)
+    done_first, real = threading.Event(), Workspace.logits
+    last = Workspace.run
+
+    def late(self: Workspace) -> np.ndarray:
+        assert done_first.wait(timeout=30), "step 0 waits for the pruner"
+        return real(self)
+
+    def run(self: Workspace, k: int, b: int) -> None:
+        last(self, k, b)
+        if (k, b) == (0, 4):
+            done_first.set()
+
+    runtime.reset()
+    with monkeypatch.context() as patched:
+        patched.setattr(Workspace, "logits", late)
+        patched.setattr(Workspace, "run", run)
+        sample, report = runtime.predict(*random_inputs(pruned, np.random.default_rng(0), 2))
+    assert np.array_equal(sample, expected)
+    timings = report.timings
+    assert min(timings.wait_pruner, timings.pruner) > 0
+    assert timings.total == pytest.approx(timings.prologue + timings.wait_pruner + timings.decode)
+
+
+class Failure(Exception):
+    """Raised by the tests."""
+
+
+@pytest.mark.parametrize("thread", ["helper", "caller"])
+def test_a_failure_on_either_thread_comes_to_the_caller_and_ends_the_episode(
+    pruned: Artifact, monkeypatch: pytest.MonkeyPatch, thread: str
+) -> None:
+    runtime = open_runtime(pruned)
+    first = call(runtime, pruned, 0)
+    finished = threading.Event()
+
+    def fail(*_: object) -> None:
+        raise Failure
+
+    def slow(self: Workspace) -> np.ndarray:
+        threading.Event().wait(0.05)
+        finished.set()
+        return np.zeros((2, 5, 5, 4), np.float32)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Workspace, "logits", fail if thread == "helper" else slow)
+        if thread == "caller":
+            patched.setattr(Workspace, "begin", fail)
+        with pytest.raises(Failure):
+            call(runtime, pruned, 1)
+    assert thread == "helper" or finished.is_set()  # nobody reads the workspace any more
+    assert runtime.streams is None
+    assert np.array_equal(call(runtime, pruned, 0), first)
+
+
+@pytest.mark.parametrize("name", ["onnxruntime", "reference"])
+def test_a_prologue_that_fails_ends_the_episode(
+    toy_artifact: Artifact, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    runtime = open_runtime(toy_artifact, name)
+    dense, reuse = dense_plan(5, 5), dense_plan(5, 5)
+    reuse[1:] = Source.ROLLOUT
+    call(runtime, toy_artifact, 0, dense)
+    with pytest.raises(IllegalPlanError):
+        call(runtime, toy_artifact, 0, dense[:, :4])
+    call(runtime, toy_artifact, 0, reuse)  # what was refused before it began changed nothing
+
+    def fail(*_: object) -> None:
+        raise Failure
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Workspace, "start", fail)
+        patched.setattr(ReferenceModel, "prologue", fail)
+        with pytest.raises(Failure):
+            call(runtime, toy_artifact, 0, dense)
+    assert runtime.streams is None
+    with pytest.raises(IllegalPlanError, match="never computed"):
+        call(runtime, toy_artifact, 0, reuse)
+
+
+def test_the_interpreter_ends_with_a_runtime_open(pruned: Artifact) -> None:
+    code = f"""
+    from ttscompile.artifact import load_artifact
+    from ttscompile.runtimes import open_runtime
+    kept = open_runtime(load_artifact({str(pruned.path)!r}))
+    print("open")
+    """
+    command = [sys.executable, "-W", "error", "-c", textwrap.dedent(code)]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=60, check=False, cwd=Path(__file__).parents[2]
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "open\n", "")
+
+
+def test_two_runtimes_work_at_the_same_time(pruned: Artifact) -> None:
+    def episode(seed: int) -> list[np.ndarray]:
+        runtime = open_runtime(pruned)
+        return [call(runtime, pruned, seed + i) for i in range(20)]
+
+    alone = [episode(seed) for seed in (0, 100)]
+    with ThreadPoolExecutor(2) as pool:
+        together = list(pool.map(episode, (0, 100)))
+    assert all(np.array_equal(a, b) for x, y in zip(alone, together, strict=True) for a, b in zip(x, y, strict=True))
+
+
+def test_a_first_call_binds_nothing(toy_artifact: Artifact, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a session is bound to is settled at load; a call that binds costs many times a warm one."""
+    from ttscompile.runtimes import workspace
+
+    runtime = open_runtime(toy_artifact)
+    obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), 1)
+
+    def bind(*_: object) -> None:
+        raise AssertionError("a session was bound during a call")
+
+    monkeypatch.setattr(workspace, "Bound", bind)
+    for _ in range(2):
+        assert runtime.predict(obs, noise, dense_plan(5, 5))[1].computed == (25,)
+        runtime.reset()
+
+
+def test_a_workspace_is_given_back_when_the_batch_changes(toy_artifact: Artifact) -> None:
+    runtime = open_runtime(toy_artifact)
+    assert isinstance(runtime, OnnxRuntime)
+    assert runtime.rollout_nbytes == 0
+    sizes = []
+    for streams in (1, 4, 2):
+        obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), streams)
+        runtime.predict(obs, Noise(noise.initial, noise.steps), dense_plan(5, 5))
+        assert runtime.rollout_nbytes == 25 * streams * 3 * 4 * 4
+        sizes.append(runtime.nbytes)
+        runtime.reset()
+    assert sizes[0] < sizes[2] < sizes[1] <= 4 * sizes[0]

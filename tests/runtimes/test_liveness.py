@@ -1,0 +1,120 @@
+"""Which entries of the rollout cache are kept."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ttscompile import Source
+from ttscompile.artifact import Artifact, load_artifact
+from ttscompile.artifact.write import update_calibration
+from ttscompile.errors import IllegalPlanError
+from ttscompile.lattice import uniform_plan
+from ttscompile.runtimes.liveness import readable_rollout, rollout_needs
+from ttscompile.runtimes.onnxruntime_cpu import OnnxRuntime
+from ttscompile.runtimes.policy import load
+from ttscompile.runtimes.reference_runtime import ReferenceRuntime
+
+from .agreement import random_inputs
+from .conftest import MakeArtifact
+from .toys import toy_program
+
+C, T, R = Source.COMPUTE, Source.TIMESTEP, Source.ROLLOUT
+ENTRY = 3 * 4 * 4
+
+
+@pytest.fixture
+def scheduled(make_artifact: MakeArtifact) -> Artifact:
+    """A toy with two schedules; one of them reads two rollout entries."""
+    artifact = make_artifact(toy_program())
+    reads = uniform_plan(5, 5, 2)
+    reads[2, 1] = reads[3, 4] = R
+    schedules = {"plain": uniform_plan(5, 5, 2), "reads": reads}
+    update_calibration(artifact.path, None, schedules, "plain", {})
+    return load_artifact(artifact.path)
+
+
+def test_schedules_say_exactly_what_they_read(scheduled: Artifact, toy_artifact: Artifact) -> None:
+    assert np.argwhere(readable_rollout(scheduled)).tolist() == [[2, 1], [3, 4]]
+    needs = load(scheduled.path).info.rollout
+    assert (needs.read, needs.bytes_read, needs.cells, needs.bytes_most) == (2, 2 * ENTRY, 25, 25 * ENTRY)
+    assert rollout_needs(toy_artifact).read == 0  # its pruner is no plan of it
+
+
+def head(**changes: float) -> dict[str, np.ndarray]:
+    """A pruner that can choose ROLLOUT nowhere: COMPUTE leads by 4, and the code moves a logit by at most 2 x 1."""
+    base = np.zeros((5, 5, 4), np.float32)
+    base[..., C] = 4
+    mask = np.zeros_like(base)
+    mask[0, :, 1:] = -1e9
+    step, block = np.ones((5, 2), np.float32), np.zeros((2, 5 * 4), np.float32)
+    block.reshape(2, 5, 4)[..., R] = changes.get("swing", 1.0)
+    base[3, 2, R] = changes.get("lead", 0.0)
+    return {"pruner.base": base, "pruner.mask": mask, "pruner.step": step, "pruner.block": block}
+
+
+@pytest.mark.parametrize(
+    ("changes", "cells"),
+    [
+        ({}, []),
+        ({"lead": 1.9}, []),
+        ({"lead": 2.1}, [[3, 2]]),
+        ({"swing": 2.1}, [[k, b] for k in range(1, 5) for b in range(5)]),
+    ],
+)
+def test_a_pruner_is_known_by_the_bounds_of_its_logits(
+    make_artifact: MakeArtifact, changes: dict[str, float], cells: list[list[int]]
+) -> None:
+    artifact = make_artifact(toy_program())
+    update_calibration(artifact.path, dict(artifact.pruner), {}, "tts", {})
+    artifact = load_artifact(artifact.path)
+    assert readable_rollout(artifact).all()  # the toy's own pruner is of another form
+    assert np.argwhere(readable_rollout(replace(artifact, pruner=head(**changes)))).tolist() == cells
+
+
+def test_calls_with_the_artifacts_plans_keep_what_these_read(scheduled: Artifact) -> None:
+    runtime, reference = OnnxRuntime(scheduled), ReferenceRuntime(scheduled)
+    rng = np.random.default_rng(0)
+    assert runtime.rollout_nbytes == 2 * ENTRY
+    for name in ("plain", "reads", "dense", "plain", "reads"):
+        obs, noise = random_inputs(scheduled, rng, 1)
+        plan = scheduled.schedule(name)
+        found, report = runtime.predict(obs, noise, plan, plan_name=name, repair=True)
+        expected, wanted = reference.predict(obs, noise, plan, plan_name=name, repair=True)
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+        assert report.legalised == wanted.legalised
+        if name == "plain":
+            kept = runtime.rollout_nbytes
+            assert kept in (2 * ENTRY, 25 * ENTRY)
+    assert report.legalised == (0,)
+    assert runtime.rollout_nbytes == 25 * ENTRY  # the dense call kept all
+
+
+def test_a_matrix_may_read_what_dense_calls_and_matrices_computed(scheduled: Artifact) -> None:
+    runtime = OnnxRuntime(scheduled)
+    obs, noise = random_inputs(scheduled, np.random.default_rng(0), 1)
+    reads = uniform_plan(5, 5, 2)
+    reads[1] = R
+    runtime.predict(obs, noise, scheduled.schedule("dense"), plan_name="dense")
+    runtime.predict(obs, noise, reads)
+    runtime.reset()
+    with pytest.raises(IllegalPlanError, match="step 1, block 0 .*never computed"):
+        runtime.predict(obs, noise, reads)
+
+
+def test_a_first_matrix_after_a_plan_of_the_artifact_is_told_what_was_not_kept(scheduled: Artifact) -> None:
+    runtime = OnnxRuntime(scheduled)
+    obs, noise = random_inputs(scheduled, np.random.default_rng(0), 1)
+    plain = scheduled.schedule("plain")
+    (k,) = np.flatnonzero((plain == C).all(axis=1))[1:]
+    reads = plain.copy()
+    reads[k] = R
+    runtime.predict(obs, noise, plain, plan_name="plain", repair=True)
+    with pytest.raises(IllegalPlanError, match=rf"step {k}, block 0, .* did not keep.*Begin the episode with"):
+        runtime.predict(obs, noise, reads)
+    runtime.predict(obs, noise, plain)  # a matrix: from here on all is kept, whatever the plan
+    runtime.reset()
+    runtime.predict(obs, noise, plain, plan_name="plain", repair=True)
+    assert runtime.predict(obs, noise, reads)[1].legalised == (0,)
