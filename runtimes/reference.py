@@ -17,12 +17,16 @@ from torch import Tensor
 from ttscompile.artifact.load import Artifact
 from ttscompile.artifact.manifest import block_name
 from ttscompile.config import Noise, PolicySpec
+from ttscompile.correction import Correction
 from ttscompile.errors import IllegalPlanError, PassError
 from ttscompile.ir.evaluate import Evaluator
 from ttscompile.ir.graph import Graph, TensorType
 from ttscompile.ir.program import Binding, Pieces, Program
 from ttscompile.lattice import PlanArray, Source, check_plan, require_legal
 
+from .criterion import Criterion
+from .reference_correction import apply as apply_correction
+from .reference_correction import empty_history
 from .reference_reuse import Caches, Cell, RolloutCache, reuse, stream_axis
 
 
@@ -214,6 +218,7 @@ class ReferenceModel:
         *,
         write_gradients: bool = True,
         keep_samples: bool = False,
+        correction: Correction | None = None,
     ) -> Rollout:
         """One call: K steps from noise to sample.
 
@@ -231,6 +236,7 @@ class ReferenceModel:
             write_gradients: let the gradient of a COMPUTE gate include what writing the caches does to later steps,
                 by taking the written value to be ``g * computed + (1 - g) * old``. Values do not change.
             keep_samples: return the sample after every step.
+            correction: of the sampler's steps; None for none.
 
         Raises:
             IllegalPlanError: gates that are not one-hot, of the wrong shape, or that read what was never computed.
@@ -239,17 +245,56 @@ class ReferenceModel:
         one_hot, plan = self._gates(gates, contexts.streams)
         require_legal(plan, self.groups, cache.written)
         caches = Caches(rollout=dict(cache.residuals))
-        sample, samples = initial, []
+        sample, samples, history = initial, [], empty_history(initial)
         for k in range(self.steps):
             stream = self.stem(sample, k, contexts)
             for b in range(self.blocks):
                 cell = Cell(k, b, self.groups[b], plan[:, k, b], one_hot[:, k, b], self._types[b])
                 stream = stream + reuse(cell, self._candidate(cell, stream, contexts), caches, write_gradients)
             prediction = self.tail(stream, k, contexts)
-            sample = self.advance(sample, prediction, None if noise is None else noise[k], k)
+            following = self.advance(sample, prediction, None if noise is None else noise[k], k)
+            if correction is not None:
+                following, history = apply_correction(correction, k, following, sample, prediction, history)
+            sample = following
             if keep_samples:
                 samples.append(sample)
         return Rollout(sample, RolloutCache(caches.rollout, cache.written | (plan == Source.COMPUTE)), tuple(samples))
+
+    def decided_rollout(
+        self,
+        contexts: Contexts,
+        initial: Tensor,
+        noise: Tensor | None,
+        criterion: Criterion,
+        cache: RolloutCache | None = None,
+    ) -> tuple[Rollout, PlanArray]:
+        """One call whose plan is decided step by step; see ``criterion``.
+
+        Otherwise as ``rollout``, and never corrected: a correction belongs to a schedule.
+
+        Returns:
+            The result, and the plan that was decided, int8 ``[B, K, blocks]``: ``rollout`` with it gives the result.
+        """
+        cache = cache if cache is not None else self.empty_cache(contexts.streams)
+        decisions = criterion.begin(self.steps, self.blocks, contexts.streams)
+        plan = np.full((contexts.streams, self.steps, self.blocks), Source.COMPUTE, np.int8)
+        caches = Caches(rollout=dict(cache.residuals))
+        sample, axis = initial, stream_axis(self._types[0])
+        for k in range(self.steps):
+            stream = self.stem(sample, k, contexts)
+            feature = stream if criterion.always == 0 else torch.zeros_like(stream)
+            for b in range(self.blocks):
+                if b == criterion.always:
+                    plan[:, k] = decisions.decide(k, feature.movedim(axis, 0).detach().numpy())
+                gates = torch.nn.functional.one_hot(torch.from_numpy(plan[:, k, b].astype(np.int64)), 4).float()
+                cell = Cell(k, b, self.groups[b], plan[:, k, b], gates, self._types[b])
+                residual = reuse(cell, self._candidate(cell, stream, contexts), caches, write_gradients=False)
+                stream = stream + residual
+                if b < criterion.always:
+                    feature = feature + residual
+            prediction = self.tail(stream, k, contexts)
+            sample = self.advance(sample, prediction, None if noise is None else noise[k], k)
+        return Rollout(sample, RolloutCache(caches.rollout, cache.written | (plan == Source.COMPUTE))), plan
 
     def _candidate(self, cell: Cell, stream: Tensor, contexts: Contexts) -> Tensor | None:
         """The computed residual of all streams, or of those that take it with zeros for the others; None if none do."""

@@ -11,6 +11,7 @@ import numpy.typing as npt
 import torch
 
 from ttscompile.config import FloatArray, Noise
+from ttscompile.correction import Correction
 
 from .base import (
     GIVEN,
@@ -21,6 +22,7 @@ from .base import (
     computed_cells,
     frozen,
     milliseconds,
+    no_pruner,
     pruner_plan,
     settle_plan,
 )
@@ -60,23 +62,29 @@ class ReferenceRuntime:
         *,
         plan_name: str | None = None,
         repair: bool = False,
+        correction: Correction | None = None,
     ) -> tuple[FloatArray, CallReport]:
         """Denoise one chunk; see ``base.Runtime.predict``."""
         spec = self._manifest.spec
         streams = check_call(self.streams, noise, spec.sample, spec.sampler)
         cache = self._cache if self._cache is not None else self.model.empty_cache(streams)
+        pruned = plan is None
+        if plan is None:
+            if "pruner" not in self._manifest.pieces:
+                raise no_pruner()
+        else:
+            plans, legalised = settle_plan(plan, self.model.groups, cache.written, repair)
         start = time.perf_counter()
+        self.reset()  # a call that fails from here on ends the episode
         with torch.no_grad():
             contexts = self.model.prologue({key: torch.from_numpy(np.array(value)) for key, value in obs.items()})
             prologue = time.perf_counter()
-            pruned = plan is None
-            if plan is None:
-                plan, repair = pruner_plan(self.model.logits(contexts).numpy()), True
+            if pruned:
+                wanted = pruner_plan(self.model.logits(contexts).numpy())
+                plans, legalised = settle_plan(wanted, self.model.groups, cache.written, True)
             pruner = time.perf_counter()
-            plans, legalised = settle_plan(plan, self.model.groups, cache.written, repair)
             initial, steps = noise_tensors(noise, spec.sampler.stochastic)
-            self.reset()  # a call that fails while decoding ends the episode
-            result = self.model.rollout(contexts, initial, steps, plans, cache)
+            result = self.model.rollout(contexts, initial, steps, plans, cache, correction=correction)
         self._cache = result.cache
         stop = time.perf_counter()
         wait = milliseconds(prologue, pruner) if pruned else 0.0

@@ -148,7 +148,7 @@ def test_pruner_weights_of_another_type(written: Path, edit: str) -> None:
 
 def test_what_cannot_be_updated(written: Path, tmp_path: Path) -> None:
     pruner = new_pruner(written)
-    with pytest.raises(ArtifactError, match="Unzip the artifact"):
+    with pytest.raises(ArtifactError, match="Unzip it"):
         update(packed(written), pruner_weights=pruner)
     with pytest.raises(ArtifactError, match="does not exist"):
         update(tmp_path / "none", pruner_weights=pruner)

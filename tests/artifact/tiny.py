@@ -200,7 +200,14 @@ def advance() -> ModelProto:
         *columns,
         *weighted("x0", [("sample", "c0"), ("out", "c1")]),
         make_node("Clip", ["x0", "low", "high"], ["clipped"]),
-        *weighted("sample_next", [("clipped", "c2"), ("sample", "c3"), ("out", "c4"), ("noise", "c5")]),
+        *weighted("updated", [("clipped", "c2"), ("sample", "c3"), ("out", "c4"), ("noise", "c5")]),
+        make_node("Identity", ["out"], ["prediction"]),
+        make_node("Concat", ["sample", "out", "history"], ["features"], axis=1),
+        make_node("Transpose", ["features"], ["turned"], perm=[2, 0, 1]),
+        make_node("MatMul", ["turned", "correction"], ["product"]),
+        make_node("Add", ["product", "correction_bias"], ["corrected"]),
+        make_node("Transpose", ["corrected"], ["added"], perm=[1, 2, 0]),
+        make_node("Add", ["updated", "added"], ["sample_next"]),
         *project("embedded", "sample_next", "stem.weight"),
         make_node("Add", ["embedded", "stem.position"], ["stream_next"]),
     ]
@@ -209,10 +216,15 @@ def advance() -> ModelProto:
         "sample": SAMPLE,
         "noise": SAMPLE,
         "coefficients": f32(6),
+        "history": TensorType((Batch(), 4 * HORIZON, CHANNELS), "float32"),
+        "correction": f32(CHANNELS, 6 * HORIZON, HORIZON),
+        "correction_bias": f32(CHANNELS, 1, HORIZON),
         "stem.position": f32(1, HORIZON, WIDTH),
     }
     constants = {"tail.weight": f32(CHANNELS, WIDTH), "stem.weight": f32(WIDTH, CHANNELS)}
-    proto = make(nodes, inputs, {"sample_next": SAMPLE, "stream_next": STREAM}, constants, list(inputs))
+    proto = make(
+        nodes, inputs, {"sample_next": SAMPLE, "stream_next": STREAM, "prediction": SAMPLE}, constants, list(inputs)
+    )
     proto.graph.initializer.extend(
         [
             onnx.numpy_helper.from_array(np.array(-1, np.float32), "low"),

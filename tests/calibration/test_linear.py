@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +24,7 @@ def prepared(directory: Path, recording: Path, count: int) -> tuple[Executor, Po
     episodes = load_trajectories([recording], spec.observations, 4)
     chosen = sample_calls(episodes, range(len(episodes)), count, seed=0)
     calls = prepare_calls(executor.model, spec, episodes, chosen, (0, 0))
-    return executor, spec, replace(calls, targets=executor.run_dense(calls))
+    return executor, spec, calls.answered(executor.run_dense(calls))
 
 
 def sparse_plan(executor: Executor, seed: int = 0) -> PlanArray:

@@ -10,7 +10,9 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
+from ..config import INT8
 from ..errors import ArtifactError
+from ..ir.joint import JOINT
 from ..ir.program import Binding, Reuse
 from .manifest import (
     DENSE,
@@ -24,6 +26,8 @@ from .manifest import (
     Manifest,
     PieceRecord,
     PlanRecord,
+    PrecisionError,
+    PrecisionRecord,
     Requires,
     Stores,
     block_name,
@@ -70,7 +74,7 @@ def decode(content: bytes, where: str = MANIFEST) -> Manifest:
 
 def to_json(manifest: Manifest) -> dict[str, Any]:
     """The manifest as JSON, without the checksum."""
-    return {
+    document = {
         "format": FORMAT,
         "schema_version": manifest.schema_version,
         "ttscompile_version": manifest.ttscompile_version,
@@ -107,6 +111,8 @@ def to_json(manifest: Manifest) -> dict[str, Any]:
         "requires": dict(vars(manifest.requires)),
         "files": {name: dict(vars(manifest.files[name])) for name in sorted(manifest.files)},
     }
+    # Without the member the blocks are in fp32, as in every manifest that was written before there was another.
+    return document if manifest.precision is None else {**document, "precision": _precision_to_json(manifest.precision)}
 
 
 def from_json(root: Value) -> Manifest:
@@ -115,7 +121,9 @@ def from_json(root: Value) -> Manifest:
     Raises:
         ArtifactError: names the path in the document, expected and found.
     """
-    fields = root.keys(
+    members = root.members()
+    precision = members.get("precision")
+    fields = Value({key: value.data for key, value in members.items() if key != "precision"}, root.path).keys(
         *("format", "schema_version", "ttscompile_version", "identity", "model_identity", "spec", "blocks", "reuse"),
         *("pieces", "contexts", "features", "flops", "plans", "default_plan", "calibration", "stores", "requires"),
         "files",
@@ -139,7 +147,10 @@ def from_json(root: Value) -> Manifest:
         stores=_stores(fields["stores"]),
         requires=_requires(fields["requires"]),
         files={_file_name(name, item): _file(item) for name, item in fields["files"].members().items()},
+        precision=None if precision is None else _precision(precision),
     )
+    if precision is not None:
+        _check_precision(manifest, precision)
     _check_parts(manifest, fields)
     return manifest
 
@@ -162,6 +173,8 @@ def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:
     if not has_pruner and any(plan.kind == "pruner" for plan in manifest.plans.values()):
         fields["plans"].fail("no plan of the kind pruner, because there is no piece called pruner")
     files = {piece.file for piece in manifest.pieces.values()} | {n for n in vars(manifest.stores).values() if n}
+    if manifest.precision is not None:
+        files |= {manifest.precision.weights, *manifest.precision.models.values()}
     if files != set(manifest.files):
         fields["files"].fail(f"exactly the files {sorted(files)}")
     if DENSE in manifest.plans:
@@ -171,6 +184,21 @@ def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:
     scheduled = any(plan.kind == "schedule" for plan in manifest.plans.values())
     if scheduled != (manifest.stores.plans is not None):
         fields["stores"].fail("a file of plans exactly when there are schedules")
+
+
+def _check_precision(manifest: Manifest, value: Value) -> None:
+    record = manifest.precision
+    assert record is not None
+    known = list(map(block_name, range(len(manifest.blocks))))
+    single = set(record.models) - {JOINT}
+    if not single or not single <= set(known):
+        value.fail(f"models of some of the blocks {', '.join(known)} and of nothing else")
+    if (JOINT in record.models) != (JOINT in manifest.pieces):
+        value.fail(f"a model called {JOINT!r} exactly when there is a piece of this name")
+    own = {record.weights, *record.models.values()}
+    others = {piece.file for piece in manifest.pieces.values()} | set(vars(manifest.stores).values())
+    if len(own) <= len(record.models) or own & others:
+        value.fail("a file for each model and one for the weights, which nothing else uses")
 
 
 def _check_schema(members: Mapping[str, Value], where: str) -> None:
@@ -265,6 +293,31 @@ def _requires(value: Value) -> Requires:
     if re.fullmatch(r"[0-9]+(\.[0-9]+)*", fields["onnxruntime"].text()) is None:
         fields["onnxruntime"].fail("a version like 1.23")
     return Requires(onnxruntime=fields["onnxruntime"].text(), opset=fields["opset"].integer(1))
+
+
+def _precision_to_json(record: PrecisionRecord) -> dict[str, Any]:
+    error = None if record.error is None else dict(vars(record.error))
+    return {"name": record.name, "weights": record.weights, "models": dict(record.models), "error": error}
+
+
+def _precision(value: Value) -> PrecisionRecord:
+    fields = value.keys("name", "weights", "models", "error")
+    models = {name: _file_name(item.text(), item) for name, item in fields["models"].members().items()}
+    return PrecisionRecord(
+        name=fields["name"].text(INT8),
+        weights=_file_name(fields["weights"].text(), fields["weights"]),
+        models=models,
+        error=None if fields["error"].absent else _precision_error(fields["error"]),
+    )
+
+
+def _precision_error(value: Value) -> PrecisionError:
+    fields = value.keys("calls", "mean", "p90", "largest", "tolerance")
+    for name in ("mean", "p90", "largest", "tolerance"):
+        if fields[name].number() < 0:
+            fields[name].fail("a number that is not negative")
+    numbers = {name: fields[name].number() for name in ("mean", "p90", "largest", "tolerance")}
+    return PrecisionError(calls=fields["calls"].integer(1), **numbers)
 
 
 def _file(value: Value) -> FileRecord:

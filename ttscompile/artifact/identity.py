@@ -17,8 +17,9 @@ def identities(manifest: Manifest) -> tuple[str, str]:
     """Identity and model identity of what a manifest describes; its own two fields are not read.
 
     The model identity covers weights, tables, graphs, sampler, normalisers, observations, chunk, block table and reuse
-    branches. The identity covers that, the pruner's weights, all plans, and which of them is the default. Neither
-    covers what people are told: source, FLOPs, reasons, sparsities, calibration record, versions.
+    branches. The identity covers that, the pruner's weights, all plans, which of them is the default, and blocks of
+    another precision: a calibration, which computes in fp32, belongs to the model with or without them. Neither covers
+    what people are told: source, FLOPs, reasons, sparsities, errors, calibration record, versions.
 
     Returns:
         Two sha256 of 64 digits.
@@ -38,12 +39,16 @@ def identities(manifest: Manifest) -> tuple[str, str]:
         "weights": hashes[manifest.stores.weights],
     }
     model_identity = _hash(model)
-    whole = {
+    whole: dict[str, Any] = {
         "model": model_identity,
         "pruner": [pruner, _optional(hashes, manifest.stores.pruner)],
         "plans": [_optional(hashes, manifest.stores.plans), {n: plan.kind for n, plan in manifest.plans.items()}],
         "default_plan": manifest.default_plan,
     }
+    if manifest.precision is not None:
+        record = manifest.precision
+        models = {name: hashes[file] for name, file in record.models.items()}
+        whole["precision"] = {"name": record.name, "weights": hashes[record.weights], "models": models}
     return _hash(whole), model_identity
 
 

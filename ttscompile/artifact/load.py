@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..config import FP32
+from ..correction import Correction
 from ..errors import ArtifactError, IllegalPlanError
 from ..ir.graph import Graph
 from ..ir.program import Binding, Block, Pieces, Program
@@ -28,6 +30,8 @@ from .manifest import DENSE, MANIFEST, Manifest, Requires, block_name
 from .strict_json import REMEDY, parse
 
 TABLE_PREFIX = "table/"
+CORRECTION_PREFIX = "correction/"
+CORRECTION_FIELDS = tuple(field.name for field in fields(Correction))
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +45,7 @@ class Artifact:
         tables: TABLE contexts ``[K, ...]``, read-only views of the file.
         pruner: constants of the pruner (their names start with ``pruner.``); empty if there is none.
         schedules: int8 ``[K, blocks]`` by name, without ``dense``.
+        corrections: of the sampler's steps, by the name of the plan that they belong to.
     """
 
     path: Path
@@ -49,11 +54,31 @@ class Artifact:
     tables: Mapping[str, npt.NDArray[Any]]
     pruner: Mapping[str, npt.NDArray[Any]]
     schedules: Mapping[str, PlanArray]
+    corrections: Mapping[str, Correction]
     _unpacked: Unpacked | None = field(default=None, repr=False)
 
     def onnx_path(self, piece: str) -> Path:
-        """The ONNX file of a piece, whose weights onnxruntime finds beside it."""
-        return self.path / self.manifest.pieces[piece].file
+        """The ONNX file of a piece, whose weights onnxruntime finds beside it; of a block the one in its precision."""
+        record = self.manifest.precision
+        models = {} if record is None else record.models
+        return self.path / models.get(piece, self.manifest.pieces[piece].file)
+
+    def at_precision(self, name: str) -> Artifact:
+        """The same artifact with its residual blocks in a precision: its own, or ``fp32``, which all artifacts hold.
+
+        Raises:
+            ArtifactError: it has no blocks of this precision.
+        """
+        own = self.manifest.precision_name
+        if name not in (FP32, own):
+            known = list(dict.fromkeys((FP32, own)))
+            raise ArtifactError(
+                f"{self.path}: precision {name!r}: expected one that the artifact holds, {known}. Convert the"
+                f" checkpoint again with --precision {name}."
+            )
+        if name == own:
+            return self
+        return replace(self, manifest=replace(self.manifest, precision=None))
 
     def schedule(self, name: str) -> PlanArray:
         """A schedule by name, ``dense`` among them, int8 ``[K, blocks]``.
@@ -207,13 +232,15 @@ def _load_directory(directory: Path) -> Artifact:
         )
     stored = tensors.read(directory / manifest.stores.weights)
     tables = {n.removeprefix(TABLE_PREFIX): a for n, a in stored.items() if n.startswith(TABLE_PREFIX)}
+    schedules, corrections = _plans(directory, manifest)
     artifact = Artifact(
         path=directory,
         manifest=manifest,
         weights=MappingProxyType({n: a for n, a in stored.items() if not n.startswith(TABLE_PREFIX)}),
         tables=MappingProxyType(tables),
         pruner=_optional(directory, manifest.stores.pruner),
-        schedules=_optional(directory, manifest.stores.plans),
+        schedules=schedules,
+        corrections=corrections,
     )
     _check_tables(artifact)
     _check_schedules(artifact)
@@ -222,6 +249,28 @@ def _load_directory(directory: Path) -> Artifact:
 
 def _optional(directory: Path, name: str | None) -> Mapping[str, npt.NDArray[Any]]:
     return MappingProxyType({}) if name is None else tensors.read(directory / name)
+
+
+def _plans(directory: Path, manifest: Manifest) -> tuple[Mapping[str, PlanArray], Mapping[str, Correction]]:
+    """Schedules, and the corrections that belong to plans."""
+    stored = _optional(directory, manifest.stores.plans)
+    schedules = {name: array for name, array in stored.items() if not name.startswith(CORRECTION_PREFIX)}
+    parts = {name.removeprefix(CORRECTION_PREFIX): array for name, array in stored.items() if name not in schedules}
+    names = {name.rpartition("/")[0] for name in parts}
+    where = directory / (manifest.stores.plans or MANIFEST)
+    if not names <= set(manifest.plans) or {f"{n}/{f}" for n in names for f in CORRECTION_FIELDS} != set(parts):
+        raise ArtifactError(
+            f"{where}: expected corrections of plans among {sorted(manifest.plans)}, each with"
+            f" {', '.join(CORRECTION_FIELDS)}; found {sorted(parts)}. {REMEDY}"
+        )
+    corrections = {}
+    for name in sorted(names):
+        try:
+            corrections[name] = Correction(**{field: parts[f"{name}/{field}"] for field in CORRECTION_FIELDS})
+            corrections[name].require_fit(manifest.steps, manifest.spec.sample)
+        except IllegalPlanError as error:
+            raise ArtifactError(f"{where}: {name}: {error} {REMEDY}") from error
+    return MappingProxyType(schedules), MappingProxyType(corrections)
 
 
 def _check_tables(artifact: Artifact) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ..config import PolicySpec
+from ..config import FP32, PolicySpec
 from ..ir.graph import TensorType
 from ..ir.program import Binding, Reuse
 from ..lattice import PlanArray, plan_flops
@@ -78,7 +78,7 @@ class FlopsRecord:
         prologue: once a call: condition, and step values for all K steps.
         pruner: once a call.
         stem: one evaluation of sample to stream; there are K a call.
-        tail: one evaluation of stream to prediction; there are K a call.
+        tail: one evaluation of stream to prediction, and of a correction; there are K a call.
         blocks: one evaluation of each block.
     """
 
@@ -142,6 +142,47 @@ class Requires:
 
 
 @dataclass(frozen=True)
+class PrecisionError:
+    """How far the actions of a dense call are from those of a dense call in fp32 with the same noise.
+
+    Measured on random observations within the range of the normaliser, when the artifact was made. The difference of
+    one call is the mean over its executed actions.
+
+    Attributes:
+        calls: how many were measured.
+        mean: over the calls, in the units of the actions.
+        p90: 90th percentile over the calls.
+        largest: of any executed action number of any call.
+        tolerance: what may be expected of dense calls in general: the largest difference of a denoised sample from the
+            reference runtime's, as a share of its largest value.
+    """
+
+    calls: int
+    mean: float
+    p90: float
+    largest: float
+    tolerance: float
+
+
+@dataclass(frozen=True)
+class PrecisionRecord:
+    """Residual blocks with weights of another precision than fp32, which the artifact holds beside those in fp32.
+
+    Attributes:
+        name: ``int8``.
+        weights: name of the file with their weights.
+        models: name of the ONNX file by block, where it is not the file of the piece; and of the piece ``blocks``,
+            which holds all blocks, if there is one.
+        error: what it does to the actions; None before it is measured.
+    """
+
+    name: str
+    weights: str
+    models: Mapping[str, str]
+    error: PrecisionError | None
+
+
+@dataclass(frozen=True)
 class Manifest:
     """The manifest.
 
@@ -154,7 +195,7 @@ class Manifest:
         blocks: block table, in order of execution.
         reuse: reuse branch of each block.
         pieces: ONNX graphs: ``condition``, ``step``, ``pruner``, ``stem``, ``advance``, ``block_00``...; those that the
-            policy has.
+            policy has; and ``blocks``, all of its blocks in one (``ir.joint``).
         contexts: binding and type of every context.
         features: condition values that the pruner reads.
         flops: see ``FlopsRecord``.
@@ -164,6 +205,7 @@ class Manifest:
         stores: names of the files that are not ONNX.
         requires: what the ONNX graphs need.
         files: every file but the manifest.
+        precision: of the blocks where it is not fp32. The reference runtime computes in fp32 always.
     """
 
     schema_version: int
@@ -183,6 +225,12 @@ class Manifest:
     stores: Stores
     requires: Requires
     files: Mapping[str, FileRecord]
+    precision: PrecisionRecord | None = None
+
+    @property
+    def precision_name(self) -> str:
+        """``fp32`` or the name of the precision."""
+        return FP32 if self.precision is None else self.precision.name
 
     @property
     def steps(self) -> int:

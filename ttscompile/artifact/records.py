@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy.typing as npt
 
+from ..correction import correction_flops
 from ..errors import ArtifactError
 from ..ir.flops import graph_flops
 from ..ir.graph import Graph, TensorType
+from ..ir.joint import JOINT, RESIDUAL, join
 from ..ir.program import Binding, Pieces, Program
 from .manifest import BlockRecord, ContextRecord, FlopsRecord, PieceRecord, Requires, block_name
 
@@ -78,7 +80,7 @@ def flops_record(program: Program) -> FlopsRecord:
         prologue=graph_flops(pieces.condition) + step,
         pruner=0 if pieces.pruner is None else graph_flops(pieces.pruner),
         stem=graph_flops(pieces.stem),
-        tail=graph_flops(pieces.tail),
+        tail=graph_flops(pieces.tail) + correction_flops(program.spec.sample),
         blocks=tuple(map(graph_flops, pieces.blocks)),
     )
 
@@ -113,13 +115,15 @@ def piece_records(
 
     Args:
         graphs: see ``piece_graphs``.
-        models: from ``lower_program``: the same names, but ``advance`` in place of ``tail``.
+        models: from ``lower_program``: the same names, but ``advance`` in place of ``tail``, and perhaps
+            ``blocks``.
         files: file name of each model.
 
     Raises:
         ArtifactError: models and graphs do not have the same names, inputs or outputs.
     """
     expected = [name for name in graphs if name != "tail"] + ["advance"]
+    expected += [JOINT] if JOINT in models else []
     if set(models) != set(expected):
         raise ArtifactError(f"expected the ONNX models {sorted(expected)}; found {sorted(models)}. {_REPORT}")
     records = {}
@@ -176,21 +180,25 @@ def _contexts(piece: str, graph: Graph) -> tuple[str, ...]:
 
 
 def _all_contexts(name: str, graphs: Mapping[str, Graph]) -> tuple[str, ...]:
-    parts: Iterable[str] = ("tail", "stem") if name == "advance" else (name,)
+    parts: Iterable[str] = ("tail", "stem") if name == "advance" else () if name == JOINT else (name,)
     return tuple(dict.fromkeys(context for part in parts for context in _contexts(part, graphs[part])))
 
 
 def _stream(name: str, graphs: Mapping[str, Graph]) -> str | None:
-    if name == "advance":
+    if name in ("advance", JOINT):
         return "stream"
     return None if name in ("condition", "step", "pruner") else next(iter(graphs[name].inputs))
 
 
 def _interface(name: str, graphs: Mapping[str, Graph]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    if name == JOINT:
+        blocks = (graph for block, graph in graphs.items() if block.startswith("block_"))
+        return join([tuple(graph.inputs.values())[1:] for graph in blocks]).inputs, (RESIDUAL,)
     if name != "advance":
         return tuple(graphs[name].inputs), graphs[name].outputs
     contexts = [f"{part}.{context}" for part in ("tail", "stem") for context in _contexts(part, graphs[part])]
-    return ("stream", "sample", "noise", "coefficients", *contexts), ("sample_next", "stream_next")
+    own = ("stream", "sample", "noise", "coefficients", "history", "correction", "correction_bias")
+    return (*own, *contexts), ("sample_next", "stream_next", "prediction")
 
 
 def _available(name: str, binding: Binding, kind: TensorType, pieces: Pieces, steps: int) -> bool:

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .. import __version__
+from ..correction import Correction
 from ..errors import ArtifactError
 from ..ir.program import Binding, Program
 from ..ir.serialize import graph_to_json
@@ -25,8 +26,17 @@ from .bind import Place, bind, rebind
 from .codec import encode
 from .files import PARTIAL, beside, content_hash, describe, replace_file, sync_directory, write_synced
 from .identity import identities
-from .load import TABLE_PREFIX, Artifact, check_schedule, load_artifact, read_manifest
+from .load import (
+    CORRECTION_FIELDS,
+    CORRECTION_PREFIX,
+    TABLE_PREFIX,
+    Artifact,
+    check_schedule,
+    load_artifact,
+    read_manifest,
+)
 from .manifest import DENSE, FORMAT, MANIFEST, SCHEMA_VERSION, Manifest, PlanRecord, Stores
+from .precision import LoweredBlocks, store_blocks
 from .records import (
     PRUNER_PREFIX,
     block_records,
@@ -52,7 +62,12 @@ _OURS = re.compile(rf"manifest\.json|program\.json|[A-Za-z0-9_-]+\.(onnx|safeten
 _PLAN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.%-]{0,63}")
 
 
-def write_artifact(program: Program, models: Mapping[str, ModelProto], directory: str | os.PathLike[str]) -> Manifest:
+def write_artifact(
+    program: Program,
+    models: Mapping[str, ModelProto],
+    directory: str | os.PathLike[str],
+    blocks: LoweredBlocks | None = None,
+) -> Manifest:
     """Write a compiled program; its default plan is ``dense`` until it is calibrated.
 
     Everything is written to a folder beside ``directory``, which then takes its place.
@@ -61,6 +76,7 @@ def write_artifact(program: Program, models: Mapping[str, ModelProto], directory
         program: after all passes.
         models: from ``lower_program``.
         directory: where it goes; its parents are made. An artifact that is there is replaced.
+        blocks: residual blocks of another precision, which then is the artifact's; None for fp32.
 
     Returns:
         The manifest.
@@ -76,7 +92,7 @@ def write_artifact(program: Program, models: Mapping[str, ModelProto], directory
         target.parent.mkdir(parents=True, exist_ok=True)
         with _locked(target) if target.is_dir() else nullcontext():
             partial.mkdir()
-            manifest = _fill(partial, program, models)
+            manifest = _fill(partial, program, models, blocks)
             sync_directory(partial)
             _install(partial, target)
     except OSError as error:
@@ -95,6 +111,7 @@ def update_calibration(
     default_plan: str,
     record: Mapping[str, Any],
     *,
+    corrections: Mapping[str, Correction] | None = None,
     model_identity: str | None = None,
 ) -> Manifest:
     """Replace the plans of an artifact, and its pruner's weights: at once, or not at all.
@@ -110,6 +127,7 @@ def update_calibration(
         schedules: int8 ``[K, blocks]`` by name.
         default_plan: what ``predict_action`` uses when it is given no plan.
         record: what was done to get here; JSON.
+        corrections: of the sampler's steps, by the name of their plan; None for none.
         model_identity: of the artifact that was calibrated; refuses another one.
 
     Returns:
@@ -117,13 +135,11 @@ def update_calibration(
 
     Raises:
         ArtifactError: no artifact, a zipped one, one that is being updated, or arguments that do not fit it.
-        IllegalPlanError: a schedule that does not fit the policy.
+        IllegalPlanError: a schedule or a correction that does not fit the policy.
     """
     directory = Path(path)
     if directory.is_file():
-        raise ArtifactError(
-            f"{directory}: expected a directory; found a file. Unzip the artifact and give the directory."
-        )
+        raise ArtifactError(f"{directory}: expected a directory; found a file. Unzip it and give the directory.")
     if not directory.is_dir():
         raise ArtifactError(f"{directory}: does not exist. Give the directory that 'ttscompile convert' wrote.")
     with _locked(directory):
@@ -140,7 +156,7 @@ def update_calibration(
             calibration=_json(record),
         )
         try:
-            manifest = _store_plans(directory, manifest, schedules)
+            manifest = _store_plans(directory, manifest, schedules, corrections or {})
             if pruner_weights is not None:
                 manifest = _store_pruner(artifact, manifest, pruner_weights)
             manifest = _identified(manifest)
@@ -154,7 +170,7 @@ def update_calibration(
     return manifest
 
 
-def _fill(folder: Path, program: Program, models: Mapping[str, ModelProto]) -> Manifest:
+def _fill(folder: Path, program: Program, models: Mapping[str, ModelProto], blocks: LoweredBlocks | None) -> Manifest:
     """Write all files of a new artifact into an empty folder."""
     graphs = piece_graphs(program)
     values = constants(program, graphs)
@@ -178,6 +194,7 @@ def _fill(folder: Path, program: Program, models: Mapping[str, ModelProto]) -> M
     pieces = piece_records(graphs, models, files)
     for name in pieces:
         write_synced(folder / files[name], bind(models[name], places, name).SerializeToString(deterministic=True))
+    precision = None if blocks is None else store_blocks(folder, blocks, pieces, places)
     document = {"graphs": {name: graph_to_json(graph) for name, graph in graphs.items()}}
     write_synced(folder / PROGRAM, dump_compact(document))
 
@@ -200,6 +217,7 @@ def _fill(folder: Path, program: Program, models: Mapping[str, ModelProto]) -> M
             stores=Stores(program=PROGRAM, weights=WEIGHTS, pruner=pruner_file, plans=None),
             requires=requires,
             files={path.name: describe(path) for path in sorted(folder.iterdir())},
+            precision=precision,
         )
     )
     write_synced(folder / MANIFEST, encode(manifest))
@@ -316,13 +334,24 @@ def _json(record: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value.data for key, value in parse(content, "calibration record").members().items()}
 
 
-def _store_plans(directory: Path, manifest: Manifest, schedules: Mapping[str, npt.NDArray[np.int8]]) -> Manifest:
-    """Write the file of schedules beside the old one."""
+def _store_plans(
+    directory: Path,
+    manifest: Manifest,
+    schedules: Mapping[str, npt.NDArray[np.int8]],
+    corrections: Mapping[str, Correction],
+) -> Manifest:
+    """Write the file of schedules and corrections beside the old one."""
+    arrays: dict[str, npt.NDArray[Any]] = dict(schedules)
+    for plan, correction in corrections.items():
+        if plan not in manifest.plans:
+            raise ArtifactError(f"correction of {plan!r}: expected a plan of the artifact, {sorted(manifest.plans)}.")
+        correction.require_fit(manifest.steps, manifest.spec.sample)
+        arrays |= {f"{CORRECTION_PREFIX}{plan}/{name}": getattr(correction, name) for name in CORRECTION_FIELDS}
     old = manifest.stores.plans
     files = {name: record for name, record in manifest.files.items() if name != old}
     name = None
-    if schedules:
-        content = tensors.serialize(schedules)
+    if arrays:
+        content = tensors.serialize(arrays)
         name = f"plans-{content_hash(content)}.safetensors"
         replace_file(directory / name, content)
         files[name] = describe(directory / name)

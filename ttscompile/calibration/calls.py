@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -58,6 +58,8 @@ class Calls:
         noise: the draw used at each step, ``[K, N, T, D]``; None if the sampler is deterministic.
         targets: the denoised sample of the dense policy with the same noise, ``[N, T, D]``; empty before it is known.
         episodes: number of the episode that each call is from, ``[N]``.
+        path: the sample of the dense policy after each step, ``[N, K, T, D]``; its last are the targets. None before
+            it is known.
     """
 
     contexts: Contexts
@@ -65,14 +67,21 @@ class Calls:
     noise: Tensor | None
     targets: Tensor
     episodes: IntArray
+    path: Tensor | None = None
 
     @property
     def count(self) -> int:
         """N."""
         return len(self.initial)
 
+    def answered(self, path: Tensor) -> Calls:
+        """These calls with what the dense policy makes of them, ``[N, K, T, D]``."""
+        return replace(self, targets=path[:, -1], path=path)
 
-def sample_calls(episodes: Sequence[Episode], numbers: Sequence[int], limit: int, seed: int) -> list[tuple[int, int]]:
+
+def sample_calls(
+    episodes: Sequence[Episode], numbers: Sequence[int], limit: int, seed: int, repeats: int = 1
+) -> list[tuple[int, int]]:
     """At most ``limit`` calls, drawn at random from some episodes: number of the episode, and row in it.
 
     Args:
@@ -80,10 +89,12 @@ def sample_calls(episodes: Sequence[Episode], numbers: Sequence[int], limit: int
         numbers: which to draw from.
         limit: number of calls.
         seed: of the draw.
+        repeats: how often a call may be drawn (it will have another noise each time), after all the others were.
     """
     draw = np.random.default_rng((seed, 1, *numbers))
     places = [(n, row) for n in numbers for row in range(episodes[n].calls)]
-    return [places[i] for i in draw.permutation(len(places))[:limit]]
+    order = np.concatenate([draw.permutation(len(places)) for _ in range(repeats)])
+    return [places[i] for i in order[:limit]]
 
 
 def prepare_calls(
@@ -147,6 +158,7 @@ class Selector:
             noise=None if calls.noise is None else calls.noise[:, index],
             targets=calls.targets[index] if len(calls.targets) else calls.targets,
             episodes=calls.episodes[index.numpy()],
+            path=None if calls.path is None else calls.path[index],
         )
 
     def _take(self, values: Mapping[str, Tensor], index: Tensor) -> dict[str, Tensor]:

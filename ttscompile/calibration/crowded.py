@@ -23,13 +23,18 @@ def crowded_plan(steps: int, blocks: int, full_steps: int, crowding: float) -> P
         int8 ``[K, blocks]``.
     """
     plan = np.full((steps, blocks), Source.TIMESTEP, dtype=np.int8)
+    plan[list(crowded_steps(steps, full_steps, crowding))] = Source.COMPUTE
+    return plan
+
+
+def crowded_steps(steps: int, full_steps: int, crowding: float) -> tuple[int, ...]:
+    """The steps that ``crowded_plan`` computes, in order."""
     wished = steps * (1 - (1 - np.arange(full_steps) / full_steps) ** crowding)
     chosen: list[int] = []
     for i, wish in enumerate(wished):  # distinct, in order, and leaving room for those that follow
         earliest = chosen[-1] + 1 if chosen else 0
         chosen.append(int(np.clip(np.floor(wish), earliest, steps - full_steps + i)))
-    plan[chosen] = Source.COMPUTE
-    return plan
+    return tuple(chosen)
 
 
 def crowded_plans(steps: int, blocks: int, full_steps: int) -> list[PlanArray]:

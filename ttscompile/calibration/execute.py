@@ -9,6 +9,7 @@ for the next is the reference runtime's business. Tests hold this against ``Refe
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,17 +19,21 @@ import torch
 from torch import Tensor
 
 from ..artifact.load import Artifact
+from ..correction import Correction
 from ..errors import IllegalPlanError
 from ..lattice import BoolArray, PlanArray, Source
 from ..runtimes.reference import ReferenceModel
+from ..runtimes.reference_correction import apply as apply_correction
+from ..runtimes.reference_correction import empty_history
 from .calls import Calls, Selector
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The loop before a step: the sample and both caches, for all streams."""
+    """The loop before a step: the sample, the history of the correction, and both caches, for all streams."""
 
     sample: Tensor
+    history: Tensor
     forward: dict[int, Tensor]
     timestep: tuple[Tensor | None, ...]
 
@@ -41,6 +46,7 @@ class Executor:
         streams: how many streams go through the loop at once, about.
 
     Attributes:
+        correction: of the sampler's steps, for all that is run but ``run_dense``; None for none.
         model: of the policy.
         selector: takes calls apart.
         types: of each block's residual.
@@ -59,6 +65,13 @@ class Executor:
         self.alike = len({block.type for block in blocks}) == 1
         self.pruner_graph = artifact.graphs.get("pruner")
         self._streams = streams
+        self.correction: Correction | None = None
+
+    def corrected(self, correction: Correction | None) -> Executor:
+        """The same executor with another correction, or none."""
+        other = copy(self)
+        other.correction = correction
+        return other
 
     def run(self, plans: Sequence[PlanArray] | PlanArray, calls: Calls, base: PlanArray | None = None) -> Tensor:
         """The denoised samples of every plan on every call.
@@ -116,8 +129,12 @@ class Executor:
             return torch.cat([self._loop(plans[p], self.selector.calls(calls, p), 0, None, {}) for p in parts])
 
     def run_dense(self, calls: Calls) -> Tensor:
-        """What the dense policy answers, ``[N, T, D]``."""
-        return self.run(np.zeros((1, self.model.steps, self.model.blocks), np.int8), calls)[0]
+        """What the dense policy answers, and how it gets there: the sample after each step, ``[N, K, T, D]``."""
+        path: list[Tensor] = []
+        with torch.no_grad():
+            dense = np.zeros((1, self.model.steps, self.model.blocks), np.int8)
+            self.corrected(None)._loop(dense, calls, 0, None, {}, path=path)
+        return torch.stack(path, 1)
 
     def logits(self, calls: Calls, weights: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[np.float32]:
         """What the pruner says with these constants, ``[N, K, blocks, 4]``."""
@@ -139,29 +156,45 @@ class Executor:
         taken: dict[int, Snapshot],
         take: Collection[int] = (),
         stop: int | None = None,
+        path: list[Tensor] | None = None,
     ) -> Tensor:
         """Steps ``start`` to ``stop`` of streams, plan by plan; fills ``taken`` before the steps ``take``."""
-        state = _State(calls, len(plans), snapshot, self.axes, self._group_axes)
-        sample = state.sample
+        state = self.begin(calls, len(plans), snapshot)
+        sample, history = state.sample, state.history
         total: Tensor | None = None  # what all blocks add together, as long as nothing is computed
         previous: PlanArray | None = None
         for k in range(start, self.model.steps if stop is None else stop):
             if k in take:
-                taken[k] = Snapshot(sample, dict(state.forward), tuple(state.timestep))
+                taken[k] = Snapshot(sample, history, dict(state.forward), tuple(state.timestep))
             row = plans[:, k]
             stem = self.model.stem(sample, k, calls.contexts)
             if total is not None and previous is not None and np.array_equal(row, previous):
                 stream = stem + total
             else:
-                stream = self._step(row, k, stem, calls, state)
+                stream = self.step(row, k, stem, calls, state)
                 computes = bool((row == Source.COMPUTE).any())
                 total = None if computes or not self.alike else stream - stem
                 previous = None if computes else row
             prediction = self.model.tail(stream, k, calls.contexts)
-            sample = self.model.advance(sample, prediction, None if calls.noise is None else calls.noise[k], k)
+            sample, history = self.advance(sample, prediction, history, calls, k)
+            if path is not None:
+                path.append(sample)
         return sample
 
-    def _step(self, row: PlanArray, k: int, stream: Tensor, calls: Calls, state: _State) -> Tensor:
+    def begin(self, calls: Calls, plans: int, snapshot: Snapshot | None = None) -> State:
+        """The state of the loop before step 0, or where a snapshot was taken; ``calls`` are those of all plans."""
+        return State(calls, plans, snapshot, self.axes, self._group_axes)
+
+    def advance(
+        self, sample: Tensor, prediction: Tensor, history: Tensor, calls: Calls, k: int
+    ) -> tuple[Tensor, Tensor]:
+        """Sample and history after step k."""
+        following = self.model.advance(sample, prediction, None if calls.noise is None else calls.noise[k], k)
+        if self.correction is None:
+            return following, history
+        return apply_correction(self.correction, k, following, sample, prediction, history)
+
+    def step(self, row: PlanArray, k: int, stream: Tensor, calls: Calls, state: State) -> Tensor:
         """All blocks of one step, where ``row [C, blocks]`` says what each plan does."""
         for b, axis in enumerate(self.axes):
             group, column = self.model.groups[b], row[:, b]
@@ -180,8 +213,8 @@ class Executor:
         return stream
 
 
-class _State:
-    """Sample and caches of ``plans x calls`` streams."""
+class State:
+    """Sample, history and caches of ``plans x calls`` streams."""
 
     def __init__(
         self, calls: Calls, plans: int, snapshot: Snapshot | None, axes: list[int], group_axes: dict[int, int]
@@ -189,9 +222,9 @@ class _State:
         self._plans, self._each = plans, calls.count // plans
         self.forward: dict[int, Tensor] = {}
         self.timestep: list[Tensor | None] = [None] * len(axes)
-        self.sample = calls.initial
+        self.sample, self.history = calls.initial, empty_history(calls.initial)
         if snapshot is not None:
-            self.sample = torch.cat([snapshot.sample] * plans)
+            self.sample, self.history = (torch.cat([one] * plans) for one in (snapshot.sample, snapshot.history))
             pairs = zip(snapshot.timestep, axes, strict=True)
             self.timestep = [None if t is None else torch.cat([t] * plans, axis) for t, axis in pairs]
             self.forward = {g: torch.cat([t] * plans, group_axes[g]) for g, t in snapshot.forward.items()}

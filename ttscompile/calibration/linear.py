@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from ..lattice import BoolArray, PlanArray, Source
+from ..runtimes.reference_correction import empty_history
 from .calls import Actions, Calls, IntArray
 from .execute import Executor
 
@@ -125,6 +126,7 @@ def _reach(executor: Executor, actions: Actions, plan: PlanArray, calls: Calls, 
     rank, count = probes.shape[1], calls.count
     streams = executor.selector.calls(calls, np.tile(np.arange(count), rank))
     sample = streams.initial.clone().requires_grad_()
+    history = empty_history(sample)
     model, axes = executor.model, executor.axes
     shape = (len(axes), model.steps)
     candidates: list[list[Tensor]] = [[] for _ in axes]
@@ -152,7 +154,7 @@ def _reach(executor: Executor, actions: Actions, plan: PlanArray, calls: Calls, 
             position[:, k] = len(passed)
             passed.append(stream)
         prediction = model.tail(stream, k, streams.contexts)
-        sample = model.advance(sample, prediction, None if streams.noise is None else streams.noise[k], k)
+        sample, history = executor.advance(sample, prediction, history, streams, k)
     executed = actions.executed(sample).reshape(rank, count, -1)
     gradients = torch.autograd.grad((executed * probes.transpose(0, 1)).sum(), passed)
     reach = np.empty((*shape, model.steps, count * rank), np.float32)

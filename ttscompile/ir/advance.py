@@ -1,6 +1,6 @@
 """One graph for everything between the last block of a step and the first block of the next.
 
-    stream --tail--> prediction --sampler--> sample_next --stem--> stream_next
+    stream --tail--> prediction --sampler, correction--> sample_next --stem--> stream_next
 
 The pieces are small; run one by one they cost more in calls than in arithmetic.
 """
@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ttscompile.config import PolicySpec, SamplerTable
+from ttscompile.correction import FEATURES, groups_of
+from ttscompile.correction import HISTORY as HISTORY_ENTRIES
 from ttscompile.errors import LoweringError
 
 from .graph import Argument, Batch, Graph, Node, Ref, TensorType
@@ -18,15 +20,21 @@ STREAM = "stream"
 SAMPLE = "sample"
 NOISE = "noise"
 COEFFICIENTS = "coefficients"
+HISTORY = "history"
+CORRECTION = "correction"
+CORRECTION_BIAS = "correction_bias"
 SAMPLE_NEXT = "sample_next"
 STREAM_NEXT = "stream_next"
+PREDICTION = "prediction"
+OUTPUTS = (SAMPLE_NEXT, STREAM_NEXT, PREDICTION)
 
 
 def fuse_advance(tail: Graph, stem: Graph, spec: PolicySpec) -> Graph:
     """Concatenate tail, sampler update and stem.
 
-    The update is that of ``SamplerTable``, with the row of the step as an input. Terms whose column is zero at every
-    step are left out.
+    The update is that of ``SamplerTable``, with the row of the step as an input, and that of ``Correction``, whose
+    weights of the step are inputs too: zeros where there is none. Terms whose column of the sampler's table is zero at
+    every step are left out.
 
     Args:
         tail: residual stream (its first input) and contexts -> prediction ``[B, T, D]``.
@@ -35,8 +43,9 @@ def fuse_advance(tail: Graph, stem: Graph, spec: PolicySpec) -> Graph:
 
     Returns:
         A graph with the inputs ``stream``, ``sample`` and ``noise`` ``[B, T, D]``, ``coefficients`` ``[6]`` in the
-        order of ``SamplerTable.COLUMNS``, the tail's contexts as ``tail.NAME`` (of this step) and the stem's as
-        ``stem.NAME`` (of the next); outputs ``sample_next`` and ``stream_next``.
+        order of ``SamplerTable.COLUMNS``, ``history`` ``[B, 4 T, D]``, ``correction`` ``[G, 6 T, T]`` and
+        ``correction_bias`` ``[G, 1, T]``, the tail's contexts as ``tail.NAME`` (of this step) and the stem's as
+        ``stem.NAME`` (of the next); outputs ``sample_next``, ``stream_next`` and ``prediction`` ``[B, T, D]``.
 
     Raises:
         LoweringError: a constant of the program has the name of one of these inputs.
@@ -44,27 +53,37 @@ def fuse_advance(tail: Graph, stem: Graph, spec: PolicySpec) -> Graph:
     (stream, *tail_contexts), (sample, *stem_contexts) = tail.inputs, stem.inputs
     type_ = TensorType((Batch(), *spec.sample), "float32")
     inputs = {STREAM: tail.inputs[stream], SAMPLE: type_, NOISE: type_, COEFFICIENTS: TensorType((6,), "float32")}
+    inputs |= _correction_types(spec)
     inputs |= {f"tail.{name}": tail.inputs[name] for name in tail_contexts}
     inputs |= {f"stem.{name}": stem.inputs[name] for name in stem_contexts}
     constants = {**tail.constants, **stem.constants}
-    if clash := sorted((constants.keys() & inputs.keys()) | (constants.keys() & {SAMPLE_NEXT, STREAM_NEXT})):
+    if clash := sorted((constants.keys() & inputs.keys()) | (constants.keys() & set(OUTPUTS))):
         raise LoweringError(
             f"the module has weights called {clash}, which are names of the compiled loop's own values."
             " Rename these parameters or buffers in the module."
         )
-    taken = {*inputs, *constants, SAMPLE_NEXT, STREAM_NEXT}
+    taken = {*inputs, *constants, *OUTPUTS}
     first = {n: n for n in tail.constants} | {n: f"tail.{n}" for n in tail_contexts} | {stream: STREAM}
     nodes, names = _moved(tail, "tail", first, taken)
     update = _Update(taken, type_)
-    prediction = names[tail.outputs[0]]
-    nodes += update.nodes_for(spec.sampler, prediction)
+    nodes.append(Node(PREDICTION, "aten.clone.default", (Ref(names[tail.outputs[0]]),), (), (type_,)))
+    nodes += update.nodes_for(spec, inputs)
     second = {n: n for n in stem.constants} | {n: f"stem.{n}" for n in stem_contexts} | {sample: SAMPLE_NEXT}
     more, names = _moved(stem, "stem", second, taken)
     nodes += more
     result = names[stem.outputs[0]]
     stream_type = stem.types()[stem.outputs[0]]
     nodes.append(Node(STREAM_NEXT, "aten.clone.default", (Ref(result),), (), (stream_type,)))
-    return Graph(inputs, constants, tuple(nodes), (SAMPLE_NEXT, STREAM_NEXT))
+    return Graph(inputs, constants, tuple(nodes), OUTPUTS)
+
+
+def _correction_types(spec: PolicySpec) -> dict[str, TensorType]:
+    (horizon, dimensions), groups = spec.sample, groups_of(spec.sampler.steps, spec.sample)
+    return {
+        HISTORY: TensorType((Batch(), HISTORY_ENTRIES * horizon, dimensions), "float32"),
+        CORRECTION: TensorType((groups, FEATURES * horizon, horizon), "float32"),
+        CORRECTION_BIAS: TensorType((groups, 1, horizon), "float32"),
+    }
 
 
 def _moved(graph: Graph, prefix: str, names: Mapping[str, str], taken: set[str]) -> tuple[list[Node], dict[str, str]]:
@@ -86,8 +105,9 @@ class _Update:
         self.type = type_
         self.nodes: list[Node] = []
 
-    def nodes_for(self, sampler: SamplerTable, prediction: str) -> list[Node]:
-        """``sample_next`` of ``sample``, ``noise``, ``coefficients`` and the prediction."""
+    def nodes_for(self, spec: PolicySpec, inputs: Mapping[str, TensorType]) -> list[Node]:
+        """``sample_next`` of the inputs and the prediction."""
+        sampler = spec.sampler
         split = _fresh("sampler.row", self.taken)
         entry = TensorType((1,), "float32")
         self.nodes.append(Node(split, "aten.split_with_sizes.default", (Ref(COEFFICIENTS), (1,) * 6), (), (entry,) * 6))
@@ -95,22 +115,38 @@ class _Update:
         for i, column in enumerate(columns):
             if getattr(sampler, column).any():
                 columns[column] = self.write(f"sampler.{column}", "getitem", (Ref(split), i), entry)
-        denoised = self.sum_of([(columns["sample_to_x0"], SAMPLE), (columns["out_to_x0"], prediction)])
+        denoised = self.sum_of([(columns["sample_to_x0"], SAMPLE), (columns["out_to_x0"], PREDICTION)])
         if sampler.clip is not None and denoised:
             denoised = self.write("sampler.x0", "aten.clamp.default", (Ref(denoised), -sampler.clip, sampler.clip))
         result = self.sum_of(
             [
                 (columns["x0_to_next"] if denoised else "", denoised),
                 (columns["sample_to_next"], SAMPLE),
-                (columns["out_to_next"], prediction),
+                (columns["out_to_next"], PREDICTION),
                 (columns["noise_to_next"], NOISE),
             ]
         )
-        # A table of zeros is no sampler, but it is arithmetic.
-        operand: tuple[Argument, ...] = (Ref(result),) if result else (Ref(SAMPLE),)
-        op = "aten.clone.default" if result else "aten.zeros_like.default"
-        self.nodes.append(Node(SAMPLE_NEXT, op, operand, (), (self.type,)))
+        correction = self.correction(spec, inputs)
+        if result:
+            self.nodes.append(Node(SAMPLE_NEXT, "aten.add.Tensor", (Ref(result), Ref(correction)), (), (self.type,)))
+        else:  # a table of zeros is no sampler, but it is arithmetic
+            self.nodes.append(Node(SAMPLE_NEXT, "aten.clone.default", (Ref(correction),), (), (self.type,)))
         return self.nodes
+
+    def correction(self, spec: PolicySpec, inputs: Mapping[str, TensorType]) -> str:
+        """What the correction adds: ``[D, B, 6 T] @ [G, 6 T, T] + [G, 1, T]``, turned back to ``[B, T, D]``."""
+        horizon, dimensions = spec.sample
+        rows, batch = FEATURES * horizon, self.type.shape[0]
+        parts = (Ref(SAMPLE), Ref(PREDICTION), Ref(HISTORY))
+        features = self.write(
+            "correction.features", "aten.cat.default", (parts, 1), TensorType((batch, rows, dimensions), "float32")
+        )
+        turned = TensorType((dimensions, batch, rows), "float32")
+        features = self.write("correction.turned", "aten.permute.default", (Ref(features), (2, 0, 1)), turned)
+        product = TensorType((dimensions, batch, horizon), "float32")
+        value = self.write("correction.product", "aten.matmul.default", (Ref(features), Ref(CORRECTION)), product)
+        value = self.write("correction.sum", "aten.add.Tensor", (Ref(value), Ref(CORRECTION_BIAS)), product)
+        return self.write("correction.value", "aten.permute.default", (Ref(value), (1, 2, 0)))
 
     def sum_of(self, terms: list[tuple[str, str]]) -> str:
         """The sum of coefficient times value, without terms that have no coefficient; empty for no terms."""

@@ -1,71 +1,63 @@
-"""Test-time sparsity: computed cells placed by their effect on the executed actions, then moved by the observation.
+"""Test-time sparsity, after arXiv 2605.13316: a schedule with a correction, from which the pruner may depart.
 
-The search starts from whole steps. An interval linearises the error of some calls around the plan (``linear``), lets
-the linear models of the last few intervals propose swaps of cells (``swaps``), measures the true error after one, two,
-four ... of them on other calls, and keeps the best if it holds on still others. The budget is kept exactly throughout.
-When that stops helping, the schedule is settled, and ``adaptation`` lets the pruner depart from it.
+The search places whole steps, because with a correction (``calibration.correction``) it is they that carry information
+about the observation and the noise, and everything in between is nearly linear. Every candidate gets a correction of
+its own, fitted on some of the calls, and is judged by the true error of its actions on others. It starts with the best
+of a family of crowded schedules, and then moves one step at a time, far at first, until no move helps. The winner's
+correction is fitted again, on all calls. Then ``adaptation`` lets the pruner depart from the schedule.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
+from ...correction import Correction
 from ...lattice import PlanArray, Source
 from ..adaptation import Adaptation
-from ..calls import Calls
-from ..crowded import crowded_plans
-from ..linear import LinearModel, Matrix, linearise
-from ..swaps import propose
+from ..correction import fit_correction
+from ..crowded import CROWDING, crowded_steps
 from .base import Array, Found, Task
 
-SEARCH = 60
-"""Intervals of the search at most."""
+FITTED, COMPARED = 384, 128
+"""Calls on which a candidate's correction is fitted, and others on which its error is measured; fewer if there are
+fewer."""
 
-PATIENCE = 8
-"""Intervals in a row without progress after which it stops."""
-
-LINEARISED, SCREENED, CONFIRMED = 32, 32, 96
-"""Calls on which an interval linearises, screens its proposals, and confirms the best; fewer if there are fewer."""
-
-EARLY = 8
-"""Intervals that linearise half as many: at first almost every swap helps."""
-
-REMEMBERED = 3
-"""Linear models that propose together: this interval's and the ones before."""
-
-SIZES = (1, 2, 3, 4, 6, 8, 12, 16)
-"""Numbers of swaps after which the error is measured."""
-
-FINALISTS = 2
+DISTANCES = (8, 4, 2, 1)
+"""How far a step is moved, in either direction. All steps are tried at one distance before the next."""
 
 
 class Tts:
     """See the module."""
 
-    closing = Adaptation.INTERVALS
-    intervals = SEARCH + closing
-
     def __init__(self, task: Task) -> None:
         self._task = task
         model = task.executor.model
-        self._plan: PlanArray = np.zeros((model.steps, model.blocks), np.int8)
+        self._full = min(max(1, task.budget // model.blocks), model.steps)
+        self._steps: tuple[int, ...] = tuple(range(self._full))
         self._loss = float("nan")
-        self._idle = 0
-        self._history: list[tuple[int, PlanArray]] = []  # interval and plan of each remembered model
-        self._models: list[LinearModel] = []
+        self._crowded = list(dict.fromkeys(crowded_steps(model.steps, self._full, c) for c in CROWDING))
+        self._moves = [(distance, i) for distance in DISTANCES for i in range(1, self._full)]
+        self.closing = Adaptation.INTERVALS
+        self.intervals = len(self._crowded) + len(self._moves) + self.closing
+        order = task.draw(0).permutation(task.calls.count)
+        compared = max(1, min(COMPARED, task.calls.count // 4))
+        select = task.executor.selector.calls
+        self._compared = select(task.calls, order[:compared])
+        self._fitted = select(task.calls, order[compared:][:FITTED]) if task.calls.count > 1 else self._compared
         self._adaptation: Adaptation | None = None
+        self._correction: Correction | None = None
 
     @property
     def plan(self) -> PlanArray:
         """The best schedule so far."""
-        return self._plan
+        return self._plan(self._steps)
 
     @property
     def loss(self) -> float:
-        """Error of the plan on the calls of the last interval."""
+        """Error of the plan on calls that its correction was not fitted on."""
         return self._loss
 
     @property
@@ -74,109 +66,71 @@ class Tts:
         return self._adaptation is not None and self._adaptation.done
 
     def close(self) -> None:
-        """Settle the schedule."""
+        """Settle the schedule, with a correction from all calls."""
         if self._adaptation is None:
-            self._adaptation = Adaptation(self._task, self._plan)
+            task = self._task
+            self._correction = fit_correction(task.executor, self.plan, task.calls)
+            corrected = replace(task, executor=task.executor.corrected(self._correction))
+            self._adaptation = Adaptation(corrected, self.plan)
 
     def advance(self, interval: int) -> None:
-        """Choose where to start, improve the plan once, or adapt it to observations."""
+        """Try a schedule of the family, or two moves of a step; or adapt the plan to observations."""
         if self._adaptation is not None:
             self._adaptation.advance()
-        elif interval == 0:
-            self._start()
+            return
+        if interval < len(self._crowded):
+            self._try([self._crowded[interval]])
         else:
-            self._improve(interval)
-            if self._idle >= PATIENCE or interval + 1 >= SEARCH:
-                self.close()
+            distance, i = self._moves[interval - len(self._crowded)]
+            self._try([self._moved(i, offset) for offset in (-distance, distance)])
+        if interval + 1 >= len(self._crowded) + len(self._moves):
+            self.close()
 
     def state(self) -> dict[str, Array]:
-        """Plan, and what is needed to make the remembered models again."""
-        state = {
-            "plan": self._plan,
-            "loss": np.array(self._loss),
-            "idle": np.array(self._idle),
-            "remembered": np.array([interval for interval, _ in self._history], np.int64),
-            "remembered_plans": np.array([plan for _, plan in self._history], np.int8).reshape(-1, *self._plan.shape),
-        }
+        """Computed steps and their error; corrections are fitted again."""
+        state: dict[str, Array] = {"steps": np.array(self._steps, np.int64), "loss": np.array(self._loss)}
         return state if self._adaptation is None else {**state, **self._adaptation.state()}
 
     def restore(self, state: Mapping[str, Array]) -> None:
-        """Go back to where ``state`` was taken; linearises again what it remembers."""
-        self._loss, self._idle = float(state["loss"]), int(state["idle"])
-        self._history, self._models = [], []
-        if Adaptation.KEY not in state:
-            for interval, plan in zip(state["remembered"], state["remembered_plans"], strict=True):
-                self._plan = np.array(plan, np.int8)
-                self._remember(int(interval), self._divide(int(interval))[0])
-        self._plan = np.array(state["plan"], np.int8)
+        """Go back to where ``state`` was taken."""
+        self._steps, self._loss = tuple(int(k) for k in state["steps"]), float(state["loss"])
         if Adaptation.KEY in state:
-            self._adaptation = Adaptation(self._task, self._plan)
+            self.close()
+            assert self._adaptation is not None
             self._adaptation.restore(state)
 
     def found(self) -> Found:
-        """The schedule, and the pruner if plans that depend on the observation were better."""
-        if self._adaptation is None or self._adaptation.pruner is None:
-            return Found(self._plan, None, {"switches": 0})
-        return Found(self._plan, self._adaptation.pruner, {"switches": self._adaptation.switches})
+        """The schedule with its correction, and the pruner if plans that depend on the observation were better."""
+        self.close()
+        assert self._adaptation is not None
+        notes = {"steps": list(self._steps), "switches": self._adaptation.switches}
+        return Found(self.plan, self._adaptation.pruner, notes, correction=self._correction)
 
-    def _start(self) -> None:
-        """The best of the crowded whole-step plans."""
-        task, calls = self._task, self._divide(0)[0]
-        model = task.executor.model
-        plans = crowded_plans(model.steps, model.blocks, max(1, task.budget // model.blocks))
-        errors = task.actions.errors(task.executor.run(plans, calls), calls.targets, units=False).mean(1)
-        best = int(np.argmin(errors))
-        self._plan, self._loss = plans[best], float(errors[best])
+    def _try(self, candidates: list[tuple[int, ...] | None]) -> None:
+        """Take the best of the candidates if it is better than the schedule so far."""
+        for steps in candidates:
+            if steps is None:
+                continue
+            error = self._error(steps)
+            if not error >= self._loss:  # the first one beats NaN
+                self._steps, self._loss = steps, error
 
-    def _improve(self, interval: int) -> None:
-        """One interval of the search."""
-        learned, screened, confirmed = self._divide(interval)
-        self._remember(interval, learned)
-        proposals = propose(self._models, self._task.budget, SIZES[-1])
-        plans = [_plan(proposals[n - 1]) for n in SIZES if n <= len(proposals)]
-        self._idle += 1
-        if not plans:
-            return
-        base, first = self._compare(plans, screened)
-        best = np.argsort(first.mean(1), kind="stable")[:FINALISTS]
-        base_again, again = self._compare([plans[i] for i in best], confirmed)
-        change = np.concatenate([first[best], again], 1).mean(1)
-        winner = int(np.argmin(change))
-        self._loss = float(np.concatenate([base, base_again]).mean())
-        if change[winner] < 0 and again[winner].mean() < 0:
-            self._plan, self._idle = plans[best[winner]], 0
-            self._loss += float(change[winner])
+    def _moved(self, i: int, offset: int) -> tuple[int, ...] | None:
+        """The schedule with its i-th step moved; None if it would meet another, or leave the loop."""
+        target = self._steps[i] + offset
+        if not 0 < target < self._task.executor.model.steps or target in self._steps:
+            return None
+        return tuple(sorted((*self._steps[:i], target, *self._steps[i + 1 :])))
 
-    def _remember(self, interval: int, calls: Calls) -> None:
-        """Linearise around the plan; the models of earlier intervals follow to it."""
-        for model in self._models:
-            model.apply(self._plan == Source.COMPUTE)
-        task = self._task
-        seed = int(task.draw(interval, 1).integers(2**31))
-        model = linearise(task.executor, task.actions, self._plan, calls, seed)
-        self._models = [*self._models, model][-REMEMBERED:]
-        self._history = [*self._history, (interval, self._plan)][-REMEMBERED:]
+    def _error(self, steps: tuple[int, ...]) -> float:
+        """Error of a schedule, with a correction of its own, on calls that this was not fitted on."""
+        task, plan, calls = self._task, self._plan(steps), self._compared
+        correction = fit_correction(task.executor, plan, self._fitted)
+        samples = task.executor.corrected(correction).run([plan], calls)[0]
+        return float(task.actions.errors(samples, calls.targets, units=False).mean())
 
-    def _divide(self, interval: int) -> tuple[Calls, Calls, Calls]:
-        """Calls to learn from, to screen on, and to confirm on; different calls if there are enough."""
-        count = self._task.calls.count
-        order = self._task.draw(interval, 0).permutation(count)
-        learned = min(LINEARISED // 2 if interval < EARLY else LINEARISED, (count + 1) // 2)
-        rest = order[learned:] if count > 1 else order
-        screened = min(SCREENED, (len(rest) + 1) // 2)
-        confirmed = rest[screened : screened + CONFIRMED] if len(rest) > 1 else rest
-        select = self._task.executor.selector.calls
-        first, second, third = (
-            select(self._task.calls, part) for part in (order[:learned], rest[:screened], confirmed)
-        )
-        return first, second, third
-
-    def _compare(self, plans: list[PlanArray], calls: Calls) -> tuple[Matrix, Matrix]:
-        """Error of the plan on each call ``[N]``, and by how much it changes with each of the others ``[C, N]``."""
-        samples = self._task.executor.run([self._plan, *plans], calls, base=self._plan)
-        errors = self._task.actions.errors(samples, calls.targets, units=False)
-        return errors[0], errors[1:] - errors[0]
-
-
-def _plan(computed: npt.NDArray[np.bool_]) -> PlanArray:
-    return np.where(computed, Source.COMPUTE, Source.TIMESTEP).astype(np.int8)
+    def _plan(self, steps: tuple[int, ...]) -> PlanArray:
+        model = self._task.executor.model
+        plan = np.full((model.steps, model.blocks), Source.TIMESTEP, np.int8)
+        plan[list(steps)] = Source.COMPUTE
+        return plan

@@ -1,0 +1,104 @@
+"""Fit the correction of a schedule: least squares, step by step, on calls whose dense path is known.
+
+At step k the sparse loop, corrected so far, has features; the correction of the step is the ridge regression, on these,
+of what is missing to the sample that the dense policy has after the step with the same noise. Then all calls go on
+with it. So every step is fitted where the loop will be when it gets there, and what one step leaves over the next can
+still repair. One pass of sparse calls: seconds.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..correction import Correction, groups_of
+from ..lattice import BoolArray, PlanArray, Source
+from ..runtimes.reference_correction import correct, features, remember
+from .calls import Calls
+from .execute import Executor
+from .workers import workers
+
+STREAMS = 64
+"""Calls that go through the loop at once."""
+
+RIDGE = 1e-4
+"""Times the mean square of a feature, for each call."""
+
+ANCHOR_SHARE = 0.5
+"""Of the blocks that a step computes, from which on it is an anchor."""
+
+
+def anchors_of(plan: PlanArray) -> BoolArray:
+    """Steps of a plan ``[K, blocks]`` that compute at least half of their blocks, ``[K]``."""
+    return np.asarray((plan == Source.COMPUTE).mean(axis=1) >= ANCHOR_SHARE)
+
+
+def fit_correction(executor: Executor, plan: PlanArray, calls: Calls, ridge: float = RIDGE) -> Correction:
+    """The correction of a schedule.
+
+    Args:
+        executor: of the policy; its own correction is not used.
+        plan: int8 ``[K, blocks]``, legal without a rollout cache.
+        calls: with the path of the dense policy.
+        ridge: see ``RIDGE``.
+    """
+    assert calls.path is not None
+    steps, sample = executor.model.steps, (calls.initial.shape[1], calls.initial.shape[2])
+    anchors, groups = anchors_of(plan), groups_of(steps, sample)
+    parts = [np.arange(i, min(i + STREAMS, calls.count)) for i in range(0, calls.count, STREAMS)]
+    lanes = [_Lane(executor, plan, executor.selector.calls(calls, part)) for part in parts]
+    weights, biases = [], []
+    with workers() as some:
+        for k in range(steps):
+            pairs = some.map(partial(_Lane.predict, k=k), lanes)
+            read, missing = torch.cat([a for a, _ in pairs], 1), torch.cat([b for _, b in pairs], 1)
+            weight, bias = _solve(read.double(), missing.double(), groups, ridge)
+            for lane in lanes:
+                lane.advance(weight, bias, bool(anchors[k]))
+            weights.append(weight.numpy())
+            biases.append(bias.numpy())
+    return Correction(anchors, np.stack(weights), np.stack(biases))
+
+
+class _Lane:
+    """Some of the calls on their way through the sparse loop."""
+
+    def __init__(self, executor: Executor, plan: PlanArray, calls: Calls) -> None:
+        assert calls.path is not None
+        self._executor, self._plan, self._calls, self._path = executor, plan, calls, calls.path
+        self._state = executor.begin(calls, 1)
+        self._sample, self._history = self._state.sample, self._state.history
+        self._prediction = self._following = self._sample
+
+    def predict(self, k: int) -> tuple[Tensor, Tensor]:
+        """Features of step k, ``[D, n, 6 T]``, and what is missing after it without a correction, ``[D, n, T]``."""
+        model, contexts, noise = self._executor.model, self._calls.contexts, self._calls.noise
+        stream = model.stem(self._sample, k, contexts)
+        stream = self._executor.step(self._plan[k][None], k, stream, self._calls, self._state)
+        self._prediction = model.tail(stream, k, contexts)
+        self._following = model.advance(self._sample, self._prediction, None if noise is None else noise[k], k)
+        missing = (self._path[:, k] - self._following).permute(2, 0, 1)
+        return features(self._sample, self._prediction, self._history), missing
+
+    def advance(self, weight: Tensor, bias: Tensor, anchor: bool) -> None:
+        """Go on with the correction of the step."""
+        sample, prediction, history = self._sample, self._prediction, self._history
+        self._sample = self._following + correct(weight, bias, sample, prediction, history)
+        if anchor:
+            self._history = remember(sample, prediction, history)
+
+
+def _solve(read: Tensor, missing: Tensor, groups: int, ridge: float) -> tuple[Tensor, Tensor]:
+    """Ridge regression of each group with a bias: float32 ``[G, 6 T, T]`` and ``[G, 1, T]``."""
+    if groups == 1:
+        read, missing = read.flatten(0, 1)[None], missing.flatten(0, 1)[None]
+    mean, offset = read.mean(1, keepdim=True), missing.mean(1, keepdim=True)
+    read, missing = read - mean, missing - offset
+    gram = read.transpose(1, 2) @ read
+    scale = gram.diagonal(dim1=1, dim2=2).mean(1)[:, None, None]
+    shift = (ridge * scale + 1e-9) * torch.eye(read.shape[-1], dtype=read.dtype)
+    weight = torch.linalg.solve(gram + shift, read.transpose(1, 2) @ missing)
+    return weight.float(), (offset - mean @ weight).float()
