@@ -8,7 +8,9 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
+from ttscompile.calibration.strategies import NAMES
 from ttscompile.cli import main
+from ttscompile.cli.calibrate import STRATEGIES
 from ttscompile.errors import CalibrationError, CalibrationFailedError
 
 
@@ -57,3 +59,13 @@ def test_a_plan_that_is_not_what_was_asked_for_is_a_failed_check(monkeypatch: py
     result = CliRunner().invoke(main, ["calibrate", "out", "--trajectories", "a.npz"])
     assert (result.exit_code, result.stdout) == (1, "")
     assert result.stderr == "failed: no better than the uniform schedule\n"
+
+
+def test_every_strategy_can_be_asked_for(asked: list[Any]) -> None:
+    assert STRATEGIES == NAMES
+    for name in NAMES:
+        CliRunner().invoke(main, ["calibrate", "out", "--trajectories", "a.npz", "--strategy", name])
+        assert asked[-1][1]["strategy"] == name
+    result = CliRunner().invoke(main, ["calibrate", "out", "--trajectories", "a.npz", "--strategy", "magic"])
+    assert result.exit_code == 2
+    assert len(asked) == len(NAMES)

@@ -10,6 +10,21 @@ import ttscompile
 from ttscompile.cli.output import artifact_argument, json_option, only_results_on_stdout, print_json, results
 from ttscompile.cli.summary import document, print_summary
 
+STRATEGIES = (
+    "tts",
+    "interval",
+    "bac",
+    "delta-dit",
+    "deepcache",
+    "sag",
+    "dip-go",
+    "l2c",
+    "evo",
+    "teacache",
+    "dbcache",
+)
+"""``calibration.strategies.NAMES``; written again, since importing that takes torch and a second."""
+
 
 class _FilesCommand(click.Command):
     """Lets ``--trajectories`` take every word up to the next option, which click's own options cannot."""
@@ -46,10 +61,11 @@ class _FilesCommand(click.Command):
 )
 @click.option(
     "--strategy",
-    type=click.Choice(["tts", "interval"]),
+    type=click.Choice(STRATEGIES),
     default="tts",
     show_default=True,
-    help="tts learns; interval computes whole steps at even distances.",
+    help="How the plan is found; tts is this project's own. The others are published methods: interval (FORA), bac,"
+    " delta-dit, deepcache, sag, dip-go, l2c, evo, teacache, dbcache.",
 )
 @click.option("--seed", type=int, default=0, show_default=True, help="Of the split, the noise and the training.")
 @click.option(

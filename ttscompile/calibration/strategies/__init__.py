@@ -1,15 +1,64 @@
-"""Ways to find a plan: one file each, behind the interface in ``base``."""
+"""Ways to find a plan: one file each, behind the interface in ``base``.
+
+=============  ===============================================================================================
+name           what it is
+=============  ===============================================================================================
+``tts``        test-time sparsity (arXiv 2605.13316): learned, and moved by the observation
+``interval``   whole steps at even distances: FORA (arXiv 2407.01425), EfficientVLA (arXiv 2506.10100)
+``bac``        block-wise adaptive caching (arXiv 2506.13456): dynamic programme, then bubbling union
+``delta-dit``  Delta-DiT (arXiv 2406.01125): rear blocks reused early, front blocks late
+``deepcache``  DeepCache (arXiv 2312.00858): the outermost blocks fresh at every step
+``sag``        Sparse ActionGen (arXiv 2601.12894): learned gates over FORWARD alone, frozen
+``dip-go``     DiP-GO (arXiv 2410.16942): learned gates over TIMESTEP, frozen
+``l2c``        Learning-to-Cache (arXiv 2406.01733): the same at every other step
+``evo``        genetic search (arXiv 2607.20293)
+``teacache``   TeaCache (arXiv 2411.19108): online, by the change of the first block's input
+``dbcache``    DBCache of cache-dit: online, by what the first blocks add
+=============  ===============================================================================================
+
+TaylorSeer (arXiv 2503.06923) is not here. It adds ``r(o) + (k - o) * (r(o) - r(p)) / (o - p)``, a combination of two
+computed residuals with a weight that grows with the step. A cell of the lattice adds one computed residual; neither a
+plan, nor an artifact, nor the runtimes' sums of reused residuals could say or hold more without a fifth source.
+"""
 
 from __future__ import annotations
 
 from ...errors import CalibrationError
+from ...lattice import Source
+from . import dbcache, deepcache, delta_dit, gates, teacache
+from .bac import bac
 from .base import Found, Strategy, Task
+from .evo import Evo
+from .fixed import Fixed, require_cells
+from .gates import Gates
 from .interval import Interval
+from .online import Online
 from .tts import Tts
 
-NAMES = ("tts", "interval")
+NAMES = (
+    "tts",
+    "interval",
+    "bac",
+    "delta-dit",
+    "deepcache",
+    "sag",
+    "dip-go",
+    "l2c",
+    "evo",
+    "teacache",
+    "dbcache",
+)
 
-__all__ = ["NAMES", "Found", "Strategy", "Task", "open_strategy", "require_strategy"]
+_LEAST = {
+    "delta-dit": delta_dit.least_cells,
+    "deepcache": deepcache.least_cells,
+    "l2c": gates.least_cells_l2c,
+    "teacache": teacache.least_cells,
+    "dbcache": dbcache.least_cells,
+}
+"""Cells that a strategy computes at least, of ``steps`` and ``blocks``; step 0 for those that are not here."""
+
+__all__ = ["NAMES", "Found", "Strategy", "Task", "open_strategy", "plan_of", "require_reach", "require_strategy"]
 
 
 def require_strategy(name: str) -> None:
@@ -22,11 +71,74 @@ def require_strategy(name: str) -> None:
         raise CalibrationError(f"no strategy is called {name!r}; expected one of {', '.join(NAMES)}.")
 
 
+def require_reach(name: str, steps: int, blocks: int, budget: int) -> None:
+    """Refuse a budget that a strategy cannot keep.
+
+    Args:
+        name: of the strategy.
+        steps: K.
+        blocks: number of residual blocks.
+        budget: cells that may be computed, step 0 included.
+
+    Raises:
+        CalibrationError: there is no such strategy, or it computes more; says how much sparsity it can reach.
+    """
+    require_strategy(name)
+    least = _LEAST[name](steps, blocks) if name in _LEAST else blocks
+    require_cells(name, least, steps, blocks, budget)
+
+
 def open_strategy(name: str, task: Task) -> Strategy:
     """The strategy of this name, ready to begin.
 
     Raises:
-        CalibrationError: there is none.
+        CalibrationError: there is none, or it cannot keep the budget.
     """
-    require_strategy(name)
-    return Tts(task) if name == "tts" else Interval(task)
+    model = task.executor.model
+    require_reach(name, model.steps, model.blocks, task.budget)
+    match name:
+        case "tts":
+            return Tts(task)
+        case "interval":
+            return Interval(task)
+        case "bac":
+            return Fixed(task, bac)
+        case "delta-dit":
+            return Fixed(task, delta_dit.delta_dit)
+        case "deepcache":
+            return Fixed(task, deepcache.deepcache)
+        case "sag":
+            return Gates(task, Source.FORWARD)
+        case "dip-go":
+            return Gates(task, Source.TIMESTEP)
+        case "l2c":
+            return Gates(task, Source.TIMESTEP, whole=2)
+        case "evo":
+            return Evo(task)
+        case "teacache":
+            return Online(task, teacache.teacache)
+        case _:
+            return Online(task, dbcache.dbcache)
+
+
+def plan_of(name: str, task: Task, intervals: int | None = None) -> Found:
+    """What a strategy finds, whether or not it is any better than the uniform schedule: for comparisons.
+
+    Args:
+        name: of the strategy.
+        task: see ``Task``.
+        intervals: how many at most; None for the strategy's own number.
+
+    Raises:
+        CalibrationError: there is no such strategy, or it cannot keep the budget.
+    """
+    strategy = open_strategy(name, task)
+    count = strategy.intervals if intervals is None else min(intervals, strategy.intervals)
+    closing = min(strategy.closing, count - 1)
+    for interval in range(count):
+        if strategy.done:
+            break
+        if closing and interval == count - closing:
+            strategy.close()
+        strategy.advance(interval)
+    return strategy.found()

@@ -9,7 +9,9 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from ...correction import Correction
 from ...lattice import PlanArray
+from ...runtimes.criterion import Criterion
 from ..calls import Actions, Calls
 from ..execute import Executor
 
@@ -27,6 +29,7 @@ class Task:
         budget: cells that a plan may compute, step 0 included.
         seed: of all that is random.
         pruner: constants of the pruner by name; empty if the artifact has none.
+        kinds: what each block is; empty if nobody asked.
     """
 
     executor: Executor
@@ -35,6 +38,7 @@ class Task:
     budget: int
     seed: int
     pruner: Mapping[str, Array]
+    kinds: tuple[str, ...] = ()
 
     def draw(self, *stage: int) -> np.random.Generator:
         """Random numbers that belong to a stage, whatever was drawn before: so that going on equals not stopping."""
@@ -50,12 +54,16 @@ class Found:
         pruner: all constants of the pruner, by name, for plans that depend on the observation; None for none.
         notes: what is worth keeping about how it was found; JSON.
         is_baseline: it is no better than the uniform schedule, and need not be.
+        correction: of the sampler's steps, for the schedule and the pruner's plans; None for none.
+        criterion: decides the plan during the call; ``schedule`` is then one of its decisions. None for none.
     """
 
     schedule: PlanArray
     pruner: Mapping[str, Array] | None
     notes: Mapping[str, Any]
     is_baseline: bool = False
+    correction: Correction | None = None
+    criterion: Criterion | None = None
 
 
 class Strategy(Protocol):

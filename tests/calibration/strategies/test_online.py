@@ -1,0 +1,129 @@
+"""Criteria on recorded calls: what they decide is what their plans do, and it is within the budget on average."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ttscompile.calibration.strategies import plan_of
+from ttscompile.calibration.strategies.dbcache import dbcache
+from ttscompile.calibration.strategies.online import decide, within
+from ttscompile.calibration.strategies.teacache import dense_changes, teacache
+from ttscompile.errors import CalibrationError
+from ttscompile.lattice import Source
+from ttscompile.runtimes.criterion import Criterion
+
+from .tasks import make_task
+
+RULES = [
+    Criterion("teacache", 0, 0.5, (1.0, 0.0), accumulates=True, warmup=1, closes=True),
+    Criterion("dbcache", 2, 0.5, (1.0, 0.0), accumulates=False, warmup=2, closes=False),
+]
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
+def test_the_decided_plans_do_what_the_call_did(compiled: Path, recording: Path, rule: Criterion) -> None:
+    task = make_task(compiled, recording, 30)
+    decided = decide(task.executor, rule, task.calls)
+    again = task.executor.run_each(decided.plans, task.calls)
+    torch.testing.assert_close(decided.samples, again, rtol=0, atol=2e-6)
+    assert len({plan.tobytes() for plan in decided.plans}) > 1  # calls differ
+    assert set(np.unique(decided.plans)) == {Source.COMPUTE, Source.TIMESTEP}
+    np.testing.assert_array_equal(decided.cells, (decided.plans == Source.COMPUTE).sum((1, 2)))
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
+def test_the_reference_decides_the_same(compiled: Path, recording: Path, rule: Criterion) -> None:
+    task = make_task(compiled, recording, 30)
+    decided = decide(task.executor, rule, task.calls)
+    model, calls = task.executor.model, task.calls
+    result, plans = model.decided_rollout(calls.contexts, calls.initial, calls.noise, rule)
+    np.testing.assert_array_equal(plans, decided.plans)
+    torch.testing.assert_close(result.sample, decided.samples, rtol=0, atol=2e-6)
+    given = model.rollout(calls.contexts, calls.initial, calls.noise, plans)
+    torch.testing.assert_close(result.sample, given.sample, rtol=0, atol=0)
+    np.testing.assert_array_equal(result.cache.written, given.cache.written)
+    assert result.cache.residuals.keys() == given.cache.residuals.keys()
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
+def test_a_call_does_not_depend_on_the_others(compiled: Path, recording: Path, rule: Criterion) -> None:
+    task = make_task(compiled, recording, 30)
+    together = decide(task.executor, rule, task.calls)
+    for i in (0, 5):
+        alone = decide(task.executor, rule, task.executor.selector.calls(task.calls, [i]))
+        np.testing.assert_array_equal(alone.plans[0], together.plans[i])
+
+
+@pytest.mark.parametrize("name", ["teacache", "dbcache"])
+@pytest.mark.parametrize("budget", [20, 40])
+def test_the_threshold_uses_the_budget(compiled: Path, recording: Path, name: str, budget: int) -> None:
+    task = make_task(compiled, recording, budget, calls=24)
+    found = plan_of(name, task)
+    assert found.criterion is not None
+    assert found.criterion.name == name
+    assert found.notes["criterion"] == found.criterion.record()
+    cells = decide(task.executor, found.criterion, task.calls).cells
+    assert found.notes["computed_cells"] == {"mean": float(cells.mean()), "most": int(cells.max())}
+    assert budget - 10 < cells.mean() <= budget
+    more = decide(task.executor, Criterion(**{**found.criterion.__dict__, "threshold": 0.0}), task.calls)
+    assert (more.cells == 60).all()  # a threshold of nothing computes everything
+
+
+@pytest.mark.parametrize("name", ["teacache", "dbcache"])
+def test_the_schedule_is_the_best_decision(compiled: Path, recording: Path, name: str) -> None:
+    task = make_task(compiled, recording, 30, calls=12)
+    found = plan_of(name, task)
+    assert found.criterion is not None
+    plans = within(decide(task.executor, found.criterion, task.calls).plans, 30)
+    samples = task.executor.run(plans, task.calls)
+    errors = task.actions.errors(samples, task.calls.targets, units=False).mean(1)
+    assert len(plans) > 1
+    np.testing.assert_array_equal(found.schedule, plans[int(np.argmin(errors))])
+
+
+def test_decisions_within_the_budget_once_each() -> None:
+    plans = np.full((5, 4, 2), Source.TIMESTEP, np.int8)
+    for plan, steps in zip(plans, ([0], [0, 1], [0, 1, 2], [0, 1], [0, 3]), strict=True):
+        plan[steps] = Source.COMPUTE
+    found = within(plans, budget=4)
+    assert [np.flatnonzero(plan[:, 0] == Source.COMPUTE).tolist() for plan in found] == [[0], [0, 1], [0, 3]]
+
+
+def test_dbcache_proposes_what_the_budget_has_room_for(compiled: Path, recording: Path) -> None:
+    assert [(c.always, c.warmup) for c, _ in dbcache(make_task(compiled, recording, 15))] == [(1, 1)]
+    proposed = [(c.always, c.warmup) for c, _ in dbcache(make_task(compiled, recording, 54))]
+    assert proposed == [(1, 8), (1, 1), (2, 8), (2, 1), (3, 8), (3, 1)]
+
+
+def test_dbcache_of_one_block_is_refused(compiled: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    task = make_task(compiled, recording, 60)
+    monkeypatch.setattr(task.executor.model, "blocks", 1)
+    with pytest.raises(CalibrationError, match="the policy has one block"):
+        dbcache(task)
+
+
+def test_teacache_fits_its_polynomial_to_dense_calls(compiled: Path, recording: Path) -> None:
+    task = make_task(compiled, recording, 30, calls=8)
+    ((criterion, start),) = teacache(task)
+    before, after = dense_changes(task.executor, task.calls)
+    assert len(criterion.polynomial) == 5
+    left = after - np.polyval(criterion.polynomial, before)
+    np.testing.assert_allclose(np.vander(before, 5).T @ left, 0, atol=1e-4)  # no polynomial of degree 4 comes nearer
+    assert start > 0
+
+
+def test_changes_of_dense_calls(compiled: Path, recording: Path) -> None:
+    task = make_task(compiled, recording, 30)
+    calls = task.executor.selector.calls(task.calls, [0, 4])
+    before, after = dense_changes(task.executor, calls)
+    assert before.shape == after.shape == (9 * 2,)
+    model, dense = task.executor.model, np.zeros((10, 6), np.int8)
+    samples = model.rollout(calls.contexts, calls.initial, calls.noise, dense, keep_samples=True).samples
+    stems = [model.stem(s, k, calls.contexts) for k, s in ((3, samples[2]), (4, samples[3]))]
+    expected = (stems[1] - stems[0]).abs().mean((1, 2)) / stems[0].abs().mean((1, 2))
+    np.testing.assert_allclose(before.reshape(9, 2)[3], expected.numpy(), rtol=1e-5)
+    assert (after != before).all()
