@@ -14,12 +14,13 @@ import numpy.typing as npt
 
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import DENSE
-from ttscompile.config import ChunkSpec, FloatArray, Noise, ObservationSpec
+from ttscompile.config import FP32, ChunkSpec, FloatArray, Noise, ObservationSpec
 from ttscompile.errors import IllegalPlanError, ObservationError, TtscompileError
 from ttscompile.ir.graph import TensorType
 
 from .arrays import check_noise, check_observation, is_tensor, like
 from .base import GIVEN, CallReport, Runtime, open_runtime
+from .liveness import RolloutNeeds, rollout_needs
 
 if TYPE_CHECKING:
     from ttscompile.artifact.load import Artifact
@@ -49,6 +50,8 @@ class PolicyInfo:
         identity: sha256 of what the artifact computes.
         plans: names that ``predict_action(plan=...)`` takes.
         default_plan: the one that is taken when none is given.
+        precision: of the weights of residual blocks, ``fp32`` or ``int8``.
+        rollout: what keeping the rollout cache of one stream takes.
     """
 
     K: int
@@ -61,22 +64,39 @@ class PolicyInfo:
     identity: str
     plans: tuple[str, ...]
     default_plan: str
+    precision: str
+    rollout: RolloutNeeds
 
 
-def load(path: str | Path, runtime: str = "onnxruntime", threads: int = 1, seed: int | None = None) -> CompiledPolicy:
+def load(
+    path: str | Path,
+    runtime: str = "onnxruntime",
+    threads: int = 1,
+    seed: int | None = None,
+    *,
+    precision: str | None = None,
+) -> CompiledPolicy:
     """Load a compiled policy.
 
     Args:
         path: the directory that ``convert`` wrote, or the same zipped.
         runtime: ``onnxruntime``; or ``reference``, which is slow and needs torch.
-        threads: threads of arithmetic, of this policy alone; 1 computes on the caller's thread.
+        threads: threads of arithmetic, of this policy alone. 1 computes on the caller's thread and makes none. With
+            more, ``threads - 1`` of them look for work for 50 us after each block, and then sleep: a loaded policy that
+            is not called takes no processor time.
         seed: of the noise that is drawn when none is given; None for another sequence every time.
+        precision: of the weights of residual blocks: ``fp32``, which every artifact holds; None for what it was
+            converted with. The reference runtime computes in fp32 always.
 
     Raises:
-        ArtifactError: the artifact is missing, damaged, or of another version.
+        ArtifactError: the artifact is missing, damaged, of another version, or without blocks of this precision.
         RuntimeUnavailableError: the runtime cannot be had on this machine.
     """
     artifact = load_artifact(path)
+    if runtime == "reference":
+        precision = precision or FP32
+    if precision is not None:
+        artifact = artifact.at_precision(precision)
     return CompiledPolicy(artifact, open_runtime(artifact, runtime, threads), seed)
 
 
@@ -118,6 +138,8 @@ class CompiledPolicy:
             identity=manifest.identity,
             plans=(DENSE, *manifest.plans),
             default_plan=manifest.default_plan,
+            precision=manifest.precision_name,
+            rollout=rollout_needs(self._artifact),
         )
 
     def reset(self, seed: int | None = None) -> None:
@@ -166,8 +188,11 @@ class CompiledPolicy:
             else:
                 noise = check_noise(noise, streams, self._manifest.steps, spec.sample, spec.sampler.stochastic)
             matrix, name, repair = self._plan(plan)
+            correction = self._artifact.corrections.get(name)
             normalized = {key: _normalized(array, spec.observations[key]) for key, array in obs.items()}
-            sample, self._report = self._runtime.predict(normalized, noise, matrix, plan_name=name, repair=repair)
+            sample, self._report = self._runtime.predict(
+                normalized, noise, matrix, plan_name=name, repair=repair, correction=correction
+            )
             predicted = sample[..., : spec.chunk.action_dim]
             if spec.chunk.normalizer is not None:
                 predicted = spec.chunk.normalizer.unnormalize(predicted)

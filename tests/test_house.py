@@ -18,12 +18,13 @@ ROOT = Path(__file__).resolve().parents[1]
 MODULES = modules(ROOT)
 GRAPH = {name: imports(name, path) for name, path in MODULES.items()}
 
-BASE = {"errors", "config", "lattice"}
+BASE = {"errors", "config", "correction", "lattice"}
 BELOW_ARTIFACT = BASE | {"ir", "artifact"}
 COMPILER = {"capture", "frontends", "lower", "passes", "samplers"}
 MAY_IMPORT = {
     "errors": set(),
     "config": {"errors"},
+    "correction": {"errors"},
     "lattice": {"errors"},
     "machine": set(),
     "plots": {"errors", "lattice"},
@@ -35,9 +36,9 @@ MAY_IMPORT = {
     "passes": BASE | {"ir"},
     "frontends": BASE | {"samplers"},
     "artifact": BASE | {"ir"},
-    "runtimes": BELOW_ARTIFACT,
+    "runtimes": BELOW_ARTIFACT | {"machine"},
     "calibration": BELOW_ARTIFACT | {"runtimes", "trajectories"},
-    "driver": BELOW_ARTIFACT | COMPILER,
+    "driver": BELOW_ARTIFACT | COMPILER | {"runtimes"},
     "cli": BELOW_ARTIFACT | COMPILER | {"calibration", "driver", "machine", "plots", "runtimes", "trajectories"},
 }
 """Part of the package -> the other parts that it may import, anywhere in its code. Design, section 4."""

@@ -17,15 +17,19 @@ if TYPE_CHECKING:
     from .errors import TtscompileError
     from .lattice import Source, legalize
     from .runtimes.base import CallReport
+    from .runtimes.executor import AsyncExecutor, ExecutorSettings, GuardLimits
     from .runtimes.policy import CompiledPolicy, PolicyInfo, load
 
 __version__ = "0.1.0"
 
 __all__ = [
     "Affine",
+    "AsyncExecutor",
     "CallReport",
     "ChunkSpec",
     "CompiledPolicy",
+    "ExecutorSettings",
+    "GuardLimits",
     "Noise",
     "ObservationSpec",
     "PolicyInfo",
@@ -43,9 +47,12 @@ __all__ = [
 
 _HOMES = {
     "Affine": "config",
+    "AsyncExecutor": "runtimes.executor",
     "CallReport": "runtimes.base",
     "ChunkSpec": "config",
     "CompiledPolicy": "runtimes.policy",
+    "ExecutorSettings": "runtimes.executor",
+    "GuardLimits": "runtimes.executor",
     "Noise": "config",
     "ObservationSpec": "config",
     "PolicyInfo": "runtimes.policy",

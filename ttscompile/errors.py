@@ -65,3 +65,31 @@ class OutputError(TtscompileError):
 
 class RuntimeUnavailableError(TtscompileError):
     """A runtime was asked for whose packages or providers are not installed."""
+
+
+class ExecutorError(TtscompileError):
+    """The executor was used in a way, or asked for a time, that it cannot serve."""
+
+
+class InfeasibleError(ExecutorError):
+    """The policy is too slow for its chunks at this rate; the message has the arithmetic."""
+
+
+class DeadlineMissedError(ExecutorError):
+    """There is no action for the time that was asked for, and none may be held any longer."""
+
+
+class StaleObservationError(DeadlineMissedError):
+    """The same, because no observation came that is recent enough to compute actions from."""
+
+
+class WorkerDeadError(ExecutorError):
+    """The thread that owns the policy has ended; ``__cause__`` is what ended it."""
+
+
+class ExecutorClosedError(ExecutorError):
+    """The executor was closed."""
+
+
+class ProtocolError(ExecutorError):
+    """A message to the executor's server that is no request of its protocol."""

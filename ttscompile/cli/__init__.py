@@ -15,6 +15,8 @@ from ttscompile.cli.bench import bench
 from ttscompile.cli.calibrate import calibrate
 from ttscompile.cli.convert import convert
 from ttscompile.cli.inspect import inspect
+from ttscompile.cli.plan import plan
+from ttscompile.cli.serve import serve
 from ttscompile.errors import CalibrationFailedError, TtscompileError
 
 
@@ -36,5 +38,5 @@ def main() -> None:
     """Compile diffusion-transformer robot policies into artifacts that run in real time without PyTorch."""
 
 
-for _command in (convert, calibrate, inspect, bench):
+for _command in (convert, calibrate, inspect, bench, plan, serve):
     main.add_command(_command)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,8 @@ from rich.console import Console
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import DENSE, Manifest
 from ttscompile.cli.output import flops, share, table
+from ttscompile.ir.joint import JOINT
+from ttscompile.runtimes.liveness import rollout_needs
 
 
 def document(directory: Path, artifact: Artifact | None = None) -> dict[str, Any]:
@@ -54,11 +57,37 @@ def document(directory: Path, artifact: Artifact | None = None) -> dict[str, Any
             }
             for i, block in enumerate(manifest.blocks)
         ],
+        "precision": _precision(manifest),
         "flops": _flops(manifest),
         "plans": _plans(artifact),
+        "rollout_cache": asdict(rollout_needs(artifact)),
         "default_plan": manifest.default_plan,
         "calibration": None if manifest.calibration is None else dict(manifest.calibration),
     }
+
+
+def _precision(manifest: Manifest) -> dict[str, Any]:
+    """Of the blocks' weights, and what it does to the actions of dense calls; ``error`` is null for fp32."""
+    record = manifest.precision
+    if record is None:
+        return {"name": manifest.precision_name, "blocks": 0, "bytes": 0, "error": None}
+    size = sum(manifest.files[name].bytes for name in (record.weights, *record.models.values()))
+    error = None if record.error is None else dict(vars(record.error))
+    return {"name": record.name, "blocks": len(set(record.models) - {JOINT}), "bytes": size, "error": error}
+
+
+def _told_precision(precision: dict[str, Any], blocks: int) -> str:
+    """The same as one line."""
+    if not precision["blocks"]:
+        return f"{precision['name']}"
+    told = f"{precision['name']} weights in {precision['blocks']} of {blocks} blocks, {precision['bytes'] / 1e6:.1f} MB"
+    error = precision["error"]
+    if error is None:
+        return f"{told}; its action error was not measured"
+    return (
+        f"{told}; dense actions {error['mean']:.4g} from fp32 on average, 90th percentile {error['p90']:.4g}"
+        f" ({error['calls']} random observations, equal noise)"
+    )
 
 
 def _flops(manifest: Manifest) -> dict[str, int]:
@@ -117,6 +146,13 @@ def print_summary(summary: dict[str, Any], console: Console) -> None:
         f"{horizon} steps of {chunk['action_dim']}, of which {chunk['start']}..{chunk['stop'] - 1} are executed"
         + (f"; the sample has {channels} channels" if channels != chunk["action_dim"] else ""),
     )
+    cache = summary["rollout_cache"]
+    about.add_row(
+        "rollout cache",
+        f"{cache['read']} of {cache['cells']} residuals a stream, {cache['bytes_read'] / 1e6:.1f} MB, are read by its"
+        f" plans; a matrix can read all, {cache['bytes_most'] / 1e6:.1f} MB",
+    )
+    about.add_row("precision", _told_precision(summary["precision"], len(summary["blocks"])))
     console.print(about)
     console.print(_block_table(summary["blocks"]))
     costs = table("FLOPs a call, one stream", "", "of the captured policy")
@@ -159,11 +195,15 @@ def _print_calibration(record: dict[str, Any] | None, console: Console) -> None:
     for name, score in record.get("plans", {}).items():
         errors = (f"{score[key]:.4g}" for key in ("error", "error_p90"))
         scores.add_row(name, *errors, *(share(score[key]) for key in ("sparsity", "flops_saved")))
+    precision = record.get("precision", {"plans": {}})
+    for name, score in precision["plans"].items():
+        errors = (f"{score[key]:.4g}" for key in ("error", "error_p90"))
+        scores.add_row(f"{name}: {precision['name']} against fp32", *errors, "", "")
     if scores.row_count:
         console.print(scores)
     made = table("calibration", "")
     for name, value in record.items():
-        if name in ("plans", "sparsity", "flops_sparsity"):
+        if name in ("plans", "precision", "sparsity", "flops_sparsity"):
             continue  # told above
         if isinstance(value, list | dict) and len(str(value)) > 60:
             value = f"{len(value)} entries; see --json"

@@ -6,16 +6,20 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 import ttscompile
 from ttscompile.artifact.load import load_artifact
-from ttscompile.config import Affine, Noise, PolicySpec
+from ttscompile.config import FP32, Affine, Noise, PolicySpec
 from ttscompile.errors import RuntimeUnavailableError, SpecError
 from ttscompile.lattice import Source
+
+if TYPE_CHECKING:
+    from ttscompile.frontends.eager import EagerPolicy
+    from ttscompile.runtimes.policy import CompiledPolicy
 
 WARM_UP = 3
 """Calls of each that are not counted: allocations, and the first call of an episode, which cannot use ROLLOUT."""
@@ -80,7 +84,7 @@ class Measurement:
 def contestants(
     directory: Path, threads: int, plan: str | None, against: Sequence[str], checkpoint: Path | None
 ) -> list[Contestant]:
-    """The compiled policy first, then its rivals; each with a policy, and caches, of its own.
+    """The compiled policy first, then its rivals, in fp32; each with a policy, and caches, of its own.
 
     Args:
         directory: the artifact.
@@ -96,10 +100,11 @@ def contestants(
     """
     manifest = load_artifact(directory).manifest
     name = plan or manifest.default_plan
-    made = [_compiled("compiled", directory, threads, name, manifest.spec)]
+    own = manifest.precision_name
+    made = [_compiled("compiled" + f", {own}" * (own != FP32), directory, threads, name, manifest.spec, own)]
     for rival in against:
         if rival == "onnxruntime-dense":
-            made.append(_compiled("dense onnxruntime", directory, threads, "dense", manifest.spec))
+            made.append(_compiled("dense onnxruntime", directory, threads, "dense", manifest.spec, FP32))
         elif checkpoint is not None:
             made.append(_eager(checkpoint, threads, manifest.spec, manifest.flops.dense))
     return made
@@ -125,38 +130,57 @@ def random_calls(spec: PolicySpec, count: int, seed: int) -> list[tuple[Observat
 
 
 def measure(
-    entered: Sequence[Contestant], runs: int, seed: int, on_round: Callable[[int, int], None] = lambda done, total: None
+    entered: Sequence[Contestant],
+    runs: int,
+    seed: int,
+    on_round: Callable[[int, int], None] = lambda done, total: None,
+    warm_up: int = WARM_UP,
 ) -> list[Measurement]:
     """Time the contestants in turn, so that whatever else the machine does hits all of them.
 
     Args:
-        entered: at least one.
+        entered: at least one; those of one specification get the same observations and noise.
         runs: counted calls of each.
         seed: of observations and noise.
         on_round: told how many rounds of how many are done.
+        warm_up: calls of each before these.
 
     Returns:
         One measurement a contestant.
     """
     times: list[list[float]] = [[] for _ in entered]
     reports: list[list[Any]] = [[] for _ in entered]
-    calls = random_calls(entered[0].spec, WARM_UP + runs, seed)
-    for number, (obs, noise) in enumerate(calls):
+    specs = {id(one.spec): one.spec for one in entered}
+    calls = {name: random_calls(spec, warm_up + runs, seed) for name, spec in specs.items()}
+    for number in range(warm_up + runs):
         for turn in range(len(entered)):
             i = (turn + number) % len(entered)  # nobody always runs after the same one
+            obs, noise = calls[id(entered[i].spec)][number]
             started = perf_counter()
             entered[i].call(obs, noise)
             elapsed = 1000 * (perf_counter() - started)
-            if number >= WARM_UP:
+            if number >= warm_up:
                 times[i].append(elapsed)
                 reports[i].append(entered[i].report())
-        on_round(number + 1, len(calls))
+        on_round(number + 1, warm_up + runs)
     return [_summary(*one) for one in zip(entered, times, reports, strict=True)]
 
 
-def _compiled(label: str, directory: Path, threads: int, plan: str, spec: PolicySpec) -> Contestant:
-    policy = ttscompile.load(directory, threads=threads)
+def _compiled(label: str, directory: Path, threads: int, plan: str, spec: PolicySpec, precision: str) -> Contestant:
+    policy = ttscompile.load(directory, threads=threads, precision=precision)
     policy.reset()
+    return plan_contestant(label, policy, plan, spec)
+
+
+def plan_contestant(label: str, policy: CompiledPolicy, plan: str, spec: PolicySpec) -> Contestant:
+    """A plan of a compiled policy.
+
+    Args:
+        label: for people.
+        policy: loaded; contestants may share one if their plans read nothing of earlier calls.
+        plan: its name.
+        spec: of the policy.
+    """
     return Contestant(
         label=label,
         plan=plan,
@@ -190,7 +214,19 @@ def _eager(checkpoint: Path, threads: int, spec: PolicySpec, dense_flops: float)
             f" the normaliser of {', '.join(different)} differs. Give that policy's checkpoint."
         )
     torch.set_num_threads(threads)
-    run = eager_policy(module, spec)
+    return network_contestant("eager PyTorch", eager_policy(module, spec), spec, dense_flops)
+
+
+def network_contestant(label: str, run: EagerPolicy, spec: PolicySpec, dense_flops: float) -> Contestant:
+    """The whole network in PyTorch, once a step.
+
+    Args:
+        label: for people.
+        run: of ``ttscompile.frontends.eager``.
+        spec: of the policy.
+        dense_flops: of a call.
+    """
+    import torch
 
     def call(obs: Mapping[str, npt.NDArray[Any]], noise: Noise) -> object:
         normalised = {}
@@ -199,7 +235,7 @@ def _eager(checkpoint: Path, threads: int, spec: PolicySpec, dense_flops: float)
             normalised[key] = torch.from_numpy(obs[key] if normalizer is None else normalizer.normalize(obs[key]))
         return run(normalised, noise)
 
-    return Contestant("eager PyTorch", "dense", call, lambda: None, spec, dense_flops)
+    return Contestant(label, "dense", call, lambda: None, spec, dense_flops)
 
 
 def _interface(spec: PolicySpec) -> str:

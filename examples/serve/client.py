@@ -1,0 +1,155 @@
+"""A client of ``ttscompile serve`` in nothing but Python's standard library: what any language needs, in a page.
+
+    ttscompile serve build/pusht/compiled --control-hz 10
+    python examples/serve/client.py ws://127.0.0.1:8765/ --seconds 5
+
+It sends frames in which nothing moves, at the control rate, and prints the actions. The framing is RFC 6455; most
+languages have a library for it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import hashlib
+import json
+import os
+import socket
+import struct
+import sys
+import time
+from typing import Any
+from urllib.parse import urlsplit
+
+TEXT, CLOSE, PING, PONG = 1, 8, 9, 10
+ACCEPT = "258EAFA5-E914-47DA-95CA-C5AB0DC85B11"  # RFC 6455, section 1.3
+
+
+class ServerError(Exception):
+    """What the server answers instead of a result.
+
+    Attributes:
+        type: name of the error, such as ``DeadlineMissedError``.
+    """
+
+    def __init__(self, type: str, message: str) -> None:
+        super().__init__(f"{type}: {message}")
+        self.type = type
+
+
+class Client:
+    """One connection; requests are answered in their order.
+
+    Args:
+        url: ``ws://127.0.0.1:8765/``.
+        timeout: seconds that an answer may take.
+    """
+
+    def __init__(self, url: str, timeout: float = 35.0) -> None:
+        parts = urlsplit(url)
+        self._socket = socket.create_connection((parts.hostname, parts.port), timeout)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._stream = self._socket.makefile("rb")
+        key = base64.b64encode(os.urandom(16)).decode()
+        self._socket.sendall(
+            f"GET {parts.path or '/'} HTTP/1.1\r\nHost: {parts.netloc}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
+        )
+        status = self._stream.readline()
+        headers = {}
+        while line := self._stream.readline().strip():
+            name, _, value = line.decode().partition(":")
+            headers[name.lower()] = value.strip()
+        expected = base64.b64encode(hashlib.sha1((key + ACCEPT).encode()).digest()).decode()
+        if b" 101 " not in status or headers.get("sec-websocket-accept") != expected:
+            self._stream.close()
+            self._socket.close()
+            raise ConnectionError(f"{url} did not accept: {status.decode().strip()}")
+
+    def __call__(self, method: str, **params: Any) -> dict[str, Any]:
+        """Send a request and wait for its answer.
+
+        Raises:
+            ServerError: the server says what went wrong.
+            ConnectionError: the connection ended.
+        """
+        self._send(TEXT, json.dumps({"method": method, **params}).encode())
+        reply = json.loads(self._receive())
+        if "error" in reply:
+            raise ServerError(**reply["error"])
+        result: dict[str, Any] = reply["result"]
+        return result
+
+    def close(self) -> None:
+        """End the connection."""
+        self._send(CLOSE, struct.pack("!H", 1000))
+        self._stream.close()
+        self._socket.close()
+
+    def _send(self, kind: int, payload: bytes) -> None:
+        size = len(payload)
+        if size < 126:
+            head = struct.pack("!BB", 0x80 | kind, 0x80 | size)
+        elif size < 1 << 16:
+            head = struct.pack("!BBH", 0x80 | kind, 0x80 | 126, size)
+        else:
+            head = struct.pack("!BBQ", 0x80 | kind, 0x80 | 127, size)
+        mask = os.urandom(4)
+        masked = bytes(byte ^ mask[i % 4] for i, byte in enumerate(payload))
+        self._socket.sendall(head + mask + masked)
+
+    def _receive(self) -> bytes:
+        message = b""
+        while True:
+            first, second = self._read(2)
+            size = second & 0x7F
+            if size >= 126:
+                (size,) = struct.unpack("!H" if size == 126 else "!Q", self._read(2 if size == 126 else 8))
+            payload, kind = self._read(size), first & 0x0F
+            if kind == PING:
+                self._send(PONG, payload)
+            elif kind == CLOSE:
+                code = struct.unpack("!H", payload[:2])[0] if payload else 1005
+                raise ConnectionError(f"the server closed the connection: {code} {payload[2:].decode()}")
+            elif kind != PONG:
+                message += payload
+                if first & 0x80:
+                    return message
+
+    def _read(self, size: int) -> bytes:
+        data = self._stream.read(size)
+        if len(data) < size:
+            raise ConnectionError("the connection ended")
+        return data
+
+
+def main() -> None:
+    """Observe and act for a while."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("url", nargs="?", default="ws://127.0.0.1:8765/")
+    parser.add_argument("--seconds", type=float, default=5.0)
+    arguments = parser.parse_args()
+    call = Client(arguments.url)
+    info = call("info")
+
+    def zeros(shape: list[int]) -> Any:
+        return [zeros(shape[1:]) for _ in range(shape[0])] if shape else 0
+
+    frame = {key: zeros(spec["shape"]) for key, spec in info["observation"].items()}
+    period = 1 / info["control_hz"]
+    start = time.monotonic()
+    for tick in range(round(arguments.seconds / period)):
+        time.sleep(max(start + tick * period - time.monotonic(), 0))
+        call("observe", obs=frame)
+        try:
+            print(call("action", timeout=period / 2)["action"])
+        except ServerError as error:
+            if error.type not in ("DeadlineMissedError", "StaleObservationError"):
+                raise
+            print(error, file=sys.stderr)
+    print(json.dumps(call("statistics")))
+    call.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,32 @@
+"""The asynchronous executor: a control loop always has the action for now, while the next chunk is computed.
+
+Everything that decides is a state machine without clock or thread, driven by ``executor``, which has the one thread:
+
+- ``window``: frames in, observation windows out.
+- ``timeline``: actions by control tick, and how chunks join.
+- ``feasibility``: whether a policy keeps up, and when its next call must start.
+- ``tiers``: which plan runs under pressure.
+- ``guard``: what a chunk must be before it is executed.
+- ``state``: all of these together.
+- ``statistics``, ``trace``: what happened.
+- ``server``, ``protocol``: the executor for other processes.
+"""
+
+from __future__ import annotations
+
+from .clock import Clock, MonotonicClock
+from .executor import AsyncExecutor
+from .feasibility import Feasibility
+from .guard import GuardLimits
+from .settings import ExecutorSettings
+from .statistics import ExecutorStatistics
+
+__all__ = [
+    "AsyncExecutor",
+    "Clock",
+    "ExecutorSettings",
+    "ExecutorStatistics",
+    "Feasibility",
+    "GuardLimits",
+    "MonotonicClock",
+]

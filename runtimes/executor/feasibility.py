@@ -1,0 +1,109 @@
+"""Whether a policy keeps up with a control loop. No clock, no threads.
+
+A call starts when a frame comes, and its chunk plays out ``horizon`` after that. The next call can start when this one
+is done, with the next frame that comes then, and must be done ``margin`` before the actions run out::
+
+    frame: call n             frame: call n + 1                       actions of n run out
+       |=====latency=======|......|=====latency=======|----margin---->|
+       |                   |<--frame period at most                   |
+       |<---------------------------- horizon ----------------------->|
+
+So the calls follow each other without a gap in the actions if ``frame period + 2 * latency + margin <= horizon``.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import asdict, dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Feasibility:
+    """The arithmetic of one policy on one loop. Times in seconds.
+
+    Attributes:
+        latency: the longest call that has to be reckoned with.
+        control_hz: rate of the control loop.
+        policy_hz: rate of observations and actions in the policy's own time.
+        horizon_steps: actions of a chunk that may be played.
+        margin_ticks: control ticks that a chunk shall be there before it is needed.
+    """
+
+    latency: float
+    control_hz: float
+    policy_hz: float
+    horizon_steps: int
+    margin_ticks: int
+
+    @property
+    def frame(self) -> float:
+        """Seconds from one frame to the next, and so for which a call may have to wait for one."""
+        return 1 / self.policy_hz
+
+    @property
+    def margin(self) -> float:
+        """``margin_ticks`` in seconds."""
+        return self.margin_ticks / self.control_hz
+
+    @property
+    def horizon(self) -> float:
+        """How long the actions of a chunk last, from its observation on."""
+        return self.horizon_steps / self.policy_hz
+
+    @property
+    def needed(self) -> float:
+        """The least horizon."""
+        return self.frame + 2 * self.latency + self.margin
+
+    @property
+    def max_latency(self) -> float:
+        """The longest call with which this would be feasible; not positive if none would be."""
+        return (self.horizon - self.frame - self.margin) / 2
+
+    @property
+    def max_policy_hz(self) -> float:
+        """The fastest rate of this latency, with as many control ticks an action as now; 0 if there is none."""
+        ticks_per_step = self.control_hz / self.policy_hz
+        return max(self.horizon_steps - 1 - self.margin_ticks / ticks_per_step, 0.0) / (2 * self.latency)
+
+    @property
+    def feasible(self) -> bool:
+        """Whether the calls keep up."""
+        return self.needed <= self.horizon + 1e-12
+
+    def explain(self) -> str:
+        """The arithmetic on one line, in milliseconds."""
+        sign = "<=" if self.feasible else ">"
+        return (
+            f"frame period {1e3 * self.frame:.4g} + 2 x latency {1e3 * self.latency:.4g}"
+            f" + margin {1e3 * self.margin:.4g} = {1e3 * self.needed:.4g} ms {sign} {1e3 * self.horizon:.4g} ms ="
+            f" {self.horizon_steps} actions at {self.policy_hz:g} Hz"
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """As plain JSON values."""
+        return asdict(self) | {
+            "needed": self.needed,
+            "horizon": self.horizon,
+            "max_latency": self.max_latency,
+            "max_policy_hz": self.max_policy_hz,
+            "feasible": self.feasible,
+        }
+
+
+class LatencyWindow:
+    """The longest of the last calls. Warm-up calls are made, and left out, before there is one of these.
+
+    Args:
+        window: calls that count.
+    """
+
+    def __init__(self, window: int) -> None:
+        self._latencies: deque[float] = deque(maxlen=window)
+        self.bound = 0.0
+
+    def add(self, latency: float) -> None:
+        """Take the latency of a call, in seconds."""
+        self._latencies.append(latency)
+        self.bound = max(self._latencies)

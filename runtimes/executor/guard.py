@@ -1,0 +1,123 @@
+"""What a chunk must be before any of it is executed. No clock, no threads."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ttscompile.config import Affine, FloatArray
+from ttscompile.errors import ExecutorError
+
+
+@dataclass(frozen=True)
+class GuardLimits:
+    """Limits on actions, in the units of the actions; numbers, or one a channel.
+
+    Attributes:
+        low: least action; None for what the normaliser maps to -1, ``margin`` further out.
+        high: largest action; likewise.
+        margin: share of the normaliser's range by which an action may be outside of it. A normaliser by mean and
+            deviation has no range: give ``low`` and ``high`` with one.
+        max_step: largest change of an action from one control tick to the next, seams included; None for no limit.
+        max_jerk: largest third difference over control ticks, ``a[3] - 3 a[2] + 3 a[1] - a[0]``; None for no limit.
+    """
+
+    low: float | Sequence[float] | None = None
+    high: float | Sequence[float] | None = None
+    margin: float = 0.05
+    max_step: float | Sequence[float] | None = None
+    max_jerk: float | Sequence[float] | None = None
+
+    def __post_init__(self) -> None:
+        if not self.margin >= 0:
+            raise ExecutorError(f"the guard's margin must not be negative; found {self.margin}.")
+        for name in ("max_step", "max_jerk"):
+            limit = getattr(self, name)
+            if limit is not None and not (np.asarray(limit) > 0).all():
+                raise ExecutorError(f"the guard's {name} must be positive; found {limit}.")
+
+
+class Guard:
+    """Checks chunks.
+
+    Args:
+        limits: see there.
+        normalizer: of the actions; None if the policy has none, and so no bounds but the ones in ``limits``.
+        channels: Da.
+
+    Raises:
+        ExecutorError: a limit has another number of channels, or the bounds leave no room.
+    """
+
+    def __init__(self, limits: GuardLimits, normalizer: Affine | None, channels: int) -> None:
+        low, high = _range(normalizer, limits.margin, channels)
+        self._low = _vector(limits.low, channels, "low", low)
+        self._high = _vector(limits.high, channels, "high", high)
+        if not (self._low < self._high).all():
+            raise ExecutorError(f"the guard's bounds leave no room: low {self._low} is not below high {self._high}.")
+        unlimited = np.full(channels, np.inf, np.float32)
+        self._max_step = None if limits.max_step is None else _vector(limits.max_step, channels, "max_step", unlimited)
+        self._max_jerk = None if limits.max_jerk is None else _vector(limits.max_jerk, channels, "max_jerk", unlimited)
+
+    def refuse(self, actions: FloatArray) -> str | None:
+        """Why a chunk ``[Ta, Da]`` must not be executed; None if nothing is wrong with it by itself."""
+        if not np.isfinite(actions).all():
+            return f"{np.count_nonzero(~np.isfinite(actions))} of its {actions.size} numbers are not finite"
+        outside = (actions < self._low) | (actions > self._high)
+        if outside.any():
+            i, d = (int(n) for n in np.argwhere(outside)[0])
+            return (
+                f"action {i}, channel {d}, is {actions[i, d]:.6g}; the bounds are {self._low[d]:.6g} to"
+                f" {self._high[d]:.6g}"
+            )
+        return None
+
+    def refuse_motion(self, played: FloatArray, scheduled: FloatArray) -> str | None:
+        """Why a schedule must not follow what was played.
+
+        Args:
+            played: the last actions that were given out, ``[N, Da]``, oldest first; at most three count.
+            scheduled: ``[M, Da]``, what would follow.
+
+        Returns:
+            The reason, or None.
+        """
+        if self._max_step is None and self._max_jerk is None:
+            return None
+        for name, limit, order in (("step", self._max_step, 1), ("jerk", self._max_jerk, 3)):
+            joined = np.concatenate([played[-order:], scheduled]).astype(np.float64)
+            if limit is None or len(joined) <= order:
+                continue
+            size = np.abs(np.diff(joined, order, axis=0))
+            excess = size - limit
+            if (excess > 0).any():
+                i, d = (int(n) for n in np.unravel_index(np.argmax(excess), excess.shape))
+                return f"its {name} of {size[i, d]:.6g} in channel {d} exceeds the limit of {limit[d]:.6g}"
+        return None
+
+
+def _range(normalizer: Affine | None, margin: float, channels: int) -> tuple[FloatArray, FloatArray]:
+    """What the normaliser maps to -1 and 1, ``margin`` further apart."""
+    if normalizer is None:
+        infinite = np.full(channels, np.inf, np.float32)
+        return -infinite, infinite
+    ends = np.stack([normalizer.unnormalize(np.full(channels, end, np.float32)) for end in (-1.0, 1.0)])
+    low, high = ends.min(axis=0), ends.max(axis=0)
+    return low - margin * (high - low), high + margin * (high - low)
+
+
+def _vector(
+    limit: float | Sequence[float] | None, channels: int, name: str, default: npt.NDArray[np.float32]
+) -> FloatArray:
+    """A limit as one number a channel."""
+    if limit is None:
+        return default
+    array = np.asarray(limit, dtype=np.float32)
+    if array.shape not in ((), (channels,)) or np.isnan(array).any():
+        raise ExecutorError(
+            f"the guard's {name} must be a number, or one for each of {channels} channels; found {limit}."
+        )
+    return np.broadcast_to(array, (channels,))

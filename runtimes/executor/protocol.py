@@ -1,0 +1,143 @@
+"""Messages of the executor's server: JSON texts, one answer a request. ``docs/serve.md`` has the protocol."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ttscompile.errors import ProtocolError
+
+from .window import Array, FrameSpec
+
+METHODS: dict[str, frozenset[str]] = {
+    "info": frozenset(),
+    "observe": frozenset({"obs", "t"}),
+    "action": frozenset({"t", "timeout"}),
+    "reset": frozenset({"seed"}),
+    "statistics": frozenset(),
+}
+"""Method -> the parameters that it may have."""
+MOST_SECONDS = 1e15
+"""Times are less than this, either way."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """A request that has been read.
+
+    Attributes:
+        id: what the client called it; sent back.
+        method: one of ``METHODS``.
+        params: checked as far as the method says.
+    """
+
+    id: int | str | None
+    method: str
+    params: Mapping[str, Any]
+
+
+def read_request(text: str | bytes) -> Request:
+    """Read one message.
+
+    Raises:
+        ProtocolError: it is no request; ``request_id`` is set on the error if the message had one.
+    """
+    if isinstance(text, bytes):
+        raise ProtocolError("a request is a text message, not a binary one.")
+    try:
+        document = json.loads(text, parse_constant=_no_number)
+    except (ValueError, RecursionError) as error:
+        raise ProtocolError(f"the message is no JSON: {str(error)[:200]}.") from error
+    if not isinstance(document, dict):
+        raise ProtocolError(f"a request is a JSON object; found {type(document).__name__}.")
+    name = document.pop("id", None)
+    if not (name is None or isinstance(name, str) or (isinstance(name, int) and not isinstance(name, bool))):
+        raise ProtocolError("a request's id is a number without fraction, a string, or left out.")
+    try:
+        return Request(name, *_checked(document))
+    except ProtocolError as error:
+        error.request_id = name  # type: ignore[attr-defined]
+        raise
+
+
+def _checked(document: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    method = document.pop("method", None)
+    allowed = METHODS.get(method) if isinstance(method, str) else None
+    if allowed is None:
+        raise ProtocolError(f"the method is one of {', '.join(METHODS)}; found {str(method)[:40]!r}.")
+    unexpected = sorted(document.keys() - allowed)
+    if unexpected:
+        raise ProtocolError(f"{method} takes {sorted(allowed)}; found {unexpected[0][:40]!r}.")
+    for key in ("t", "timeout"):
+        value = document.get(key)
+        if value is None:
+            continue
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MOST_SECONDS:
+            raise ProtocolError(f"{key} is a number of seconds; found {str(value)[:40]}.")
+    seed = document.get("seed")
+    if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 1 << 63):
+        raise ProtocolError("seed is a number without fraction, from 0 to 2**63 - 1.")
+    if method == "observe" and not isinstance(document.get("obs"), dict):
+        raise ProtocolError("observe needs obs, an object with an array a key.")
+    return str(method), document
+
+
+def read_frame(obs: Mapping[str, Any], frames: FrameSpec) -> dict[str, Array]:
+    """The arrays of an observation; shapes are left to ``observe``.
+
+    Raises:
+        ProtocolError: something is no array.
+    """
+    return {key: _array(key, value, frames.dtypes.get(key, "float32")) for key, value in obs.items()}
+
+
+def _array(key: str, value: Any, dtype: str) -> Array:
+    if isinstance(value, dict):
+        return _packed(key, value)
+    try:
+        array = np.asarray(value)
+        if array.dtype.kind not in "iuf" or (array.dtype.kind == "f" and np.dtype(dtype).kind != "f"):
+            raise ProtocolError(f"observation {key[:40]!r} must be lists of numbers that are {dtype}.")
+        if array.dtype.kind != "f" and np.dtype(dtype).kind in "iu" and array.size:
+            limits = np.iinfo(dtype)
+            if array.min() < limits.min or array.max() > limits.max:
+                raise ProtocolError(f"observation {key[:40]!r} has a number that is no {dtype}.")
+        return array.astype(dtype)
+    except (ValueError, OverflowError) as error:
+        raise ProtocolError(f"observation {key[:40]!r} is no array: {str(error)[:200]}.") from error
+
+
+def _packed(key: str, value: dict[str, Any]) -> Array:
+    """``{"dtype": "uint8", "shape": [96, 96, 3], "base64": "..."}``: little-endian, the last axis fastest."""
+    try:
+        dtype = np.dtype(str(value["dtype"])).newbyteorder("<")
+        shape = tuple(int(n) for n in value["shape"])
+        if dtype.kind not in "iuf" or min(shape, default=1) < 0:
+            raise ProtocolError(f"observation {key[:40]!r} must be of integers or floats, with a shape that is one.")
+        content = base64.b64decode(value["base64"], validate=True)
+        array: Array = np.frombuffer(content, dtype).reshape(shape)
+        return array.astype(dtype.newbyteorder("="))
+    except (KeyError, TypeError, ValueError) as error:
+        raise ProtocolError(
+            f"observation {key[:40]!r} must be lists of numbers, or an object with dtype, shape and base64:"
+            f" {str(error)[:200]}."
+        ) from error
+
+
+def answer(request_id: int | str | None, result: Mapping[str, Any]) -> str:
+    """The text of an answer."""
+    return json.dumps({"id": request_id, "result": result}, allow_nan=False)
+
+
+def failure(request_id: int | str | None, error: Exception) -> str:
+    """The text of an answer that says what went wrong."""
+    return json.dumps({"id": request_id, "error": {"type": type(error).__name__, "message": str(error)}})
+
+
+def _no_number(name: str) -> float:
+    raise ValueError(f"{name} is no JSON number")

@@ -1,0 +1,198 @@
+"""What can be set on an executor, and what of it follows from the policy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol
+
+from ttscompile.config import ChunkSpec, ObservationSpec
+from ttscompile.errors import ExecutorError
+
+from .guard import GuardLimits
+from .window import FrameSpec
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+INTERPOLATIONS = ("hold", "linear")
+SEAMS = ("replace", "blend", "prefix")
+
+
+class PolicyFacts(Protocol):
+    """What the executor has to know of a policy: the part of ``PolicyInfo`` that it reads."""
+
+    @property
+    def observation(self) -> Mapping[str, ObservationSpec]:
+        """Specification of each key."""
+
+    @property
+    def action(self) -> ChunkSpec:
+        """Chunking."""
+
+    @property
+    def sample(self) -> tuple[int, int]:
+        """``(T, D)``."""
+
+    @property
+    def plans(self) -> tuple[str, ...]:
+        """Names that ``predict_action(plan=...)`` takes."""
+
+    @property
+    def default_plan(self) -> str:
+        """The one that is taken when none is given."""
+
+
+class Policy(Protocol):
+    """What the executor calls: a ``CompiledPolicy``, or what acts like one."""
+
+    @property
+    def info(self) -> PolicyFacts:
+        """What it is."""
+
+    def reset(self, seed: int | None = None) -> None:
+        """A new episode."""
+
+    def predict_action(self, obs_dict: Mapping[str, Any], *, plan: str) -> Mapping[str, Any]:
+        """``{"action": [1, Ta, Da], "action_pred": [1, T, Da]}``."""
+
+
+@dataclass(frozen=True)
+class ExecutorSettings:
+    """Settings of an ``AsyncExecutor``; times in seconds, rates in Hz.
+
+    Attributes:
+        policy_hz: rate of frames and actions that the policy was trained with; None: the control rate. The control rate
+            has to be a multiple of it.
+        interpolation: between actions, if the control loop is faster than the policy: ``hold`` or ``linear``.
+        n_obs_steps: To; None: what the policy's chunking implies, ``start + 1``.
+        horizon: actions of a chunk that may be played, from its observation on; None: as many as the policy executes.
+            More of them, up to the end of the prediction, allow slower calls, and play actions that the policy was not
+            judged on.
+        rate_tolerance: how far from its place in the window a frame may be, as a share of the policy's period.
+        max_age: of the newest frame of a window when a call starts; None: three periods of the policy.
+        seam: how a chunk joins the one before: ``replace``; ``blend``, linear over ``blend_steps``; or ``prefix``
+            (experimental), for policies that take ``prefix``, the actions that are committed already, and inpaint.
+        blend_steps: control ticks.
+        max_hold: control ticks for which the last action is repeated when there is no other; then ``action`` raises.
+            Right for positions; for velocities and differences set 0.
+        margin_ticks: control ticks that a chunk shall be there before it is needed.
+        warm_up: first calls of each plan whose latency does not count.
+        measured_calls: calls of each plan, after these, that measure its latency before the executor is ready.
+        latency_window: calls whose longest latency is reckoned with.
+        refuse_infeasible: raise if no tier is fast enough; False lets a loop miss its deadlines knowingly.
+        tiers: plans from slow to fast; None: the policy's default plan alone.
+        down_after: missed deadlines in a row after which the next faster plan is run.
+        up_after: calls in time, in a row, after which the next slower plan is tried again.
+        guard: limits on actions.
+        cores: processors that the policy's thread is pinned to; None: any.
+        statistics_window: measurements that percentiles are made from.
+        trace_events: events that the trace keeps; 0 for no trace.
+    """
+
+    policy_hz: float | None = None
+    interpolation: str = "hold"
+    n_obs_steps: int | None = None
+    horizon: int | None = None
+    rate_tolerance: float = 0.3
+    max_age: float | None = None
+    seam: str = "replace"
+    blend_steps: int = 4
+    max_hold: int = 3
+    margin_ticks: int = 1
+    warm_up: int = 2
+    measured_calls: int = 5
+    latency_window: int = 50
+    refuse_infeasible: bool = True
+    tiers: tuple[str, ...] | None = None
+    down_after: int = 1
+    up_after: int = 20
+    guard: GuardLimits = field(default_factory=GuardLimits)
+    cores: tuple[int, ...] | None = None
+    statistics_window: int = 4096
+    trace_events: int = 65536
+
+    def __post_init__(self) -> None:
+        positive = ("policy_hz", "n_obs_steps", "horizon", "max_age", "measured_calls", "latency_window", "down_after")
+        for name in (*positive, "up_after", "statistics_window"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ExecutorError(f"{name} must be positive; found {value}.")
+        for name in ("blend_steps", "max_hold", "margin_ticks", "warm_up", "trace_events"):
+            if not getattr(self, name) >= 0:
+                raise ExecutorError(f"{name} must not be negative; found {getattr(self, name)}.")
+        if not 0 < self.rate_tolerance < 0.5:
+            raise ExecutorError(f"rate_tolerance must be between 0 and 0.5 periods; found {self.rate_tolerance}.")
+        if self.interpolation not in INTERPOLATIONS:
+            raise ExecutorError(f"interpolation must be one of {INTERPOLATIONS}; found {self.interpolation!r}.")
+        if self.seam not in SEAMS:
+            raise ExecutorError(f"seam must be one of {SEAMS}; found {self.seam!r}.")
+        if self.tiers is not None and (not self.tiers or len(set(self.tiers)) < len(self.tiers)):
+            raise ExecutorError(f"tiers must be names of plans, each once; found {self.tiers}.")
+
+
+@dataclass(frozen=True)
+class Resolved:
+    """Settings with everything that follows from the policy filled in.
+
+    Attributes:
+        control_hz: ticks a second.
+        policy_hz: frames and actions a second.
+        ticks_per_step: control ticks that an action lasts.
+        horizon: actions of a chunk that may be played.
+        first: index of the first of them in ``action_pred``.
+        channels: Da.
+        frames: what a frame holds.
+        max_age: seconds.
+        tiers: plans, slowest first.
+    """
+
+    control_hz: float
+    policy_hz: float
+    ticks_per_step: int
+    horizon: int
+    first: int
+    channels: int
+    frames: FrameSpec
+    max_age: float
+    tiers: tuple[str, ...]
+
+
+def resolve(settings: ExecutorSettings, info: PolicyFacts, control_hz: float) -> Resolved:
+    """Fit settings to a policy.
+
+    Raises:
+        ExecutorError: they do not fit.
+    """
+    if not control_hz > 0:
+        raise ExecutorError(f"control_hz must be positive; found {control_hz}.")
+    policy_hz = settings.policy_hz or control_hz
+    ticks_per_step = round(control_hz / policy_hz)
+    if ticks_per_step < 1 or abs(ticks_per_step * policy_hz - control_hz) > 1e-6 * control_hz:
+        raise ExecutorError(
+            f"control_hz = {control_hz:g} is no multiple of policy_hz = {policy_hz:g}: an action would last"
+            f" {control_hz / policy_hz:.4g} ticks. Run the loop at a multiple of the policy's rate."
+        )
+    chunk, tiers = info.action, settings.tiers or (info.default_plan,)
+    longest = info.sample[0] - chunk.start
+    horizon = settings.horizon or chunk.stop - chunk.start
+    if horizon > longest:
+        raise ExecutorError(
+            f"horizon = {horizon}: the policy predicts {info.sample[0]} actions, {longest} of them from the observation"
+            f" on. Give at most {longest}."
+        )
+    unknown = [name for name in tiers if name not in info.plans]
+    if unknown:
+        raise ExecutorError(
+            f"the policy has no plan {unknown[0]!r}; it has {list(info.plans)}. Name tiers among these."
+        )
+    return Resolved(
+        control_hz=control_hz,
+        policy_hz=policy_hz,
+        ticks_per_step=ticks_per_step,
+        horizon=horizon,
+        first=chunk.start,
+        channels=chunk.action_dim,
+        frames=FrameSpec.of(info.observation, settings.n_obs_steps or chunk.start + 1),
+        max_age=settings.max_age or 3 / policy_hz,
+        tiers=tiers,
+    )

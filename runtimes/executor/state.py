@@ -1,0 +1,344 @@
+"""All that an executor knows: a state machine, events in with the time at which they happened. No clock, no threads.
+
+``AsyncExecutor`` calls every method under its lock, so each takes microseconds.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ttscompile.config import Affine, FloatArray
+from ttscompile.errors import DeadlineMissedError, ExecutorError, ObservationError, StaleObservationError
+
+from .feasibility import Feasibility, LatencyWindow
+from .guard import Guard
+from .settings import ExecutorSettings, Resolved
+from .statistics import Recorder
+from .tiers import Tiers
+from .timeline import TickGrid, Timeline, expand, splice
+from .window import Frame, ObservationWindow
+
+FAR = 1e6
+"""Seconds from now that a time may be at most; what is further is of another clock."""
+SAME_TIME = 1e-6
+"""Seconds; what is meant to happen at one time is not told apart by rounding."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One call of the policy.
+
+    Attributes:
+        epoch: number of resets before it.
+        frames: of the window, oldest first.
+        observed: time of the newest.
+        plan: to run.
+        started: when it was handed to the policy.
+        deadline: when the scheduled actions run out; None if there were none, and nothing can be missed.
+        prefix: actions that are committed, ``[N, Da]`` from the observation on, one a step of the policy; None unless
+            the seam is ``prefix``.
+    """
+
+    epoch: int
+    frames: list[Frame]
+    observed: float
+    plan: str
+    started: float
+    deadline: float | None
+    prefix: FloatArray | None
+
+
+class ExecutorState:
+    """The state of one executor.
+
+    Args:
+        settings: as given.
+        resolved: what follows from them and the policy.
+        normalizer: of the actions.
+        tiers: plans that are fast enough.
+        latencies: of each tier.
+    """
+
+    def __init__(
+        self,
+        settings: ExecutorSettings,
+        resolved: Resolved,
+        normalizer: Affine | None,
+        tiers: tuple[str, ...],
+        latencies: Mapping[str, LatencyWindow],
+    ) -> None:
+        self._settings, self._resolved = settings, resolved
+        self._guard = Guard(settings.guard, normalizer, resolved.channels)
+        self._tiers = Tiers(tiers, settings.down_after, settings.up_after)
+        self._latencies = latencies
+        period = 1 / resolved.policy_hz
+        self._window = ObservationWindow(resolved.frames.steps, period, settings.rate_tolerance, resolved.max_age)
+        self._grid = TickGrid(resolved.control_hz)
+        self._played: deque[tuple[int, FloatArray]] = deque(maxlen=max(resolved.horizon * resolved.ticks_per_step, 3))
+        self.recorder = Recorder(settings.statistics_window)
+        self.epoch = 0
+        self._job: Job | None = None
+        self._forget()
+
+    def _forget(self) -> None:
+        """Everything that belongs to an episode."""
+        self._window.clear()
+        self._grid.clear()
+        self._played.clear()
+        self._timeline: Timeline | None = None
+        self._last: tuple[int, FloatArray] | None = None  # tick and action that were given out last
+        self._used = float("-inf")  # time of the newest frame that a call was made from
+        self._holds = 0
+        self._gap = False
+        self._refusal: str | None = None
+
+    @property
+    def plan(self) -> str:
+        """Of the next call."""
+        return self._tiers.plan
+
+    @property
+    def ready(self) -> bool:
+        """Whether a chunk of this episode has been scheduled."""
+        return self._timeline is not None
+
+    def reset(self) -> None:
+        """A new episode: nothing from before is given out any more."""
+        self.epoch += 1
+        self.recorder.counts.resets += 1
+        self.recorder.pause()
+        self._forget()
+
+    # Observations
+
+    def observe(self, frame: Frame, time: float, now: float) -> None:
+        """Take a frame.
+
+        Raises:
+            ObservationError: it comes from the future.
+        """
+        ahead = time - now
+        if not ahead <= 0.5 / self._resolved.control_hz:
+            raise ObservationError(
+                f"the observation's time is {ahead:.6g} s ahead of the executor's clock, {now:.6f}. Stamp frames with"
+                " time.monotonic(), or with the clock that the executor was given."
+            )
+        counts = self.recorder.counts
+        counts.frames += 1
+        added = self._window.add(time, frame, now)
+        if added == "late":
+            counts.frames_late += 1
+            return
+        counts.frames_replaced += added == "replaced"
+        self._grid.tick(time)
+
+    # Actions
+
+    def play(self, time: float, now: float) -> FloatArray | None:
+        """The scheduled action for a time; None if there is none. What is returned belongs to the caller.
+
+        Raises:
+            ExecutorError: an action for a later time was given out before, or the time is of another clock.
+        """
+        tick = self._tick(time, now)
+        if self._last is not None and tick == self._last[0]:
+            self.recorder.tick(now)
+            return self._last[1].copy()
+        timeline = self._timeline
+        row = None if timeline is None else timeline.at(tick)
+        if row is None or timeline is None:
+            return None
+        recorder = self.recorder
+        recorder.queue_depth.add(timeline.end - tick - 1)
+        recorder.action_age_ms.add(1e3 * (time - float(timeline.observed[tick - timeline.start])))
+        recorder.tick(now)
+        self._holds, self._gap = 0, False
+        self._give(tick, row, time)
+        return row.copy()
+
+    def hold(self, time: float, now: float) -> FloatArray | None:
+        """The last action once more; None if there is none, or it was held long enough."""
+        tick = self._tick(time, now)
+        counts = self.recorder.counts
+        if self._timeline is not None and not self._gap:
+            self._gap = True
+            counts.deadlines_missed += 1
+        if self._last is None:
+            counts.starved += 1
+            return None
+        last, action = self._last
+        held = self._holds + tick - last
+        if held > self._settings.max_hold:
+            counts.starved += 1
+            return None
+        self._holds = held
+        counts.holds += 1
+        self.recorder.tick(now)
+        self._give(tick, action, time)
+        return action.copy()
+
+    def starved(self, time: float, now: float) -> DeadlineMissedError:
+        """Why there is no action for a time, as an error to raise."""
+        reason, stale = self._reason(now)
+        since = "" if self._last is None else f", and the last one was held for {self._holds} ticks"
+        remedy = "call reset(), or observe() and wait for the next chunk with action(timeout=...)"
+        message = f"no action for time {time:.6f}{since}: {reason}. Stop the robot safely; then {remedy}."
+        return (StaleObservationError if stale else DeadlineMissedError)(message)
+
+    def _tick(self, time: float, now: float) -> int:
+        if not abs(time - now) < FAR:
+            raise ExecutorError(
+                f"an action was asked for {time - now:.6g} s from now. Give times of time.monotonic(), or of the clock"
+                " that the executor was given."
+            )
+        tick = self._grid.tick(time)
+        if self._last is not None and tick < self._last[0]:
+            raise ExecutorError(
+                f"an action was asked for {self._last[0] - tick} ticks before the last one that was given out. Times"
+                " must not go backwards within an episode; one control loop asks for actions."
+            )
+        return tick
+
+    def _give(self, tick: int, action: FloatArray, time: float) -> None:
+        self._grid.follow(time, tick)
+        self._last = (tick, action)
+        self._played.append(self._last)
+
+    def _reason(self, now: float) -> tuple[str, bool]:
+        """Why nothing is scheduled, and whether observations are to blame."""
+        if self._refusal is not None:
+            return f"the guard refused the last chunk: {self._refusal}", False
+        if self._job is not None:
+            bound = self._latencies[self._job.plan].bound
+            before = " for the episode before" if self._job.epoch != self.epoch else ""
+            took = f"has been under way for {now - self._job.started:.4g} s"
+            longest = f"the longest of the last ones took {bound:.4g} s"
+            return f"a call{before} with plan {self._job.plan!r} {took}; {longest}", False
+        window = self._window.complete
+        if window is None:
+            return f"there is no complete observation window: {self._window.why_incomplete()}", True
+        age, limit = now - window.time, self._resolved.max_age
+        if age > limit:
+            return f"the newest complete observation window is {age:.4g} s old, and may be {limit:.4g} s", True
+        if window.time <= self._used:
+            return f"no observation came since the last call, {now - self._used:.4g} s ago", True
+        return "the next call has not started", False
+
+    # Calls
+
+    def next_start(self, now: float) -> float | None:
+        """When the next call has to start; None: not before something new is observed.
+
+        As late as the last frame allows that comes early enough: with that frame a call can only start later, not
+        better, so it starts when the frame comes.
+        """
+        window = self._window.complete
+        if window is None or window.time <= self._used or now - window.time > self._resolved.max_age:
+            return None
+        runs_out = self._runs_out(now)
+        if runs_out is None:
+            return now
+        margin = self._settings.margin_ticks / self._resolved.control_hz
+        latest = runs_out - self._latencies[self.plan].bound - margin
+        return max(latest, now) if window.time + self._window.interval < latest - SAME_TIME else now
+
+    def begin(self, now: float) -> Job:
+        """Start the call that ``next_start`` announced."""
+        window = self._window.complete
+        assert window is not None  # next_start said so
+        self._used = window.time
+        self.recorder.observation_age_ms.add(1e3 * (now - window.time))
+        prefix = self._committed(window.time, now) if self._settings.seam == "prefix" else None
+        self._job = Job(self.epoch, window.frames, window.time, self.plan, now, self._runs_out(now), prefix)
+        return self._job
+
+    def finish(self, job: Job, actions: FloatArray, now: float) -> str:
+        """Take the chunk of a call.
+
+        Args:
+            job: the call.
+            actions: ``[horizon, Da]``, the playable part of the prediction.
+            now: when it was done.
+
+        Returns:
+            What became of it: ``scheduled``, ``discarded``, ``refused`` or ``overdue``.
+        """
+        counts, self._job = self.recorder.counts, None
+        counts.calls += 1
+        latency = now - job.started
+        self._latencies[job.plan].add(latency)
+        self.recorder.latency_ms.add(1e3 * latency)
+        if job.epoch != self.epoch:
+            counts.chunks_discarded += 1
+            return "discarded"
+        outcome = self._schedule(job, actions, now)
+        if outcome == "refused":
+            counts.chunks_refused += 1
+            self.recorder.last_refusal = self._refusal
+            return outcome
+        self._refusal = None
+        counts.chunks += outcome == "scheduled"
+        counts.chunks_overdue += outcome == "overdue"
+        if job.deadline is not None:
+            self.recorder.slack_ms.add(1e3 * (job.deadline - now))
+        late = job.deadline is not None and now > job.deadline
+        switched = self._tiers.after_call(missed=late or outcome == "overdue")
+        counts.switches_down += switched == 1
+        counts.switches_up += switched == -1
+        return outcome
+
+    def fail(self) -> None:
+        """The call under way came to nothing."""
+        self._job = None
+
+    def _schedule(self, job: Job, actions: FloatArray, now: float) -> str:
+        self._refusal = self._guard.refuse(actions)
+        if self._refusal is not None:
+            return "refused"
+        settings, resolved = self._settings, self._resolved
+        rows = expand(actions, resolved.ticks_per_step, settings.interpolation)
+        start = self._grid.tick(job.observed)
+        new = Timeline(start, rows, np.full(len(rows), job.observed))
+        seam = start if self._last is None else self._last[0] + 1
+        spliced = splice(self._timeline, new, seam, settings.blend_steps if settings.seam == "blend" else 0)
+        if spliced is None or new.end <= self._grid.tick(now):
+            return "overdue"
+        played = [action for _, action in list(self._played)[-3:]]
+        past = np.stack(played) if played else np.empty((0, resolved.channels), np.float32)
+        self._refusal = self._guard.refuse_motion(past, spliced.rows)
+        if self._refusal is not None:
+            return "refused"
+        self._timeline = spliced
+        return "scheduled"
+
+    def _runs_out(self, now: float) -> float | None:
+        """When the first tick comes for which nothing is scheduled; None if that is so already."""
+        if self._timeline is None:
+            return None
+        end = self._grid.time(self._timeline.end)
+        return end if end > now else None
+
+    def _committed(self, observed: float, now: float) -> FloatArray:
+        """Actions from the observation to when this call will be done, one a step of the policy, ``[N, Da]``."""
+        tick, step = self._grid.tick(observed), self._resolved.ticks_per_step
+        until = self._grid.tick(now + (self._latencies[self.plan].bound))
+        played = dict(self._played)
+        rows: list[FloatArray] = []
+        while tick <= until and len(rows) < self._resolved.horizon:
+            row = played.get(tick)
+            if row is None and self._timeline is not None:
+                row = self._timeline.at(tick)
+            if row is None:
+                break
+            rows.append(row)
+            tick += step
+        return np.stack(rows) if rows else np.empty((0, self._resolved.channels), np.float32)
+
+
+def feasibility(settings: ExecutorSettings, resolved: Resolved, latency: float) -> Feasibility:
+    """The arithmetic of one latency with these settings."""
+    return Feasibility(latency, resolved.control_hz, resolved.policy_hz, resolved.horizon, settings.margin_ticks)

@@ -1,0 +1,186 @@
+"""What the executor counts and measures, in memory of a fixed size."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+
+class Samples:
+    """The last measurements of one quantity, and the extremes of all of them.
+
+    Args:
+        size: measurements that percentiles are made from.
+    """
+
+    def __init__(self, size: int) -> None:
+        self._ring = np.empty(size, np.float64)
+        self._size = size
+        self.count = 0
+        self._low, self._high = float("inf"), float("-inf")
+
+    def add(self, value: float) -> None:
+        """Take a measurement."""
+        self._ring[self.count % self._size] = value
+        self.count += 1
+        if value > self._high:
+            self._high = value
+        if value < self._low:
+            self._low = value
+
+    def copy(self) -> tuple[npt.NDArray[np.float64], int, float, float]:
+        """The kept measurements, how many there were, the least and the largest: all that ``summary`` needs."""
+        return self._ring[: min(self.count, self._size)].copy(), self.count, self._low, self._high
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Percentiles of the last measurements; number, least and largest of all of them.
+
+    Attributes:
+        count: measurements since the executor was made.
+        min: of all of them.
+        p50: of the last ones, see ``ExecutorSettings.statistics_window``; so are the other percentiles.
+        max: of all of them.
+    """
+
+    count: int
+    min: float
+    p50: float
+    p95: float
+    p99: float
+    max: float
+
+
+def summary(kept: npt.NDArray[np.float64], count: int, low: float, high: float) -> Summary | None:
+    """Summary of what ``Samples.copy`` gave; None if nothing was measured."""
+    if count == 0:
+        return None
+    p50, p95, p99 = (float(p) for p in np.percentile(kept, [50, 95, 99]))
+    return Summary(count, low, p50, p95, p99, high)
+
+
+@dataclass
+class Counts:
+    """What happened, in numbers; see ``ExecutorStatistics``. Changed under the executor's lock only."""
+
+    ticks: int = 0
+    holds: int = 0
+    starved: int = 0
+    frames: int = 0
+    frames_late: int = 0
+    frames_replaced: int = 0
+    calls: int = 0
+    chunks: int = 0
+    chunks_refused: int = 0
+    chunks_overdue: int = 0
+    chunks_discarded: int = 0
+    deadlines_missed: int = 0
+    switches_down: int = 0
+    switches_up: int = 0
+    resets: int = 0
+
+
+@dataclass(frozen=True)
+class ExecutorStatistics:
+    """What an executor did so far.
+
+    Attributes:
+        plan: that the next call runs.
+        ticks: actions that were given out, held ones included.
+        holds: of these, the last action given out again because there was no other.
+        starved: times that there was no action and none could be held, so that ``action`` raised. Before the first
+            chunk of an episode this is no missed deadline.
+        frames: observations taken.
+        frames_late: of these, too old to be part of a window.
+        frames_replaced: of these, of the same time as one that was there.
+        calls: of the policy, finished; those that measured its latency at the start are not counted.
+        chunks: of these, scheduled.
+        chunks_refused: by the guard.
+        chunks_overdue: wholly in the past when they came.
+        chunks_discarded: computed from observations before a reset.
+        deadlines_missed: times that the scheduled actions had run out before the next chunk came.
+        switches_down: to a faster plan.
+        switches_up: back to a slower one.
+        resets: of the executor.
+        last_refusal: why the guard refused the last chunk that it refused; None if it refused none.
+        latency_ms: of calls.
+        observation_age_ms: of the newest frame when a call starts.
+        action_age_ms: of the newest frame that an action was computed from, when it is given out.
+        slack_ms: from the end of a call to when its chunk is needed; negative: it came late.
+        queue_depth: scheduled ticks after the one that is given out.
+        tick_ms: from one ``action`` to the next: the control rate as it is, not as it was declared.
+    """
+
+    plan: str
+    ticks: int
+    holds: int
+    starved: int
+    frames: int
+    frames_late: int
+    frames_replaced: int
+    calls: int
+    chunks: int
+    chunks_refused: int
+    chunks_overdue: int
+    chunks_discarded: int
+    deadlines_missed: int
+    switches_down: int
+    switches_up: int
+    resets: int
+    last_refusal: str | None
+    latency_ms: Summary | None
+    observation_age_ms: Summary | None
+    action_age_ms: Summary | None
+    slack_ms: Summary | None
+    queue_depth: Summary | None
+    tick_ms: Summary | None
+
+    def to_json(self) -> dict[str, Any]:
+        """As plain JSON values."""
+        return asdict(self)
+
+
+class Recorder:
+    """Counts and samples of an executor. Changed under its lock only; nothing here allocates while the loop runs.
+
+    Args:
+        window: measurements that percentiles are made from.
+    """
+
+    def __init__(self, window: int) -> None:
+        self.counts = Counts()
+        self.last_refusal: str | None = None
+        self.latency_ms = Samples(window)
+        self.observation_age_ms = Samples(window)
+        self.action_age_ms = Samples(window)
+        self.slack_ms = Samples(window)
+        self.queue_depth = Samples(window)
+        self.tick_ms = Samples(window)
+        self._last_tick: float | None = None
+
+    def tick(self, now: float) -> None:
+        """An action was given out."""
+        self.counts.ticks += 1
+        if self._last_tick is not None:
+            self.tick_ms.add(1e3 * (now - self._last_tick))
+        self._last_tick = now
+
+    def pause(self) -> None:
+        """The loop stands still on purpose: the time to the next tick is not measured."""
+        self._last_tick = None
+
+    def copy(self) -> dict[str, Any]:
+        """What ``statistics`` needs, copied while the lock is held; the percentiles are made without it."""
+        samples = {name: value.copy() for name, value in vars(self).items() if isinstance(value, Samples)}
+        counts = {field.name: getattr(self.counts, field.name) for field in fields(Counts)}
+        return {"last_refusal": self.last_refusal, "counts": counts, "samples": samples}
+
+
+def statistics(plan: str, copied: dict[str, Any]) -> ExecutorStatistics:
+    """Statistics from what ``Recorder.copy`` gave."""
+    summaries: dict[str, Any] = {name: summary(*sample) for name, sample in copied["samples"].items()}
+    return ExecutorStatistics(plan=plan, last_refusal=copied["last_refusal"], **copied["counts"], **summaries)

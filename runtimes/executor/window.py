@@ -1,0 +1,200 @@
+"""The observation window: frames as they come in, To of them at the policy's rate as they go out. No clock, no threads.
+
+Frames may come faster than the policy's rate, late, or out of order. A window is the newest frame and, for each of the
+To - 1 before it, the frame nearest to where it should be, if one is near enough: no frame is ever repeated, because
+that would tell the policy that nothing moves.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from ttscompile.config import ObservationSpec
+from ttscompile.errors import ObservationError
+from ttscompile.runtimes.arrays import as_array, check_finite
+
+Array: TypeAlias = npt.NDArray[Any]
+Frame: TypeAlias = dict[str, Array]
+
+MOST_FRAMES = 1024
+"""Frames that are kept at most, whatever their rate; they are thrown away by age long before."""
+
+
+@dataclass(frozen=True)
+class FrameSpec:
+    """What one frame holds.
+
+    Attributes:
+        shapes: shape of each key's array in one frame.
+        dtypes: numpy name of each key's dtype.
+        history: keys of which the policy sees To frames; of the others it sees the newest.
+        steps: To; 1 if there is no history.
+    """
+
+    shapes: Mapping[str, tuple[int, ...]]
+    dtypes: Mapping[str, str]
+    history: frozenset[str]
+    steps: int
+
+    @classmethod
+    def of(cls, specs: Mapping[str, ObservationSpec], steps: int) -> FrameSpec:
+        """The frame of a policy whose window has ``steps`` frames.
+
+        A key is a history if its first axis has the length ``steps`` and is not its only one.
+        """
+        history = frozenset(key for key, spec in specs.items() if len(spec.shape) > 1 and spec.shape[0] == steps)
+        return cls(
+            {key: spec.shape[1:] if key in history else spec.shape for key, spec in specs.items()},
+            {key: spec.dtype for key, spec in specs.items()},
+            history,
+            steps if history else 1,
+        )
+
+    def check(self, obs: Mapping[str, Any]) -> Frame:
+        """One frame as numpy arrays of its own, which the caller may not change any more.
+
+        Raises:
+            ObservationError: a key, a shape or a dtype is not the policy's, or a number is not finite.
+        """
+        if not isinstance(obs, Mapping) or obs.keys() != self.shapes.keys():
+            found = sorted(map(str, obs)) if isinstance(obs, Mapping) else type(obs).__name__
+            raise ObservationError(
+                f"expected one frame, a dictionary with the keys {sorted(self.shapes)}; found {found}."
+            )
+        return {key: self._one(key, as_array(obs[key], f"observation {key!r}")) for key in self.shapes}
+
+    def _one(self, key: str, array: Array) -> Array:
+        shape, dtype = self.shapes[key], self.dtypes[key]
+        if array.shape != shape or array.dtype != dtype:
+            remedy = "Convert it with .astype." if array.shape == shape else ""
+            if array.shape[1:] == shape and key in self.history:
+                remedy = f"Give one frame at a time; the executor makes the window of {self.steps}."
+            raise ObservationError(
+                f"one frame of observation {key!r} must be {dtype} {list(shape)}; found {array.dtype}"
+                f" {list(array.shape)}. {remedy}".rstrip()
+            )
+        check_finite(array, f"observation {key!r}", "Look for the sensor, or the division, that made it.")
+        return array.copy()
+
+    def observation(self, frames: list[Frame]) -> dict[str, Array]:
+        """What the policy is called with, ``[1, ...]`` a key, from a window's frames, oldest first."""
+        newest = frames[-1]
+        return {
+            key: np.stack([frame[key] for frame in frames])[None] if key in self.history else newest[key][None]
+            for key in self.shapes
+        }
+
+
+@dataclass(frozen=True)
+class Window:
+    """A complete window.
+
+    Attributes:
+        time: of its newest frame.
+        frames: To of them, oldest first.
+    """
+
+    time: float
+    frames: list[Frame]
+
+
+class ObservationWindow:
+    """The frames of one episode that are recent enough to be part of a window.
+
+    Args:
+        steps: To.
+        period: seconds between the frames of a window.
+        tolerance: how far from its place a frame may be, as a share of the period.
+        max_age: seconds that the newest frame of a window may be old.
+    """
+
+    def __init__(self, steps: int, period: float, tolerance: float, max_age: float) -> None:
+        self._steps, self._period, self._slack = steps, period, tolerance * period
+        self._keep = max_age + (steps - 1) * period + self._slack
+        self._times: list[float] = []
+        self._frames: list[Frame] = []
+        self._complete: Window | None = None
+
+    def clear(self) -> None:
+        """A new episode."""
+        self._times, self._frames, self._complete = [], [], None
+
+    @property
+    def complete(self) -> Window | None:
+        """The newest complete window; None if there is none."""
+        return self._complete
+
+    @property
+    def interval(self) -> float:
+        """Seconds until the next frame is to be expected: what the last two were apart, the policy's period at most."""
+        times = self._times
+        return min(times[-1] - times[-2], self._period) if len(times) > 1 else self._period
+
+    def add(self, time: float, frame: Frame, now: float) -> str:
+        """Take a frame.
+
+        Args:
+            time: when it was taken.
+            frame: checked, and nobody else's.
+            now: when it came.
+
+        Returns:
+            ``added``; ``replaced`` if there was one of the same time; or ``late``: too old to be part of a window, and
+            thrown away.
+        """
+        times, frames = self._times, self._frames
+        place = bisect_left(times, time)
+        if place < len(times) and times[place] == time:
+            frames[place] = frame
+            self._complete = self._find()
+            return "replaced"
+        if time < self._oldest(now):
+            return "late"
+        times.insert(place, time)
+        frames.insert(place, frame)
+        keep = max(bisect_left(times, self._oldest(times[-1])), len(times) - MOST_FRAMES)
+        if keep:
+            del times[:keep], frames[:keep]
+        self._complete = self._find()
+        return "added"
+
+    def why_incomplete(self) -> str:
+        """What a complete window lacks, for people."""
+        found = len(self._times)
+        if found < self._steps:
+            return f"{found} of {self._steps} frames came"
+        gaps = np.diff(self._times[-self._steps :])
+        return (
+            f"the policy wants {self._steps} frames every {self._period:.4g} s, to within {self._slack:.2g} s; the"
+            f" newest came {', '.join(f'{gap:.4g}' for gap in gaps)} s apart"
+        )
+
+    def _oldest(self, newest: float) -> float:
+        """Frames before this can only be part of a window that is too old, if the newest one is of this time."""
+        return newest - self._keep
+
+    def _find(self) -> Window | None:
+        times, frames = self._times, self._frames
+        for newest in range(len(times) - 1, self._steps - 2, -1):
+            chosen, before = [newest], newest
+            for back in range(1, self._steps):
+                before = self._nearest(times[newest] - back * self._period, before)
+                if before < 0:
+                    break
+                chosen.append(before)
+            else:
+                return Window(times[newest], [frames[i] for i in reversed(chosen)])
+        return None
+
+    def _nearest(self, time: float, before: int) -> int:
+        """Index under ``before`` of the frame nearest to ``time``; -1 if none is within the tolerance."""
+        times = self._times
+        right = bisect_left(times, time, 0, before)
+        candidates = [i for i in (right - 1, right) if 0 <= i < before and abs(times[i] - time) <= self._slack + 1e-9]
+        return min(candidates, key=lambda i: abs(times[i] - time), default=-1)

@@ -1,0 +1,237 @@
+"""A world without real time: a clock that tests advance, and a policy whose latency, faults and actions are scripted.
+
+The worker thread is real. Advancing the clock wakes it where it waits, and returns when it waits again, so that every
+run is the same.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ttscompile import ChunkSpec, ObservationSpec
+from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
+
+REAL_LIMIT = 20.0
+"""Seconds of real time after which a thread that should have moved is called stuck."""
+TO, TA, T = 2, 8, 16
+
+
+class FakeClock:
+    """``Clock`` that stands still until it is advanced. The thread that makes it is the one that may advance it.
+
+    When that thread waits itself, time jumps to the next moment at which anybody wanted to be woken.
+    """
+
+    def __init__(self) -> None:
+        self._now = 1000.0
+        self._owner = threading.current_thread()
+        self._waiting: dict[threading.Thread, tuple[threading.Condition, float]] = {}
+        self._free = False
+
+    def now(self) -> float:
+        return self._now
+
+    def wait(self, condition: threading.Condition, timeout: float | None) -> None:
+        until = float("inf") if timeout is None else self._now + timeout
+        thread = threading.current_thread()
+        if thread is self._owner:
+            condition.release()
+            try:
+                ends = [each for _, each in list(self._waiting.values())]
+                self.advance_to(max(min([until, *ends]), self._now))
+            finally:
+                condition.acquire()
+            return
+        if until <= self._now:
+            return
+        if self._free:
+            if timeout is None:
+                condition.wait(REAL_LIMIT)
+            else:
+                self._now = until
+            return
+        self._waiting[thread] = (condition, until)
+        woken = condition.wait(REAL_LIMIT + 10)
+        del self._waiting[thread]
+        assert woken, "nobody woke a waiting thread"
+
+    def free(self) -> None:
+        """From now on nobody waits for a time: it is that time at once."""
+        self._free = True
+        for condition, until in list(self._waiting.values()):
+            self._now = max(self._now, until) if until < float("inf") else self._now
+            with condition:
+                condition.notify_all()
+
+    def advance(self, seconds: float) -> None:
+        self.advance_to(self._now + seconds)
+
+    def advance_to(self, when: float) -> None:
+        """Move to a time, stopping wherever a thread wants to be woken on the way."""
+        assert when >= self._now
+        self.settle()
+        while True:
+            due = min((until for _, until in list(self._waiting.values())), default=float("inf"))
+            self._now = max(self._now, min(when, due))
+            for condition, until in list(self._waiting.values()):
+                if until <= self._now:
+                    with condition:
+                        condition.notify_all()
+            self.settle()
+            if due > when:
+                return
+
+    def settle(self) -> None:
+        """Return when every thread of an executor waits for something that has not happened."""
+        limit = time.monotonic() + REAL_LIMIT
+        while not all(self._parked(thread) for thread in workers()):
+            assert time.monotonic() < limit, f"stuck: {workers()}"
+            time.sleep(0)
+
+    def _parked(self, thread: threading.Thread) -> bool:
+        entry = self._waiting.get(thread)
+        if entry is None:
+            return not thread.is_alive()
+        condition, until = entry
+        with condition:  # a thread that was notified has left the condition's list, though it may not have run yet
+            return until > self._now and len(condition._waiters) > 0  # type: ignore[attr-defined]
+
+
+def workers() -> list[threading.Thread]:
+    return [thread for thread in threading.enumerate() if thread.name == "ttscompile-executor"]
+
+
+@dataclass(frozen=True)
+class Facts:
+    """``PolicyFacts`` of a policy that observes ``[episode, seconds]``."""
+
+    observation: Mapping[str, ObservationSpec]
+    action: ChunkSpec
+    sample: tuple[int, int]
+    plans: tuple[str, ...]
+    default_plan: str
+
+
+@dataclass
+class ScriptedPolicy:
+    """Its actions say where they come from: ``[episode, time of the newest frame, index in the chunk]``.
+
+    Attributes:
+        clock: that its calls take time of.
+        latency: seconds of each plan's calls; the slowest first.
+        fault: by number of the call: ``raise``, ``hang``, ``nan``, ``shape`` or seconds that it takes instead.
+        calls: what it was called with.
+    """
+
+    clock: FakeClock
+    latency: dict[str, float] = field(default_factory=lambda: {"dense": 0.1})
+    fault: dict[int, str | float] = field(default_factory=dict)
+    actions: Callable[[np.ndarray], np.ndarray] | None = None
+    calls: list[tuple[float, str, np.ndarray]] = field(default_factory=list)
+    resets: list[int | None] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        spec, chunk = ObservationSpec((TO, 2), dtype="float64"), ChunkSpec(3, TO - 1, TO - 1 + TA)
+        self.info = Facts({"obs": spec}, chunk, (T, 3), tuple(self.latency), next(iter(self.latency)))
+        self._released = threading.Condition()
+        self._hanging = False
+
+    def reset(self, seed: int | None = None) -> None:
+        self.resets.append(seed)
+
+    def predict_action(self, obs_dict: Mapping[str, Any], *, plan: str) -> dict[str, Any]:
+        obs = obs_dict["obs"]
+        number = len(self.calls)
+        self.calls.append((self.clock.now(), plan, obs))
+        fault = self.fault.get(number)
+        self._take(fault if isinstance(fault, float) else self.latency[plan], fault == "hang")
+        if fault == "raise":
+            raise ZeroDivisionError("scripted")
+        episode, seen = obs[0, -1]
+        chunk = np.stack([np.full(T, episode), np.full(T, seen), np.arange(T) - (TO - 1)], axis=1)
+        if self.actions is not None:
+            chunk = self.actions(obs[0])
+        if fault == "nan":
+            chunk[3, 1] = np.nan
+        if fault == "shape":
+            chunk = chunk[:4]
+        return {"action": chunk[None, TO - 1 : TO - 1 + TA], "action_pred": chunk[None]}
+
+    def release(self) -> None:
+        """Let a hanging call end."""
+        with self._released:
+            self._hanging = False
+            self._released.notify_all()
+
+    def _take(self, seconds: float, hang: bool) -> None:
+        until = self.clock.now() + seconds
+        with self._released:
+            self._hanging = hang
+            while self._hanging or self.clock.now() < until:
+                self.clock.wait(self._released, None if self._hanging else until - self.clock.now())
+
+
+class World:
+    """An executor over a scripted policy; times are offsets from the start, so that float32 actions hold them."""
+
+    def __init__(
+        self,
+        hz: float = 10.0,
+        settings: ExecutorSettings | None = None,
+        policy: ScriptedPolicy | None = None,
+        latency: dict[str, float] | None = None,
+        fault: dict[int, str | float] | None = None,
+    ) -> None:
+        self.clock = policy.clock if policy is not None else FakeClock()
+        self.start = self.clock.now()
+        self.policy = policy or ScriptedPolicy(self.clock, latency or {"dense": 0.1}, fault or {})
+        self.hz, self.episode = hz, 0
+        self.ticks_per_step = round(hz / (settings.policy_hz or hz)) if settings else 1
+        self.executor = AsyncExecutor(
+            self.policy, hz, settings, clock=self.clock, latencies=self.policy.latency, open_timeout=REAL_LIMIT
+        )
+        self.clock.settle()
+
+    @property
+    def time(self) -> float:
+        return self.clock.now() - self.start
+
+    def frame(self, at: float | None = None) -> dict[str, np.ndarray]:
+        return {"obs": np.array([self.episode, self.time if at is None else at])}
+
+    def observe(self, at: float | None = None) -> None:
+        """A frame of now, or of an earlier time."""
+        at = self.time if at is None else at
+        self.executor.observe(self.frame(at), self.start + at)
+        self.clock.settle()
+
+    def tick(self, observe: bool = True, action: bool = True) -> np.ndarray | None:
+        """One tick of the control loop: observe, act, wait for the next."""
+        if observe:
+            self.observe()
+        made = self.executor.action() if action else None
+        self.clock.advance(1 / self.hz)
+        return made
+
+    def begin(self) -> None:
+        """Observe until the first chunk is there."""
+        for _ in range((TO - 1) * self.ticks_per_step):
+            self.tick(action=False)
+        self.observe()
+        self.executor.action(timeout=10.0)
+        self.clock.advance(1 / self.hz)
+
+    def __enter__(self) -> World:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.clock.free()
+        self.policy.release()
+        self.executor.close(timeout=REAL_LIMIT)
+        assert workers() == []

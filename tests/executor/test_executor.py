@@ -1,0 +1,344 @@
+"""The executor with its real thread, on a clock that the test advances."""
+
+from __future__ import annotations
+
+import inspect
+import subprocess
+import sys
+import threading
+import time
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ttscompile
+from ttscompile.errors import (
+    DeadlineMissedError,
+    ExecutorClosedError,
+    ExecutorError,
+    InfeasibleError,
+    WorkerDeadError,
+)
+from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings, GuardLimits, settings
+
+from .simulation import REAL_LIMIT, TA, FakeClock, ScriptedPolicy, World
+
+
+def test_every_tick_has_the_action_for_its_time() -> None:
+    with World() as world:
+        world.begin()
+        for _ in range(60):
+            now = world.time
+            episode, seen, index = world.tick()
+            assert episode == 0
+            assert seen + index / world.hz == pytest.approx(now, abs=1e-3)
+            assert 0 <= index < TA
+        counted = world.executor.statistics()
+    assert (counted.ticks, counted.holds, counted.starved, counted.deadlines_missed) == (61, 0, 0, 0)
+    assert counted.chunks == counted.calls == len(world.policy.calls)
+    assert counted.latency_ms.p50 == pytest.approx(100)
+
+
+def test_calls_start_with_the_last_frame_that_comes_early_enough() -> None:
+    """Actions for 0.8 s; latency and margin are 0.1 s each. A call at 0.6 s is on time to the tick, so 0.5 s it is."""
+    with World() as world:
+        world.begin()
+        for _ in range(60):
+            world.tick()
+        starts = np.array([start for start, _, _ in world.policy.calls])
+        counted = world.executor.statistics()
+    np.testing.assert_allclose(np.diff(starts), 0.5, atol=1e-6)
+    assert counted.slack_ms.min == pytest.approx(200)
+    assert counted.slack_ms.max == pytest.approx(200)
+    assert counted.observation_age_ms.max == 0
+
+
+def test_the_window_holds_consecutive_frames_of_one_episode() -> None:
+    with World() as world:
+        world.begin()
+        for _ in range(30):
+            world.tick()
+        for _, _, obs in world.policy.calls:
+            (first, second) = obs[0]
+            assert second[1] - first[1] == pytest.approx(0.1)
+
+
+def test_a_slow_start_plays_what_is_left_of_the_chunk() -> None:
+    """Three actions are given out while a chunk is computed: it is played from its fourth on."""
+    with World(latency={"dense": 0.25}) as world:
+        world.begin()
+        seen = [world.tick() for _ in range(30)]
+    changes = [b[2] for a, b in pairwise(seen) if a[1] != b[1]]
+    assert changes
+    assert set(changes) <= {3.0, 4.0}  # 0.25 s of inference and one tick of margin
+    assert world.executor.statistics().deadlines_missed == 0
+
+
+def test_the_same_times_give_the_same_actions() -> None:
+    def run() -> list[float]:
+        with World(20, ExecutorSettings(policy_hz=10, seam="blend", interpolation="linear")) as world:
+            world.begin()
+            return [float(x) for _ in range(100) for x in world.tick()]
+
+    assert run() == run()
+
+
+@pytest.mark.parametrize(("interpolation", "expected"), [("hold", [0, 0, 1, 1, 2]), ("linear", [0, 0.5, 1, 1.5, 2])])
+def test_a_faster_control_loop_holds_or_interpolates(interpolation: str, expected: list[float]) -> None:
+    made = ExecutorSettings(policy_hz=10, interpolation=interpolation)
+    with World(20, made, latency={"dense": 0.04}) as world:
+        for _ in range(3):
+            world.tick(action=False)
+        frame = world.clock.now() - 0.05  # of the newest window
+        index = [world.executor.action(frame + i / 20)[2] for i in range(5)]
+    np.testing.assert_allclose(index, expected)
+
+
+def test_action_waits_only_if_it_is_told_to() -> None:
+    with World() as world:
+        world.tick(action=False)
+        world.observe()
+        before = world.time
+        with pytest.raises(DeadlineMissedError, match=r"under way for 0 s; the longest of the last ones took 0\.1 s"):
+            world.executor.action()
+        with pytest.raises(DeadlineMissedError):
+            world.executor.action(timeout=0.05)
+        assert world.time == pytest.approx(before + 0.05)
+        assert world.executor.action(timeout=1.0) is not None
+        assert world.time == pytest.approx(before + 0.1)
+
+
+def test_ready_says_whether_an_episode_has_its_first_chunk() -> None:
+    with World() as world:
+        seen = []
+        for _ in range(2):
+            for _ in range(4):
+                world.observe()
+                seen.append(world.executor.ready)
+                if seen[-1]:
+                    assert world.executor.action()[0] == world.episode
+                world.clock.advance(0.1)
+            world.executor.reset()
+            world.episode += 1
+    assert seen == 2 * [False, False, True, True]
+    with World(fault={0: "raise"}) as world, pytest.raises(WorkerDeadError):  # noqa: PT012
+        world.tick(action=False)
+        world.observe()
+        world.clock.advance(1.0)
+        world.executor.ready  # noqa: B018
+
+
+def test_actions_are_the_callers_own() -> None:
+    with World() as world:
+        world.begin()
+        now = world.clock.now()
+        first = world.executor.action(now)
+        expected = first.copy()
+        first[:] = -1
+        np.testing.assert_array_equal(world.executor.action(now), expected)
+
+
+def test_frames_are_copied() -> None:
+    with World() as world:
+        mine = np.array([0.0, 0.0])
+        for _ in range(2):
+            world.executor.observe({"obs": mine})
+            mine += 1
+            world.clock.advance(0.1)
+        np.testing.assert_array_equal(world.policy.calls[0][2][0], [[0, 0], [1, 1]])
+
+
+def test_times_that_go_backwards_are_refused() -> None:
+    with World() as world:
+        world.begin()
+        now = world.clock.now()
+        world.executor.action(now + 0.3)
+        with pytest.raises(ExecutorError, match="3 ticks before the last one"):
+            world.executor.action(now)
+
+
+def test_reset_starts_an_episode_and_passes_the_seed_on() -> None:
+    with World() as world:
+        world.begin()
+        world.executor.reset(seed=7)
+        world.episode = 1
+        with pytest.raises(DeadlineMissedError, match="0 of 2 frames"):
+            world.executor.action()
+        world.begin()
+        assert world.tick()[0] == 1
+        assert world.policy.resets == [None, 7]
+        assert world.executor.statistics().resets == 1
+
+
+def test_the_prefix_seam_is_refused_for_a_policy_that_cannot_inpaint() -> None:
+    with pytest.raises(
+        ExecutorError, match=r"takes prefix= and inpaints it; ScriptedPolicy does not. Use seam='blend'"
+    ):
+        World(settings=ExecutorSettings(seam="prefix"))
+
+
+def test_the_prefix_seam_gives_the_policy_what_is_committed() -> None:
+    class Inpainting(ScriptedPolicy):
+        prefixes: list[np.ndarray] = []  # noqa: RUF012
+
+        def predict_action(self, obs_dict, *, plan, prefix):  # type: ignore[no-untyped-def, override]
+            self.prefixes.append(prefix)
+            return super().predict_action(obs_dict, plan=plan)
+
+    clock = FakeClock()
+    policy = Inpainting(clock, {"dense": 0.2})
+    with World(settings=ExecutorSettings(seam="prefix"), policy=policy) as world:
+        world.begin()
+        played = {round(world.hz * world.time): world.tick() for _ in range(20)}
+    assert policy.prefixes[0].shape == (1, 0, 3)
+    for (start, _, _), prefix in list(zip(policy.calls, policy.prefixes, strict=True))[1:3]:
+        tick = round(world.hz * (start - world.start))
+        assert prefix.shape == (1, 3, 3)  # now, and the two ticks that the call will take
+        np.testing.assert_array_equal(prefix[0, :2], [played[tick], played[tick + 1]])
+        assert prefix[0, 2, 2] == prefix[0, 1, 2] + 1
+
+
+def test_what_is_infeasible_is_refused_with_the_arithmetic() -> None:
+    with pytest.raises(
+        InfeasibleError,
+        match=r"100 \+ 2 x latency 400 \+ margin 100 = 1000 ms > 800 ms = 8 actions at 10 Hz.*at most 300 ms",
+    ):
+        World(latency={"dense": 0.4})
+    assert threading.active_count() == len(threading.enumerate())
+    with World(latency={"dense": 0.4, "fast": 0.1}, settings=ExecutorSettings(tiers=("dense", "fast"))) as world:
+        assert world.executor.statistics().plan == "fast"
+        assert not world.executor.feasibility()["dense"].feasible
+
+
+def test_latencies_are_measured_if_they_are_not_given_and_warm_up_does_not_count() -> None:
+    clock = FakeClock()
+    policy = ScriptedPolicy(clock, {"dense": 0.1}, fault={0: 5.0, 1: 3.0})
+
+    def drive() -> None:
+        while not done.is_set():
+            clock.advance(0.05)
+
+    # The constructor waits for the worker in real time, so somebody else has to advance the clock.
+    done = threading.Event()
+    made: list[AsyncExecutor] = []
+    opener = threading.Thread(target=lambda: (made.append(AsyncExecutor(policy, 10, clock=clock)), done.set()))
+    opener.start()
+    drive()
+    opener.join()
+    (executor,) = made
+    executor.close()
+    assert executor.feasibility()["dense"].latency == pytest.approx(0.1, abs=0.02)
+    assert len(policy.calls) == 7
+    assert policy.resets[0] is None  # before measuring; the reset after it comes with the first episode
+
+
+def test_a_closed_executor_says_so() -> None:
+    with World() as world:
+        world.begin()
+    for use in (world.executor.action, world.executor.reset, lambda: world.executor.observe(world.frame())):
+        with pytest.raises(ExecutorClosedError):
+            use()
+    world.executor.close()
+    assert world.executor.statistics().chunks == 1
+
+
+def test_the_guard_refuses_and_the_loop_goes_on_with_what_it_has() -> None:
+    limits = GuardLimits(low=-1, high=[10, 3, 20])  # channel 1 is the time of the observation
+    with World(settings=ExecutorSettings(guard=limits, max_hold=2)) as world:
+        world.begin()
+        refused = r"the guard refused the last chunk: action 0, channel 1, is 3\.\d"
+        with pytest.raises(DeadlineMissedError, match=refused):  # noqa: PT012
+            for _ in range(60):
+                world.tick()
+        counted = world.executor.statistics()
+        assert counted.chunks_refused > 0
+        assert counted.holds == 2
+        assert "the bounds are -1 to 3" in str(counted.last_refusal)
+
+
+@pytest.mark.parametrize(
+    ("made", "message"),
+    [
+        ({"policy_hz": -1}, "policy_hz must be positive"),
+        ({"max_hold": -1}, "max_hold must not be negative"),
+        ({"rate_tolerance": 0.5}, "rate_tolerance must be between"),
+        ({"seam": "glue"}, "seam must be one of"),
+        ({"interpolation": "cubic"}, "interpolation must be one of"),
+        ({"tiers": ()}, "tiers must be names"),
+        ({"tiers": ("a", "a")}, "each once"),
+    ],
+)
+def test_settings_are_checked(made: dict[str, object], message: str) -> None:
+    with pytest.raises(ExecutorError, match=message):
+        ExecutorSettings(**made)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("made", "hz", "message"),
+    [
+        ({}, 0, "control_hz must be positive"),
+        ({"policy_hz": 20}, 50, "no multiple of policy_hz = 20: an action would last 2.5 ticks"),
+        ({"policy_hz": 20}, 10, "no multiple"),
+        ({"horizon": 16}, 10, "Give at most 15"),
+        ({"tiers": ("dense", "quick")}, 10, "no plan 'quick'; it has"),
+    ],
+)
+def test_settings_have_to_fit_the_policy(made: dict[str, object], hz: float, message: str) -> None:
+    info = ScriptedPolicy(FakeClock()).info
+    with pytest.raises(ExecutorError, match=message):
+        settings.resolve(ExecutorSettings(**made), info, hz)  # type: ignore[arg-type]
+
+
+def test_a_policys_thread_is_pinned() -> None:
+    import os
+
+    cores: list[set[int]] = []
+
+    class Looking(ScriptedPolicy):
+        def reset(self, seed: int | None = None) -> None:
+            cores.append(os.sched_getaffinity(0))
+
+    own = os.sched_getaffinity(0)
+    with World(settings=ExecutorSettings(cores=(min(own),)), policy=Looking(FakeClock())):
+        pass
+    assert cores == [{min(own)}]
+    assert os.sched_getaffinity(0) == own
+    with pytest.raises(ExecutorError, match=r"cannot be pinned to \(4096,\)"):
+        World(settings=ExecutorSettings(cores=(4096,)))
+
+
+@pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
+def test_it_runs_the_compiled_policy_on_either_runtime(toy_compiled: Path, runtime: str) -> None:
+    """In real time, on a machine that may be busy: deadlines are not what this is about."""
+    policy = ttscompile.load(toy_compiled, runtime=runtime, seed=0)
+    settled = ExecutorSettings(guard=GuardLimits(low=-1e6, high=1e6), max_hold=1000, refuse_infeasible=False)
+    limit = time.monotonic() + REAL_LIMIT
+    with ttscompile.AsyncExecutor(policy, 20, settled) as executor:
+        while executor.statistics().chunks < 3:
+            assert time.monotonic() < limit
+            executor.observe({"obs": np.array([0.5, -0.5], np.float32)})
+            action = executor.action(timeout=5.0)
+            assert action.shape == (2,)
+            assert np.isfinite(action).all()
+            time.sleep(0.05)
+    names = {event["name"] for event in executor.trace.to_json()["traceEvents"]}
+    assert {"tick", "inference", "prologue", "decode"} <= names
+    policy.reset()  # it is the caller's again
+    assert policy.predict_action({"obs": np.zeros((1, 2), np.float32)})["action"].shape == (1, 2, 2)
+
+
+def test_the_executor_needs_nothing_but_numpy() -> None:
+    code = (
+        "import sys, ttscompile; ttscompile.AsyncExecutor, ttscompile.ExecutorSettings; import numpy;"
+        "found = {name.partition('.')[0] for name in sys.modules};"
+        "print(sorted(found & {'onnxruntime', 'torch', 'websockets', 'asyncio', 'click'}))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
+
+
+def test_everything_public_says_what_it_does() -> None:
+    for name in ("observe", "action", "reset", "close", "statistics", "feasibility"):
+        assert inspect.getdoc(getattr(AsyncExecutor, name))

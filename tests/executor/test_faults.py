@@ -1,0 +1,334 @@
+"""The fault drill: everything that goes wrong in the field, injected."""
+
+from __future__ import annotations
+
+import random
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from ttscompile.errors import (
+    DeadlineMissedError,
+    ExecutorClosedError,
+    ExecutorError,
+    StaleObservationError,
+    WorkerDeadError,
+)
+from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings, GuardLimits
+
+from .simulation import REAL_LIMIT, TA, FakeClock, ScriptedPolicy, World, workers
+
+KNOWINGLY_SLOW = ExecutorSettings(refuse_infeasible=False, max_hold=2)
+
+
+def run_until_starved(world: World, ticks: int = 100) -> tuple[list[np.ndarray], DeadlineMissedError]:
+    """Tick until there is no action; the actions before that, and the error."""
+    made: list[np.ndarray] = []
+    for _ in range(ticks):
+        world.observe()
+        try:
+            made.append(world.executor.action())
+        except DeadlineMissedError as error:
+            return made, error
+        world.clock.advance(1 / world.hz)
+    raise AssertionError("never starved")
+
+
+def test_inference_slower_than_the_horizon_holds_and_then_raises_and_says_why() -> None:
+    with World(latency={"dense": 1.5}, settings=KNOWINGLY_SLOW) as world:
+        for _ in range(2):
+            world.tick(action=False)
+        with pytest.raises(
+            DeadlineMissedError, match=r"has been under way for 0\.3 s; the longest of the last ones took 1\.5"
+        ):
+            world.executor.action(timeout=0.2)
+        for _ in range(100):
+            try:
+                world.tick()
+            except DeadlineMissedError:
+                world.clock.advance(0.1)
+        counted = world.executor.statistics()
+    assert counted.chunks == 0  # its actions are for a time that is over
+    assert counted.chunks_overdue > 3
+    assert counted.starved > 90
+
+
+def test_a_gap_holds_the_last_action_for_a_bounded_number_of_ticks() -> None:
+    with World(latency={"dense": 0.1}, fault={1: 1.0}, settings=ExecutorSettings(max_hold=3)) as world:
+        world.begin()
+        made, error = run_until_starved(world)
+        counted = world.executor.statistics()
+        assert "the last one was held for 3 ticks" in str(error)
+        assert not isinstance(error, StaleObservationError)
+        np.testing.assert_array_equal(made[-4:], [made[-4]] * 4)
+        assert made[-4][2] == TA - 1
+        assert (counted.holds, counted.starved, counted.deadlines_missed) == (3, 1, 1)
+        while world.executor.statistics().chunks < 2:  # the call ends, and the loop goes on
+            world.tick(action=False)
+        for _ in range(20):
+            assert world.tick() is not None
+        assert world.executor.statistics().deadlines_missed == 1
+
+
+def test_a_hold_of_nothing_raises_at_once() -> None:
+    with World(fault={1: 1.0}, settings=ExecutorSettings(max_hold=0)) as world:
+        world.begin()
+        made, _ = run_until_starved(world)
+        assert made[-1][2] == TA - 1
+        assert world.executor.statistics().holds == 0
+
+
+def test_a_call_that_hangs_raises_in_time_and_the_executor_recovers_if_it_ends() -> None:
+    with World(fault={1: "hang"}, settings=ExecutorSettings(max_hold=2)) as world:
+        world.begin()
+        _, error = run_until_starved(world)
+        assert "has been under way for" in str(error)
+        with pytest.raises(DeadlineMissedError):
+            world.executor.action(timeout=5.0)  # a declared timeout ends, too
+        before = world.time
+        world.policy.release()
+        world.clock.settle()
+        world.begin()
+        assert world.tick()[1] >= before  # nothing that the hanging call computed
+        assert world.executor.statistics().chunks_overdue == 1
+
+
+def test_closing_while_a_call_hangs_says_so_and_leaves_when_it_ends() -> None:
+    with World(fault={0: "hang"}) as world:
+        for _ in range(3):
+            world.tick(action=False)
+        with pytest.raises(ExecutorError, match="still in a call, 0.05 s after close"):
+            world.executor.close(timeout=0.05)
+        with pytest.raises(ExecutorClosedError):
+            world.executor.action()
+        world.policy.release()
+        world.executor.close(timeout=REAL_LIMIT)
+
+
+def test_closing_during_inference_waits_for_it() -> None:
+    world = World()
+    for _ in range(2):
+        world.tick(action=False)
+    assert len(world.policy.calls) == 1
+    closer = threading.Thread(target=world.executor.close)
+    closer.start()
+    world.clock.advance(0.2)
+    closer.join(REAL_LIMIT)
+    assert not closer.is_alive()
+    assert len(world.policy.calls) == 1
+
+
+def test_closing_wakes_whoever_waits_for_an_action() -> None:
+    """In real time: the caller must not sit out its timeout."""
+    policy = ScriptedPolicy(FakeClock())
+    executor = AsyncExecutor(policy, 10, latencies={"dense": 0.1})
+    caught: list[BaseException] = []
+
+    def wait() -> None:
+        try:
+            executor.action(timeout=REAL_LIMIT)
+        except ExecutorError as error:
+            caught.append(error)
+
+    waiter = threading.Thread(target=wait)
+    waiter.start()
+    time.sleep(0.05)
+    executor.close()
+    waiter.join(1.0)
+    assert [type(each) for each in caught] == [ExecutorClosedError]
+
+
+def test_an_exception_in_the_policy_is_raised_at_the_next_call_of_anybody() -> None:
+    with World(fault={1: "raise"}) as world:
+        world.begin()
+        with pytest.raises(WorkerDeadError, match="ZeroDivisionError: scripted") as caught:  # noqa: PT012
+            for _ in range(30):
+                world.tick()
+        assert isinstance(caught.value.__cause__, ZeroDivisionError)
+        for use in (world.executor.action, world.executor.reset, world.observe):
+            with pytest.raises(WorkerDeadError):
+                use()
+        assert workers() == []
+
+
+def test_an_exception_wakes_whoever_waits() -> None:
+    with World(fault={0: "raise"}) as world:
+        world.tick(action=False)
+        world.observe()
+        before = world.time
+        with pytest.raises(WorkerDeadError):
+            world.executor.action(timeout=10.0)
+        assert world.time - before < 1
+
+
+def test_an_error_that_nobody_was_told_is_raised_by_close_and_only_once() -> None:
+    world = World(fault={0: "raise"})
+    for _ in range(3):
+        try:
+            world.tick(action=False)
+        except WorkerDeadError:  # told: so that close has nothing left to say
+            break
+    world.executor.close()
+    quiet = World(fault={0: "raise"})
+    quiet.tick(action=False)
+    quiet.observe()
+    quiet.clock.advance(1.0)
+    with pytest.raises(WorkerDeadError, match="scripted"):
+        quiet.executor.close()
+    quiet.executor.close()
+
+
+def test_an_error_under_way_is_not_hidden_by_the_error_of_closing() -> None:
+    with pytest.raises(KeyError) as caught, World(fault={0: "raise"}).executor as executor:  # noqa: PT012
+        clock: FakeClock = executor._clock  # type: ignore[assignment]
+        for at in (0.0, 0.1):
+            executor.observe({"obs": np.array([0.0, at])})
+            clock.advance(0.1)
+        raise KeyError("mine")
+    assert "ZeroDivisionError" in caught.value.__notes__[0]
+
+
+def test_a_prediction_of_the_wrong_shape_is_an_error() -> None:
+    with (
+        World(fault={0: "shape"}) as world,
+        pytest.raises(WorkerDeadError, match=r"shape \[1, 4, 3\]; expected \[1, T, Da\]"),
+    ):
+        world.begin()
+
+
+def test_nan_is_not_executed() -> None:
+    with World(fault=dict.fromkeys(range(1, 4), "nan")) as world:
+        world.begin()
+        for _ in range(30):
+            assert np.isfinite(world.tick()).all()
+        counted = world.executor.statistics()
+        assert counted.chunks_refused == 3
+        assert counted.last_refusal == f"1 of its {3 * TA} numbers are not finite"
+        assert counted.starved == 0
+
+
+def test_nothing_but_nan_ends_in_an_error_that_says_so() -> None:
+    with World(fault=dict.fromkeys(range(1, 100), "nan")) as world:
+        world.begin()
+        _, error = run_until_starved(world)
+        assert "the guard refused the last chunk: 1 of its" in str(error)
+
+
+def test_a_jump_at_the_seam_is_refused() -> None:
+    """The second chunk jumps: with a limit on steps it is refused, and the first one plays to its end."""
+    policy = ScriptedPolicy(FakeClock())
+    policy.actions = lambda obs: np.full((16, 3), 0.0 if obs[-1, 1] < 0.3 else 5.0)
+    with World(policy=policy, settings=ExecutorSettings(guard=GuardLimits(max_step=1.0))) as world:
+        world.begin()
+        made, error = run_until_starved(world)
+        assert "its step of 5 in channel 0 exceeds the limit of 1" in str(error)
+        assert not np.any(made)
+
+
+def test_reset_during_inference_a_hundred_times_at_random_moments() -> None:
+    chance = random.Random(1)
+    with World(latency={"dense": 0.28}) as world:
+        during = set()
+        for episode in range(1, 101):
+            for _ in range(chance.randrange(1, 12)):
+                world.observe()
+                try:
+                    action = world.executor.action()
+                    assert action[0] == world.episode
+                except DeadlineMissedError:
+                    pass
+                world.clock.advance(0.1)
+            world.clock.advance(chance.random() * 0.1)
+            calls = len(world.policy.calls)
+            world.executor.reset()
+            world.episode = episode
+            if world.executor.statistics().calls < calls:
+                during.add(calls)
+            assert len(world.policy.calls) == calls
+        world.begin()
+        assert world.tick()[0] == 100
+        counted = world.executor.statistics()
+        assert len(during) > 50
+        assert counted.chunks_discarded == len(during)
+        assert counted.resets == 100
+
+
+def test_a_reset_before_a_call_reaches_the_policy_before_that_call() -> None:
+    order: list[str] = []
+
+    class Noting(ScriptedPolicy):
+        def reset(self, seed: int | None = None) -> None:
+            order.append(f"reset {seed}")
+
+        def predict_action(self, obs_dict, *, plan):  # type: ignore[no-untyped-def, override]
+            order.append(f"call {obs_dict['obs'][0, -1, 0]:.0f}")
+            return super().predict_action(obs_dict, plan=plan)
+
+    with World(policy=Noting(FakeClock())) as world:
+        world.begin()
+        for _ in range(4):
+            world.tick()
+        assert order == ["reset None", "call 0", "call 0"]  # the second one is under way
+        for seed in (3, None):
+            world.executor.reset(seed)
+        world.episode = 1
+        world.begin()
+    assert order == ["reset None", "call 0", "call 0", "reset 3", "call 1"]
+
+
+def test_pressure_leads_to_the_faster_plan_and_back() -> None:
+    settings = ExecutorSettings(tiers=("dense", "fast"), up_after=4)
+    with World(latency={"dense": 0.25, "fast": 0.05}, fault={2: 0.9, 3: 0.1}, settings=settings) as world:
+        world.begin()
+        plans = set()
+        for _ in range(120):
+            try:
+                world.tick()
+            except DeadlineMissedError:
+                world.clock.advance(0.1)
+            plans.add(world.executor.statistics().plan)
+        counted = world.executor.statistics()
+        ran = [plan for _, plan, _ in world.policy.calls]
+    assert plans == {"dense", "fast"}
+    assert ran[:3] == ["dense"] * 3
+    assert ran[3:7] == ["fast"] * 4
+    assert ran[7] == "dense"
+    assert (counted.switches_down, counted.switches_up) == (1, 1)
+
+
+def test_two_threads_may_observe_and_act() -> None:
+    """In real time: a camera at 200 Hz on one thread, a control loop at 100 Hz on another."""
+
+    class Quick(ScriptedPolicy):
+        def predict_action(self, obs_dict, *, plan):  # type: ignore[no-untyped-def, override]
+            time.sleep(0.005)
+            chunk = np.zeros((1, 16, 3)) + obs_dict["obs"][0, -1, 0]
+            return {"action_pred": chunk}
+
+    executor = AsyncExecutor(
+        Quick(FakeClock()), 100, ExecutorSettings(max_hold=100, policy_hz=50), latencies={"dense": 0.01}
+    )
+    stop, failures = threading.Event(), []
+
+    def camera() -> None:
+        try:
+            while not stop.wait(0.005):
+                executor.observe({"obs": np.zeros(2)})
+        except ExecutorError as error:
+            failures.append(error)
+
+    thread = threading.Thread(target=camera)
+    with executor:
+        thread.start()
+        before = time.monotonic()
+        executor.action(timeout=REAL_LIMIT)
+        assert time.monotonic() - before < REAL_LIMIT / 4  # woken by the chunk, not by the timeout
+        for _ in range(50):
+            assert not executor.action().any()
+            time.sleep(0.01)
+        stop.set()
+        thread.join()
+    assert failures == []
+    assert executor.statistics().chunks > 3

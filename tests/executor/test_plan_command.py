@@ -1,0 +1,61 @@
+"""``ttscompile plan``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from ttscompile.cli import main
+
+
+def run(*arguments: object) -> tuple[int, str, str]:
+    result = CliRunner().invoke(main, ["plan", *map(str, arguments)])
+    return result.exit_code, result.stdout, result.stderr
+
+
+def test_it_says_what_is_feasible_with_the_arithmetic(toy_compiled: Path) -> None:
+    """The toy has two actions a chunk: without a margin they last for a frame and two short calls."""
+    code, out, _ = run(toy_compiled, "--control-hz", 5, "--margin-ticks", 0, "--runs", 3, "--json")
+    assert code == 0
+    document = json.loads(out)
+    (name,) = document["plans"]
+    dense = document["plans"][name]
+    assert name == "dense"
+    assert dense["feasible"]
+    assert dense["horizon"] == pytest.approx(0.4)
+    assert dense["needed"] == pytest.approx(0.2 + 2 * dense["latency"])
+    assert dense["latency"] * 1e3 >= dense["median_ms"]
+    assert document["jitter"] is None
+
+
+def test_what_is_not_feasible_is_exit_status_1(toy_compiled: Path) -> None:
+    code, out, _ = run(toy_compiled, "--control-hz", 5, "--runs", 3)
+    assert code == 1
+    assert "too slow" in out
+    assert "ms > 400 ms = 2 actions at 5 Hz" in out
+
+
+def test_jitter_is_measured_and_printed(toy_compiled: Path) -> None:
+    code, out, _ = run(toy_compiled, "--control-hz", 10, "--margin-ticks", 0, "--runs", 2, "--jitter", 0.3)
+    assert code == 0
+    assert "200 Hz loop" in out
+    assert "alone" in out
+    assert "beside plan 'dense'" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--control-hz", 25, "--policy-hz", 10], "no multiple of policy_hz"),
+        (["--control-hz", 10, "--plan", "quick"], "no plan 'quick'"),
+        (["--control-hz", 10, "--horizon", 9], "Give at most 2"),
+        ([], "--control-hz"),
+    ],
+)
+def test_bad_usage_is_exit_status_2(toy_compiled: Path, arguments: list[object], message: str) -> None:
+    code, _, err = run(toy_compiled, *arguments)
+    assert code == 2
+    assert message in err

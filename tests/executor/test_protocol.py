@@ -1,0 +1,56 @@
+"""Messages of the server, without one."""
+
+from __future__ import annotations
+
+import json
+from contextlib import suppress
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ttscompile import ObservationSpec
+from ttscompile.errors import ProtocolError
+from ttscompile.runtimes.executor.protocol import read_frame, read_request
+from ttscompile.runtimes.executor.window import FrameSpec
+
+
+def test_requests_are_read_and_frames_converted() -> None:
+    request = read_request('{"id": 1, "method": "observe", "obs": {"image": [[255, 0]]}, "t": 2}')
+    assert (request.id, request.method, request.params["t"]) == (1, "observe", 2)
+    frames = FrameSpec.of({"image": ObservationSpec((2, 1, 2), dtype="uint8")}, 2)
+    image = read_frame(request.params["obs"], frames)["image"]
+    assert (image.dtype, image.tolist()) == (np.uint8, [[255, 0]])
+    for wrong in ([[256, 0]], [[-1, 0]], [[1.5, 0]], [["1", 0]], [[10**30, 0]]):
+        with pytest.raises(ProtocolError, match="image"):
+            read_frame({"image": wrong}, frames)
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=4),
+    max_leaves=12,
+)
+FRAMES = FrameSpec.of({"obs": ObservationSpec((2, 3)), "image": ObservationSpec((2, 2, 2), dtype="uint8")}, 2)
+DTYPES = JSON | st.sampled_from(["f4", "O", "U3", "M8[s]"])
+PACKED = st.fixed_dictionaries({"dtype": DTYPES, "shape": JSON, "base64": JSON})
+
+
+@given(st.text() | st.binary() | JSON.map(json.dumps))
+def test_anything_is_a_request_or_a_protocol_error(message: str | bytes) -> None:
+    with suppress(ProtocolError):
+        read_request(message)
+
+
+@given(
+    st.sampled_from(["info", "observe", "action", "reset", "statistics"]),
+    st.dictionaries(st.sampled_from(["obs", "t", "timeout", "seed"]), JSON, max_size=3),
+    st.dictionaries(st.sampled_from(["obs", "image", "other"]), JSON | PACKED, max_size=3),
+)
+def test_any_parameters_are_taken_or_a_protocol_error(method: str, params: dict, obs: dict) -> None:  # type: ignore[type-arg]
+    message = json.dumps({"method": method, **params, **({"obs": obs} if "obs" in params else {})})
+    with suppress(ProtocolError):
+        request = read_request(message)
+        if method == "observe":
+            read_frame(request.params["obs"], FRAMES)

@@ -1,0 +1,116 @@
+"""Statistics and traces: of a fixed size, and in the form that other tools read."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ttscompile.runtimes.base import Timings
+from ttscompile.runtimes.executor.statistics import Counts, ExecutorStatistics, Recorder, Samples, statistics, summary
+from ttscompile.runtimes.executor.trace import CONTROL, WORKER, Trace
+
+from .simulation import World
+
+
+def test_percentiles_are_of_the_last_measurements_and_extremes_of_all() -> None:
+    samples = Samples(100)
+    assert summary(*samples.copy()) is None
+    for value in [1000.0, -5.0, *range(200)]:
+        samples.add(value)
+    made = summary(*samples.copy())
+    last = np.arange(100, 200)
+    assert made is not None
+    assert (made.count, made.min, made.max) == (202, -5, 1000)
+    assert (made.p50, made.p95, made.p99) == tuple(np.percentile(last, [50, 95, 99]))
+
+
+def test_statistics_do_not_grow() -> None:
+    recorder = Recorder(16)
+    before = {name: value.copy()[0].nbytes for name, value in vars(recorder).items() if isinstance(value, Samples)}
+    for i in range(1000):
+        recorder.tick(0.1 * i)
+    assert len(recorder.tick_ms.copy()[0]) == 16
+    assert set(before.values()) == {0}
+    assert recorder.counts.ticks == 1000
+
+
+def test_every_count_has_its_place_in_the_statistics() -> None:
+    names = {field.name for field in fields(ExecutorStatistics)}
+    assert {field.name for field in fields(Counts)} < names
+    made = statistics("plan", Recorder(4).copy())
+    assert json.loads(json.dumps(made.to_json(), allow_nan=False))["plan"] == "plan"
+    for name in names:
+        assert f"        {name}: " in str(ExecutorStatistics.__doc__)
+
+
+def test_the_control_rate_is_measured() -> None:
+    with World() as world:
+        world.begin()
+        for _ in range(20):
+            world.tick()
+        assert world.executor.statistics().tick_ms.p50 == pytest.approx(100)
+
+
+def test_a_trace_is_what_perfetto_reads(tmp_path: Path) -> None:
+    trace = Trace(10)
+    trace.span(WORKER, "inference", 5.0, 0.25, {"plan": "dense"})
+    trace.span(CONTROL, "tick", 4.0, 0.001)
+    trace.instant(CONTROL, "reset", 4.5)
+    trace.write(tmp_path / "trace.json", "a robot")
+    document = json.loads((tmp_path / "trace.json").read_text())
+    meta = [event for event in document["traceEvents"] if event["ph"] == "M"]
+    assert {event["args"]["name"] for event in meta} == {"a robot", "control loop", "policy", "pruner"}
+    events = [event for event in document["traceEvents"] if event["ph"] != "M"]
+    assert events == [
+        {"ph": "X", "name": "tick", "pid": 1, "tid": CONTROL, "ts": 0.0, "dur": 1000.0},
+        {"ph": "i", "name": "reset", "pid": 1, "tid": CONTROL, "ts": 5e5, "s": "t"},
+        {"ph": "X", "name": "inference", "pid": 1, "tid": WORKER, "ts": 1e6, "dur": 2.5e5, "args": {"plan": "dense"}},
+    ]
+
+
+@pytest.mark.parametrize(
+    ("wait", "decode"), [(5, (3.5e4, 6e4)), (2, (3e4, 6.2e4))], ids=["pruner first", "beside step 0"]
+)
+def test_the_parts_of_a_call_stand_within_it(wait: float, decode: tuple[float, float]) -> None:
+    trace = Trace(10)
+    trace.call(1.0, 1.1, {"plan": "p"}, Timings(prologue=10, pruner=5, wait_pruner=wait, decode=60, total=80))
+    events = [e for e in trace.to_json()["traceEvents"] if e["ph"] == "X"]
+    found = {e["name"]: (e["ts"], e["dur"]) for e in events}
+    expected = {"inference": (0, 1e5), "prologue": (2e4, 1e4), "pruner": (3e4, 5e3), "decode": decode}
+    assert found.keys() == expected.keys()
+    for name, times in expected.items():
+        assert found[name] == pytest.approx(times)
+    assert {e["name"]: e["tid"] for e in events} == {"inference": 2, "prologue": 2, "pruner": 3, "decode": 2}
+
+
+def test_a_trace_keeps_the_last_events() -> None:
+    trace = Trace(5)
+    for i in range(12):
+        trace.instant(CONTROL, str(i), float(i))
+    names = [event["name"] for event in trace.to_json()["traceEvents"] if event["ph"] != "M"]
+    assert names == ["7", "8", "9", "10", "11"]
+    off = Trace(0)
+    off.instant(CONTROL, "x", 0.0)
+    assert not off.on
+    assert len(off.to_json()["traceEvents"]) == 4
+
+
+def test_a_run_leaves_ticks_calls_and_resets_in_the_trace() -> None:
+    with World() as world:
+        world.begin()
+        for _ in range(10):
+            world.tick()
+        world.executor.reset()
+        world.tick(action=False)
+        events = world.executor.trace.to_json()["traceEvents"]
+    names = [event["name"] for event in events]
+    assert names.count("tick") == 11
+    assert names.count("reset") == 1
+    calls = [event for event in events if event["name"] == "inference"]
+    assert len(calls) == len(world.policy.calls)
+    assert all(event["dur"] == pytest.approx(1e5) for event in calls)
+    assert calls[0]["args"] == {"plan": "dense", "epoch": 0, "chunk": "scheduled"}

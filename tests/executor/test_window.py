@@ -1,0 +1,159 @@
+"""Frames in, windows out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ttscompile import ObservationSpec
+from ttscompile.errors import ObservationError
+from ttscompile.runtimes.executor.window import MOST_FRAMES, FrameSpec, ObservationWindow
+
+SPECS = {
+    "obs": ObservationSpec((2, 3)),
+    "image": ObservationSpec((2, 4, 4), dtype="uint8"),
+    "goal": ObservationSpec((5,)),
+}
+
+
+def frame(value: float) -> dict[str, np.ndarray]:
+    return {"obs": np.array([value])}
+
+
+def window(steps: int = 2, tolerance: float = 0.3, times: list[float] | None = None) -> ObservationWindow:
+    made = ObservationWindow(steps, 0.1, tolerance, 0.3)
+    for time in times or []:
+        made.add(time, frame(time), time)
+    return made
+
+
+def values(made: ObservationWindow) -> list[float] | None:
+    return None if made.complete is None else [float(each["obs"][0]) for each in made.complete.frames]
+
+
+def test_the_first_axis_of_a_history_is_time() -> None:
+    spec = FrameSpec.of(SPECS, 2)
+    assert spec.history == {"obs", "image"}
+    assert spec.shapes == {"obs": (3,), "image": (4, 4), "goal": (5,)}
+    assert spec.steps == 2
+    alone = FrameSpec.of({"goal": SPECS["goal"]}, 2)
+    assert (alone.steps, alone.history) == (1, frozenset())
+
+
+def test_an_observation_is_stacked_and_has_a_batch_of_one() -> None:
+    spec = FrameSpec.of(SPECS, 2)
+    frames = [
+        {"obs": np.full(3, v, np.float32), "image": np.full((4, 4), v, np.uint8), "goal": np.full(5, v, np.float32)}
+        for v in (1, 2)
+    ]
+    made = spec.observation(frames)
+    assert {key: array.shape for key, array in made.items()} == {
+        "obs": (1, 2, 3),
+        "image": (1, 2, 4, 4),
+        "goal": (1, 5),
+    }
+    assert made["obs"][0, :, 0].tolist() == [1, 2]
+    assert made["goal"][0, 0] == 2
+
+
+@pytest.mark.parametrize(
+    ("obs", "message"),
+    [
+        (
+            {"obs": np.zeros(4, np.float32)},
+            r"one frame of observation 'obs' must be float32 \[3\]; found float32 \[4\]",
+        ),
+        ({"obs": np.zeros((2, 3), np.float32)}, r"Give one frame at a time; the executor makes the window of 2"),
+        ({"obs": np.zeros(3)}, r"found float64 \[3\]. Convert it with .astype"),
+        ({"obs": np.array([0, np.nan, 0], np.float32)}, r"'obs' must be finite; found nan at index \(1,\)"),
+        ({"obs": [0.0, 0.0, 0.0]}, "is a list; expected a numpy array"),
+        ({}, r"with the keys \['obs'\]; found \[\]"),
+        ({"obs": np.zeros(3, np.float32), "more": 1}, r"found \['more', 'obs'\]"),
+        (np.zeros(3), "found ndarray"),
+    ],
+)
+def test_a_wrong_frame_is_refused(obs: object, message: str) -> None:
+    spec = FrameSpec.of({"obs": SPECS["obs"]}, 2)
+    with pytest.raises(ObservationError, match=message):
+        spec.check(obs)  # type: ignore[arg-type]
+
+
+def test_a_window_needs_all_its_frames_and_repeats_none() -> None:
+    made = window(3, times=[0.0, 0.1])
+    assert made.complete is None
+    assert made.why_incomplete() == "2 of 3 frames came"
+    made.add(0.2, frame(0.2), 0.2)
+    assert values(made) == [0.0, 0.1, 0.2]
+
+
+def test_a_gap_leaves_the_newest_window_that_has_none() -> None:
+    made = window(times=[0.0, 0.1, 0.3])
+    assert values(made) == [0.0, 0.1]
+    made.add(0.4, frame(0.4), 0.4)
+    assert values(made) == [0.3, 0.4]
+
+
+def test_frames_out_of_order_are_put_in_order() -> None:
+    made = window(3, times=[0.0, 0.2])
+    assert values(made) is None
+    assert made.add(0.1, frame(0.1), 0.2) == "added"
+    assert values(made) == [0.0, 0.1, 0.2]
+
+
+def test_frames_too_old_for_any_window_are_late() -> None:
+    made = window(times=[1.0, 1.1])
+    assert made.add(0.5, frame(0.5), 1.1) == "late"
+    assert values(made) == [1.0, 1.1]
+
+
+def test_a_second_frame_of_a_time_replaces_the_first() -> None:
+    made = window(times=[0.0, 0.1])
+    assert made.add(0.1, frame(7), 0.1) == "replaced"
+    assert values(made) == [0.0, 7.0]
+
+
+def test_faster_frames_are_sampled_at_the_policys_rate() -> None:
+    made = window(3, times=[i / 50 for i in range(30)])
+    assert values(made) == pytest.approx([0.38, 0.48, 0.58])
+
+
+def test_slower_frames_make_no_window_and_the_reason_is_told() -> None:
+    made = window(times=[0.0, 0.2, 0.4])
+    assert made.complete is None
+    assert "every 0.1 s, to within 0.03 s; the newest came 0.2 s apart" in made.why_incomplete()
+
+
+@pytest.mark.parametrize(("time", "complete"), [(0.1299, True), (0.1301, False), (0.0701, True), (0.0699, False)])
+def test_the_tolerance(time: float, complete: bool) -> None:
+    assert (window(times=[0.0, time]).complete is not None) is complete
+
+
+def test_old_frames_are_thrown_away() -> None:
+    made = window(times=[i * 1e-6 for i in range(3 * MOST_FRAMES)])
+    assert len(made._times) == len(made._frames) == MOST_FRAMES
+    made.add(10.0, frame(10), 10.0)
+    assert made._times == [10.0]
+    made.clear()
+    assert made.complete is None
+
+
+def test_the_next_frame_is_expected_when_the_last_ones_say() -> None:
+    assert window(times=[0.0]).interval == pytest.approx(0.1)
+    assert window(times=[0.0, 0.02]).interval == pytest.approx(0.02)
+    assert window(times=[0.0, 0.15]).interval == pytest.approx(0.1)
+
+
+@given(st.lists(st.integers(0, 40), min_size=1, max_size=40), st.integers(1, 4))
+def test_a_window_is_always_the_newest_there_is(times: list[int], steps: int) -> None:
+    """Against a search over everything that is kept."""
+    made = ObservationWindow(steps, 2.0, 0.3, 4.0)  # so that a frame must stand exactly in its place
+    now = max(times)
+    for time in times:
+        made.add(float(time), frame(time), float(now))
+    kept = set(made._times)
+    assert kept == {float(t) for t in times if t >= now - (4.0 + 2.0 * (steps - 1) + 0.6)}
+    whole = [t for t in kept if all(t - 2.0 * back in kept for back in range(steps))]
+    expected = None if not whole else [max(whole) - 2.0 * back for back in reversed(range(steps))]
+    assert values(made) == expected

@@ -1,0 +1,170 @@
+"""``ttscompile plan``: at which rates this machine can run which plans of an artifact in a control loop."""
+
+from __future__ import annotations
+
+from math import ceil
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+import ttscompile
+from ttscompile.cli.output import artifact_argument, json_option, print_json, progress, results, table
+from ttscompile.errors import DeadlineMissedError
+from ttscompile.machine import fingerprint, one_line
+from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings, Feasibility, GuardLimits, MonotonicClock
+from ttscompile.runtimes.executor.jitter import Jitter, measure_jitter
+from ttscompile.runtimes.executor.measure import measure_latencies, neutral_observation
+from ttscompile.runtimes.executor.settings import resolve
+from ttscompile.runtimes.executor.state import feasibility
+from ttscompile.runtimes.policy import CompiledPolicy
+
+JITTER_HZ = 200
+
+
+@click.command()
+@artifact_argument
+@click.option("--control-hz", type=click.FloatRange(min=0, min_open=True), required=True, help="Of the control loop.")
+@click.option(
+    "--policy-hz",
+    type=click.FloatRange(min=0, min_open=True),
+    help="Of frames and actions in training; the control rate if not given.",
+)
+@click.option(
+    "--horizon", type=click.IntRange(min=1), help="Actions of a chunk to play; those that the policy executes."
+)
+@click.option("--plan", "names", multiple=True, help="Which plan to measure; may be repeated. All, if not given.")
+@click.option("--margin-ticks", type=click.IntRange(min=0), default=1, show_default=True, help="To be early by.")
+@click.option("--threads", type=click.IntRange(min=1), default=1, show_default=True, help="Of the policy.")
+@click.option("--runs", type=click.IntRange(min=1), default=20, show_default=True, help="Counted calls of each plan.")
+@click.option(
+    "--jitter",
+    "jitter_seconds",
+    type=click.FloatRange(min=0, min_open=True),
+    help=f"Also run a {JITTER_HZ} Hz loop for so many seconds, alone and beside the policy, and say how late it wakes.",
+)
+@json_option
+@click.pass_context
+def plan(
+    context: click.Context,
+    directory: Path,
+    control_hz: float,
+    policy_hz: float | None,
+    horizon: int | None,
+    names: tuple[str, ...],
+    margin_ticks: int,
+    threads: int,
+    runs: int,
+    jitter_seconds: float | None,
+    as_json: bool,
+) -> None:
+    """Measure the plans of the artifact DIRECTORY and say which of them keep up with a control loop.
+
+    Exit status 1: none does.
+    """
+    console = progress()
+    policy = ttscompile.load(directory, threads=threads)
+    settings = ExecutorSettings(
+        policy_hz=policy_hz,
+        horizon=horizon,
+        margin_ticks=margin_ticks,
+        measured_calls=runs,
+        tiers=names or policy.info.plans,
+    )
+    resolved = resolve(settings, policy.info, control_hz)
+    with console.status("timing"):
+        policy.reset()
+        measured = measure_latencies(policy, MonotonicClock(), settings, resolved.tiers)
+    judged = {name: feasibility(settings, resolved, max(values)) for name, values in measured.items()}
+    jitter = None
+    if jitter_seconds is not None:
+        fastest = min(judged, key=lambda name: judged[name].latency)
+        with console.status("measuring jitter"):
+            jitter = _jitter(policy, fastest, resolved.policy_hz, judged[fastest].latency, jitter_seconds)
+    if as_json:
+        print_json(
+            {
+                "machine": fingerprint(),
+                "threads": threads,
+                "runs": runs,
+                "plans": {
+                    name: {"median_ms": 1e3 * float(np.median(measured[name]))} | each.to_json()
+                    for name, each in judged.items()
+                },
+                "jitter": None if jitter is None else {name: each.to_json() for name, each in jitter.items()},
+            }
+        )
+    else:
+        _print(measured, judged, jitter, runs, threads)
+    if not any(each.feasible for each in judged.values()):
+        context.exit(1)
+
+
+def _print(
+    measured: dict[str, list[float]],
+    judged: dict[str, Feasibility],
+    jitter: dict[str, Jitter] | None,
+    runs: int,
+    threads: int,
+) -> None:
+    output = results()
+    made = table("plan", "median ms", "longest ms", "may take ms", "up to Hz", "verdict")
+    for name, each in judged.items():
+        made.add_row(
+            name,
+            f"{1e3 * np.median(measured[name]):.4g}",
+            f"{1e3 * each.latency:.4g}",
+            f"{max(1e3 * each.max_latency, 0):.4g}",
+            f"{each.max_policy_hz:.3g}",
+            "feasible" if each.feasible else "too slow",
+        )
+    output.print(made)
+    for name, each in judged.items():
+        output.print(f"{name}: {each.explain()}", markup=False, soft_wrap=True)
+    output.print(
+        f"Of {runs} calls with {threads} thread{'s' * (threads > 1)}; the longest has to fit. Hz: of the policy, with"
+        " as many control ticks an action as here.",
+        soft_wrap=True,
+    )
+    if jitter is not None:
+        made = table(f"{JITTER_HZ} Hz loop", "late, median ms", "p99 ms", "max ms", "ticks late by half", "work us")
+        for name, one in jitter.items():
+            made.add_row(
+                name,
+                f"{one.p50:.3f}",
+                f"{one.p99:.3f}",
+                f"{one.max:.3f}",
+                f"{one.late} of {one.ticks}",
+                f"{one.work_us:.1f}",
+            )
+        output.print(made)
+    output.print(one_line(fingerprint()), markup=False, soft_wrap=True)
+
+
+def _jitter(policy: CompiledPolicy, name: str, policy_hz: float, latency: float, seconds: float) -> dict[str, Jitter]:
+    """A loop of about ``JITTER_HZ``, alone and with the executor at work."""
+    hz = ceil(JITTER_HZ / policy_hz) * policy_hz
+    settings = ExecutorSettings(
+        policy_hz=policy_hz,
+        tiers=(name,),
+        refuse_infeasible=False,
+        max_hold=int(seconds * hz) + 1,
+        guard=GuardLimits(low=-np.inf, high=np.inf),  # nothing is driven, and the observation is not of this world
+        trace_events=0,
+    )
+    alone = measure_jitter(hz, seconds)
+    with AsyncExecutor(policy, hz, settings, latencies={name: latency}) as executor:
+        frames = resolve(settings, policy.info, hz).frames
+        obs = neutral_observation(dict(policy.info.observation))
+        frame: dict[str, Any] = {key: obs[key][0, -1] if key in frames.history else obs[key][0] for key in obs}
+
+        def work() -> None:
+            executor.observe(frame)
+            try:
+                executor.action()
+            except DeadlineMissedError:
+                return  # before the first chunk
+
+        beside = measure_jitter(hz, seconds, work)
+    return {"alone": alone, f"beside plan {name!r}": beside}
