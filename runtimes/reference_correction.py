@@ -41,6 +41,6 @@ def apply(
     correction: Correction, k: int, following: Tensor, sample: Tensor, prediction: Tensor, history: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Sample and history after step k, from the sample that the sampler makes without correction."""
-    weights, bias = torch.from_numpy(correction.weights[k]), torch.from_numpy(correction.bias[k])
+    weights, bias = torch.tensor(correction.weights[k]), torch.tensor(correction.bias[k])
     corrected = following + correct(weights, bias, sample, prediction, history)
     return corrected, remember(sample, prediction, history) if correction.anchors[k] else history

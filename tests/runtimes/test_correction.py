@@ -1,0 +1,111 @@
+"""Corrections in both runtimes, and which plans get them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ttscompile
+from ttscompile import Noise, Source
+from ttscompile.artifact import Artifact, load_artifact
+from ttscompile.artifact.write import update_calibration
+from ttscompile.correction import Correction, no_correction
+from ttscompile.errors import ArtifactError, IllegalPlanError
+from ttscompile.lattice import uniform_plan
+from ttscompile.runtimes import open_runtime
+
+from .agreement import random_inputs
+from .plans import random_plan
+from .toys import toy_program, written_artifact
+
+
+def random_correction(artifact: Artifact, rng: np.random.Generator) -> Correction:
+    manifest = artifact.manifest
+    like = no_correction(manifest.steps, manifest.spec.sample)
+    scale = 0.3 / np.sqrt(like.weights.shape[2])
+    return Correction(
+        rng.random(manifest.steps) < 0.5,
+        (scale * rng.standard_normal(like.weights.shape)).astype(np.float32),
+        (0.1 * rng.standard_normal(like.bias.shape)).astype(np.float32),
+    )
+
+
+@pytest.mark.parametrize("streams", [1, 3])
+def test_both_runtimes_agree_on_random_corrections(toy_artifact: Artifact, streams: int) -> None:
+    rng = np.random.default_rng(streams)
+    runtimes = [open_runtime(toy_artifact, name) for name in ("onnxruntime", "reference")]
+    manifest = toy_artifact.manifest
+    written = np.zeros((streams, manifest.steps, len(manifest.groups)), np.bool_)
+    for _ in range(4):
+        plans = np.stack([random_plan(rng, manifest.steps, manifest.groups, cells) for cells in written])
+        obs, noise = random_inputs(toy_artifact, rng, streams)
+        correction = random_correction(toy_artifact, rng)
+        ours, theirs = (r.predict(obs, noise, plans, correction=correction)[0] for r in runtimes)
+        np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=2e-5)
+        written |= plans == Source.COMPUTE
+
+
+def test_a_correction_of_one_call_is_gone_in_the_next(toy_artifact: Artifact) -> None:
+    rng = np.random.default_rng(0)
+    runtime = open_runtime(toy_artifact)
+    obs, noise = random_inputs(toy_artifact, rng, 1)
+    plan = uniform_plan(toy_artifact.manifest.steps, len(toy_artifact.manifest.groups), 2)
+    before, _ = runtime.predict(obs, noise, plan)
+    corrected, _ = runtime.predict(obs, noise, plan, correction=random_correction(toy_artifact, rng))
+    after, _ = runtime.predict(obs, noise, plan)
+    assert np.abs(corrected - before).max() > 1e-2
+    np.testing.assert_array_equal(before, after)
+
+
+@pytest.fixture
+def corrected(tmp_path: Path) -> tuple[Path, Correction, np.ndarray]:
+    artifact = written_artifact(toy_program(), tmp_path / "toy")
+    manifest = artifact.manifest
+    correction = random_correction(artifact, np.random.default_rng(0))
+    plan = uniform_plan(manifest.steps, len(manifest.groups), 2)
+    update_calibration(artifact.path, None, {"fast": plan, "bare": plan}, "fast", {}, corrections={"fast": correction})
+    return artifact.path, correction, plan
+
+
+@pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
+def test_it_belongs_to_the_plan_of_its_name(corrected: tuple[Path, Correction, np.ndarray], runtime: str) -> None:
+    path, correction, plan = corrected
+    artifact = load_artifact(path)
+    assert set(artifact.corrections) == {"fast"}
+    np.testing.assert_array_equal(artifact.corrections["fast"].weights, correction.weights)
+    obs, noise = random_inputs(artifact, np.random.default_rng(1), 1)
+    policy = ttscompile.load(path, runtime=runtime)
+
+    def call(**options: object) -> np.ndarray:
+        policy.reset()
+        return np.asarray(policy.predict_action(obs, noise=Noise(noise.initial, noise.steps), **options)["action_pred"])
+
+    by_default, named, bare, matrix = call(), call(plan="fast"), call(plan="bare"), call(plan=plan)
+    np.testing.assert_array_equal(by_default, named)
+    np.testing.assert_array_equal(bare, matrix)
+    assert np.abs(named - bare).max() > 1e-2
+    dense = call(plan="dense")
+    assert np.abs(dense - named).max() > 1e-3
+
+
+def test_it_is_part_of_the_identity(corrected: tuple[Path, Correction, np.ndarray]) -> None:
+    path, _, plan = corrected
+    before = load_artifact(path).manifest
+    update_calibration(path, None, {"fast": plan, "bare": plan}, "fast", {})
+    after = load_artifact(path).manifest
+    assert before.identity != after.identity
+    assert before.model_identity == after.model_identity
+
+
+def test_one_that_does_not_fit_is_not_written(corrected: tuple[Path, Correction, np.ndarray]) -> None:
+    path, _, plan = corrected
+    before = {file.name: file.read_bytes() for file in path.iterdir()}
+    with pytest.raises(IllegalPlanError, match="this policy needs"):
+        update_calibration(path, None, {"fast": plan}, "fast", {}, corrections={"fast": no_correction(3, (2, 2))})
+    manifest = load_artifact(path).manifest
+    fitting = no_correction(manifest.steps, manifest.spec.sample)
+    with pytest.raises(ArtifactError, match="expected a plan of the artifact"):
+        update_calibration(path, None, {"fast": plan}, "fast", {}, corrections={"slow": fitting})
+    assert {file.name: file.read_bytes() for file in path.iterdir()} == before
