@@ -48,6 +48,7 @@ class PolicyInfo:
         sample: ``(T, D)``, the shape of one stream's noise.
         stochastic: whether the sampler draws noise in its steps, so that ``Noise.steps`` is needed.
         identity: sha256 of what the artifact computes.
+        model_identity: the same without plans, corrections and pruner: what calibration leaves as it is.
         plans: names that ``predict_action(plan=...)`` takes.
         default_plan: the one that is taken when none is given.
         precision: of the weights of residual blocks, ``fp32`` or ``int8``.
@@ -62,6 +63,7 @@ class PolicyInfo:
     sample: tuple[int, int]
     stochastic: bool
     identity: str
+    model_identity: str
     plans: tuple[str, ...]
     default_plan: str
     precision: str
@@ -136,6 +138,7 @@ class CompiledPolicy:
             sample=manifest.spec.sample,
             stochastic=manifest.spec.sampler.stochastic,
             identity=manifest.identity,
+            model_identity=manifest.model_identity,
             plans=(DENSE, *manifest.plans),
             default_plan=manifest.default_plan,
             precision=manifest.precision_name,

@@ -12,15 +12,17 @@ import dataclasses
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import click
 import numpy as np
 from bootstrap import Estimate, estimate, paired_difference
+from episodes import Episodes
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
-from rollout import Rollout, run_episodes
+from rollout import EpisodeCache, Rollout, run_episodes
 from variants import Variant, first_seed_option, open_variant, results_console, run, runtime_option, threads_option
 
 
@@ -68,6 +70,7 @@ def evaluate(
     seeds: Sequence[int],
     batch: int,
     on_done: Callable[[str, int], None] | None = None,
+    caches: Sequence[EpisodeCache | None] | None = None,
 ) -> list[Evaluation]:
     """Run every variant on every seed.
 
@@ -76,18 +79,19 @@ def evaluate(
         seeds: one an episode.
         batch: episodes in lockstep.
         on_done: told the variant's label and its number of finished episodes.
+        caches: of the episodes of each variant; None for none.
 
     Returns:
         One evaluation a variant.
     """
     rollouts = []
-    for variant in variants:
+    for variant, cache in zip(variants, caches or [None] * len(variants), strict=True):
 
         def finished(episodes: int, label: str = variant.label) -> None:
             if on_done is not None:
                 on_done(label, episodes)
 
-        rollouts.append(run_episodes(variant.policy, seeds, variant.noise, batch, variant.plan, finished))
+        rollouts.append(run_episodes(variant.policy, seeds, variant.noise, batch, variant.plan, finished, cache))
     return [summarise(variant.label, rollout, rollouts[0]) for variant, rollout in zip(variants, rollouts, strict=True)]
 
 
@@ -143,6 +147,14 @@ def evaluation_table(evaluations: Sequence[Evaluation], seeds: Sequence[int]) ->
 @click.option("--batch", default=16, show_default=True, type=click.IntRange(1), help="Episodes in lockstep.")
 @runtime_option
 @threads_option
+@click.option(
+    "--cache",
+    type=click.Path(file_okay=False, path_type=Path),
+    default=Path("build/pusht/episodes"),
+    show_default=True,
+    help="Where episodes are kept, by what was computed, and taken from.",
+)
+@click.option("--no-cache", is_flag=True, help="Run all episodes, and keep none.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON document instead of a table.")
 def main(
     variants: tuple[str, ...],
@@ -151,14 +163,21 @@ def main(
     batch: int,
     runtime: str,
     threads: int,
+    cache: Path,
+    no_cache: bool,
     as_json: bool,
 ) -> None:
     """Compare artifacts and plans: DIR takes the artifact's own plan, DIR:dense computes everything."""
     opened = [open_variant(text, runtime, threads) for text in variants]
     seeds = range(first_seed, first_seed + episodes)
+    caches = [None if no_cache else Episodes(cache, v, runtime) for v in opened]
     with Progress(console=Console(stderr=True)) as progress:
         tasks = {v.label: progress.add_task(v.label, total=episodes) for v in opened}
-        evaluations = evaluate(opened, seeds, batch, lambda label, n: progress.update(tasks[label], completed=n))
+
+        def finished(label: str, count: int) -> None:
+            progress.update(tasks[label], completed=count)
+
+        evaluations = evaluate(opened, seeds, batch, finished, caches)
     if as_json:
         click.echo(json.dumps([e.to_json() for e in evaluations], indent=2))
     else:

@@ -54,6 +54,9 @@ class Episode:
         states: ``[S + 1, 5]``.
         targets: ``[S, 2]``, the executed actions.
         coverages: ``[S]``, share of the goal covered after each action.
+        sparsity: share of the cells that were reused in each call, ``[calls]``; empty when the policy makes no reports.
+        flops: of each call, prologue and pruner included; likewise.
+        legalised: cells of each call that had to be replaced; likewise.
     """
 
     seed: int
@@ -61,6 +64,9 @@ class Episode:
     states: Float64Array
     targets: Float64Array
     coverages: Float64Array
+    sparsity: tuple[float, ...] = ()
+    flops: tuple[float, ...] = ()
+    legalised: tuple[int, ...] = ()
 
     @property
     def best_coverage(self) -> float:
@@ -78,24 +84,42 @@ class Episode:
         return self.best_coverage > SUCCESS_COVERAGE
 
 
+class EpisodeCache(Protocol):
+    """Keeps the episodes of one policy with one plan."""
+
+    def read(self, seed: int) -> Episode | None:
+        """The episode of a seed, if it is kept."""
+
+    def write(self, episode: Episode) -> None:
+        """Keep an episode."""
+
+
 @dataclass(frozen=True)
 class Rollout:
     """Episodes of one policy.
 
     Attributes:
         episodes: in the order of the seeds.
-        sparsity: share of the cells that were reused, one number a call of an unfinished episode; empty when the
-            policy makes no reports.
-        flops: of the same calls, prologue and pruner included.
-        legalised: cells that had to be replaced, of the same calls.
-        call_ms: wall time of each (batched) call, milliseconds.
+        call_ms: wall time of each (batched) call that was made, milliseconds.
     """
 
     episodes: tuple[Episode, ...]
-    sparsity: tuple[float, ...]
-    flops: tuple[float, ...]
-    legalised: tuple[int, ...]
     call_ms: tuple[float, ...]
+
+    @property
+    def sparsity(self) -> tuple[float, ...]:
+        """Of all calls."""
+        return tuple(value for episode in self.episodes for value in episode.sparsity)
+
+    @property
+    def flops(self) -> tuple[float, ...]:
+        """Of all calls."""
+        return tuple(value for episode in self.episodes for value in episode.flops)
+
+    @property
+    def legalised(self) -> tuple[int, ...]:
+        """Of all calls."""
+        return tuple(value for episode in self.episodes for value in episode.legalised)
 
 
 def seeded_noise(shape: NoiseShape, seeds: Sequence[int], call: int) -> ttscompile.Noise:
@@ -145,9 +169,7 @@ def run_batch(
     environments = [PushT() for _ in seeds]
     current = [environment.reset(seed) for environment, seed in zip(environments, seeds, strict=True)]
     windows: list[list[FloatArray]] = [[] for _ in seeds]
-    sparsity: list[float] = []
-    flops: list[float] = []
-    legalised: list[int] = []
+    figures: list[list[tuple[float, float, int]]] = [[] for _ in seeds]
     call_ms: list[float] = []
     policy.reset()
     while not all(environment.done for environment in environments):
@@ -157,11 +179,10 @@ def run_batch(
         actions = policy.predict_action({"obs": np.stack(current)}, noise=noise, plan=plan)["action"]
         call_ms.append(1000 * (time.perf_counter() - started))
         report = getattr(policy, "last_report", None)
-        if report is not None:
-            sparsity += np.mean(report.plan[active] != ttscompile.Source.COMPUTE, axis=(1, 2)).tolist()
-            flops += [report.flops[i] for i in active]
-            legalised += [report.legalised[i] for i in active]
         for i in active:
+            if report is not None:
+                reused = float(np.mean(report.plan[i] != ttscompile.Source.COMPUTE))
+                figures[i].append((reused, report.flops[i], report.legalised[i]))
             windows[i].append(current[i])
             current[i] = environments[i].execute(actions[i])
         if on_call is not None:
@@ -174,12 +195,12 @@ def run_batch(
                 states=np.stack(environment.states),
                 targets=np.stack(environment.targets),
                 coverages=np.array(environment.coverages),
+                sparsity=tuple(reused for reused, _, _ in calls),
+                flops=tuple(flops for _, flops, _ in calls),
+                legalised=tuple(legalised for _, _, legalised in calls),
             )
-            for seed, rows, environment in zip(seeds, windows, environments, strict=True)
+            for seed, rows, environment, calls in zip(seeds, windows, environments, figures, strict=True)
         ),
-        sparsity=tuple(sparsity),
-        flops=tuple(flops),
-        legalised=tuple(legalised),
         call_ms=tuple(call_ms),
     )
 
@@ -191,6 +212,7 @@ def run_episodes(
     batch: int,
     plan: Plan | None = None,
     on_done: Callable[[int], None] | None = None,
+    cache: EpisodeCache | None = None,
 ) -> Rollout:
     """Run one episode a seed, ``batch`` at a time.
 
@@ -201,23 +223,29 @@ def run_episodes(
         batch: episodes in lockstep.
         plan: as in ``run_batch``.
         on_done: told the number of finished episodes, after each call.
+        cache: where episodes of this policy and plan were kept, and are; None for nowhere.
 
     Returns:
         All episodes, in the order of the seeds.
     """
+    known = {} if cache is None else {seed: episode for seed in seeds if (episode := cache.read(seed)) is not None}
+    missing = [seed for seed in seeds if seed not in known]
     parts: list[Rollout] = []
-    for start in range(0, len(seeds), batch):
-        some = seeds[start : start + batch]
+    for start in range(0, len(missing), batch):
+        some = missing[start : start + batch]
 
-        def finished(running: int, first: int = start, size: int = len(some)) -> None:
+        def finished(running: int, first: int = len(known), size: int = len(some)) -> None:
             if on_done is not None:
                 on_done(first + size - running)
 
         parts.append(run_batch(policy, some, shape, plan, finished))
+        for episode in parts[-1].episodes:
+            known[episode.seed] = episode
+            if cache is not None:
+                cache.write(episode)
+    if on_done is not None:
+        on_done(len(seeds))
     return Rollout(
-        episodes=tuple(episode for part in parts for episode in part.episodes),
-        sparsity=tuple(value for part in parts for value in part.sparsity),
-        flops=tuple(value for part in parts for value in part.flops),
-        legalised=tuple(value for part in parts for value in part.legalised),
+        episodes=tuple(known[seed] for seed in seeds),
         call_ms=tuple(ms for part in parts for ms in part.call_ms),
     )

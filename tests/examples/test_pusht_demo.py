@@ -22,8 +22,17 @@ def printed(table):
 
 
 def rollout(coverage):
-    one = Episode(0, np.zeros((1, 2, 20), np.float32), np.zeros((2, 5)), np.zeros((1, 2)), np.array([coverage]))
-    return Rollout((one,), (0.95,), (1e9,), (0,), (1.0,))
+    one = Episode(
+        0,
+        np.zeros((1, 2, 20), np.float32),
+        np.zeros((2, 5)),
+        np.zeros((1, 2)),
+        np.array([coverage]),
+        (0.95,),
+        (1e9,),
+        (0,),
+    )
+    return Rollout((one,), (1.0,))
 
 
 def test_final_table_has_speed_and_score_of_each():
