@@ -88,6 +88,7 @@ class OnnxRuntime:
         self._groups = self._manifest.groups
         self._lowering = LoweringCache(self._groups)
         self._readable = readable_rollout(artifact)
+        self._corrections = tuple(artifact.corrections.values())
         self._matrices = False  # whether one was ever given
         self._written: BoolArray | None = None
         self._dropped: BoolArray | None = None  # computed in this episode, and not kept
@@ -152,7 +153,7 @@ class OnnxRuntime:
         else:
             decode_first(work, keep)
         decode_rest(work, settled.lowered, keep)
-        sample = work.sample[spec.sampler.steps % 2].copy()
+        sample = work.result()
         stop = time.perf_counter()
         computed = settled.plans == Source.COMPUTE
         self._written, self._dropped = written | (computed & keep), (dropped | computed) & ~keep
@@ -219,6 +220,8 @@ class OnnxRuntime:
         """
         work = Workspace(self._manifest, self._sessions, self._tables, streams)
         work.sums(self._slots)
+        for correction in self._corrections:
+            work.prepare(correction)
         for cell in np.flatnonzero(self._readable).tolist():
             work.rollout.entry(cell)
         spec = self._manifest.spec

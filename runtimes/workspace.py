@@ -9,16 +9,18 @@ same context buffers, to which the values of the step are copied.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ttscompile.artifact.manifest import ContextRecord, Manifest, PieceRecord, block_name
-from ttscompile.config import FloatArray, Noise, SamplerTable
+from ttscompile.config import FloatArray, Noise
 from ttscompile.correction import HISTORY, Correction, no_correction
 from ttscompile.errors import ArtifactError, ObservationError
 from ttscompile.ir.graph import TensorType
 from ttscompile.ir.program import Binding
+from ttscompile.update import matrices
 
 from .onnxruntime_sessions import Array, Bound, repeat_streams, run_named
 from .rollout_store import RolloutStore
@@ -41,7 +43,7 @@ class Workspace:
     Attributes:
         streams: B.
         axis: the axis of the streams in the residual stream.
-        sample: two arrays ``[B, T, D]``.
+        sample: two arrays ``[D, B, T]``.
         fresh: the residual stream as a step begins.
         stream: the residual stream after what was added to it.
         current: float32 ``[blocks, *stream]``, what each block computed last.
@@ -58,15 +60,16 @@ class Workspace:
         self.axis = kind.batch_axis or 0
         self._manifest, self._sessions = manifest, sessions
         self._steps, count = manifest.steps, len(manifest.blocks)
-        self.sample = [np.zeros((streams, *manifest.spec.sample), np.float32) for _ in range(2)]
+        horizon, dimensions = manifest.spec.sample
+        self.sample = [np.zeros((dimensions, streams, horizon), np.float32) for _ in range(2)]
+        self._initial = np.zeros((streams, horizon, dimensions), np.float32)
         self.fresh, self.stream = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
         self.current = np.zeros((count, *shape), np.float32)
         self.table = np.zeros((count, *shape), np.float32)
         self.rollout = RolloutStore(shape, self.axis)
         self._sums = np.zeros((0, *shape), np.float32)
-        self._noise = np.zeros((self._steps, streams, *manifest.spec.sample), np.float32)
-        sampler = manifest.spec.sampler
-        self._coefficients = np.stack([getattr(sampler, name) for name in SamplerTable.COLUMNS], axis=1)
+        self._sampler = manifest.spec.sampler
+        self._offset = np.zeros((self._steps, dimensions, streams, horizon), np.float32)
         self._step_inputs: dict[str, Array] = {}
         self._values: dict[str, Array] = {  # condition values; step and table values [K, ...]
             name: repeat_streams(tables[name], _row_axis(context), streams)
@@ -77,22 +80,28 @@ class Workspace:
         stem = manifest.pieces[STEM]
         assert stem.stream is not None
         at_first = {name: self._value(name, 0) for name in stem.inputs if name != stem.stream}
-        self._stem = Bound(sessions[STEM], {stem.stream: self.sample[0], **at_first}, {stem.outputs[0]: self.fresh})
-        self._history = np.zeros((streams, HISTORY * manifest.spec.sample[0], manifest.spec.sample[1]), np.float32)
+        self._stem = Bound(sessions[STEM], {stem.stream: self._initial, **at_first}, {stem.outputs[0]: self.fresh})
+        self._history = np.zeros((dimensions, streams, HISTORY * horizon), np.float32)
         self._prediction = np.zeros_like(self.sample[0])
         self._no_correction = no_correction(self._steps, manifest.spec.sample)
-        self._advances: dict[int, tuple[Correction, list[Bound]]] = {}  # by identity, which the entry keeps from reuse
-        self._corrected, self._advance = self._advances_with(self._no_correction)
+        self._advances: dict[int, _Advances] = {}  # by the correction's identity, which the entry keeps from reuse
+        self._advance = self._advances_with(self._no_correction)
         self._blocks = [_BoundBlock(self, b, streams, self.stream, self.current[b]) for b in range(count)]
         self._some: dict[tuple[int, int], _BoundBlock] = {}
 
     def start(self, obs: Mapping[str, FloatArray], noise: Noise, correction: Correction | None) -> None:
         """Take in an observation and the noise of a call, and run what they decide before the loop."""
-        np.copyto(self.sample[0], noise.initial)
-        self._corrected, self._advance = self._advances_with(correction or self._no_correction)
+        np.copyto(self._initial, noise.initial)
+        np.copyto(self.sample[0], noise.initial.transpose(2, 0, 1))
+        self._advance = self._advances_with(correction or self._no_correction)
         self._history.fill(0)
-        if self._manifest.spec.sampler.stochastic and noise.steps is not None:
-            np.copyto(self._noise, noise.steps)
+        if self._sampler.stochastic and noise.steps is not None:
+            column = self._sampler.noise_to_next[:, None, None, None]
+            np.multiply(noise.steps.transpose(0, 3, 1, 2), column, out=self._offset)
+        else:
+            self._offset.fill(0)
+        if correction is not None:
+            self._offset += correction.bias
         piece = self._manifest.pieces["condition"]
         if piece.outputs:
             feed = {name: np.ascontiguousarray(obs[name]) for name in piece.inputs}
@@ -117,12 +126,20 @@ class Workspace:
 
     def advance(self, k: int) -> None:
         """Tail, sampler, correction, and the next step's stem: reads ``stream``, writes ``fresh`` and a sample."""
-        self._advance[k].run()
-        if self._corrected.anchors[k]:
-            half, horizon = self._history.shape[1] // 2, self._prediction.shape[1]
-            self._history[:, half:] = self._history[:, :half]
-            self._history[:, :horizon] = self.sample[k % 2]
-            self._history[:, horizon:half] = self._prediction
+        self._advance.steps[k].run()
+        if self._advance.anchors[k]:
+            half, horizon = self._history.shape[2] // 2, self._prediction.shape[2]
+            self._history[:, :, half:] = self._history[:, :, :half]
+            self._history[:, :, :horizon] = self.sample[k % 2]
+            self._history[:, :, horizon:half] = self._prediction
+
+    def result(self) -> FloatArray:
+        """The sample after the last step, a copy ``[B, T, D]``."""
+        return np.ascontiguousarray(self.sample[self._steps % 2].transpose(1, 2, 0))
+
+    def prepare(self, correction: Correction) -> None:
+        """Make what the first call with a correction would have to make."""
+        self._advances_with(correction)
 
     def run(self, k: int, b: int) -> None:
         """Block b at step k for all streams: reads ``stream``, writes ``current[b]``."""
@@ -153,30 +170,32 @@ class Workspace:
     @property
     def nbytes(self) -> int:
         """Memory of all buffers, the rollout cache included."""
-        own = (*self.sample, self.fresh, self.stream, self.current, self.table, self._sums, self._noise, self._history)
+        own = (*self.sample, self.fresh, self.stream, self.current, self.table, self._sums, self._offset, self._history)
         kept = (*self._values.values(), *self._step_inputs.values())
         bound = sum(block.nbytes for block in (*self._blocks, *self._some.values()))
-        return sum(array.nbytes for array in (*own, *kept)) + bound + self.rollout.nbytes
+        updates = sum(advances.updates.nbytes for advances in self._advances.values())
+        return sum(array.nbytes for array in (*own, *kept)) + updates + bound + self.rollout.nbytes
 
-    def _advances_with(self, correction: Correction) -> tuple[Correction, list[Bound]]:
+    def _advances_with(self, correction: Correction) -> _Advances:
         """Bindings of all steps to the rows of a correction; made once for each."""
         known = self._advances.get(id(correction))
         if known is None:
-            known = correction, [self._bind_advance(k, correction) for k in range(self._steps)]
-            self._advances[id(correction)] = known
+            updates = matrices(self._sampler, correction)
+            steps = [self._bind_advance(k, updates[k]) for k in range(self._steps)]
+            known = self._advances[id(correction)] = _Advances(correction, correction.anchors.tolist(), updates, steps)
         return known
 
-    def _bind_advance(self, k: int, correction: Correction) -> Bound:
+    def _bind_advance(self, k: int, update: Array) -> Bound:
         piece = self._manifest.pieces[ADVANCE]
         following = min(k + 1, self._steps - 1)  # after the last step there is no stream to make; it is not read
         inputs = {
             "stream": self.stream,
             "sample": self.sample[k % 2],
-            "noise": self._noise[k],
-            "coefficients": self._coefficients[k],
+            "offset": self._offset[k],
             "history": self._history,
-            "correction": correction.weights[k],
-            "correction_bias": correction.bias[k],
+            "update": update,
+            "sample_to_x0": self._sampler.sample_to_x0[k : k + 1],
+            "out_to_x0": self._sampler.out_to_x0[k : k + 1],
         }
         for name in piece.inputs:
             if name not in inputs:
@@ -238,6 +257,23 @@ class Workspace:
         """Contexts that block b reads, and their values: ``[K, ...]`` unless they are of the condition."""
         piece = self._manifest.pieces[block_name(b)]
         return {n: (self._manifest.contexts[n], self._values[n]) for n in piece.inputs if n != piece.stream}
+
+
+@dataclass(frozen=True)
+class _Advances:
+    """What ``advance`` runs with one correction.
+
+    Attributes:
+        correction: it.
+        anchors: of each step, whether it enters the history.
+        updates: float32 ``[K, G, R, T]``.
+        steps: the bindings.
+    """
+
+    correction: Correction
+    anchors: list[bool]
+    updates: Array
+    steps: list[Bound]
 
 
 class _BoundBlock:

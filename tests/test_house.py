@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 MODULES = modules(ROOT)
 GRAPH = {name: imports(name, path) for name, path in MODULES.items()}
 
-BASE = {"errors", "config", "correction", "lattice"}
+BASE = {"errors", "config", "correction", "lattice", "update"}
 BELOW_ARTIFACT = BASE | {"ir", "artifact"}
 COMPILER = {"capture", "frontends", "lower", "passes", "samplers"}
 MAY_IMPORT = {
@@ -26,6 +26,7 @@ MAY_IMPORT = {
     "config": {"errors"},
     "correction": {"errors"},
     "lattice": {"errors"},
+    "update": {"config", "correction"},
     "machine": set(),
     "plots": {"errors", "lattice"},
     "samplers": BASE,

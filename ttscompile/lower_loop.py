@@ -20,33 +20,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from onnx import GraphProto, ModelProto
 
+from .ir.advance import X0_COLUMNS
 from .ir.program import Program
 from .lower_contexts import Contexts
 from .lower_graph_writer import GraphWriter, Weights, sequence, tensor
 from .lower_plan import LoweredPlan
 
-CORRECTION, CORRECTION_BIAS, ANCHORS = "correction", "correction_bias", "correction_anchors"
-"""Inputs of the whole call that carry a schedule's correction; the first two are ``advance``'s, with a row a step."""
-
 GROUP = 6
 """Blocks that are skipped with one question where none of them is computed."""
-
-
-@dataclass(frozen=True)
-class CorrectionInputs:
-    """Names of values of a correction (``ttscompile.correction``).
-
-    Attributes:
-        anchors: bool ``[K]``.
-        weights: ``[K, ...]``.
-        bias: ``[K, ...]``.
-        history: before step 0.
-    """
-
-    anchors: str
-    weights: str
-    bias: str
-    history: str
 
 
 @dataclass(frozen=True)
@@ -54,31 +35,35 @@ class LoopInputs:
     """Names of values that the loop reads.
 
     Attributes:
-        initial: sample at step 0.
-        noise: of all steps; None for a deterministic sampler.
+        initial: sample at step 0, ``[B, T, D]``.
+        offset: of the sampler's updates, ``[K, D, B, T]``.
+        update: matrices of the sampler's updates, ``[K, G, R, T]``.
+        anchors: bool ``[K]``; after these steps sample and prediction enter the history.
+        history: before step 0, ``[D, B, 4 T]``.
         rows: rollout cache ``[R, E]``, with a residual as a row of E numbers.
         index: int64 ``[K, N]``; which row is the residual of a cell.
-        correction: of the sampler's steps; None if ``advance`` reads none.
     """
 
     initial: str
-    noise: str | None
+    offset: str
+    update: str
+    anchors: str
+    history: str
     rows: str
     index: str
-    correction: CorrectionInputs | None
 
 
 @dataclass(frozen=True)
 class _State:
-    """What a step hands to the next; the history of the correction if there is one."""
+    """What a step hands to the next; the sample as ``[D, B, T]``."""
 
     sample: str
     stream: str
-    history: str | None = None
+    history: str
 
     @property
     def values(self) -> tuple[str, ...]:
-        return (self.sample, self.stream) if self.history is None else (self.sample, self.stream, self.history)
+        return (self.sample, self.stream, self.history)
 
 
 @dataclass(frozen=True)
@@ -121,12 +106,12 @@ class DenoisingLoop:
         """Write stem and loop.
 
         Returns:
-            The sample after the last step, and the computed residuals ``[computed cells, E]`` in order.
+            The sample after the last step ``[B, T, D]``, and the computed residuals ``[computed cells, E]`` in order.
         """
         main = self._main
         self._plan, self._inputs = plan, inputs
-        columns = [getattr(self._sampler, name) for name in self._sampler.COLUMNS]
-        self._coefficients = main.constant(np.stack(columns, axis=1), np.float32)
+        columns = {name: getattr(self._sampler, name)[:, None] for name in X0_COLUMNS}
+        self._x0_columns = {name: main.constant(column, np.float32) for name, column in columns.items()}
         stem = self._feeds(main, "stem", inputs.initial, main.constant(0))
         (stream,) = main.inline(self._models["stem"], stem, self._weights)
         self._shape = main.op("Shape", stream)
@@ -134,11 +119,12 @@ class DenoisingLoop:
         self._none = main.op("ConstantOfShape", main.op("Concat", main.constant([0]), width, axis=0))
         count = main.constant([len(self._groups)])
         table = main.op("ConstantOfShape", main.op("Concat", count, width, axis=0))
-        first = _State(inputs.initial, stream, inputs.correction.history if inputs.correction else None)
+        first = _State(main.op("Transpose", inputs.initial, perm=[2, 0, 1]), stream, inputs.history)
         carried = [*first.values, table, main.op("SequenceEmpty")]
         body = self._computed_step()
         state = main.ops("Loop", [plan.computed_steps, "", *carried], len(carried), body=body)
-        return state[0], main.op("ConcatFromSequence", state[-1], axis=0)
+        sample = main.op("Transpose", state[0], perm=[1, 2, 0])
+        return sample, main.op("ConcatFromSequence", state[-1], axis=0)
 
     def _computed_step(self) -> GraphProto:
         """Body of the outer loop: carries sample, stream, every block's last computed residual, and all computed."""
@@ -275,36 +261,28 @@ class DenoisingLoop:
 
     def _fresh_state(self, w: GraphWriter) -> _State:
         """Names for what a body carries."""
-        return _State(w.fresh("sample"), w.fresh("stream"), w.fresh("history") if self._inputs.correction else None)
+        return _State(w.fresh("sample"), w.fresh("stream"), w.fresh("history"))
 
     def _advance(self, w: GraphWriter, state: _State, k: str) -> _State:
         """Tail, sampler and the next step's stem."""
-        row = w.op("Gather", self._coefficients, k)
-        feeds = {"stream": state.stream, "sample": state.sample, "coefficients": row}
-        # A deterministic sampler has the input too, and does not read it.
-        feeds["noise"] = state.sample if self._inputs.noise is None else w.op("Gather", self._inputs.noise, k)
-        correction = self._inputs.correction
-        if correction is not None and state.history is not None:
-            feeds["history"] = state.history
-            feeds[CORRECTION] = w.op("Gather", correction.weights, k)
-            feeds[CORRECTION_BIAS] = w.op("Gather", correction.bias, k)
+        by_step = {"offset": self._inputs.offset, "update": self._inputs.update, **self._x0_columns}
+        feeds = {"stream": state.stream, "sample": state.sample, "history": state.history}
+        feeds |= {name: w.op("Gather", values, k) for name, values in by_step.items()}
         for value in self._models["advance"].graph.input:
             if value.name not in feeds:
                 where, _, name = value.name.partition(".")
                 graph, at = (self._pieces.tail, k) if where == "tail" else (self._pieces.stem, self._following(w, k))
                 feeds[value.name] = self._contexts.value(w, name, at, graph.inputs[name])
-        sample, stream, *prediction = w.inline(self._models["advance"], feeds, self._weights)
-        if correction is None or state.history is None:
-            return _State(sample, stream)
-        anchors = w.op("Gather", correction.anchors, k)
-        return _State(sample, stream, self._remembered(w, anchors, state.sample, prediction[0], state.history))
+        sample, stream, prediction = w.inline(self._models["advance"], feeds, self._weights)
+        is_anchor = w.op("Gather", self._inputs.anchors, k)
+        return _State(sample, stream, self._remembered(w, is_anchor, state.sample, prediction, state.history))
 
     def _remembered(self, w: GraphWriter, is_anchor: str, sample: str, prediction: str, history: str) -> str:
         """The history after a step: sample and prediction enter it if the step is an anchor, and the oldest leave."""
         anchor, other = w.inner(), w.inner()
-        length = anchor.op("Mul", anchor.op("Shape", sample, start=1, end=2), anchor.constant([2]))
-        kept = anchor.op("Slice", history, anchor.constant([0]), length, anchor.constant([1]))
-        longer = anchor.op("Concat", sample, prediction, kept, axis=1)
+        length = anchor.op("Mul", anchor.op("Shape", sample, start=2, end=3), anchor.constant([2]))
+        kept = anchor.op("Slice", history, anchor.constant([0]), length, anchor.constant([2]))
+        longer = anchor.op("Concat", sample, prediction, kept, axis=2)
         same = other.op("Identity", history)
         return w.choose(
             is_anchor,

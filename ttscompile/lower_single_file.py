@@ -40,13 +40,18 @@ import numpy as np
 from onnx import ModelProto, ValueInfoProto, helper
 
 from .config import PolicySpec
+from .correction import FEATURES, HISTORY, groups_of, no_correction
 from .errors import LoweringError
 from .ir.graph import TensorType
 from .ir.program import Program
 from .lower_contexts import Contexts
-from .lower_graph_writer import Array, GraphWriter, Weights, tensor
-from .lower_loop import ANCHORS, CORRECTION, CORRECTION_BIAS, GROUP, CorrectionInputs, DenoisingLoop, LoopInputs
+from .lower_graph_writer import GraphWriter, Weights, tensor
+from .lower_loop import GROUP, DenoisingLoop, LoopInputs
 from .lower_plan import LoweredPlan, lower_plan
+from .update import diagonals
+
+CORRECTION, CORRECTION_BIAS, ANCHORS = "correction", "correction_bias", "correction_anchors"
+"""Inputs of the whole call that carry a schedule's correction."""
 
 IR_VERSION = 10
 LARGEST = 2**31 - 1
@@ -79,12 +84,14 @@ def lower_single_file(program: Program, models: Mapping[str, ModelProto], weight
     plan = lower_plan(main, "plan", "rollout_index", groups, spec.sampler.steps, GROUP)
     one = main.op("Concat", main.op("Shape", "rollout_rows", start=0, end=1), _width(main), axis=0)
     stored = main.op("Reshape", "rollout_rows", one, allowzero=1)
-    noise = "step_noise" if spec.sampler.stochastic else None
-    defaults = _no_correction(models["advance"], spec.sampler.steps)
-    inputs += [tensor(name, array.dtype, array.shape) for name, array in defaults.items()]
-    correction = _correction(main, models["advance"], defaults) if defaults else None
+    given = no_correction(spec.sampler.steps, spec.sample)
+    for name, array in ((ANCHORS, given.anchors), (CORRECTION, given.weights), (CORRECTION_BIAS, given.bias)):
+        inputs.append(tensor(name, array.dtype, array.shape))
+        main.default(name, array)
+    update, offset, history = _update(main, spec, streams)
     loop = DenoisingLoop(main, program, models, weights, contexts)
-    sample, residuals = loop.write(plan, LoopInputs("initial_noise", noise, stored, "rollout_index", correction))
+    values = LoopInputs("initial_noise", offset, update, ANCHORS, history, stored, "rollout_index")
+    sample, residuals = loop.write(plan, values)
     _write_actions(main, sample, spec)
     main.rename(plan.executed, "executed_plan")
     _write_cache(main, plan, stored, residuals, (spec.sampler.steps, len(groups)))
@@ -144,23 +151,37 @@ def _normalized(main: GraphWriter, key: str, spec: PolicySpec) -> str:
     return main.op("Add", scaled, main.constant(each.normalizer.offset, np.float32))
 
 
-def _no_correction(advance: ModelProto, steps: int) -> dict[str, Array]:
-    """Inputs of the correction, and what they are if they are not given; none if ``advance`` reads none."""
-    shapes = {value.name: [d.dim_value for d in value.type.tensor_type.shape.dim] for value in advance.graph.input}
-    if CORRECTION not in shapes:
-        return {}
-    zeros = {name: np.zeros((steps, *shapes[name]), np.float32) for name in (CORRECTION, CORRECTION_BIAS)}
-    return {ANCHORS: np.zeros(steps, np.bool_), **zeros}
+def _update(main: GraphWriter, spec: PolicySpec, streams: str) -> tuple[str, str, str]:
+    """``ttscompile.update`` in ONNX: matrices of all steps, offsets of all steps, and the history before step 0."""
+    (horizon, dimensions), sampler = spec.sample, spec.sampler
+    groups, eye = groups_of(sampler.steps, spec.sample), np.eye(horizon, dtype=np.float32)
+    parts, end = [], 0
+    for place, column in diagonals(sampler).items():
+        diagonal = main.constant(column[:, None, None, None] * eye, np.float32)
+        if place == FEATURES:  # the correction has no rows for it
+            parts.append(_slice(main, CORRECTION, end * horizon, FEATURES * horizon))
+            end = FEATURES
+            shape = main.constant([sampler.steps, groups, horizon, horizon])
+            parts.append(main.op("Expand", diagonal, shape))
+        else:
+            part = _slice(main, CORRECTION, place * horizon, (place + 1) * horizon)
+            parts.append(main.op("Add", part, diagonal))
+            end = place + 1
+    if end < FEATURES:
+        parts.append(_slice(main, CORRECTION, end * horizon, FEATURES * horizon))
+    update = main.op("Concat", *parts, axis=2)
+    sizes = main.constant([sampler.steps, dimensions]), streams, main.constant([horizon])
+    offset = main.op("Expand", CORRECTION_BIAS, main.op("Concat", *sizes, axis=0))
+    if sampler.stochastic:
+        noise = main.op("Transpose", "step_noise", perm=[0, 3, 1, 2])
+        scale = main.constant(sampler.noise_to_next[:, None, None, None], np.float32)
+        offset = main.op("Add", main.op("Mul", noise, scale), offset)
+    shape = main.op("Concat", main.constant([dimensions]), streams, main.constant([HISTORY * horizon]), axis=0)
+    return update, offset, main.op("ConstantOfShape", shape)
 
 
-def _correction(main: GraphWriter, advance: ModelProto, defaults: Mapping[str, Array]) -> CorrectionInputs:
-    """The correction, with an empty history."""
-    for name, array in defaults.items():
-        main.default(name, array)
-    (history,) = (value for value in advance.graph.input if value.name == "history")
-    sizes = [main.constant([d.dim_value]) for d in list(history.type.tensor_type.shape.dim)[1:]]
-    shape = main.op("Concat", main.op("Shape", "initial_noise", start=0, end=1), *sizes, axis=0)
-    return CorrectionInputs(ANCHORS, CORRECTION, CORRECTION_BIAS, main.op("ConstantOfShape", shape))
+def _slice(main: GraphWriter, value: str, start: int, stop: int) -> str:
+    return main.op("Slice", value, *(main.constant([n]) for n in (start, stop, 2)))
 
 
 def _width(main: GraphWriter) -> str:

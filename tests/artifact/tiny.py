@@ -21,6 +21,7 @@ def f32(*shape: int | Batch) -> TensorType:
 
 B = Batch()
 SAMPLE, STREAM, CONTEXT = f32(B, HORIZON, CHANNELS), f32(B, HORIZON, WIDTH), f32(B, 1, WIDTH)
+TURNED = f32(CHANNELS, B, HORIZON)
 LOGITS = f32(B, STEPS, 2, 4)
 
 
@@ -194,36 +195,33 @@ def model(graph: Graph, nodes: list[NodeProto]) -> ModelProto:
 
 def advance() -> ModelProto:
     """Tail, sampler update and stem as one graph."""
-    columns = [make_node("Split", ["coefficients"], [f"c{i}" for i in range(6)], axis=0, num_outputs=6)]
     nodes = [
         *project("out", "stream", "tail.weight"),
-        *columns,
-        *weighted("x0", [("sample", "c0"), ("out", "c1")]),
-        make_node("Clip", ["x0", "low", "high"], ["clipped"]),
-        *weighted("updated", [("clipped", "c2"), ("sample", "c3"), ("out", "c4"), ("noise", "c5")]),
-        make_node("Identity", ["out"], ["prediction"]),
-        make_node("Concat", ["sample", "out", "history"], ["features"], axis=1),
-        make_node("Transpose", ["features"], ["turned"], perm=[2, 0, 1]),
-        make_node("MatMul", ["turned", "correction"], ["product"]),
-        make_node("Add", ["product", "correction_bias"], ["corrected"]),
-        make_node("Transpose", ["corrected"], ["added"], perm=[1, 2, 0]),
-        make_node("Add", ["updated", "added"], ["sample_next"]),
-        *project("embedded", "sample_next", "stem.weight"),
+        make_node("Transpose", ["out"], ["prediction"], perm=[2, 0, 1]),
+        make_node("Mul", ["sample", "sample_to_x0"], ["from_sample"]),
+        make_node("Mul", ["prediction", "out_to_x0"], ["from_out"]),
+        make_node("Sum", ["from_sample", "from_out"], ["x0"]),
+        make_node("Clip", ["x0", "low", "high"], ["denoised"]),
+        make_node("Concat", ["sample", "prediction", "history", "denoised"], ["features"], axis=2),
+        make_node("MatMul", ["features", "update"], ["product"]),
+        make_node("Add", ["product", "offset"], ["sample_next"]),
+        make_node("Transpose", ["sample_next"], ["following"], perm=[1, 2, 0]),
+        *project("embedded", "following", "stem.weight"),
         make_node("Add", ["embedded", "stem.position"], ["stream_next"]),
     ]
     inputs = {
         "stream": STREAM,
-        "sample": SAMPLE,
-        "noise": SAMPLE,
-        "coefficients": f32(6),
-        "history": TensorType((Batch(), 4 * HORIZON, CHANNELS), "float32"),
-        "correction": f32(CHANNELS, 6 * HORIZON, HORIZON),
-        "correction_bias": f32(CHANNELS, 1, HORIZON),
+        "sample": TURNED,
+        "offset": TURNED,
+        "history": TensorType((CHANNELS, Batch(), 4 * HORIZON), "float32"),
+        "update": f32(CHANNELS, 7 * HORIZON, HORIZON),
+        "sample_to_x0": f32(1),
+        "out_to_x0": f32(1),
         "stem.position": f32(1, HORIZON, WIDTH),
     }
     constants = {"tail.weight": f32(CHANNELS, WIDTH), "stem.weight": f32(WIDTH, CHANNELS)}
     proto = make(
-        nodes, inputs, {"sample_next": SAMPLE, "stream_next": STREAM, "prediction": SAMPLE}, constants, list(inputs)
+        nodes, inputs, {"sample_next": TURNED, "stream_next": STREAM, "prediction": TURNED}, constants, list(inputs)
     )
     proto.graph.initializer.extend(
         [
@@ -232,11 +230,6 @@ def advance() -> ModelProto:
         ]
     )
     return proto
-
-
-def weighted(result: str, terms: list[tuple[str, str]]) -> list[NodeProto]:
-    nodes = [make_node("Mul", [x, c], [f"{result}_{i}"]) for i, (x, c) in enumerate(terms)]
-    return [*nodes, make_node("Sum", [f"{result}_{i}" for i in range(len(terms))], [result])]
 
 
 def make(nodes, inputs, outputs, constants, order) -> ModelProto:  # type: ignore[no-untyped-def]

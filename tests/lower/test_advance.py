@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from tests.lower.modules import TOKENS, WIDTH, spec, table
 from tests.passes.graphs import Builder
 from ttscompile.config import SamplerTable
+from ttscompile.correction import Correction, no_correction
 from ttscompile.errors import LoweringError
 from ttscompile.ir.advance import fuse_advance
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Batch, Graph, Ref
+from ttscompile.update import matrices
 
 B = Batch()
 SHAPE = (B, TOKENS, WIDTH)
@@ -44,60 +47,79 @@ def update(sampler: SamplerTable, x: torch.Tensor, out: torch.Tensor, noise: tor
     return row["x0_to_next"] * x0 + rest
 
 
-def correction(inputs: dict[str, torch.Tensor], out: torch.Tensor) -> torch.Tensor:
-    """What the correction adds, one number at a time."""
-    weights, bias = inputs["correction"], inputs["correction_bias"]
-    streams, horizon, dimensions = out.shape
-    result = torch.zeros_like(out)
+def corrected(weights: torch.Tensor, bias: torch.Tensor, *parts: torch.Tensor) -> torch.Tensor:
+    """What the correction adds, one number at a time; parts are ``[B, T', D]``."""
+    streams, horizon, dimensions = parts[0].shape
+    result = torch.zeros_like(parts[0])
     for s in range(streams):
         for d in range(dimensions):
-            features = torch.cat([inputs["sample"][s, :, d], out[s, :, d], inputs["history"][s, :, d]])
+            features = torch.cat([part[s, :, d] for part in parts])
             group = min(d, len(weights) - 1)
             for t in range(horizon):
                 result[s, t, d] = features @ weights[group, :, t] + bias[group, 0, t]
     return result
 
 
+def random_correction(steps: int, scale: float) -> Correction:
+    rng = np.random.default_rng(0)
+    nothing = no_correction(steps, (TOKENS, WIDTH))
+    weights, bias = (rng.standard_normal(a.shape).astype(np.float32) * scale for a in (nothing.weights, nothing.bias))
+    return Correction(nothing.anchors, weights, bias)
+
+
+def turned(x: torch.Tensor) -> torch.Tensor:
+    return x.permute(2, 0, 1)
+
+
 @pytest.mark.parametrize(
-    ("sampler", "sums"),
+    ("sampler", "terms"),
     [
-        (table(clip=1.0, **DDPM), 3),
-        (table(clip=None, **DDPM), 3),
-        (table(clip=0.5, **dict.fromkeys(SamplerTable.COLUMNS, 0.3)), 4),
-        (table(clip=1.0, sample_to_next=1.0, out_to_next=-0.1), 1),
-        (table(clip=1.0, out_to_x0=1.0, x0_to_next=0.5), 0),
+        (table(clip=1.0, **DDPM), 2),
+        (table(clip=None, **DDPM), 0),
+        (table(clip=0.5, **dict.fromkeys(SamplerTable.COLUMNS, 0.3)), 2),
+        (table(clip=None, **dict.fromkeys(SamplerTable.COLUMNS, 0.3)), 0),
+        (table(clip=1.0, sample_to_next=1.0, out_to_next=-0.1), 0),
+        (table(clip=1.0, out_to_x0=1.0, x0_to_next=0.5), 1),
         (table(clip=1.0, x0_to_next=1.0), 0),
         (table(clip=None), 0),
     ],
 )
-def test_equals_the_parts_one_by_one(sampler: SamplerTable, sums: int) -> None:
+def test_equals_the_parts_one_by_one(sampler: SamplerTable, terms: int) -> None:
     tail, stem = pieces()
     fused = fuse_advance(tail, stem, spec(sampler))
     assert list(fused.inputs) == [
         "stream",
         "sample",
-        "noise",
-        "coefficients",
+        "offset",
         "history",
-        "correction",
-        "correction_bias",
+        "update",
+        "sample_to_x0",
+        "out_to_x0",
         "tail.time",
         "stem.time",
     ]
     assert fused.outputs == ("sample_next", "stream_next", "prediction")
     assert set(fused.constants) == {"head", "bias", "embed"}
-    assert sum(node.name.startswith("sampler.sum") for node in fused.nodes) == sums  # terms of zero are left out
+    assert sum(node.name.startswith("update.term") for node in fused.nodes) == terms  # terms of zero are left out
     torch.manual_seed(0)
     weights = {name: torch.randn(type_.at(1)) for name, type_ in fused.constants.items()}
+    of_plan = random_correction(sampler.steps, 0.1)  # small, so that float32 is exact to the tolerance
+    row = {name: torch.tensor([float(getattr(sampler, name)[0])]) for name in SamplerTable.COLUMNS}
+    bias = torch.from_numpy(of_plan.bias[0])
     for streams in (1, 3):
         inputs = {name: torch.randn(type_.at(streams)) for name, type_ in fused.inputs.items()}
-        inputs["coefficients"] = torch.tensor([float(getattr(sampler, name)[0]) for name in SamplerTable.COLUMNS])
-        inputs["correction"] *= 0.1  # so that float32 is exact to the tolerance
+        sample, noise = torch.randn(2, streams, TOKENS, WIDTH)
+        history = torch.randn(streams, 4 * TOKENS, WIDTH)
+        inputs |= {"sample": turned(sample), "history": turned(history)}
+        inputs |= {"offset": turned(noise) * row["noise_to_next"] + bias}
+        inputs |= {"update": torch.from_numpy(matrices(sampler, of_plan)[0])}
+        inputs |= {name: row[name] for name in ("sample_to_x0", "out_to_x0")}
         sample_next, stream_next, prediction = evaluate(fused, weights, inputs)
         (out,) = evaluate(tail, weights, {"a9": inputs["stream"], "time": inputs["tail.time"]})
-        torch.testing.assert_close(prediction, out)
-        expected = update(sampler, inputs["sample"], out, inputs["noise"]) + correction(inputs, out)
-        torch.testing.assert_close(sample_next, expected)
+        torch.testing.assert_close(prediction, turned(out))
+        added = corrected(torch.from_numpy(of_plan.weights[0]), bias, sample, out, history)
+        expected = update(sampler, sample, out, noise) + added
+        torch.testing.assert_close(sample_next, turned(expected))
         (expected,) = evaluate(stem, weights, {"sample": expected, "time": inputs["stem.time"]})
         torch.testing.assert_close(stream_next, expected)
 
@@ -109,12 +131,12 @@ def test_a_stem_that_does_nothing() -> None:
     weights = {name: torch.randn(type_.at(1)) for name, type_ in fused.constants.items()}
     inputs = {name: torch.randn(type_.at(2)) for name, type_ in fused.inputs.items()}
     sample_next, stream_next, _ = evaluate(fused, weights, inputs)
-    torch.testing.assert_close(sample_next, stream_next)
+    torch.testing.assert_close(sample_next, turned(stream_next))
 
 
 def test_weights_whose_names_are_taken_are_refused() -> None:
     tail, stem = pieces()
-    for name in ("noise", "tail.time", "sample_next"):
+    for name in ("offset", "tail.time", "sample_next"):
         nodes = tuple(node.renamed(lambda n, name=name: name if n == "head" else n) for node in tail.nodes)
         constants = {name if n == "head" else n: t for n, t in tail.constants.items()}
         with pytest.raises(LoweringError, match=f"'{name}'.*Rename"):
@@ -123,9 +145,9 @@ def test_weights_whose_names_are_taken_are_refused() -> None:
 
 def test_inner_names_give_way_to_constants() -> None:
     tail, stem = pieces()
-    nodes = tuple(node.renamed(lambda n: "sampler.row" if n == "head" else n) for node in tail.nodes)
-    constants = {"sampler.row" if n == "head" else n: t for n, t in tail.constants.items()}
+    nodes = tuple(node.renamed(lambda n: "update.features" if n == "head" else n) for node in tail.nodes)
+    constants = {"update.features" if n == "head" else n: t for n, t in tail.constants.items()}
     fused = fuse_advance(replace(tail, nodes=nodes, constants=constants), stem, spec(table(**DDPM)))
     names = [*fused.inputs, *fused.constants, *(node.name for node in fused.nodes)]
     assert len(set(names)) == len(names)
-    assert any(Ref("sampler.row") in node.args for node in fused.nodes)
+    assert any(Ref("update.features") in node.args for node in fused.nodes)

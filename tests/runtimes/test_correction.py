@@ -90,6 +90,23 @@ def test_it_belongs_to_the_plan_of_its_name(corrected: tuple[Path, Correction, n
     assert np.abs(dense - named).max() > 1e-3
 
 
+def test_the_first_call_binds_nothing(
+    corrected: tuple[Path, Correction, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    artifact = load_artifact(corrected[0])
+    runtime = open_runtime(artifact, "onnxruntime")
+    obs, noise = random_inputs(artifact, np.random.default_rng(1), 1)
+    made: list[object] = []
+    monkeypatch.setattr("ttscompile.runtimes.workspace.Bound", lambda *arguments: made.append(arguments))
+    plans, correction = artifact.schedule("fast")[None], artifact.corrections["fast"]
+    runtime.predict(obs, noise, plans, plan_name="fast", correction=correction)
+    assert made == []
+    another = Correction(correction.anchors, correction.weights, correction.bias)
+    with pytest.raises(AttributeError):  # what stands in for a binding cannot run
+        runtime.predict(obs, noise, plans, plan_name="fast", correction=another)
+    assert len(made) == artifact.manifest.steps
+
+
 def test_it_is_part_of_the_identity(corrected: tuple[Path, Correction, np.ndarray]) -> None:
     path, _, plan = corrected
     before = load_artifact(path).manifest

@@ -15,7 +15,7 @@ from ..ir.program import Binding, Reuse
 from ..lattice import PlanArray, plan_flops
 
 FORMAT = "ttscompile artifact"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 MANIFEST = "manifest.json"
 DENSE = "dense"
 """The plan that computes every cell; every artifact has it without listing it."""

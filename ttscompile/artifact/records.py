@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from ..correction import correction_flops
 from ..errors import ArtifactError
+from ..ir.advance import OUTPUTS, OWN_INPUTS
 from ..ir.flops import graph_flops
 from ..ir.graph import Graph, TensorType
 from ..ir.joint import JOINT, RESIDUAL, join
@@ -197,8 +198,7 @@ def _interface(name: str, graphs: Mapping[str, Graph]) -> tuple[tuple[str, ...],
     if name != "advance":
         return tuple(graphs[name].inputs), graphs[name].outputs
     contexts = [f"{part}.{context}" for part in ("tail", "stem") for context in _contexts(part, graphs[part])]
-    own = ("stream", "sample", "noise", "coefficients", "history", "correction", "correction_bias")
-    return (*own, *contexts), ("sample_next", "stream_next", "prediction")
+    return (*OWN_INPUTS, *contexts), OUTPUTS
 
 
 def _available(name: str, binding: Binding, kind: TensorType, pieces: Pieces, steps: int) -> bool:
