@@ -18,6 +18,8 @@ from ttscompile.errors import RuntimeUnavailableError, SpecError
 from ttscompile.lattice import Source
 
 if TYPE_CHECKING:
+    from torch import nn
+
     from ttscompile.frontends.eager import EagerPolicy
     from ttscompile.runtimes.policy import CompiledPolicy
 
@@ -196,12 +198,28 @@ def _eager(checkpoint: Path, threads: int, spec: PolicySpec, dense_flops: float)
     try:
         import torch
 
-        from ttscompile.frontends import load_checkpoint_policy
         from ttscompile.frontends.eager import eager_policy
     except ModuleNotFoundError as error:
         raise RuntimeUnavailableError(
             f"--against eager needs {error.name}, which is not installed. Run: pip install 'ttscompile[compile]'."
         ) from error
+    module = original_network(checkpoint, spec)
+    torch.set_num_threads(threads)
+    return network_contestant("eager PyTorch", eager_policy(module, spec), spec, dense_flops)
+
+
+def original_network(checkpoint: Path, spec: PolicySpec) -> nn.Module:
+    """The network of the checkpoint that an artifact was made from; needs torch.
+
+    Args:
+        checkpoint: as ``convert`` took it.
+        spec: of the artifact.
+
+    Raises:
+        SpecError: the checkpoint is of another policy.
+    """
+    from ttscompile.frontends import load_checkpoint_policy
+
     module, original = load_checkpoint_policy(checkpoint)
     if _interface(original) != _interface(spec):
         raise SpecError(
@@ -213,8 +231,7 @@ def _eager(checkpoint: Path, threads: int, spec: PolicySpec, dense_flops: float)
             f"{checkpoint}: expected the policy that the artifact was made from; found another one of the same shapes:"
             f" the normaliser of {', '.join(different)} differs. Give that policy's checkpoint."
         )
-    torch.set_num_threads(threads)
-    return network_contestant("eager PyTorch", eager_policy(module, spec), spec, dense_flops)
+    return module
 
 
 def network_contestant(label: str, run: EagerPolicy, spec: PolicySpec, dense_flops: float) -> Contestant:

@@ -1,0 +1,75 @@
+"""What the arithmetic alone takes: onnxruntime on the same blocks, one after the other, and nothing between them.
+
+    floor of a call = FLOPs of its computed cells / FLOP/s of that
+
+The blocks run in sequence, over and over, as in a dense step, so that the weights come from the same caches as in a
+call. Prologue, pruner, tails, additions and the loop are not in it: the quotient of a measured time and its floor is
+what all of these cost.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ttscompile.artifact.load import Artifact, load_artifact
+from ttscompile.artifact.manifest import block_name
+from ttscompile.cli.timing import Contestant, Measurement, random_calls
+from ttscompile.lattice import PlanArray, plan_flops
+from ttscompile.runtimes.onnxruntime_sessions import Bound, open_sessions
+from ttscompile.runtimes.workspace import Workspace
+
+FLOOR, TAILS = "blocks back to back", "tails back to back"
+SEQUENCES = 5
+"""How often the blocks are gone through in one timed run: about the cells of a 95 % plan of 100 steps."""
+
+
+def blocks_contestant(directory: Path, threads: int) -> Contestant:
+    """All blocks in order, ``SEQUENCES`` times over; ``flops`` of its measurement are theirs alone."""
+    artifact = load_artifact(directory)
+    manifest = artifact.manifest
+    sessions = open_sessions(artifact, threads)
+    bound = [_bind(artifact, sessions[block_name(b)], b) for b in range(len(manifest.blocks))] * SEQUENCES
+
+    def call(*_: object) -> None:
+        for one in bound:
+            one.run()
+
+    total = SEQUENCES * float(sum(manifest.flops.blocks))
+    return Contestant(FLOOR, "", call, lambda: None, manifest.spec, total)
+
+
+def tails_contestant(directory: Path, threads: int) -> Contestant:
+    """Tail, sampler and the next step's stem of all K steps, with no block between them."""
+    artifact = load_artifact(directory)
+    manifest = artifact.manifest
+    work = Workspace(manifest, open_sessions(artifact, threads), artifact.tables, 1)
+    ((obs, noise),) = random_calls(manifest.spec, 1, seed=0)
+    for key, spec in manifest.spec.observations.items():
+        obs[key] = obs[key] if spec.normalizer is None else spec.normalizer.normalize(obs[key])
+    work.start(obs, noise, None)
+
+    def call(*_: object) -> None:
+        for k in range(manifest.steps):
+            work.advance(k)
+
+    total = float(manifest.steps * (manifest.flops.stem + manifest.flops.tail))
+    return Contestant(TAILS, "", call, lambda: None, manifest.spec, total)
+
+
+def floor_ms(plan: PlanArray, artifact: Artifact, blocks: Measurement) -> float:
+    """Milliseconds that the computed cells of a plan take at the speed of ``blocks_contestant``."""
+    rate = blocks.flops / blocks.median_ms
+    return plan_flops(plan, artifact.manifest.flops.blocks) / rate
+
+
+def _bind(artifact: Artifact, session: object, b: int) -> Bound:
+    """A block tied to arrays of random numbers: zeros would have attention and normalisation work on special cases."""
+    manifest = artifact.manifest
+    piece, kind = manifest.pieces[block_name(b)], manifest.blocks[b].type
+    assert piece.stream is not None
+    rng = np.random.default_rng(b)
+    types = {piece.stream: kind, **{name: manifest.contexts[name].type for name in piece.contexts}}
+    inputs = {name: rng.standard_normal(one.at(1)).astype(one.dtype) for name, one in types.items()}
+    return Bound(session, inputs, {piece.outputs[0]: np.zeros(kind.at(1), np.float32)})

@@ -1,0 +1,143 @@
+"""The plans, the floor and the rounds of the benchmark; no time is asserted."""
+
+from pathlib import Path
+
+import floor
+import numpy as np
+import pytest
+import rounds
+from networks import plan_at, plan_name, random_network, sampler_of
+
+import ttscompile
+from ttscompile import Source
+from ttscompile.artifact import load_artifact
+from ttscompile.cli.timing import Contestant, Measurement, random_calls
+from ttscompile.errors import RuntimeUnavailableError
+
+
+@pytest.mark.parametrize("steps", [8, 16, 100])
+@pytest.mark.parametrize("sparsity", [0.0, 0.8, 0.9, 0.95, 0.98])
+def test_a_plan_has_its_share_of_reused_cells(steps: int, sparsity: float) -> None:
+    plan = plan_at(steps, 24, sparsity)
+    if (1 - sparsity) * steps < 1 - 1e-9:
+        assert plan is None
+        return
+    assert plan.shape == (steps, 24)
+    assert np.count_nonzero(plan == Source.COMPUTE) == round((1 - sparsity) * steps * 24)
+    assert (plan[0] == Source.COMPUTE).all()
+    assert set(np.unique(plan)) <= {Source.COMPUTE, Source.TIMESTEP}
+
+
+def test_a_sampler_may_have_more_steps_than_the_training() -> None:
+    table = sampler_of("ddpm", 120)
+    assert table.steps == len(set(table.timesteps.tolist())) == 120
+    assert sampler_of("ddim", 8).steps == 8
+
+
+@pytest.fixture(scope="module")
+def tiny(tiny_artifact: Path) -> tuple[Path, dict[float, np.ndarray]]:
+    artifact = load_artifact(tiny_artifact)
+    return tiny_artifact, {s: artifact.schedule(plan_name(s)) for s in (0.0, 0.5)}
+
+
+def test_an_artifact_has_the_plans_that_there_can_be(tiny: tuple[Path, dict[float, np.ndarray]]) -> None:
+    directory, plans = tiny
+    artifact = load_artifact(directory)
+    assert set(artifact.schedules) == {"reuse-0%", "reuse-50%"}  # 98 % were asked for, too
+    assert artifact.manifest.default_plan == "reuse-50%"
+    np.testing.assert_array_equal(plans[0.5], plan_at(8, 3, 0.5))
+    assert (plans[0.0] == Source.COMPUTE).all()
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_the_floor_runs_every_block_as_often_as_it_says(
+    tiny: tuple[Path, dict[float, np.ndarray]], threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    directory, plans = tiny
+    ran = []
+    monkeypatch.setattr(floor.Bound, "run", lambda self: ran.append(self))
+    contestant = floor.blocks_contestant(directory, threads)
+    contestant.call({}, None)
+    assert len(ran) == 3 * floor.SEQUENCES
+    assert ran[:3] == ran[3:6]
+    assert len(set(map(id, ran))) == 3
+    artifact = load_artifact(directory)
+    flops = artifact.manifest.flops.blocks
+    assert contestant.dense_flops == floor.SEQUENCES * sum(flops)
+    # At 5 sequences in 20 ms, the eight steps of a dense call take 32 ms, and half of its cells half of that.
+    blocks = Measurement("", "", (20.0,), 20.0, (20.0, 20.0), None, None, contestant.dense_flops, 0.0, 0)
+    assert floor.floor_ms(plans[0.0], artifact, blocks) == pytest.approx(32.0)
+    assert floor.floor_ms(plans[0.5], artifact, blocks) == pytest.approx(16.0)
+
+
+def test_the_floors_blocks_compute_numbers(tiny: tuple[Path, dict[float, np.ndarray]]) -> None:
+    artifact = load_artifact(tiny[0])
+    sessions = floor.open_sessions(artifact, 1)
+    for b in range(3):
+        bound = floor._bind(artifact, sessions[f"block_{b:02d}"], b)
+        bound.run()
+        assert np.isfinite(bound._arrays[-1]).all()
+        assert bound._arrays[-1].std() > 0
+
+
+def test_tails_take_every_step(tiny: tuple[Path, dict[float, np.ndarray]], monkeypatch: pytest.MonkeyPatch) -> None:
+    steps = []
+    contestant = floor.tails_contestant(tiny[0], 1)
+    advance = floor.Workspace.advance
+    monkeypatch.setattr(floor.Workspace, "advance", lambda self, k: (steps.append(k), advance(self, k)))
+    contestant.call({}, None)
+    assert steps == list(range(8))
+
+
+def test_passes_are_pooled_and_every_group_has_its_threads() -> None:
+    spec = random_network(16, "ddim", 8, layers=1).spec
+    seen = []
+
+    def contestant(label: str) -> Contestant:
+        return Contestant(
+            label, "", lambda *_: seen.append((label, rounds.torch.get_num_threads())), lambda: None, spec, 1.0
+        )
+
+    before = rounds.torch.get_num_threads()
+    groups = {1: [contestant("a"), contestant("b")], 2: [contestant("a")]}
+    ticks = []
+    measured = rounds.measure_in_passes(groups, rounds.Effort(2, 3), lambda: ticks.append(1))
+    assert rounds.torch.get_num_threads() == before
+    assert [[len(m.times_ms) for m in measured[threads]] for threads in (1, 2)] == [[6, 6], [6]]
+    assert measured[1][0].median_ms == pytest.approx(np.median(measured[1][0].times_ms))
+    assert {one for one in seen if one[0] == "b"} == {("b", 1)}
+    assert len([one for one in seen if one == ("a", 2)]) == len(ticks) / 2 == (3 + 2) + (1 + 2) + (1 + 2)
+    assert len(ticks) == rounds.rounds_of(groups, rounds.Effort(2, 3))
+
+
+def test_eager_and_compiled_agree(tiny: tuple[Path, dict[float, np.ndarray]]) -> None:
+    network = random_network(16, "ddim", 8, layers=1)
+    ((obs, noise),) = random_calls(network.spec, 1, seed=0)
+    eager = rounds.eager_contestant(network, 1.0).call(obs, noise)
+    found = ttscompile.load(tiny[0]).predict_action(obs, noise=noise, plan="dense")["action_pred"]
+    np.testing.assert_allclose(np.asarray(eager), found, atol=1e-4)
+
+
+def test_without_torch_compile_the_reason_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(module: object, **_: object) -> object:
+        def call(**_: object) -> None:
+            raise RuntimeError("no C++\n\ncompiler\nand much more")
+
+        return call
+
+    monkeypatch.setattr(rounds.torch, "compile", refuse)
+    with pytest.raises(RuntimeUnavailableError, match=r"RuntimeError: no C\+\+ compiler \(inductor needs"):
+        rounds.torch_compile_contestant(random_network(16, "ddim", 8, layers=1), 1.0, 1)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:torch")
+def test_torch_compile_computes_the_same() -> None:
+    network = random_network(16, "ddim", 8, layers=1)
+    ((obs, noise),) = random_calls(network.spec, 1, seed=0)
+    try:
+        contestant = rounds.torch_compile_contestant(network, 1.0, 1)
+    except RuntimeUnavailableError as error:
+        pytest.skip(str(error))
+    found = contestant.call(obs, noise)
+    np.testing.assert_allclose(found, rounds.eager_contestant(network, 1.0).call(obs, noise), atol=1e-4)
