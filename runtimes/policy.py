@@ -77,6 +77,7 @@ def load(
     seed: int | None = None,
     *,
     precision: str | None = None,
+    plan: str | None = None,
 ) -> CompiledPolicy:
     """Load a compiled policy.
 
@@ -89,8 +90,11 @@ def load(
         seed: of the noise that is drawn when none is given; None for another sequence every time.
         precision: of the weights of residual blocks: ``fp32``, which every artifact holds; None for what it was
             converted with. The reference runtime computes in fp32 always.
+        plan: that ``predict_action`` uses when it is given none: ``dense`` or the name of a plan of the artifact; None
+            for the artifact's default.
 
     Raises:
+        IllegalPlanError: the artifact has no plan of this name.
         ArtifactError: the artifact is missing, damaged, of another version, or without blocks of this precision.
         RuntimeUnavailableError: the runtime cannot be had on this machine.
     """
@@ -99,7 +103,9 @@ def load(
         precision = precision or FP32
     if precision is not None:
         artifact = artifact.at_precision(precision)
-    return CompiledPolicy(artifact, open_runtime(artifact, runtime, threads), seed)
+    if plan is not None:
+        _require_plan(artifact, plan)  # before the sessions are opened
+    return CompiledPolicy(artifact, open_runtime(artifact, runtime, threads), seed, plan)
 
 
 class CompiledPolicy:
@@ -111,11 +117,17 @@ class CompiledPolicy:
         artifact: loaded and checked.
         runtime: opened on the same artifact.
         seed: of the noise that is drawn when none is given.
+        plan: see ``load``.
+
+    Raises:
+        IllegalPlanError: the artifact has no plan of this name.
     """
 
-    def __init__(self, artifact: Artifact, runtime: Runtime, seed: int | None = None) -> None:
+    def __init__(self, artifact: Artifact, runtime: Runtime, seed: int | None = None, plan: str | None = None) -> None:
         self._artifact, self._runtime = artifact, runtime
         self._manifest = artifact.manifest
+        self._default = artifact.manifest.default_plan if plan is None else plan
+        _require_plan(artifact, self._default)
         self._rng = np.random.default_rng(seed)
         self._report: CallReport | None = None
         self._lock = threading.Lock()
@@ -140,7 +152,7 @@ class CompiledPolicy:
             identity=manifest.identity,
             model_identity=manifest.model_identity,
             plans=(DENSE, *manifest.plans),
-            default_plan=manifest.default_plan,
+            default_plan=self._default,
             precision=manifest.precision_name,
             rollout=rollout_needs(self._artifact),
         )
@@ -165,7 +177,7 @@ class CompiledPolicy:
             obs_dict: by key ``[B, ...]``, numpy arrays or torch tensors, not normalised. ``info.observation`` has keys,
                 shapes and dtypes. B may only change after ``reset``.
             noise: the random numbers of the call; None has them drawn.
-            plan: None for the artifact's default; ``dense`` or the name of a plan of the artifact, whose reads of what
+            plan: None for the default of ``load``; ``dense`` or the name of a plan of the artifact, whose reads of what
                 was never computed are repaired and counted in the report; or int8 ``[K, blocks]`` or
                 ``[B, K, blocks]`` of ``ttscompile.Source``, which is executed as it is or refused.
 
@@ -213,7 +225,7 @@ class CompiledPolicy:
     def _plan(self, plan: str | npt.ArrayLike | None) -> tuple[npt.NDArray[Any] | None, str, bool]:
         """Matrix (None: the pruner's), name for the report, and whether illegal reads are repaired."""
         if plan is None:
-            plan = self._manifest.default_plan
+            plan = self._default
         if not isinstance(plan, str):
             given: Any = plan
             try:
@@ -225,12 +237,8 @@ class CompiledPolicy:
                 ) from error
         if plan == DENSE:
             return self._artifact.schedule(DENSE), DENSE, False
-        record = self._manifest.plans.get(plan)
-        if record is None:
-            raise IllegalPlanError(
-                f"the artifact has no plan {plan!r}; it has {[DENSE, *self._manifest.plans]}. Use one of these, or a"
-                " matrix [K, blocks] of ttscompile.Source."
-            )
+        _require_plan(self._artifact, plan)
+        record = self._manifest.plans[plan]
         return (None if record.kind == "pruner" else self._artifact.schedule(plan)), plan, True
 
     @contextmanager
@@ -244,6 +252,16 @@ class CompiledPolicy:
             yield
         finally:
             self._lock.release()
+
+
+def _require_plan(artifact: Artifact, name: str) -> None:
+    """Raise unless the artifact has a plan of this name."""
+    known = [DENSE, *artifact.manifest.plans]
+    if name not in known:
+        raise IllegalPlanError(
+            f"the artifact has no plan {name!r}; it has {known}. Use one of these, or give predict_action a matrix"
+            " [K, blocks] of ttscompile.Source."
+        )
 
 
 def _of_one_stream(type_: TensorType) -> tuple[int, ...]:

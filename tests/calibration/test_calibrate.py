@@ -34,7 +34,7 @@ def quick(artifact: Path, recording: Path, **changes: Any) -> CalibrationResult:
 @pytest.fixture(autouse=True)
 def short_search(monkeypatch: pytest.MonkeyPatch) -> None:
     """So few intervals that all phases are gone through."""
-    monkeypatch.setattr(tts, "SEARCH", 4)
+    monkeypatch.setattr(tts, "DISTANCES", (1,))
 
 
 @pytest.fixture(scope="session")
@@ -45,7 +45,7 @@ def calibrated(
     directory = tmp_path_factory.mktemp("calibrated") / "compiled"
     shutil.copytree(compiled, directory)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tts, "SEARCH", 4)
+        patch.setattr(tts, "DISTANCES", (1,))
         return directory, quick(directory, recording, max_intervals=None)
 
 
@@ -102,6 +102,7 @@ def test_the_record_is_in_the_artifact(calibrated: tuple[Path, CalibrationResult
     assert record["sparsity"] == pytest.approx(result.sparsity)
     assert record["stopped"] == result.stopped == "converged"
     assert set(manifest.plans) == set(result.plans)
+    assert record["budget"] == {"target_sparsity": TARGET, "cells": 18}
     assert not (directory / FILE).exists()
 
 
@@ -148,9 +149,9 @@ def test_resuming_after_a_kill_ends_where_it_would_have_ended(
             quick(artifact, recording, max_intervals=None)
     assert load_artifact(artifact).manifest.identity == before  # the artifact works as it did
     counted = _count_targets(monkeypatch)
-    quick(artifact, recording, max_intervals=None, resume=True)
+    result = quick(artifact, recording, max_intervals=None, resume=True)
     assert contents(artifact) == contents(calibrated[0])
-    assert counted() < 40  # some were known
+    assert counted() < sum(result.calls.values())  # some were known
 
 
 def _count_targets(monkeypatch: pytest.MonkeyPatch) -> Callable[[], int]:
@@ -229,7 +230,7 @@ def test_no_better_than_uniform_is_a_failure_that_changes_nothing(
     assert {n: c for n, c in contents(artifact).items() if n != FILE} == before
 
 
-@pytest.mark.parametrize("target", [0.95, 1.0, -0.1, float("nan")])
+@pytest.mark.parametrize("target", [0.95, 0.901])
 def test_a_target_out_of_reach_is_refused(artifact: Path, recording: Path, target: float) -> None:
     with pytest.raises(CalibrationError, match=r"at most 0\.9 of the 10 x 6 cells"):
         quick(artifact, recording, target_sparsity=target)
@@ -265,7 +266,7 @@ def test_two_short_episodes_are_enough(artifact: Path, tmp_path: Path) -> None:
     path = tmp_path / "short.npz"
     np.savez(path, obs=draw.standard_normal((2, 2, 3)).astype(np.float32), episode_ends=[1, 2])
     result = quick(artifact, path, strategy="interval")
-    assert result.calls == {"calibration": 1, "validation": 1}
+    assert result.calls == {"calibration": 8, "validation": 1}  # each observation with eight noises
 
 
 def test_constant_observations_are_fine(artifact: Path, tmp_path: Path) -> None:

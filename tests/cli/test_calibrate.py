@@ -43,10 +43,14 @@ def test_every_file_up_to_the_next_option_is_taken(arguments: list[str], asked: 
     assert args == (Path("out"),)
     assert kwargs == {
         "trajectories": [Path("a.npz"), Path("b.npz")],
-        "target_sparsity": 0.95,
+        "target_sparsity": None,
         "strategy": "tts",
         "seed": 3,
         "resume": False,
+        "target_flops": None,
+        "latency_ms": None,
+        "max_action_error": None,
+        "threads": 1,
         "max_minutes": 15.0,
     }
 
@@ -69,3 +73,27 @@ def test_every_strategy_can_be_asked_for(asked: list[Any]) -> None:
     result = CliRunner().invoke(main, ["calibrate", "out", "--trajectories", "a.npz", "--strategy", "magic"])
     assert result.exit_code == 2
     assert len(asked) == len(NAMES)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--target-sparsity", "0"], "target_sparsity 0 asks for the dense policy"),
+        (["--target-sparsity", "1"], "expected a number above 0 and below 1; found 1.0"),
+        (["--latency-ms", "20", "--target-flops", "0.9"], "found target_flops and latency_ms. They exclude each other"),
+        (["--max-action-error", "nan"], "max_action_error: expected a number above 0; found nan"),
+    ],
+)
+def test_a_budget_that_cannot_be_is_an_error(options: list[str], message: str) -> None:
+    result = CliRunner().invoke(main, ["calibrate", "out", "--trajectories", "a.npz", *options])
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert message in result.stderr
+
+
+def test_budgets_reach_the_library(asked: list[Any]) -> None:
+    CliRunner().invoke(
+        main, ["calibrate", "out", "--trajectories", "a.npz", "b.npz", "--latency-ms", "20", "--threads", "2"]
+    )
+    ((_, kwargs),) = asked
+    assert (kwargs["target_sparsity"], kwargs["latency_ms"], kwargs["threads"]) == (None, 20.0, 2)
+    assert len(kwargs["trajectories"]) == 2

@@ -32,13 +32,13 @@ def test_a_file_that_is_no_checkpoint(no_checkpoint: Path) -> None:
     assert list(no_checkpoint.parent.iterdir()) == [no_checkpoint]
 
 
-@pytest.mark.parametrize("command", ["inspect", "bench", "calibrate"])
+@pytest.mark.parametrize("command", ["inspect", "bench", "calibrate", "compare"])
 @pytest.mark.parametrize("made", [False, True])
 def test_what_is_no_artifact(command: str, made: bool, tmp_path: Path) -> None:
     directory = tmp_path / "nothing"
     if made:
         directory.mkdir()
-    arguments = [command, str(directory)] + ["--trajectories", "calls.npz"] * (command == "calibrate")
+    arguments = [command, str(directory)] + ["--trajectories", "calls.npz"] * (command in ("calibrate", "compare"))
     result = CliRunner().invoke(main, arguments)
     assert result.exit_code == 2
     assert result.stdout == ""
@@ -55,7 +55,7 @@ def test_what_is_no_artifact(command: str, made: bool, tmp_path: Path) -> None:
         (["convert", "policy.ckpt", "-o", "out", "--steps", "0"], "not in the range"),
         (["calibrate", "out"], "Missing option '--trajectories'"),
         (["calibrate", "out", "--trajectories"], "Missing option '--trajectories'"),
-        (["calibrate", "out", "--trajectories", "a.npz", "--target-sparsity", "1"], "not in the range"),
+        (["calibrate", "out", "--trajectories", "a.npz", "--target-sparsity", "1"], "above 0 and below 1"),
         (["inspect", "out", "--plan", "dense"], "give --plot FILE too"),
         (["bench", "out", "--against", "eager"], "give --checkpoint FILE too"),
         (["bench", "out", "--against", "tensorrt"], "'tensorrt' is not one of eager, onnxruntime-dense"),

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from ..artifact.load import Artifact
+from ..artifact.manifest import Manifest
 from ..errors import CalibrationFailedError
 from ..lattice import PlanArray, uniform_plan
 from ..runtimes.base import pruner_plan
+from .budget import ERROR, FLOPS, Goal
 from .calls import Actions, Calls
 from .execute import Executor
+from .named import Named
 from .result import CalibrationResult, PlanScore
 from .strategies import Found
 
@@ -27,13 +32,16 @@ def uniform_of(artifact: Artifact, budget: int) -> PlanArray:
     return uniform_plan(manifest.steps, blocks, -(-budget // blocks))
 
 
-def judge(artifact: Artifact, executor: Executor, found: Found, calls: Calls, budget: int) -> dict[str, PlanScore]:
-    """Scores of the plans that a strategy found and of the baseline.
+def judge(
+    artifact: Artifact, executor: Executor, found: Found, named: Named, calls: Calls, budget: int
+) -> dict[str, PlanScore]:
+    """Scores of the plans that a strategy found, of those beside it, and of the baseline.
 
     Args:
         artifact: the policy.
         executor: of the policy.
         found: by the strategy.
+        named: plans beside the target.
         calls: of episodes that it did not learn from, with targets.
         budget: computed cells.
 
@@ -42,21 +50,41 @@ def judge(artifact: Artifact, executor: Executor, found: Found, calls: Calls, bu
     """
     manifest, actions = artifact.manifest, Actions(artifact.manifest.spec)
     scores = {}
-    for name, plan in ((SCHEDULE, found.schedule), (UNIFORM, uniform_of(artifact, budget))):
-        errors = actions.errors(executor.run([plan], calls)[0], calls.targets, units=True)
+    corrected, plain = executor.corrected(found.correction), executor.corrected(None)
+    judged = [(SCHEDULE, found.schedule, corrected), (UNIFORM, uniform_of(artifact, budget), plain)]
+    judged += [(name, plan, executor.corrected(named.corrections[name])) for name, plan in named.plans.items()]
+    for name, plan, runs in judged:
+        errors = actions.errors(runs.run([plan], calls)[0], calls.targets, units=True)
         scores[name] = PlanScore.of(errors, plan[None], manifest.flops, pruned=False)
     if found.pruner is not None:
         plans = pruner_plan(executor.logits(calls, found.pruner))
-        errors = actions.errors(executor.run_each(plans, calls), calls.targets, units=True)
+        errors = actions.errors(corrected.run_each(plans, calls), calls.targets, units=True)
         scores[PRUNED] = PlanScore.of(errors, plans, manifest.flops, pruned=True)
     return scores
 
 
-def require_success(result: CalibrationResult, is_baseline: bool) -> None:
+def default_of(scores: Mapping[str, PlanScore], goal: Goal, cells: int, manifest: Manifest) -> str:
+    """The pruner's plans if they are no worse than the schedule on held-out calls, and keep the budget as it does.
+
+    Args:
+        scores: of all plans.
+        goal: what was asked for.
+        cells: what it comes to.
+        manifest: of the artifact.
+    """
+    pruned = scores.get(PRUNED)
+    if pruned is None or pruned.sparsity < goal.sparsity(cells, manifest) - 1e-9:
+        return SCHEDULE
+    saves = goal.kind != FLOPS or pruned.flops_saved >= goal.value - 1e-9
+    return PRUNED if saves and pruned.error <= scores[SCHEDULE].error else SCHEDULE
+
+
+def require_success(result: CalibrationResult, goal: Goal, is_baseline: bool) -> None:
     """Raise unless the default plan is what was asked for.
 
     Args:
         result: of the calibration.
+        goal: what was asked for.
         is_baseline: the strategy is the baseline, and need not be better than it.
 
     Raises:
@@ -70,6 +98,18 @@ def require_success(result: CalibrationResult, is_baseline: bool) -> None:
         raise CalibrationFailedError(
             f"{what} reaches a sparsity of {chosen.sparsity:.4f} on the validation calls; the target is"
             f" {result.target_sparsity:g}. The artifact is as it was. Calibrate with more episodes or more time."
+        )
+    if goal.kind == FLOPS and chosen.flops_saved < goal.value - 1e-9:
+        raise CalibrationFailedError(
+            f"{what} saves {chosen.flops_saved:.4f} of the FLOPs of a dense call; the target is {goal.value:g}: its"
+            " blocks cost more than the average. The artifact is as it was. Raise the target a little, or take strategy"
+            " 'tts', which computes whole steps."
+        )
+    if goal.kind == ERROR and not chosen.error <= goal.value:
+        raise CalibrationFailedError(
+            f"{what} computes {result.budget['cells']} cells, and is {chosen.error:.4g} off on average on the"
+            f" validation calls; at most {goal.value:g} was asked for. The artifact is as it was. Allow a larger error,"
+            " more time, or calibrate with more episodes."
         )
     if not is_baseline and not chosen.error < BETTER * baseline.error:
         raise CalibrationFailedError(

@@ -5,47 +5,55 @@ from __future__ import annotations
 import hashlib
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from ..artifact.load import Artifact, load_artifact
-from ..artifact.write import update_calibration
+from ..artifact.write import PRUNER, update_calibration
 from ..errors import CalibrationError
-from ..lattice import sparsity
 from ..trajectories import Episode, load_trajectories
-from .calls import Actions, Calls, prepare_calls, sample_calls, split_episodes
+from .budget import ERROR, LATENCY, Budget, Goal, cells_of, goal_of
+from .calls import Actions, Calls, split_episodes
+from .clock import Clock
 from .execute import Executor
-from .judge import PRUNED, SCHEDULE, UNIFORM, judge, require_success, uniform_of
+from .families import Families, budget_of_error
+from .head import has_head
+from .judge import PRUNED, SCHEDULE, UNIFORM, default_of, judge, require_success, uniform_of
+from .latency import measure_budget
+from .named import SHARE, Named, named_plans, relaxed
+from .precision import precision_record
 from .progress import Bar
-from .result import CalibrationResult, PlanScore
+from .result import CalibrationResult
+from .search import search_plan
 from .state import StateFile
-from .strategies import Found, Strategy, Task, open_strategy, require_strategy
+from .strategies import Found, Task, open_strategy, require_reach, require_strategy
+from .targets import draw_calls, with_targets
+from .whole_steps import WholeSteps
 
-CALLS_A_MINUTE = 16
-"""Calls to learn from, for each minute of the time limit; half as many again are judged on."""
+CALLS_A_MINUTE = 64
+"""Calls to learn from, for each minute of the time limit."""
 
-FEWEST_CALLS, MOST_CALLS = 32, 192
+FEWEST_CALLS, MOST_CALLS = 32, 1024
 
-CLOSING_SHARE = 0.3
-"""What a strategy does at the end is left out where it would take more than this share of the time: on Push-T an
-interval of search lowers the error by 3 to 30 %, the switches by a few."""
-
-TARGETS_AT_ONCE = 16
-"""Dense calls between two states: a few seconds."""
+JUDGED = 128
+"""Calls of the held-out episodes at most that plans are judged on."""
 
 
 def calibrate(
     path: str | os.PathLike[str],
     trajectories: Sequence[str | os.PathLike[str]],
-    target_sparsity: float = 0.95,
+    target_sparsity: float | None = None,
     strategy: str = "tts",
     seed: int = 0,
     resume: bool = False,
     *,
+    target_flops: float | None = None,
+    latency_ms: float | None = None,
+    max_action_error: float | None = None,
+    threads: int = 1,
     max_minutes: float = 15.0,
     validation_fraction: float = 0.25,
     max_intervals: int | None = None,
@@ -56,15 +64,24 @@ def calibrate(
     Targets come from the dense policy with the same noise. Plans are judged on episodes that they were not learned
     from. After every interval of some seconds the state is saved in the artifact's directory: whatever stops the
     process, a call with ``resume`` goes on from there, and ends where it would have ended. The same arguments give the
-    same bytes, unless the time limit cuts the search short.
+    same bytes, unless the time limit cuts the search short, or the budget is a latency, which is measured.
+
+    At most one budget: ``target_sparsity``, ``target_flops``, ``latency_ms`` or ``max_action_error``. Beside the plan
+    that keeps it, ``schedule``, the artifact gets ``uniform``, the baseline; and with strategy ``tts`` ``safe``, which
+    computes twice as many cells, and ``fast``, which computes half as many.
 
     Args:
         path: the artifact's directory.
         trajectories: ``.npz`` files, see ``ttscompile.trajectories``.
-        target_sparsity: share of the cells to reuse.
-        strategy: ``tts`` learns; ``interval`` is the uniform schedule.
+        target_sparsity: share of the cells to reuse; 0.95 if no budget is given.
+        strategy: how the plan is found, see ``ttscompile.calibration.strategies``.
         seed: of the split, the noise and the search.
         resume: go on where a calibration with the same arguments was interrupted; begins anew if none was.
+        target_flops: share of the FLOPs of a dense call to save, prologue and pruner counted.
+        latency_ms: of a call with onnxruntime on this machine. Measured once, for as many whole steps as fit.
+        max_action_error: mean absolute error of the executed actions on held-out episodes, in their units; the plan is
+            the sparsest that was found below it. Strategy ``tts`` only.
+        threads: of the calls that are timed for ``latency_ms``.
         max_minutes: after this time the best plan so far is taken. Also decides how many calls are used.
         validation_fraction: of the episodes.
         max_intervals: an end that does not depend on the machine's speed; None for the strategy's own.
@@ -74,21 +91,21 @@ def calibrate(
         What was achieved.
 
     Raises:
-        CalibrationFailedError: the target was not reached, or the plan is no better than the uniform schedule of the
-            same sparsity. The artifact is as it was.
+        CalibrationFailedError: the budget was not kept, or the plan is no better than the uniform schedule that
+            computes as much. The artifact is as it was.
         CalibrationError: the arguments cannot be satisfied, or there is nothing to resume with these.
         TrajectoryError: the recordings do not fit the policy.
         ArtifactError: no artifact, or it cannot be written.
     """
     begun = time.monotonic()
+    goal = goal_of(target_sparsity, target_flops, latency_ms, max_action_error, threads)
     artifact = load_artifact(Path(path))
     spec = artifact.manifest.spec
     if not Path(path).is_dir():
         raise CalibrationError(
             f"{path}: only a directory can be calibrated. Unzip the artifact and give the directory."
         )
-    require_strategy(strategy)
-    budget = _budget(artifact, target_sparsity, validation_fraction, max_minutes)
+    budget = _known_budget(artifact, goal, strategy, validation_fraction, max_minutes)
     episodes = load_trajectories(trajectories, spec.observations, spec.chunk.stop - spec.chunk.start)
     if len(episodes) < 2:
         raise CalibrationError(
@@ -96,20 +113,13 @@ def calibrate(
             " learned from. Record more; about sixteen are enough."
         )
     split = split_episodes(len(episodes), validation_fraction, seed)
-    executor = Executor(artifact)
     limit = int(np.clip(CALLS_A_MINUTE * max_minutes, FEWEST_CALLS, MOST_CALLS))
-    sets = {}
-    for number, (name, chosen, count) in enumerate(
-        (("calibration", split.calibration, limit), ("validation", split.validation, limit // 2))
-    ):
-        drawn = sample_calls(episodes, chosen, count, seed)
-        sets[name] = prepare_calls(executor.model, spec, episodes, drawn, (seed, 2, number))
     state = StateFile(
         Path(path),
         {
             "model": artifact.manifest.model_identity[:16],
             "trajectories": _digest(episodes),
-            "target_sparsity": target_sparsity,
+            "budget": goal.record(),
             "strategy": strategy,
             "seed": seed,
             "validation_fraction": validation_fraction,
@@ -119,70 +129,123 @@ def calibrate(
     )
     if not (resume and state.load()):
         state.remove()
-    clock = _Clock(begun, float(state.progress.get("seconds", 0.0)), 60 * max_minutes)
+    clock = Clock(begun, float(state.progress.get("seconds", 0.0)), 60 * max_minutes)
+    if goal.kind == LATENCY:
+        budget = _timed_budget(artifact, goal, strategy, state, clock)
+    executor = Executor(artifact)
+    sets = draw_calls(executor, spec, episodes, split, limit, min(JUDGED, limit // 2), seed)
     with Bar(progress) as bar:
-        sets = {name: _with_targets(executor, name, calls, state, clock, bar) for name, calls in sets.items()}
-        task = Task(executor, Actions(spec), sets["calibration"], budget, seed, artifact.pruner)
-        found, intervals, stopped = _search(open_strategy(strategy, task), state, clock, bar, max_intervals)
-    scores = judge(artifact, executor, found, sets["validation"], budget)
+        sets = {name: with_targets(executor, name, calls, state, clock, bar) for name, calls in sets.items()}
+        kinds = tuple(block.kind for block in artifact.manifest.blocks)
+        task = Task(executor, Actions(spec), sets["calibration"], len(kinds), seed, artifact.pruner, kinds)
+        whole = WholeSteps(task)
+        families = Families(whole, state, clock, bar)
+        if budget is None:
+            budget = budget_of_error(families, goal, artifact.manifest.steps, len(kinds))
+        task = replace(task, budget=budget.cells)
+        searching = clock.until(1 - SHARE) if strategy == "tts" else clock
+        found, intervals, stopped = search_plan(open_strategy(strategy, task), state, searching, bar, max_intervals)
+        if goal.kind == ERROR:
+            found, budget = _relax(artifact, families, whole, task, found, budget, sets["validation"])
+        named = named_plans(families, whole, task, strategy, budget.cells)
+    scores = judge(artifact, executor, found, named, sets["validation"], budget.cells)
     result = CalibrationResult(
         strategy=strategy,
         seed=seed,
-        target_sparsity=target_sparsity,
-        default_plan=_default(scores, target_sparsity),
+        target_sparsity=goal.sparsity(budget.cells, artifact.manifest),
+        budget=budget.record(),
+        default_plan=default_of(scores, goal, budget.cells, artifact.manifest),
         plans=scores,
+        skipped=named.skipped,
         episodes={"calibration": split.calibration, "validation": split.validation},
         calls={name: calls.count for name, calls in sets.items()},
         intervals=intervals,
         stopped=stopped,
         seconds=clock.elapsed(),
     )
-    require_success(result, found.is_baseline)
-    update_calibration(
-        path,
-        found.pruner,
-        {SCHEDULE: found.schedule, UNIFORM: uniform_of(artifact, budget)},
-        result.default_plan,
-        {**result.record(), **found.notes},
-        model_identity=artifact.manifest.model_identity,
-    )
+    require_success(result, goal, found.is_baseline)
+    precision = precision_record(artifact, episodes, split.validation, SCHEDULE, found.schedule, seed)
+    _write(Path(path), artifact, result, found, named, {**found.notes, **precision})
     state.remove()
     return result
 
 
-def _default(scores: Mapping[str, PlanScore], target: float) -> str:
-    """The pruner's plans if they are no worse than the schedule on the held-out calls, and as sparse as was asked."""
-    pruned = scores.get(PRUNED)
-    if pruned is None or pruned.sparsity < target - 1e-9 or pruned.error > scores[SCHEDULE].error:
-        return SCHEDULE
-    return PRUNED
+def _write(
+    path: Path, artifact: Artifact, result: CalibrationResult, found: Found, named: Named, notes: dict[str, object]
+) -> None:
+    """Put the plans into the artifact."""
+    corrections = dict(named.corrections)
+    if found.correction is not None:
+        corrections[SCHEDULE] = found.correction
+        if found.pruner is not None:
+            corrections[PRUNED if result.default_plan == PRUNED else PRUNER] = found.correction
+    uniform = uniform_of(artifact, int(result.budget["cells"]))
+    update_calibration(
+        path,
+        found.pruner,
+        {SCHEDULE: found.schedule, UNIFORM: uniform, **named.plans},
+        result.default_plan,
+        {**result.record(), **notes, "named_steps": dict(named.steps)},
+        corrections=corrections,
+        model_identity=artifact.manifest.model_identity,
+    )
 
 
-class _Clock:
-    """Seconds of work, the parts before an interruption included."""
-
-    def __init__(self, begun: float, before: float, limit: float) -> None:
-        self._begun, self._before, self.limit = begun, before, limit
-
-    def elapsed(self) -> float:
-        return time.monotonic() - self._begun + self._before
-
-
-def _budget(artifact: Artifact, target: float, fraction: float, minutes: float) -> int:
-    """How many cells a plan may compute."""
-    steps, blocks = artifact.manifest.steps, len(artifact.manifest.blocks)
+def _known_budget(artifact: Artifact, goal: Goal, strategy: str, fraction: float, minutes: float) -> Budget | None:
+    """The budget where nothing has to be run for it; refuses what cannot be satisfied before any work."""
+    require_strategy(strategy)
     if not 0 < fraction < 1 or not minutes > 0:
         raise CalibrationError(
             f"expected validation_fraction between 0 and 1 and max_minutes above 0; found {fraction} and {minutes}."
         )
-    budget = int((1 - target) * steps * blocks + 1e-6) if 0 <= target < 1 else 0
-    if budget < blocks:
+    if goal.kind == ERROR and strategy != "tts":
         raise CalibrationError(
-            f"target sparsity {target:g} cannot be reached: step 0 of every call is dense, so at most"
-            f" {1 - 1 / steps:.4g} of the {steps} x {blocks} cells can be reused. Lower the target, or convert with"
-            " more denoising steps."
+            f"max_action_error needs strategy 'tts'; found {strategy!r}. Give this strategy a target_sparsity, a"
+            " target_flops or a latency_ms."
         )
+    if goal.kind in (LATENCY, ERROR):
+        return None
+    cells = cells_of(goal, artifact.manifest, _may_prune(artifact, strategy))
+    require_reach(strategy, artifact.manifest.steps, len(artifact.manifest.blocks), cells)
+    return Budget(goal, cells)
+
+
+def _timed_budget(artifact: Artifact, goal: Goal, strategy: str, state: StateFile, clock: Clock) -> Budget:
+    """The budget of a latency: measured, or what was measured before an interruption."""
+    known = state.progress.get("latency")
+    if known is None:
+        budget = measure_budget(artifact, goal, _may_prune(artifact, strategy))
+        state.progress.update(latency={"cells": budget.cells, "measured": budget.measured}, seconds=clock.elapsed())
+        state.save()
+    else:
+        budget = Budget(goal, known["cells"], known["measured"])
+    require_reach(strategy, artifact.manifest.steps, len(artifact.manifest.blocks), budget.cells)
     return budget
+
+
+def _may_prune(artifact: Artifact, strategy: str) -> bool:
+    """Whether plans may be made by the pruner, whose cost then counts."""
+    return strategy == "tts" and has_head(artifact.pruner)
+
+
+def _relax(
+    artifact: Artifact, families: Families, whole: WholeSteps, task: Task, found: Found, budget: Budget, held_out: Calls
+) -> tuple[Found, Budget]:
+    """More steps, as long as the held-out error is above what was asked for and at least half of them are left out."""
+    steps, blocks = artifact.manifest.steps, len(artifact.manifest.blocks)
+
+    def misses(one: Found, cells: int) -> bool:
+        scores = judge(artifact, task.executor, one, Named(), held_out, cells)
+        return not scores[default_of(scores, budget.goal, cells, artifact.manifest)].error <= budget.goal.value
+
+    while misses(found, budget.cells):
+        full = budget.cells // blocks
+        more = full + max(1, full // 4)
+        other = relaxed(found, families, whole, task, more) if more <= steps // 2 else None
+        if other is None:
+            break
+        found, budget = other, replace(budget, cells=more * blocks)
+    return found, budget
 
 
 def _digest(episodes: Sequence[Episode]) -> str:
@@ -192,45 +255,3 @@ def _digest(episodes: Sequence[Episode]) -> str:
             digest.update(f"{key} {array.dtype} {array.shape}".encode())
             digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()[:16]
-
-
-def _with_targets(executor: Executor, name: str, calls: Calls, state: StateFile, clock: _Clock, bar: Bar) -> Calls:
-    """The calls with what the dense policy answers to them."""
-    known = state.get("targets").get(name)
-    targets = calls.targets if known is None else torch.from_numpy(known)
-    bar.stage(f"dense, {name}", calls.count, len(targets))
-    while len(targets) < calls.count:
-        numbers = np.arange(len(targets), min(len(targets) + TARGETS_AT_ONCE, calls.count))
-        targets = torch.cat([targets, executor.run_dense(executor.selector.calls(calls, numbers))])
-        state.put("targets", {**state.get("targets"), name: targets.numpy()})
-        state.progress["seconds"] = clock.elapsed()
-        state.save()
-        bar.update(len(targets), "", clock.limit - clock.elapsed())
-    return replace(calls, targets=targets)
-
-
-def _search(search: Strategy, state: StateFile, clock: _Clock, bar: Bar, most: int | None) -> tuple[Found, int, str]:
-    """Intervals until the strategy is done, or the time is up; what it found, how many, and why it stopped."""
-    count = search.intervals if most is None else min(most, search.intervals)
-    first = int(state.progress.get("intervals", 0))
-    if first:
-        search.restore(state.get("strategy"))
-    bar.stage("search", count, first)
-    number, longest, cut = first, 0.0, False
-    while number < count and not search.done:
-        start = clock.elapsed()
-        if number > 0 and start + longest > clock.limit:
-            return search.found(), number, "time limit"
-        closing = search.closing * longest
-        if number > 0 and closing <= CLOSING_SHARE * clock.limit and start + longest + closing > clock.limit:
-            search.close()
-            cut = True
-        search.advance(number)
-        number += 1
-        longest = max(longest, clock.elapsed() - start)
-        state.put("strategy", search.state())
-        state.progress.update(intervals=number, seconds=clock.elapsed())
-        state.save()
-        left = min(clock.limit - clock.elapsed(), (count - number) * longest)
-        bar.update(number, f"error {search.loss:.4f}, sparsity {sparsity(search.plan):.2%}", left)
-    return search.found(), number, "time limit" if cut else "converged" if search.done else "finished"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -60,7 +60,7 @@ class CalibrationResult:
     Attributes:
         strategy: how the plan was found.
         seed: of everything random.
-        target_sparsity: what was asked for.
+        target_sparsity: what was asked for, or what the budget comes to.
         default_plan: the plan that the artifact now uses; a key of ``plans``.
         plans: every plan that was judged, by name; ``uniform`` is the baseline that computes as much.
         episodes: numbers of the episodes in the order of the files, learned from and judged on.
@@ -68,6 +68,8 @@ class CalibrationResult:
         intervals: how many intervals the search took.
         stopped: why it ended: ``converged``, ``finished`` or ``time limit``.
         seconds: of work, the parts before an interruption included.
+        budget: what was asked for, the cells that it comes to, and what was measured for it; JSON.
+        skipped: why there is no plan of a name that there might be.
     """
 
     strategy: str
@@ -80,6 +82,8 @@ class CalibrationResult:
     intervals: int
     stopped: str
     seconds: float
+    budget: Mapping[str, Any] = field(default_factory=dict)
+    skipped: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def sparsity(self) -> float:

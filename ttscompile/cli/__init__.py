@@ -13,6 +13,7 @@ import click
 from ttscompile import __version__
 from ttscompile.cli.bench import bench
 from ttscompile.cli.calibrate import calibrate
+from ttscompile.cli.compare import compare
 from ttscompile.cli.convert import convert
 from ttscompile.cli.inspect import inspect
 from ttscompile.cli.plan import plan
@@ -38,5 +39,5 @@ def main() -> None:
     """Compile diffusion-transformer robot policies into artifacts that run in real time without PyTorch."""
 
 
-for _command in (convert, calibrate, inspect, bench, plan, serve):
+for _command in (convert, calibrate, inspect, compare, bench, plan, serve):
     main.add_command(_command)

@@ -26,23 +26,24 @@ STRATEGIES = (
 """``calibration.strategies.NAMES``; written again, since importing that takes torch and a second."""
 
 
-class _FilesCommand(click.Command):
-    """Lets ``--trajectories`` take every word up to the next option, which click's own options cannot."""
+class FilesCommand(click.Command):
+    """Lets ``--trajectories`` and ``--with`` take every word up to the next option, which click's own cannot."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """As click does, with the option repeated before every word."""
         expanded: list[str] = []
-        taking = False
+        taking = ""
         for arg in args:
             if taking and not arg.startswith("-"):
-                expanded += ["--trajectories", arg]
+                expanded += [taking, arg]
                 continue
-            taking = arg == "--trajectories"
+            taking = arg if arg in ("--trajectories", "--with") else ""
             if not taking:
                 expanded.append(arg)
         return super().parse_args(ctx, expanded)
 
 
-@click.command(cls=_FilesCommand)
+@click.command(cls=FilesCommand)
 @artifact_argument
 @click.option(
     "--trajectories",
@@ -52,13 +53,24 @@ class _FilesCommand(click.Command):
     metavar="FILE...",
     help="Recordings of episodes, .npz; every word up to the next option.",
 )
+@click.option("--target-sparsity", type=float, help="Share of the cells to reuse; 0.95 if no budget is given.")
 @click.option(
-    "--target-sparsity",
-    type=click.FloatRange(0, 1, max_open=True),
-    default=0.95,
-    show_default=True,
-    help="Share of the cells to reuse.",
+    "--target-flops",
+    type=float,
+    help="In its place: share of the FLOPs of a dense call to save, prologue and pruner counted.",
 )
+@click.option(
+    "--latency-ms",
+    type=float,
+    help="In its place: what a call with onnxruntime may take on this machine; measured at the start.",
+)
+@click.option(
+    "--max-action-error",
+    type=float,
+    help="In its place: the sparsest plan whose mean action error on held-out episodes, in the units of the actions, is"
+    " not above this.",
+)
+@click.option("--threads", type=click.IntRange(min=1), default=1, show_default=True, help="Of calls for --latency-ms.")
 @click.option(
     "--strategy",
     type=click.Choice(STRATEGIES),
@@ -80,7 +92,11 @@ class _FilesCommand(click.Command):
 def calibrate(
     directory: Path,
     trajectories: tuple[Path, ...],
-    target_sparsity: float,
+    target_sparsity: float | None,
+    target_flops: float | None,
+    latency_ms: float | None,
+    max_action_error: float | None,
+    threads: int,
     strategy: str,
     seed: int,
     max_minutes: float,
@@ -89,7 +105,9 @@ def calibrate(
 ) -> None:
     """Learn for the artifact DIRECTORY which residuals can be reused, from recorded episodes.
 
-    The targets come from the dense policy itself with the same noise. Exit status 1: the target was not reached.
+    The targets come from the dense policy itself with the same noise. Beside the plan that keeps the budget the
+    artifact gets 'safe', which computes twice as much, and 'fast', which computes half. Exit status 1: the budget was
+    not kept.
     """
     with only_results_on_stdout():
         ttscompile.calibrate(
@@ -99,6 +117,10 @@ def calibrate(
             strategy=strategy,
             seed=seed,
             resume=resume,
+            target_flops=target_flops,
+            latency_ms=latency_ms,
+            max_action_error=max_action_error,
+            threads=threads,
             max_minutes=max_minutes,
         )
     summary = document(directory)

@@ -199,11 +199,13 @@ def _print_calibration(record: dict[str, Any] | None, console: Console) -> None:
     for name, score in precision["plans"].items():
         errors = (f"{score[key]:.4g}" for key in ("error", "error_p90"))
         scores.add_row(f"{name}: {precision['name']} against fp32", *errors, "", "")
+    for name, reason in record.get("skipped", {}).items():
+        scores.add_row(f"{name}: none, {reason}", *[""] * 4)
     if scores.row_count:
         console.print(scores)
     made = table("calibration", "")
     for name, value in record.items():
-        if name in ("plans", "precision", "sparsity", "flops_sparsity"):
+        if name in ("plans", "precision", "sparsity", "flops_sparsity", "skipped"):
             continue  # told above
         if isinstance(value, list | dict) and len(str(value)) > 60:
             value = f"{len(value)} entries; see --json"

@@ -31,8 +31,7 @@ BUDGET = 34
 
 @pytest.fixture(autouse=True)
 def short_searches(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tts, "SEARCH", 3)
-    monkeypatch.setattr(tts.Tts, "intervals", 3 + tts.Tts.closing)
+    monkeypatch.setattr(tts, "DISTANCES", (1,))
     monkeypatch.setattr(gates.Gates, "intervals", 4)
     monkeypatch.setattr(evo.Evo, "intervals", 4)
     monkeypatch.setattr(evo, "POPULATION", 16)

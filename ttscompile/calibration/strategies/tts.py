@@ -15,15 +15,11 @@ from dataclasses import replace
 import numpy as np
 
 from ...correction import Correction
-from ...lattice import PlanArray, Source
+from ...lattice import PlanArray
 from ..adaptation import Adaptation
 from ..correction import fit_correction
-from ..crowded import CROWDING, crowded_steps
+from ..whole_steps import WholeSteps
 from .base import Array, Found, Task
-
-FITTED, COMPARED = 384, 128
-"""Calls on which a candidate's correction is fitted, and others on which its error is measured; fewer if there are
-fewer."""
 
 DISTANCES = (8, 4, 2, 1)
 """How far a step is moved, in either direction. All steps are tried at one distance before the next."""
@@ -33,27 +29,22 @@ class Tts:
     """See the module."""
 
     def __init__(self, task: Task) -> None:
-        self._task = task
+        self._task, self._whole = task, WholeSteps(task)
         model = task.executor.model
         self._full = min(max(1, task.budget // model.blocks), model.steps)
         self._steps: tuple[int, ...] = tuple(range(self._full))
         self._loss = float("nan")
-        self._crowded = list(dict.fromkeys(crowded_steps(model.steps, self._full, c) for c in CROWDING))
+        self._crowded = self._whole.crowded(self._full)
         self._moves = [(distance, i) for distance in DISTANCES for i in range(1, self._full)]
         self.closing = Adaptation.INTERVALS
         self.intervals = len(self._crowded) + len(self._moves) + self.closing
-        order = task.draw(0).permutation(task.calls.count)
-        compared = max(1, min(COMPARED, task.calls.count // 4))
-        select = task.executor.selector.calls
-        self._compared = select(task.calls, order[:compared])
-        self._fitted = select(task.calls, order[compared:][:FITTED]) if task.calls.count > 1 else self._compared
         self._adaptation: Adaptation | None = None
         self._correction: Correction | None = None
 
     @property
     def plan(self) -> PlanArray:
         """The best schedule so far."""
-        return self._plan(self._steps)
+        return self._whole.plan(self._steps)
 
     @property
     def loss(self) -> float:
@@ -111,7 +102,7 @@ class Tts:
         for steps in candidates:
             if steps is None:
                 continue
-            error = self._error(steps)
+            error = self._whole.errors(steps).normalised
             if not error >= self._loss:  # the first one beats NaN
                 self._steps, self._loss = steps, error
 
@@ -121,16 +112,3 @@ class Tts:
         if not 0 < target < self._task.executor.model.steps or target in self._steps:
             return None
         return tuple(sorted((*self._steps[:i], target, *self._steps[i + 1 :])))
-
-    def _error(self, steps: tuple[int, ...]) -> float:
-        """Error of a schedule, with a correction of its own, on calls that this was not fitted on."""
-        task, plan, calls = self._task, self._plan(steps), self._compared
-        correction = fit_correction(task.executor, plan, self._fitted)
-        samples = task.executor.corrected(correction).run([plan], calls)[0]
-        return float(task.actions.errors(samples, calls.targets, units=False).mean())
-
-    def _plan(self, steps: tuple[int, ...]) -> PlanArray:
-        model = self._task.executor.model
-        plan = np.full((model.steps, model.blocks), Source.TIMESTEP, np.int8)
-        plan[list(steps)] = Source.COMPUTE
-        return plan

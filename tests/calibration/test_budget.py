@@ -1,0 +1,226 @@
+"""Budgets: in which terms they can be given, what they come to, and when they are refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ttscompile.artifact.load import load_artifact
+from ttscompile.calibration import CalibrationResult, calibrate, latency, pipeline
+from ttscompile.calibration.budget import Goal, cells_of, goal_of
+from ttscompile.calibration.clock import Clock
+from ttscompile.calibration.families import Families, budget_of_error
+from ttscompile.calibration.latency import measure_budget
+from ttscompile.calibration.progress import Bar
+from ttscompile.calibration.state import FILE, StateFile
+from ttscompile.calibration.strategies import tts
+from ttscompile.calibration.whole_steps import Errors, WholeSteps
+from ttscompile.errors import CalibrationError, CalibrationFailedError
+from ttscompile.lattice import Source
+
+STEPS, BLOCKS = 10, 6
+
+
+@pytest.fixture(autouse=True)
+def short_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tts, "DISTANCES", (1,))
+
+
+def quick(artifact: Path, recording: Path, **changes: Any) -> CalibrationResult:
+    arguments: dict[str, Any] = {"progress": False, "max_intervals": 6, "max_minutes": 1, **changes}
+    return calibrate(artifact, [recording], **arguments)
+
+
+def test_nothing_asked_for_is_the_default_and_one_thing_is_itself() -> None:
+    assert goal_of() == Goal("target_sparsity", 0.95)
+    assert goal_of(target_flops=0.9).record() == {"target_flops": 0.9}
+    assert goal_of(latency_ms=20, threads=2).record() == {"latency_ms": 20.0, "threads": 2}
+    assert goal_of(max_action_error=3).record() == {"max_action_error": 3.0}
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({"target_sparsity": 0.9, "latency_ms": 5}, "found target_sparsity and latency_ms. They exclude each other"),
+        ({"target_flops": 0.9, "max_action_error": 5}, "found target_flops and max_action_error"),
+        ({"target_sparsity": 0}, "asks for the dense policy, which every artifact has"),
+        ({"target_flops": 0.0}, "target_flops 0 asks for the dense policy"),
+        ({"target_sparsity": 1.0}, "above 0 and below 1; found 1.0"),
+        ({"target_sparsity": -0.1}, "above 0 and below 1; found -0.1"),
+        ({"target_sparsity": float("nan")}, "above 0 and below 1; found nan"),
+        ({"target_sparsity": "0.9"}, "found '0.9'"),
+        ({"target_flops": 2}, "target_flops: expected a number above 0 and below 1"),
+        ({"latency_ms": 0}, "latency_ms: expected a number above 0; found 0"),
+        ({"latency_ms": float("inf")}, "latency_ms: expected a number above 0; found inf"),
+        ({"max_action_error": -1}, "max_action_error: expected a number above 0"),
+        ({"latency_ms": 5, "threads": 0}, "threads: expected an integer of at least 1; found 0"),
+    ],
+)
+def test_what_nothing_can_satisfy_is_refused_before_any_work(
+    artifact: Path, recording: Path, asked: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(CalibrationError, match=message):
+        quick(artifact, recording, **asked)
+    assert not (artifact / FILE).exists()
+
+
+def test_less_than_a_whole_step_to_reuse_is_the_dense_policy(compiled: Path) -> None:
+    manifest = load_artifact(compiled).manifest
+    assert cells_of(goal_of(target_sparsity=0.1), manifest, pruned=False) == 54
+    with pytest.raises(CalibrationError, match=r"leaves 55 of the 10 x 6 cells.*Ask for at least 0\.1\."):
+        cells_of(goal_of(target_sparsity=0.08), manifest, pruned=False)
+
+
+def test_flops_count_all_that_a_call_does(compiled: Path) -> None:
+    manifest = load_artifact(compiled).manifest
+    flops = manifest.flops
+    fixed = flops.prologue + STEPS * (flops.stem + flops.tail)
+    for full in (1, 3, 9):
+        saved = 1 - (fixed + full * sum(flops.blocks)) / flops.dense
+        assert cells_of(goal_of(target_flops=saved), manifest, pruned=False) == full * BLOCKS
+        if full > 1:
+            assert cells_of(goal_of(target_flops=saved), manifest, pruned=True) < full * BLOCKS
+
+
+@pytest.mark.parametrize("target", [0.999, 0.97])
+def test_more_flops_than_can_be_saved_are_refused(artifact: Path, recording: Path, target: float) -> None:
+    with pytest.raises(CalibrationError, match=r"target flops .* cannot be reached: prologue.* at most 0\.\d+ can"):
+        quick(artifact, recording, target_flops=target)
+
+
+def test_a_target_of_flops_is_kept_and_recorded(artifact: Path, recording: Path) -> None:
+    result = quick(artifact, recording, target_flops=0.5)
+    assert result.plans[result.default_plan].flops_saved >= 0.5
+    record = load_artifact(artifact).manifest.calibration
+    assert record is not None
+    assert record["budget"] == {"target_flops": 0.5, "cells": result.budget["cells"]}
+    one_more = result.plans["schedule"].flops_saved - 1 / STEPS
+    assert one_more < 0.5  # another whole step would not fit
+
+
+def _timed(monkeypatch: pytest.MonkeyPatch, step_ms: float) -> list[str]:
+    """Calls take ``step_ms`` for each computed step, and no time; what was timed."""
+    asked: list[str] = []
+
+    def median_ms(call: Any) -> float:
+        call()
+        policy = next(cell.cell_contents for cell in call.__closure__ if hasattr(cell.cell_contents, "last_report"))
+        asked.append(policy.last_report.plan_name)
+        return float(step_ms * np.count_nonzero(policy.last_report.plan == Source.COMPUTE) / BLOCKS)
+
+    monkeypatch.setattr(latency, "median_ms", median_ms)
+    monkeypatch.setattr(latency, "_pruner_ms", lambda artifact, runtime: 0.5)
+    return asked
+
+
+@pytest.mark.parametrize(("limit", "full"), [(1.0, 1), (3.4, 3), (9.9, 9)])
+def test_a_latency_is_as_many_whole_steps_as_fit(
+    compiled: Path, monkeypatch: pytest.MonkeyPatch, limit: float, full: int
+) -> None:
+    asked = _timed(monkeypatch, 1.0)
+    budget = measure_budget(load_artifact(compiled), Goal("latency_ms", limit), pruned=False)
+    assert budget.cells == full * BLOCKS
+    assert budget.measured["measured_ms"][str(full)] == full
+    assert len(asked) <= 6
+
+
+def test_what_the_loop_waits_for_the_pruner_counts(compiled: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _timed(monkeypatch, 1.0)
+    budget = measure_budget(load_artifact(compiled), Goal("latency_ms", 3.4), pruned=True)
+    assert budget.cells == 2 * BLOCKS
+
+
+@pytest.mark.parametrize(
+    ("limit", "message"), [(0.9, "a call that computes step 0 alone takes 1 ms"), (10.0, "is met by the dense policy")]
+)
+def test_a_latency_out_of_reach_is_refused(
+    compiled: Path, monkeypatch: pytest.MonkeyPatch, limit: float, message: str
+) -> None:
+    _timed(monkeypatch, 1.0)
+    with pytest.raises(CalibrationError, match=message):
+        measure_budget(load_artifact(compiled), Goal("latency_ms", limit), pruned=False)
+
+
+def test_the_real_clock_finds_that_nothing_takes_no_time(artifact: Path, recording: Path) -> None:
+    with pytest.raises(
+        CalibrationError, match=r"latency ms 0\.0001 cannot be reached: .* on this machine with 2 threads"
+    ):
+        quick(artifact, recording, latency_ms=0.0001, threads=2)
+
+
+def test_the_latency_is_measured_once(artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _timed(monkeypatch, 1.0)
+    save = StateFile.save
+
+    def dying(self: StateFile) -> None:
+        save(self)
+        if self.arrays:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(StateFile, "save", dying)
+        with pytest.raises(KeyboardInterrupt):
+            quick(artifact, recording, latency_ms=3.9)
+
+    def again(*_: Any) -> None:
+        raise AssertionError("measured again")
+
+    monkeypatch.setattr(pipeline, "measure_budget", again)
+    result = quick(artifact, recording, latency_ms=3.9, resume=True)
+    assert result.budget["cells"] == 3 * BLOCKS
+    assert result.budget["latency_ms"] == 3.9
+    assert result.budget["measured_ms"]["3"] == 3.5
+    assert np.count_nonzero(load_artifact(artifact).schedule("schedule") == Source.COMPUTE) == 3 * BLOCKS
+
+
+class _Judged(WholeSteps):
+    """Schedules whose error is one over the number of their steps."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[int, ...]] = []
+
+    def errors(self, steps: Any) -> Errors:
+        self.asked.append(tuple(steps))
+        return Errors(1 / len(steps), 10 / len(steps))
+
+    def crowded(self, full_steps: int, crowding: Any = (1.0,)) -> list[tuple[int, ...]]:
+        return [tuple(range(full_steps))]
+
+
+@pytest.mark.parametrize(("limit", "full"), [(10.0, 1), (4.9, 3), (1.0, 10), (0.85, 12), (0.2, 50)])
+def test_an_error_is_as_few_steps_as_do(tmp_path: Path, limit: float, full: int) -> None:
+    whole, state = _Judged(), StateFile(tmp_path, {})
+    with Bar(shown=False) as bar:
+        families = Families(whole, state, Clock(0.0, 0.0, float("inf")), bar)
+        budget = budget_of_error(families, Goal("max_action_error", limit), 100, BLOCKS)
+        assert budget.cells == full * BLOCKS
+        asked = len(whole.asked)
+        assert budget_of_error(families, Goal("max_action_error", limit), 100, BLOCKS) == budget
+        assert len(whole.asked) == asked  # remembered
+
+
+def test_an_error_out_of_reach_and_one_out_of_time_are_failures(tmp_path: Path) -> None:
+    with Bar(shown=False) as bar:
+        families = Families(_Judged(), StateFile(tmp_path, {}), Clock(0.0, 0.0, float("inf")), bar)
+        with pytest.raises(CalibrationFailedError, match="at least half of the cells: 10 with 1 of .*, 0.2 with 50 of"):
+            budget_of_error(families, Goal("max_action_error", 0.1), 100, BLOCKS)
+        late = Families(_Judged(), StateFile(tmp_path, {}), Clock(0.0, 0.0, 0.0), bar)
+        with pytest.raises(CalibrationFailedError, match="time limit ended the search .*: none tried"):
+            budget_of_error(late, Goal("max_action_error", 0.1), 100, BLOCKS)
+
+
+def test_an_error_is_kept_on_held_out_episodes(artifact: Path, recording: Path) -> None:
+    loose = quick(artifact, recording, max_action_error=0.05)
+    assert loose.validation_error <= 0.05
+    strict = quick(artifact, recording, max_action_error=0.6 * loose.validation_error)
+    assert strict.validation_error <= 0.6 * loose.validation_error
+    assert strict.sparsity < loose.sparsity
+    assert strict.budget["max_action_error"] == 0.6 * loose.validation_error
+
+
+def test_an_error_needs_the_strategy_that_fits_corrections(artifact: Path, recording: Path) -> None:
+    with pytest.raises(CalibrationError, match="max_action_error needs strategy 'tts'; found 'bac'"):
+        quick(artifact, recording, max_action_error=1.0, strategy="bac")

@@ -1,0 +1,86 @@
+"""Plans beside the target: safe and fast."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ttscompile
+from ttscompile.artifact.load import load_artifact
+from ttscompile.calibration import CalibrationResult, calibrate
+from ttscompile.calibration.strategies import tts
+from ttscompile.errors import IllegalPlanError
+from ttscompile.lattice import Source
+
+
+@pytest.fixture
+def short_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tts, "DISTANCES", (1,))
+
+
+@pytest.fixture
+def result(artifact: Path, recording: Path, short_search: None) -> CalibrationResult:
+    """Four of ten steps."""
+    return calibrate(artifact, [recording], 0.6, progress=False, max_minutes=1)
+
+
+def computed(artifact: Path, name: str) -> list[int]:
+    plan = load_artifact(artifact).schedule(name)
+    rows = (plan == Source.COMPUTE).all(1)
+    np.testing.assert_array_equal((plan == Source.COMPUTE).any(1), rows)  # whole steps
+    return [int(k) for k in np.flatnonzero(rows)]
+
+
+def test_safe_computes_twice_as_much_and_fast_half_each_with_its_own_score(
+    artifact: Path, result: CalibrationResult
+) -> None:
+    loaded = load_artifact(artifact)
+    assert {name: len(computed(artifact, name)) for name in ("safe", "schedule", "fast")} == {
+        "safe": 8,
+        "schedule": 4,
+        "fast": 2,
+    }
+    assert result.plans["safe"].error < result.plans["schedule"].error < result.plans["fast"].error
+    assert {"safe", "schedule", "fast"} <= set(loaded.corrections)
+    weights = [loaded.corrections[name].weights.tobytes() for name in ("safe", "schedule", "fast")]
+    assert len(set(weights)) == 3
+    record = loaded.manifest.calibration
+    assert record is not None
+    assert record["named_steps"] == {name: computed(artifact, name) for name in ("safe", "fast")}
+    assert record["plans"]["safe"]["error"] == pytest.approx(result.plans["safe"].error)
+    assert record["skipped"] == {}
+
+
+def test_a_plan_is_chosen_when_loading_or_calling(artifact: Path, result: CalibrationResult) -> None:
+    policy = ttscompile.load(artifact, plan="safe", seed=0)
+    obs = {"obs": np.zeros((1, 2, 3), np.float32)}
+    assert policy.info.default_plan == "safe"
+    assert result.default_plan in policy.info.plans
+    safe = policy.predict_action(obs)["action"]
+    assert policy.last_report is not None
+    assert policy.last_report.plan_name == "safe"
+    policy.predict_action(obs, plan="fast")
+    assert policy.last_report.plan_name == "fast"
+    assert policy.last_report.computed == (12,)
+    named = ttscompile.load(artifact, seed=0).predict_action(obs, plan="safe")["action"]
+    np.testing.assert_array_equal(safe, named)
+    with pytest.raises(IllegalPlanError, match=r"no plan 'swift'; it has \['dense', 'fast', 'safe'"):
+        ttscompile.load(artifact, plan="swift")
+
+
+def test_what_cannot_be_made_is_said(artifact: Path, recording: Path, short_search: None) -> None:
+    result = calibrate(artifact, [recording], 0.8, progress=False, max_minutes=1)
+    assert result.skipped == {"fast": "the target computes 2 whole steps: half of that is too little"}
+    assert len(computed(artifact, "safe")) == 4
+    result = calibrate(artifact, [recording], 0.5, progress=False, max_minutes=1)
+    assert result.skipped == {"safe": "twice 5 of 10 steps is the dense plan"}
+    assert len(computed(artifact, "fast")) == 2
+    result = calibrate(artifact, [recording], 0.5, strategy="interval", progress=False, max_minutes=1)
+    assert set(result.skipped) == {"safe", "fast"}
+    assert "fits no correction" in result.skipped["safe"]
+    record = load_artifact(artifact).manifest.calibration
+    assert record is not None
+    assert record["skipped"] == dict(result.skipped)
+    assert set(load_artifact(artifact).schedules) == {"schedule", "uniform"}

@@ -1,0 +1,142 @@
+"""Plans take turns, call by call, on the same observations and noise: their error and their latency."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..artifact.load import Artifact
+from ..artifact.manifest import DENSE
+from ..config import FP32, Noise
+from ..lattice import Source
+from ..runtimes.base import open_runtime
+from ..runtimes.policy import CompiledPolicy
+from ..trajectories import Episode
+from .points import Point
+
+WARM_UP = 2
+"""Rounds that are not timed; their actions count."""
+
+Array = npt.NDArray[Any]
+Progress = Callable[[str, int, int], None]
+"""Told what is being done, how many parts are done, and of how many."""
+
+
+@dataclass(frozen=True)
+class Entrant:
+    """A plan that takes part.
+
+    Attributes:
+        series: see ``Point``.
+        name: see ``Point``.
+        policy: that runs it.
+        plan: its name there.
+        paired: whether it takes all the noise of the dense calls.
+    """
+
+    series: str
+    name: str
+    policy: CompiledPolicy
+    plan: str
+    paired: bool
+
+
+def measure(
+    artifact: Artifact,
+    entrants: Sequence[Entrant],
+    episodes: Sequence[Episode],
+    chosen: Sequence[tuple[int, int]],
+    seed: int,
+    threads: int,
+    progress: Progress,
+) -> tuple[tuple[Point, ...], dict[str, float]]:
+    """All entrants on all calls, in turn; and the yardsticks.
+
+    Args:
+        artifact: whose dense policy is the truth.
+        entrants: at least one.
+        episodes: all of them.
+        chosen: number of the episode, and row in it, of each call.
+        seed: of the noise.
+        threads: of the dense policy.
+        progress: told how far it is.
+
+    Returns:
+        A point for each entrant, and ``Frontier.yardsticks``.
+    """
+    spec, draw = artifact.manifest.spec, np.random.default_rng((seed, 4))
+    exact = artifact.at_precision(FP32)
+    truth = CompiledPolicy(exact, open_runtime(exact, "onnxruntime", threads))
+    errors: list[list[float]] = [[] for _ in entrants]
+    times: list[list[float]] = [[] for _ in entrants]
+    reports: list[list[tuple[float, float]]] = [[] for _ in entrants]
+    apart: dict[str, list[float]] = {"all": [], **({"steps": []} if spec.sampler.stochastic else {})}
+    for number, (episode, row) in enumerate(chosen):
+        obs = {key: array[row : row + 1] for key, array in episodes[episode].observations.items()}
+        one, two = _noise(artifact, draw), _noise(artifact, draw)
+        dense = _call(truth, obs, one, DENSE)
+        apart["all"].append(_error(_call(truth, obs, two, DENSE), dense))
+        if "steps" in apart:
+            mixed = Noise(one.initial, two.steps)
+            apart["steps"].append(_error(_call(truth, obs, mixed, DENSE), dense))
+        for turn in range(len(entrants)):
+            i = (turn + number) % len(entrants)  # nobody always runs after the same one
+            noise = one if entrants[i].paired else _adapted(one, entrants[i].policy, draw)
+            start = time.perf_counter()
+            actions = _call(entrants[i].policy, obs, noise, entrants[i].plan)
+            times[i].append(1000 * (time.perf_counter() - start))
+            errors[i].append(_error(actions, dense))
+            report = entrants[i].policy.last_report
+            assert report is not None
+            reports[i].append((float(np.mean(report.plan != Source.COMPUTE)), report.flops[0]))
+        progress("held-out calls", number + 1, len(chosen))
+    points = tuple(map(_point, entrants, errors, times, reports))
+    return points, {name: float(np.mean(found)) for name, found in apart.items()}
+
+
+def _point(entrant: Entrant, errors: list[float], times: list[float], reports: list[tuple[float, float]]) -> Point:
+    timed = times[WARM_UP:] or times
+    low, high = np.percentile(timed, [25, 75])
+    sparsity, flops = np.mean(reports, axis=0)
+    return Point(
+        series=entrant.series,
+        name=entrant.name,
+        sparsity=float(sparsity),
+        flops=float(flops),
+        error=float(np.mean(errors)),
+        error_p90=float(np.quantile(errors, 0.9)),
+        latency_ms=float(np.median(timed)),
+        quartiles_ms=(float(low), float(high)),
+        noise="all" if entrant.paired else "initial",
+    )
+
+
+def _call(policy: CompiledPolicy, obs: Mapping[str, Array], noise: Noise, plan: str) -> Array:
+    """The executed actions of a first call, ``[Ta, Da]``."""
+    policy.reset()
+    actions: Array = policy.predict_action(obs, noise=noise, plan=plan)["action"][0]
+    return actions
+
+
+def _error(actions: Array, dense: Array) -> float:
+    return float(np.abs(actions - dense).mean())
+
+
+def _noise(artifact: Artifact, draw: np.random.Generator) -> Noise:
+    spec = artifact.manifest.spec
+    initial = draw.standard_normal((1, *spec.sample), dtype=np.float32)
+    draws = draw.standard_normal((spec.sampler.steps, *initial.shape), dtype=np.float32)
+    return Noise(initial, draws if spec.sampler.stochastic else None)
+
+
+def _adapted(noise: Noise, policy: CompiledPolicy, draw: np.random.Generator) -> Noise:
+    """The same initial sample, with the draws that another sampler needs."""
+    info = policy.info
+    if not info.stochastic:
+        return Noise(noise.initial)
+    return Noise(noise.initial, draw.standard_normal((info.K, *noise.initial.shape), dtype=np.float32))

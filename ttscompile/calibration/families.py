@@ -1,0 +1,132 @@
+"""The best crowded schedule for a number of whole steps, for an error budget and for plans beside the target."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from ..errors import CalibrationFailedError
+from .budget import Budget, Goal
+from .clock import Clock
+from .crowded import CROWDING
+from .progress import Bar
+from .state import StateFile
+from .whole_steps import WholeSteps
+
+COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
+"""Numbers of computed steps that an error budget is tried with, before bisection between two of them."""
+
+TRIED = (1.0, 2.0, 3.0, 4.0)
+"""Of ``CROWDING``, while only the number of steps is in question."""
+
+
+@dataclass(frozen=True)
+class Best:
+    """The best of a family.
+
+    Attributes:
+        steps: that are computed.
+        error: on calls that its correction was not fitted on, in the units of the actions.
+    """
+
+    steps: tuple[int, ...]
+    error: float
+
+
+class Families:
+    """Compares crowded schedules, and remembers every comparison in the state.
+
+    Args:
+        whole: compares.
+        state: of the calibration.
+        clock: nothing new is begun when the time is up.
+        bar: shows the progress.
+    """
+
+    KEY = "families"
+
+    def __init__(self, whole: WholeSteps, state: StateFile, clock: Clock, bar: Bar) -> None:
+        self._whole, self._state, self._clock, self._bar = whole, state, clock, bar
+        self._longest = 0.0
+
+    def best(self, full_steps: int, what: str, crowding: Sequence[float] = CROWDING) -> Best | None:
+        """The best of the family of ``full_steps`` computed steps, of those that there was time for; None if of none.
+
+        Args:
+            full_steps: at least one.
+            what: it is for; for the bar.
+            crowding: members of the family.
+        """
+        found: tuple[float, float, tuple[int, ...]] | None = None
+        members = self._whole.crowded(full_steps, crowding)
+        self._bar.stage(what, len(members))
+        for number, steps in enumerate(members):
+            errors = self._errors(steps)
+            if errors is None:
+                break
+            if found is None or not errors[0] >= found[0]:
+                found = (*errors, steps)
+            self._bar.update(number + 1, f"error {found[1]:.4g}", self._clock.left())
+        return None if found is None else Best(found[2], found[1])
+
+    def _errors(self, steps: tuple[int, ...]) -> tuple[float, float] | None:
+        """Normalised and in units; None if they are not known and there is no time."""
+        known = self._state.progress.setdefault(self.KEY, {})
+        key = ",".join(map(str, steps))
+        if key not in known:
+            start = self._clock.elapsed()
+            if start + self._longest > self._clock.limit:
+                return None
+            errors = self._whole.errors(steps)
+            known[key] = [errors.normalised, errors.units]
+            self._longest = max(self._longest, self._clock.elapsed() - start)
+            self._state.progress["seconds"] = self._clock.elapsed()
+            self._state.save()
+        normalised, units = known[key]
+        return normalised, units
+
+
+def budget_of_error(families: Families, goal: Goal, steps: int, blocks: int) -> Budget:
+    """The fewest whole steps with which a crowded schedule is as good as was asked for.
+
+    Judged on calls to learn from that its correction was not fitted on: the held-out episodes stay out of it.
+
+    Args:
+        families: compares.
+        goal: of kind ``max_action_error``.
+        steps: K.
+        blocks: number of residual blocks.
+
+    Raises:
+        CalibrationFailedError: no plan that reuses at least half of the cells is, or the time is up before one is.
+    """
+    tried: dict[int, float] = {}
+
+    def enough(full: int) -> bool:
+        best = families.best(full, f"{full} steps", TRIED)
+        if best is None:
+            raise CalibrationFailedError(
+                f"the time limit ended the search for a plan with an action error of at most {goal.value:g}:"
+                f" {_told(tried)}. The artifact is as it was. Allow more time, or a larger error."
+            )
+        tried[full] = best.error
+        return best.error <= goal.value
+
+    most, low = max(1, steps // 2), 0
+    for high in [count for count in COUNTS if count < most] + [most]:
+        if enough(high):
+            break
+        low = high
+    else:
+        raise CalibrationFailedError(
+            f"max action error {goal.value:g} cannot be reached by a plan that reuses at least half of the cells:"
+            f" {_told(tried)}. The artifact is as it was. Allow a larger error, or use the dense plan."
+        )
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if enough(middle) else (middle, high)
+    return Budget(goal, high * blocks, {"errors": {str(full): error for full, error in sorted(tried.items())}})
+
+
+def _told(tried: dict[int, float]) -> str:
+    return ", ".join(f"{error:.4g} with {full} of the steps computed" for full, error in tried.items()) or "none tried"

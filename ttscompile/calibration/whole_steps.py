@@ -1,0 +1,69 @@
+"""Schedules of whole steps, each with a correction of its own, and how good they are on calls it was not fitted on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..lattice import PlanArray, Source
+from .correction import fit_correction
+from .crowded import CROWDING, crowded_steps
+
+if TYPE_CHECKING:
+    from .strategies.base import Task
+
+FITTED, COMPARED = 384, 128
+"""Calls on which a candidate's correction is fitted, and others on which its error is measured; fewer if there are
+fewer."""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Mean absolute error of the executed actions of a schedule.
+
+    Attributes:
+        normalised: as the network has them.
+        units: in the units of the actions.
+    """
+
+    normalised: float
+    units: float
+
+
+class WholeSteps:
+    """Compares schedules of whole steps.
+
+    Args:
+        task: see ``Task``; its budget is not used.
+    """
+
+    def __init__(self, task: Task) -> None:
+        self._task = task
+        order = task.draw(0).permutation(task.calls.count)
+        compared = max(1, min(COMPARED, task.calls.count // 4))
+        select = task.executor.selector.calls
+        self._compared = select(task.calls, order[:compared])
+        self._fitted = select(task.calls, order[compared:][:FITTED]) if task.calls.count > 1 else self._compared
+
+    def plan(self, steps: Sequence[int]) -> PlanArray:
+        """The schedule that computes these steps and reads TIMESTEP elsewhere, int8 ``[K, blocks]``."""
+        model = self._task.executor.model
+        plan = np.full((model.steps, model.blocks), Source.TIMESTEP, np.int8)
+        plan[list(steps)] = Source.COMPUTE
+        return plan
+
+    def errors(self, steps: Sequence[int]) -> Errors:
+        """Errors of a schedule, with a correction of its own, on calls that this was not fitted on."""
+        task, plan, calls = self._task, self.plan(steps), self._compared
+        correction = fit_correction(task.executor, plan, self._fitted)
+        samples = task.executor.corrected(correction).run([plan], calls)[0]
+        normalised, units = (task.actions.errors(samples, calls.targets, units=u).mean() for u in (False, True))
+        return Errors(float(normalised), float(units))
+
+    def crowded(self, full_steps: int, crowding: Sequence[float] = CROWDING) -> list[tuple[int, ...]]:
+        """The family of schedules that a search starts with: the different ones of ``full_steps`` steps."""
+        steps = self._task.executor.model.steps
+        return list(dict.fromkeys(crowded_steps(steps, full_steps, c) for c in crowding))

@@ -1,0 +1,178 @@
+"""``ttscompile compare``: what accuracy costs, for strategies, the artifact's plans and other artifacts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from ttscompile.cli.calibrate import STRATEGIES, FilesCommand
+from ttscompile.cli.output import (
+    artifact_argument,
+    json_option,
+    only_results_on_stdout,
+    print_json,
+    progress,
+    results,
+    share,
+    table,
+)
+from ttscompile.errors import RuntimeUnavailableError
+from ttscompile.machine import fingerprint, one_line
+from ttscompile.plots_frontier import plot_frontier
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from ttscompile.calibration.points import Frontier
+
+
+def _strategies(_: click.Context, __: click.Parameter, value: str) -> tuple[str, ...]:
+    names = tuple(dict.fromkeys(name.strip() for name in value.split(",") if name.strip()))
+    unknown = [name for name in names if name not in STRATEGIES]
+    if unknown:
+        raise click.BadParameter(f"{unknown[0]!r} is not one of {', '.join(STRATEGIES)}.")
+    return names
+
+
+def _sparsities(_: click.Context, __: click.Parameter, value: str) -> tuple[float, ...]:
+    try:
+        found = tuple(dict.fromkeys(float(part) for part in value.split(",") if part.strip()))
+    except ValueError as error:
+        raise click.BadParameter(f"{error}; expected numbers, such as 0.9,0.95.") from error
+    wrong = [one for one in found if not 0 < one < 1]
+    if wrong:
+        raise click.BadParameter(f"{wrong[0]:g} is not above 0 and below 1.")
+    return found
+
+
+@click.command(cls=FilesCommand)
+@artifact_argument
+@click.option(
+    "--trajectories",
+    required=True,
+    multiple=True,
+    type=click.Path(path_type=Path),
+    metavar="FILE...",
+    help="Recordings of episodes, .npz; every word up to the next option.",
+)
+@click.option(
+    "--strategies",
+    default="tts,bac,interval",
+    show_default=True,
+    callback=_strategies,
+    help="Each finds a plan for each sparsity; an empty list compares plans of artifacts alone.",
+)
+@click.option("--sparsities", default="0.9,0.95,0.98", show_default=True, callback=_sparsities, help="For strategies.")
+@click.option(
+    "--with",
+    "others",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    metavar="DIR...",
+    help="Other artifacts of the same checkpoint, for instance with other samplers; every word up to the next option.",
+)
+@click.option("--calls", type=click.IntRange(min=1), default=32, show_default=True, help="Held-out calls, at most.")
+@click.option(
+    "--learned-calls", type=click.IntRange(min=2), default=256, show_default=True, help="To learn from, at most."
+)
+@click.option("--threads", type=click.IntRange(min=1), default=1, show_default=True, help="Of onnxruntime.")
+@click.option("--intervals", type=click.IntRange(min=1), help="Of each search, at most; for a quick look.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Of the split, the noise and the searches.")
+@click.option("--plot", "picture", type=click.Path(path_type=Path), help="Draw into this file (.png, .svg, .pdf).")
+@json_option
+def compare(
+    directory: Path,
+    trajectories: tuple[Path, ...],
+    strategies: tuple[str, ...],
+    sparsities: tuple[float, ...],
+    others: tuple[Path, ...],
+    calls: int,
+    learned_calls: int,
+    threads: int,
+    intervals: int | None,
+    seed: int,
+    picture: Path | None,
+    as_json: bool,
+) -> None:
+    """Hold plans of the artifact DIRECTORY against each other: held-out action error and measured latency.
+
+    Strategies find plans now, from the episodes that are not held out; nothing is written to the artifact. Every plan
+    runs on the same calls, in turn, and its actions are held against those of the dense policy with the same noise.
+    """
+    try:
+        from ttscompile.calibration.frontier import compare as measure
+    except ModuleNotFoundError as error:
+        raise RuntimeUnavailableError(
+            f"compare needs {error.name}, which is not installed. Run: pip install 'ttscompile[compile]'."
+        ) from error
+    columns = (TextColumn("{task.description:<28}"), BarColumn(bar_width=24), MofNCompleteColumn(), TimeElapsedColumn())
+    told = progress()
+    with only_results_on_stdout(), Progress(*columns, console=told, disable=not told.is_terminal) as bar:
+        task = bar.add_task("loading", total=None)
+        found = measure(
+            directory,
+            trajectories,
+            strategies,
+            sparsities,
+            others,
+            calls=calls,
+            learned=learned_calls,
+            threads=threads,
+            seed=seed,
+            intervals=intervals,
+            progress=lambda what, done, total: bar.update(task, description=what, completed=done, total=total),
+        )
+    for warning in found.warnings:
+        told.print(f"warning: {warning}", markup=False, soft_wrap=True)
+    machine = one_line(fingerprint())
+    if picture is not None:
+        title = f"{directory.name}: {found.calls} held-out calls, {threads} thread{'s' * (threads > 1)}\n{machine}"
+        plot_frontier(found.points, found.efficient(), found.yardsticks, picture, title)
+        told.print(f"wrote {picture}", markup=False, soft_wrap=True)
+    if as_json:
+        print_json({"machine": fingerprint(), **found.to_json()})
+    else:
+        _print(found, results(), machine)
+
+
+def _print(found: Frontier, output: Console, machine: str) -> None:
+    """The comparison as a table, and what is compared."""
+    efficient = found.efficient()
+    made = table("", "plan", "error", "90th pct.", "ms a call", "quartiles", "GFLOP", "reused", "frontier")
+    for p in found.points:
+        low, high = p.quartiles_ms
+        made.add_row(
+            p.series,
+            p.name + " *" * (p.noise != "all"),
+            f"{p.error:.4g}",
+            f"{p.error_p90:.4g}",
+            f"{p.latency_ms:.4g}",
+            f"{low:.4g}..{high:.4g}",
+            f"{p.flops / 1e9:.3f}",
+            share(p.sparsity),
+            "yes" if p in efficient else "",
+        )
+    output.print(made)
+    output.print(
+        f"Error: mean absolute difference of the executed actions, in their units, from those of the dense policy in"
+        f" fp32 with the same observation and noise; {found.calls} calls of episodes that no strategy here learned"
+        f" from. Latency: medians of the same calls, one stream, {found.threads} thread{'s' * (found.threads > 1)}."
+        " Frontier: no other plan is faster and more accurate.",
+        soft_wrap=True,
+    )
+    told = {"steps": "the same initial sample and other draws", "all": "other noise altogether"}
+    apart = "; ".join(f"with {told[name]} {error:.4g}" for name, error in found.yardsticks.items())
+    if any(p.noise != "all" for p in found.points):
+        output.print(
+            "* Another sampler: it shares the initial sample with the dense policy and nothing else (and a stochastic"
+            " sampler soon forgets that), so its error holds what other noise would change too. Compare it with the"
+            " yardstick, and judge it by the task's score.",
+            soft_wrap=True,
+        )
+    output.print(f"Yardstick: two dense calls are apart {apart}.", soft_wrap=True)
+    for name, reason in found.skipped.items():
+        output.print(f"{name}: left out: {reason}", markup=False, soft_wrap=True)
+    output.print(machine, markup=False, soft_wrap=True)

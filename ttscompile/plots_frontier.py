@@ -1,0 +1,117 @@
+"""The picture of a comparison: latency across, action error up, a line for each series."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Protocol
+
+from .errors import OutputError, RuntimeUnavailableError
+
+COLOURS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
+"""Okabe and Ito's palette, without the yellow that white paper swallows."""
+
+MARKERS = "osD^vP*"
+
+_TOLD = {
+    "steps": "dense, same initial sample, other draws",
+    "all": "dense, other noise",
+}
+
+
+class Plotted(Protocol):
+    """What a point has to have; see ``ttscompile.calibration.points.Point``."""
+
+    @property
+    def series(self) -> str:
+        """Strategy, or artifact."""
+
+    @property
+    def name(self) -> str:
+        """Of the plan in its series."""
+
+    @property
+    def error(self) -> float:
+        """Of the executed actions."""
+
+    @property
+    def latency_ms(self) -> float:
+        """Of a call."""
+
+
+def plot_frontier(
+    points: Sequence[Plotted], efficient: Sequence[Plotted], yardsticks: Mapping[str, float], path: Path, title: str
+) -> None:
+    """Draw the points and write the picture.
+
+    Args:
+        points: of all series; those without an error (the dense policy itself) are left out: the axis is logarithmic.
+        efficient: points that no other beats, fastest first.
+        yardsticks: errors that are drawn as level lines, by their key in ``Frontier.yardsticks``.
+        path: of the picture; its suffix (``.png``, ``.svg``, ``.pdf``) is the format.
+        title: over the picture.
+
+    Raises:
+        OutputError: the picture cannot be written.
+        RuntimeUnavailableError: matplotlib is not installed.
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+        from matplotlib.ticker import LogFormatter
+    except ModuleNotFoundError as error:
+        raise RuntimeUnavailableError(
+            f"a picture needs matplotlib, and {error.name!r} is not installed. Install 'ttscompile[compile]', or read"
+            " the figures with --json."
+        ) from error
+    figure = Figure(figsize=(9.0, 6.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    shown = [point for point in points if point.error > 0]
+    for i, series in enumerate(dict.fromkeys(point.series for point in shown)):
+        own = sorted((p for p in shown if p.series == series), key=lambda p: p.latency_ms)
+        axes.plot(
+            [p.latency_ms for p in own],
+            [p.error for p in own],
+            marker=MARKERS[i % len(MARKERS)],
+            linestyle="none" if len({p.name.strip("0123456789.") for p in own}) > 1 else "-",
+            linewidth=1,
+            color=COLOURS[i % len(COLOURS)],
+            label=series,
+        )
+        for p in own:
+            axes.annotate(p.name, (p.latency_ms, p.error), xytext=(5, 4), textcoords="offset points", fontsize=7)
+    best = [point for point in efficient if point.error > 0]
+    axes.step(
+        [p.latency_ms for p in best],
+        [p.error for p in best],
+        where="post",
+        color="#999999",
+        linewidth=4,
+        alpha=0.35,
+        zorder=0,
+        label="frontier",
+    )
+    for (name, height), style in zip(yardsticks.items(), ("--", ":"), strict=False):
+        if height > 0:
+            axes.axhline(height, color="#555555", linestyle=style, linewidth=1, label=_TOLD[name])
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_xlabel("latency of a call, ms (median)")
+    axes.set_ylabel("error of the executed actions on held-out calls, in their units")
+    for axis in (axes.xaxis, axes.yaxis):  # 40 rather than 4 x 10^1
+        axis.set_major_formatter(LogFormatter())
+        axis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
+    axes.margins(x=0.08)
+    axes.set_title(title, fontsize=8, loc="left")
+    axes.grid(which="both", color="#dddddd", linewidth=0.5)
+    axes.set_axisbelow(True)
+    figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=8)
+    # A picture of the same figures is the same file: matplotlib would put its version or the date into it.
+    metadata = {"Software": None} if path.suffix == ".png" else {"Date": None} if path.suffix == ".svg" else None
+    try:
+        figure.savefig(path, dpi=150, metadata=metadata)
+    except (OSError, ValueError) as error:  # no such folder; no such format
+        raise OutputError(
+            f"{path}: the picture cannot be written: {error}. Give a .png, .svg or .pdf in a folder that exists."
+        ) from error
