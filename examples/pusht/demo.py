@@ -109,13 +109,13 @@ def final_table(speeds: Sequence[Measurement], evaluations: Sequence[Evaluation]
 @click.command()
 @click.option("--checkpoint", default=CHECKPOINT, show_default=True, type=click.Path(exists=True, path_type=Path))
 @click.option("--directory", default=BUILD, show_default=True, type=click.Path(file_okay=False, path_type=Path))
-@click.option("--record-episodes", default=8, show_default=True, type=click.IntRange(2))
-@click.option("--calibration-minutes", default=8.0, show_default=True, type=click.FloatRange(min=0.1))
+@click.option("--record-episodes", default=16, show_default=True, type=click.IntRange(2))
+@click.option("--calibration-minutes", default=5.0, show_default=True, type=click.FloatRange(min=0.1))
 @click.option("--target-sparsity", default=0.95, show_default=True, type=click.FloatRange(0, 1, max_open=True))
 @click.option("--episodes", default=12, show_default=True, type=click.IntRange(1), help="Of the evaluation.")
 @first_seed_option
 @click.option("--runs", default=10, show_default=True, type=click.IntRange(1), help="Timed calls of each.")
-@click.option("--batch", default=12, show_default=True, type=click.IntRange(1), help="Episodes in lockstep.")
+@click.option("--batch", default=16, show_default=True, type=click.IntRange(1), help="Episodes in lockstep.")
 @threads_option
 def main(
     checkpoint: Path,

@@ -52,7 +52,7 @@ def judge(
     scores = {}
     corrected, plain = executor.corrected(found.correction), executor.corrected(None)
     judged = [(SCHEDULE, found.schedule, corrected), (UNIFORM, uniform_of(artifact, budget), plain)]
-    judged += [(name, plan, executor.corrected(named.corrections[name])) for name, plan in named.plans.items()]
+    judged += [(name, plan, executor.corrected(named.corrections.get(name))) for name, plan in named.plans.items()]
     for name, plan, runs in judged:
         errors = actions.errors(runs.run([plan], calls)[0], calls.targets, units=True)
         scores[name] = PlanScore.of(errors, plan[None], manifest.flops, pruned=False)

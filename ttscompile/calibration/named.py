@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 
 from ..correction import Correction
 from ..lattice import PlanArray
-from .correction import fit_correction
 from .families import Families
 from .strategies import Found, Task
 from .whole_steps import WholeSteps
@@ -27,7 +26,7 @@ class Named:
 
     Attributes:
         plans: int8 ``[K, blocks]`` by name.
-        corrections: of each.
+        corrections: of those that are better with one.
         steps: that each computes, for the record.
         skipped: why a name has no plan.
     """
@@ -70,7 +69,9 @@ def named_plans(families: Families, whole: WholeSteps, task: Task, strategy: str
             skipped[name] = "the time limit left none for it"
             continue
         plans[name], steps[name] = whole.plan(best.steps), list(best.steps)
-        corrections[name] = fit_correction(task.executor, plans[name], task.calls)
+        correction = whole.correction(best.steps)
+        if correction is not None:
+            corrections[name] = correction
     return Named(plans, corrections, steps, skipped)
 
 
@@ -92,4 +93,4 @@ def relaxed(found: Found, families: Families, whole: WholeSteps, task: Task, ful
         return None
     plan = whole.plan(best.steps)
     notes = {**found.notes, "steps": list(best.steps), "switches": 0}
-    return Found(plan, None, notes, correction=fit_correction(task.executor, plan, task.calls))
+    return Found(plan, None, notes, correction=whole.correction(best.steps))

@@ -13,6 +13,7 @@ import numpy as np
 
 from ..artifact.load import Artifact, load_artifact
 from ..artifact.write import PRUNER, update_calibration
+from ..correction import FEATURES
 from ..errors import CalibrationError
 from ..trajectories import Episode, load_trajectories
 from .budget import ERROR, LATENCY, Budget, Goal, cells_of, goal_of
@@ -36,7 +37,11 @@ from .whole_steps import WholeSteps
 CALLS_A_MINUTE = 64
 """Calls to learn from, for each minute of the time limit."""
 
-FEWEST_CALLS, MOST_CALLS = 32, 1024
+MOST_CALLS = 1024
+
+CALLS_A_FEATURE = 3
+"""Calls to learn from at least, for each number that a correction reads. On Push-T (97 of them, 95 %) one that is
+fitted on 30 calls does harm, on 64 it lowers the held-out error from 19 to 6 px, on 128 to 2.7."""
 
 JUDGED = 128
 """Calls of the held-out episodes at most that plans are judged on."""
@@ -113,7 +118,8 @@ def calibrate(
             " learned from. Record more; about sixteen are enough."
         )
     split = split_episodes(len(episodes), validation_fraction, seed)
-    limit = int(np.clip(CALLS_A_MINUTE * max_minutes, FEWEST_CALLS, MOST_CALLS))
+    fewest = CALLS_A_FEATURE * (FEATURES * spec.sample[0] + 1)
+    limit = int(np.clip(CALLS_A_MINUTE * max_minutes, min(fewest, MOST_CALLS), MOST_CALLS))
     state = StateFile(
         Path(path),
         {

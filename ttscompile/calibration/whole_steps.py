@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..correction import Correction
 from ..lattice import PlanArray, Source
 from .correction import fit_correction
 from .crowded import CROWDING, crowded_steps
@@ -56,10 +57,22 @@ class WholeSteps:
         return plan
 
     def errors(self, steps: Sequence[int]) -> Errors:
-        """Errors of a schedule, with a correction of its own, on calls that this was not fitted on."""
-        task, plan, calls = self._task, self.plan(steps), self._compared
-        correction = fit_correction(task.executor, plan, self._fitted)
-        samples = task.executor.corrected(correction).run([plan], calls)[0]
+        """Errors of a schedule, with a correction of its own, on calls that this was not fitted on.
+
+        Or without one where that is better: fitted on too few calls, a correction does harm.
+        """
+        corrected = self._errors(steps, fit_correction(self._task.executor, self.plan(steps), self._fitted))
+        return min(corrected, self._errors(steps, None), key=lambda errors: errors.normalised)
+
+    def correction(self, steps: Sequence[int]) -> Correction | None:
+        """The correction of a schedule, fitted on all calls; None where the schedule is better without."""
+        if self.errors(steps) == self._errors(steps, None):
+            return None
+        return fit_correction(self._task.executor, self.plan(steps), self._task.calls)
+
+    def _errors(self, steps: Sequence[int], correction: Correction | None) -> Errors:
+        task, calls = self._task, self._compared
+        samples = task.executor.corrected(correction).run([self.plan(steps)], calls)[0]
         normalised, units = (task.actions.errors(samples, calls.targets, units=u).mean() for u in (False, True))
         return Errors(float(normalised), float(units))
 

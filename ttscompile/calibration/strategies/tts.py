@@ -17,7 +17,6 @@ import numpy as np
 from ...correction import Correction
 from ...lattice import PlanArray
 from ..adaptation import Adaptation
-from ..correction import fit_correction
 from ..whole_steps import WholeSteps
 from .base import Array, Found, Task
 
@@ -60,7 +59,7 @@ class Tts:
         """Settle the schedule, with a correction from all calls."""
         if self._adaptation is None:
             task = self._task
-            self._correction = fit_correction(task.executor, self.plan, task.calls)
+            self._correction = self._whole.correction(self._steps)
             corrected = replace(task, executor=task.executor.corrected(self._correction))
             self._adaptation = Adaptation(corrected, self.plan)
 
