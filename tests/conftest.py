@@ -22,7 +22,7 @@ def pytest_configure() -> None:
     if importlib.util.find_spec("torch") is not None:
         import torch
 
-        torch.set_num_threads(2)
+        torch.set_num_threads(1)
 
 
 def pytest_terminal_summary(terminalreporter: TerminalReporter) -> None:
