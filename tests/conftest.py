@@ -18,7 +18,7 @@ NO_SHARED = "NO GOLDEN FILES: no folder 'shared' with DESIGN.md and golden/ besi
 
 
 def pytest_configure() -> None:
-    """Two threads of torch, so that the tests of a CI machine do not fight over its cores."""
+    """One thread for each of torch's operations: those of the tests are small, and wait for each other otherwise."""
     if importlib.util.find_spec("torch") is not None:
         import torch
 
