@@ -12,7 +12,9 @@ import gc
 import hashlib
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from itertools import combinations
 from pathlib import Path
 from time import perf_counter
 
@@ -33,7 +35,8 @@ class Soak:
         before_load_mb: resident memory before the policy was loaded, MB of 2**20 bytes.
         loaded_mb: after.
         rss_mb: after each tenth of the calls.
-        growth_kb_a_call: slope of these, without the first.
+        growth_kb_a_call: median slope between any two of these, without the first: what grows call by call. A single
+            step, which the allocator of a process makes once in a while, does not count.
         p50_ms: of all calls but those of the first episode.
         p99_ms: likewise.
         first_ms: median of the first calls of the episodes.
@@ -55,6 +58,12 @@ class Soak:
     collections: int
     digest: str
     repeatable: bool
+
+
+def median_slope(values: Sequence[float]) -> float:
+    """Median of the slopes between any two of these values (Theil 1950, Sen 1968); 0 of fewer than two."""
+    slopes = [(b - a) / (j - i) for (i, a), (j, b) in combinations(enumerate(values), 2)]
+    return float(np.median(slopes)) if slopes else 0.0
 
 
 def resident_mb() -> float:
@@ -81,13 +90,12 @@ def soak(directory: Path, calls: int, threads: int = 1, plan: str | None = None)
             memory.append(resident_mb())
     collections = sum(one["collections"] for one in gc.get_stats()) - collections
     later = np.concatenate(times[1:])
-    slope = np.polyfit(np.arange(len(memory) - 1), memory[1:], 1)[0] if len(memory) > 2 else 0.0
     return Soak(
         calls=episodes * EPISODE,
         before_load_mb=before,
         loaded_mb=loaded,
         rss_mb=tuple(memory),
-        growth_kb_a_call=float(slope * 1024 / (max(episodes // 10, 1) * EPISODE)),
+        growth_kb_a_call=median_slope(memory[1:]) * 1024 / (max(episodes // 10, 1) * EPISODE),
         p50_ms=float(np.percentile(later, 50)),
         p99_ms=float(np.percentile(later, 99)),
         first_ms=float(np.median([one[0] for one in times[1:]])),
