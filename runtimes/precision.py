@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from ttscompile.artifact.manifest import DENSE, PrecisionError
 from ttscompile.config import FP32, ChunkSpec, FloatArray, Noise, PolicySpec
+from ttscompile.correction import Correction
 from ttscompile.errors import ObservationError
 from ttscompile.machine import has_integer_dot_product
 
@@ -75,7 +76,7 @@ def measure_precision(artifact: Artifact) -> PrecisionError:
 
 
 def compare(
-    artifact: Artifact, plan: npt.NDArray[np.int8], calls: Iterable[Call]
+    artifact: Artifact, plan: npt.NDArray[np.int8], calls: Iterable[Call], correction: Correction | None = None
 ) -> list[tuple[FloatArray, FloatArray]]:
     """Denoised samples ``[T, D]`` of each call in the artifact's precision, and in fp32.
 
@@ -85,6 +86,10 @@ def compare(
         artifact: with blocks of another precision.
         plan: ``[K, blocks]``, without reads of earlier calls.
         calls: normalised observation and noise of one stream each.
+        correction: of the sampler's steps, which belongs to the plan; None for none.
+
+    Raises:
+        ObservationError: an action is not a number.
     """
     runtimes = open_runtime(artifact), open_runtime(artifact.at_precision(FP32))
     pairs = []
@@ -92,11 +97,12 @@ def compare(
         samples = []
         for runtime in runtimes:
             runtime.reset()
-            samples.append(runtime.predict(obs, noise, plan)[0][0])
+            samples.append(runtime.predict(obs, noise, plan, correction=correction)[0][0])
         if not np.isfinite(samples).all():
             raise ObservationError(
-                "the policy's dense action on a random observation within the range of its normaliser is not a number."
-                " Convert with precision 'fp32', and look for NaN in the checkpoint."
+                f"the policy's action is not a number: {_count_bad(samples[1])} of its values in precision {FP32!r},"
+                f" {_count_bad(samples[0])} in that of the artifact. Convert with precision {FP32!r}; where it fails too,"
+                " look for NaN in the checkpoint and in the recorded observations."
             )
         pairs.append((samples[0], samples[1]))
     return pairs
@@ -122,6 +128,10 @@ def random_calls(spec: PolicySpec, count: int) -> Iterator[Call]:
         initial = rng.standard_normal((1, *spec.sample), dtype=np.float32)
         draws = rng.standard_normal((spec.sampler.steps, *initial.shape), dtype=np.float32)
         yield obs, Noise(initial, draws if spec.sampler.stochastic else None)
+
+
+def _count_bad(sample: FloatArray) -> int:
+    return int(np.count_nonzero(~np.isfinite(sample)))
 
 
 def _rounded(number: float) -> float:

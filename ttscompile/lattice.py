@@ -7,7 +7,7 @@ executes them literally, and ``origins`` is the same meaning solved ahead of tim
 from __future__ import annotations
 
 import enum
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -187,15 +187,20 @@ def dense_plan(steps: int, blocks: int) -> PlanArray:
     return np.full((steps, blocks), Source.COMPUTE, dtype=np.int8)
 
 
+def whole_steps_plan(steps: int, blocks: int, chosen: Iterable[int]) -> PlanArray:
+    """Every block computed at the chosen steps, TIMESTEP elsewhere: int8 ``[K, blocks]``."""
+    plan = np.full((steps, blocks), Source.TIMESTEP, dtype=np.int8)
+    plan[list(chosen)] = Source.COMPUTE
+    return plan
+
+
 def uniform_plan(steps: int, blocks: int, full_steps: int) -> PlanArray:
     """Every block computed at ``full_steps`` evenly spaced steps (step 0 among them), TIMESTEP elsewhere.
 
     Returns:
         int8 ``[K, blocks]``.
     """
-    plan = np.full((steps, blocks), Source.TIMESTEP, dtype=np.int8)
-    plan[np.unique(np.floor(np.arange(full_steps) * steps / full_steps).astype(int))] = Source.COMPUTE
-    return plan
+    return whole_steps_plan(steps, blocks, (step * steps // full_steps for step in range(full_steps)))
 
 
 def sparsity(plan: PlanArray) -> float:

@@ -73,16 +73,6 @@ def test_the_reference_runtime_does_the_same(compiled: Path, recording: Path, pl
     torch.testing.assert_close(ours, theirs.sample, rtol=0, atol=2e-5)
 
 
-def test_a_shared_start_changes_nothing(compiled: Path, recording: Path, plan: PlanArray) -> None:
-    """Plans that begin alike go on from a snapshot, which has to hold the history too."""
-    executor, _, calls = prepared(compiled, recording, range(6), 20)
-    corrected = executor.corrected(fit_correction(executor, plan, calls))
-    other = plan.copy()
-    other[-1] = Source.COMPUTE
-    whole, shared = corrected.run([plan, other], calls), corrected.run([plan, other], calls, base=plan)
-    torch.testing.assert_close(whole, shared, rtol=0, atol=1e-6)
-
-
 def test_the_same_calls_give_the_same_bytes(compiled: Path, recording: Path, plan: PlanArray) -> None:
     executor, _, calls = prepared(compiled, recording, range(6), 150)
     one, two = (fit_correction(executor, plan, calls) for _ in range(2))

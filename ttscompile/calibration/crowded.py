@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..lattice import PlanArray, Source
+from ..lattice import PlanArray, whole_steps_plan
 
 CROWDING = (0.4, 0.6, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0)
 """1 is even, above it the steps crowd towards the end, below it towards the start."""
@@ -22,9 +22,7 @@ def crowded_plan(steps: int, blocks: int, full_steps: int, crowding: float) -> P
     Returns:
         int8 ``[K, blocks]``.
     """
-    plan = np.full((steps, blocks), Source.TIMESTEP, dtype=np.int8)
-    plan[list(crowded_steps(steps, full_steps, crowding))] = Source.COMPUTE
-    return plan
+    return whole_steps_plan(steps, blocks, crowded_steps(steps, full_steps, crowding))
 
 
 def crowded_steps(steps: int, full_steps: int, crowding: float) -> tuple[int, ...]:

@@ -1,16 +1,15 @@
 """Many plans at once: the meaning of the reference runtime for calls that are independent of each other.
 
 A search tries thousands of plans, most of them alike. So plans go through the loop together, in one batch of
-``plans x calls`` streams; a step in which no plan computes anything costs one addition; and what plans have in common
-with a plan that was executed before is taken from there. No plan here reads the rollout cache: what one call leaves
-for the next is the reference runtime's business. Tests hold this against ``ReferenceModel.rollout``.
+``plans x calls`` streams, and a step in which no plan computes anything costs one addition. No plan here reads the
+rollout cache: what one call leaves for the next is the reference runtime's business. Tests hold this against
+``ReferenceModel.rollout``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,16 +25,6 @@ from ..runtimes.reference import ReferenceModel
 from ..runtimes.reference_correction import apply as apply_correction
 from ..runtimes.reference_correction import empty_history
 from .calls import Calls, Selector
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """The loop before a step: the sample, the history of the correction, and both caches, for all streams."""
-
-    sample: Tensor
-    history: Tensor
-    forward: dict[int, Tensor]
-    timestep: tuple[Tensor | None, ...]
 
 
 class Executor:
@@ -61,7 +50,6 @@ class Executor:
         self.selector = Selector(graph for name, graph in artifact.graphs.items() if name in ("condition", "step"))
         self.types = [block.type for block in blocks]
         self.axes = [block.type.batch_axis or 0 for block in blocks]
-        self._group_axes = {block.group: block.type.batch_axis or 0 for block in blocks}
         self.alike = len({block.type for block in blocks}) == 1
         self.pruner_graph = artifact.graphs.get("pruner")
         self._streams = streams
@@ -73,13 +61,12 @@ class Executor:
         other.correction = correction
         return other
 
-    def run(self, plans: Sequence[PlanArray] | PlanArray, calls: Calls, base: PlanArray | None = None) -> Tensor:
+    def run(self, plans: Sequence[PlanArray] | PlanArray, calls: Calls) -> Tensor:
         """The denoised samples of every plan on every call.
 
         Args:
             plans: ``[C, K, blocks]``, legal without a rollout cache.
             calls: N of them.
-            base: a plan that the others resemble: the steps before their first difference are executed once.
 
         Returns:
             ``[C, N, T, D]``.
@@ -89,26 +76,14 @@ class Executor:
         """
         stacked = np.stack(list(plans))
         self._check(stacked)
-        results: list[Tensor | None] = [None] * len(stacked)
-        differs = np.full(len(stacked), 0)
-        if base is not None:
-            changed = (stacked != base).any(-1)
-            differs = np.where(changed.any(1), changed.argmax(1), len(base) - 1)
-        order = np.argsort(differs, kind="stable")
         rows = max(1, self._streams // calls.count)
-        groups = [order[i : i + rows] for i in range(0, len(order), rows)]
+        parts = []
         with torch.no_grad():
-            starts = {int(differs[group[0]]) for group in groups} - {0}
-            snapshots: dict[int, Snapshot] = {}
-            if base is not None and starts:
-                self._loop(base[None], calls, 0, None, snapshots, starts, max(starts) + 1)
-            for group in groups:
-                start = int(differs[group[0]])
+            for group in (stacked[i : i + rows] for i in range(0, len(stacked), rows)):
                 many = self.selector.calls(calls, np.tile(np.arange(calls.count), len(group)))
-                samples = self._loop(stacked[group], many, start, snapshots.get(start), {})
-                for i, sample in zip(group, samples.reshape(len(group), calls.count, *samples.shape[1:]), strict=True):
-                    results[i] = sample
-        return torch.stack([sample for sample in results if sample is not None])
+                samples = self._loop(group, many)
+                parts.append(samples.reshape(len(group), calls.count, *samples.shape[1:]))
+        return torch.cat(parts)
 
     def run_each(self, plans: PlanArray, calls: Calls) -> Tensor:
         """The denoised sample of every call with a plan of its own.
@@ -126,14 +101,14 @@ class Executor:
         self._check(plans)
         parts = [np.arange(i, min(i + self._streams, len(plans))) for i in range(0, len(plans), self._streams)]
         with torch.no_grad():
-            return torch.cat([self._loop(plans[p], self.selector.calls(calls, p), 0, None, {}) for p in parts])
+            return torch.cat([self._loop(plans[p], self.selector.calls(calls, p)) for p in parts])
 
     def run_dense(self, calls: Calls) -> Tensor:
         """What the dense policy answers, and how it gets there: the sample after each step, ``[N, K, T, D]``."""
         path: list[Tensor] = []
         with torch.no_grad():
             dense = np.zeros((1, self.model.steps, self.model.blocks), np.int8)
-            self.corrected(None)._loop(dense, calls, 0, None, {}, path=path)
+            self.corrected(None)._loop(dense, calls, path)
         return torch.stack(path, 1)
 
     def logits(self, calls: Calls, weights: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[np.float32]:
@@ -147,25 +122,13 @@ class Executor:
         if (plans == Source.ROLLOUT).any() or (plans[:, 0] != Source.COMPUTE).any():
             raise IllegalPlanError("expected plans with a dense step 0 that read nothing of an earlier call.")
 
-    def _loop(
-        self,
-        plans: PlanArray,
-        calls: Calls,
-        start: int,
-        snapshot: Snapshot | None,
-        taken: dict[int, Snapshot],
-        take: Collection[int] = (),
-        stop: int | None = None,
-        path: list[Tensor] | None = None,
-    ) -> Tensor:
-        """Steps ``start`` to ``stop`` of streams, plan by plan; fills ``taken`` before the steps ``take``."""
-        state = self.begin(calls, len(plans), snapshot)
+    def _loop(self, plans: PlanArray, calls: Calls, path: list[Tensor] | None = None) -> Tensor:
+        """All steps of streams, plan by plan; the sample after each goes to ``path``."""
+        state = self.begin(calls, len(plans))
         sample, history = state.sample, state.history
         total: Tensor | None = None  # what all blocks add together, as long as nothing is computed
         previous: PlanArray | None = None
-        for k in range(start, self.model.steps if stop is None else stop):
-            if k in take:
-                taken[k] = Snapshot(sample, history, dict(state.forward), tuple(state.timestep))
+        for k in range(self.model.steps):
             row = plans[:, k]
             stem = self.model.stem(sample, k, calls.contexts)
             if total is not None and previous is not None and np.array_equal(row, previous):
@@ -181,9 +144,9 @@ class Executor:
                 path.append(sample)
         return sample
 
-    def begin(self, calls: Calls, plans: int, snapshot: Snapshot | None = None) -> State:
-        """The state of the loop before step 0, or where a snapshot was taken; ``calls`` are those of all plans."""
-        return State(calls, plans, snapshot, self.axes, self._group_axes)
+    def begin(self, calls: Calls, plans: int) -> State:
+        """The state of the loop before step 0; ``calls`` are those of all plans."""
+        return State(calls, plans, len(self.axes))
 
     def advance(
         self, sample: Tensor, prediction: Tensor, history: Tensor, calls: Calls, k: int
@@ -216,18 +179,11 @@ class Executor:
 class State:
     """Sample, history and caches of ``plans x calls`` streams."""
 
-    def __init__(
-        self, calls: Calls, plans: int, snapshot: Snapshot | None, axes: list[int], group_axes: dict[int, int]
-    ) -> None:
+    def __init__(self, calls: Calls, plans: int, blocks: int) -> None:
         self._plans, self._each = plans, calls.count // plans
         self.forward: dict[int, Tensor] = {}
-        self.timestep: list[Tensor | None] = [None] * len(axes)
+        self.timestep: list[Tensor | None] = [None] * blocks
         self.sample, self.history = calls.initial, empty_history(calls.initial)
-        if snapshot is not None:
-            self.sample, self.history = (torch.cat([one] * plans) for one in (snapshot.sample, snapshot.history))
-            pairs = zip(snapshot.timestep, axes, strict=True)
-            self.timestep = [None if t is None else torch.cat([t] * plans, axis) for t, axis in pairs]
-            self.forward = {g: torch.cat([t] * plans, group_axes[g]) for g, t in snapshot.forward.items()}
 
     def streams(self, plans: BoolArray) -> Tensor:
         """Numbers of the streams of these plans."""

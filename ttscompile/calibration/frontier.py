@@ -33,8 +33,7 @@ from .execute import Executor
 from .latency import with_plans
 from .points import Frontier
 from .strategies import Task, plan_of, require_reach
-from .targets import draw_calls
-from .workers import workers
+from .targets import dense_rounds, draw_calls
 
 LEARNED = 256
 """Calls that strategies learn from, at most. ``calibrate`` takes up to 960: its corrections are better."""
@@ -136,14 +135,11 @@ def _find(
         return plans, corrections
     spec, executor = artifact.manifest.spec, Executor(artifact)
     learned = draw_calls(executor, spec, episodes, split, limit, 1, seed)["calibration"]
-    parts = np.array_split(np.arange(learned.count), max(1, learned.count // 16))
     progress("dense calls to learn from", 0, learned.count)
     paths: list[torch.Tensor] = []
-    with workers() as some:
-        for i in range(0, len(parts), some.count):
-            chunk = parts[i : i + some.count]
-            paths += some.map(lambda part: executor.run_dense(executor.selector.calls(learned, part)), chunk)
-            progress("dense calls to learn from", sum(map(len, paths)), learned.count)
+    for found in dense_rounds(executor, learned):
+        paths += found
+        progress("dense calls to learn from", sum(map(len, paths)), learned.count)
     learned = learned.answered(torch.cat(paths))
     kinds = tuple(block.kind for block in artifact.manifest.blocks)
     # Without constants of a pruner nobody spends time on plans that depend on the observation: schedules are compared.
@@ -151,10 +147,10 @@ def _find(
     for number, (strategy, sparsity) in enumerate(wished):
         name = f"{strategy} {sparsity:g}"
         progress(f"search: {name}", number, len(wished))
-        found = plan_of(strategy, replace(task, budget=budgets[sparsity]), intervals)
-        plans[name] = found.schedule
-        if found.correction is not None:
-            corrections[name] = found.correction
+        proposal = plan_of(strategy, replace(task, budget=budgets[sparsity]), intervals)
+        plans[name] = proposal.schedule
+        if proposal.correction is not None:
+            corrections[name] = proposal.correction
     progress("search", len(wished), len(wished))
     return plans, corrections
 

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from ..lattice import BoolArray, PlanArray, Source
 from ..runtimes.reference_correction import empty_history
-from .calls import Actions, Calls, IntArray
+from .calls import Actions, Calls
 from .execute import Executor
 
 Matrix = npt.NDArray[np.float32]
@@ -40,7 +40,7 @@ SOFTEN = 0.5
 """Share of the median error that is added where errors are divided by their size."""
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class LinearModel:
     """The linearised error of a set of calls under changes of one plan.
 
@@ -55,11 +55,6 @@ class LinearModel:
     error: Matrix
     computed: BoolArray
 
-    def column(self, b: int, steps: IntArray) -> Matrix:
-        """What block b contributes, ``[N * directions]``, if it is computed at these steps, the first being 0."""
-        until = np.append(steps[1:], len(self.computed))
-        return np.asarray((self.reach[b, until, steps] - self.reach[b, steps, steps]).sum(0))
-
     def toggles(self) -> Matrix:
         """By how much the error changes if one cell is toggled: ``[K, blocks, N * directions]``."""
         count = len(self.computed)
@@ -73,16 +68,6 @@ class LinearModel:
                 if now > 0:
                     effects[now, b] = reach[after, before] - reach[now, before] - reach[after, now] + reach[now, now]
         return effects
-
-    def change(self, b: int, steps: IntArray) -> Matrix:
-        """By how much the error changes if block b is computed at these steps and no others."""
-        return self.column(b, steps) - self.column(b, np.flatnonzero(self.computed[:, b]))
-
-    def apply(self, computed: BoolArray) -> None:
-        """Go over to another plan, still linearised around the first."""
-        for b in np.flatnonzero((computed != self.computed).any(0)):
-            self.error = self.error + self.change(int(b), np.flatnonzero(computed[:, b]))
-        self.computed = computed.copy()
 
 
 def linearise(executor: Executor, actions: Actions, plan: PlanArray, calls: Calls, seed: int) -> LinearModel:

@@ -170,7 +170,7 @@ def calibrate(
         seconds=clock.elapsed(),
     )
     require_success(result, goal, found.is_baseline)
-    precision = precision_record(artifact, episodes, split.validation, SCHEDULE, found.schedule, seed)
+    precision = precision_record(artifact, episodes, split.validation, SCHEDULE, found.schedule, found.correction, seed)
     _write(Path(path), artifact, result, found, named, {**found.notes, **precision})
     state.remove()
     return result

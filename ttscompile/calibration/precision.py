@@ -10,6 +10,7 @@ import numpy as np
 from ..artifact.load import Artifact
 from ..artifact.manifest import DENSE
 from ..config import Noise
+from ..correction import Correction
 from ..lattice import PlanArray, Source
 from ..runtimes.precision import Call, action_errors, compare
 from ..trajectories import Episode
@@ -20,7 +21,13 @@ HELD_OUT = 8
 
 
 def precision_record(
-    artifact: Artifact, episodes: Sequence[Episode], numbers: Sequence[int], name: str, plan: PlanArray, seed: int
+    artifact: Artifact,
+    episodes: Sequence[Episode],
+    numbers: Sequence[int],
+    name: str,
+    plan: PlanArray,
+    correction: Correction | None,
+    seed: int,
 ) -> dict[str, Any]:
     """Actions in the artifact's precision against those in fp32 with the same plan and noise.
 
@@ -32,6 +39,7 @@ def precision_record(
         numbers: of those that were held out.
         name: of a schedule beside ``dense``.
         plan: the schedule, ``[K, blocks]``; left out if it reads earlier calls, which these calls do not have.
+        correction: of the schedule; None for none.
         seed: of calls and noise.
 
     Returns:
@@ -42,12 +50,12 @@ def precision_record(
     if manifest.precision is None:
         return {}
     chosen = sample_calls(episodes, numbers, HELD_OUT, seed)
-    plans = {DENSE: artifact.schedule(DENSE), name: plan}
+    plans = ((DENSE, artifact.schedule(DENSE), None), (name, plan, correction))
     scores = {}
-    for title, each in plans.items():
+    for title, each, its_correction in plans:
         if (each == Source.ROLLOUT).any():
             continue
-        pairs = compare(artifact, each, _calls(artifact, episodes, chosen, seed))
+        pairs = compare(artifact, each, _calls(artifact, episodes, chosen, seed), its_correction)
         errors = [action_errors(manifest.spec.chunk, one, other).mean() for one, other in pairs]
         scores[title] = {"error": float(np.mean(errors)), "error_p90": float(np.quantile(errors, 0.9))}
     return {"precision": {"name": manifest.precision.name, "calls": len(chosen), "plans": scores}}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
@@ -38,16 +38,28 @@ def with_targets(executor: Executor, name: str, calls: Calls, state: StateFile, 
     sample = calls.initial.shape[1:]
     path = torch.empty(0, executor.model.steps, *sample) if known is None else torch.from_numpy(known)
     bar.stage(f"dense, {name}", calls.count, len(path))
-    while len(path) < calls.count:
-        with workers() as some:
-            begins = range(len(path), min(len(path) + some.count * TARGETS_AT_ONCE, calls.count), TARGETS_AT_ONCE)
-            parts = [np.arange(i, min(i + TARGETS_AT_ONCE, calls.count)) for i in begins]
-            path = torch.cat([path, *some.map(lambda p: executor.run_dense(executor.selector.calls(calls, p)), parts)])
+    for found in dense_rounds(executor, calls, len(path)):
+        path = torch.cat([path, *found])
         state.put("targets", {**state.get("targets"), name: path.numpy()})
         state.progress["seconds"] = clock.elapsed()
         state.save()
         bar.update(len(path), "", clock.left())
     return calls.answered(path)
+
+
+def dense_rounds(executor: Executor, calls: Calls, begin: int = 0) -> Iterator[list[torch.Tensor]]:
+    """What the dense policy answers to calls, from number ``begin`` on, a round of all workers at a time.
+
+    Yields:
+        Paths ``[n, K, T, D]``, in order.
+    """
+    while begin < calls.count:
+        with workers() as some:
+            end = min(begin + some.count * TARGETS_AT_ONCE, calls.count)
+            parts = [np.arange(i, min(i + TARGETS_AT_ONCE, end)) for i in range(begin, end, TARGETS_AT_ONCE)]
+            found = some.map(lambda part: executor.run_dense(executor.selector.calls(calls, part)), parts)
+        begin = end
+        yield found
 
 
 def draw_calls(

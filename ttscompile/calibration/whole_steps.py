@@ -6,10 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from ..correction import Correction
-from ..lattice import PlanArray, Source
+from ..lattice import PlanArray, whole_steps_plan
 from .correction import fit_correction
 from .crowded import CROWDING, crowded_steps
 
@@ -52,23 +50,25 @@ class WholeSteps:
     def plan(self, steps: Sequence[int]) -> PlanArray:
         """The schedule that computes these steps and reads TIMESTEP elsewhere, int8 ``[K, blocks]``."""
         model = self._task.executor.model
-        plan = np.full((model.steps, model.blocks), Source.TIMESTEP, np.int8)
-        plan[list(steps)] = Source.COMPUTE
-        return plan
+        return whole_steps_plan(model.steps, model.blocks, steps)
 
     def errors(self, steps: Sequence[int]) -> Errors:
         """Errors of a schedule, with a correction of its own, on calls that this was not fitted on.
 
         Or without one where that is better: fitted on too few calls, a correction does harm.
         """
-        corrected = self._errors(steps, fit_correction(self._task.executor, self.plan(steps), self._fitted))
-        return min(corrected, self._errors(steps, None), key=lambda errors: errors.normalised)
+        return min(self._with_and_without(steps), key=lambda errors: errors.normalised)
 
     def correction(self, steps: Sequence[int]) -> Correction | None:
         """The correction of a schedule, fitted on all calls; None where the schedule is better without."""
-        if self.errors(steps) == self._errors(steps, None):
+        corrected, plain = self._with_and_without(steps)
+        if plain.normalised <= corrected.normalised:
             return None
         return fit_correction(self._task.executor, self.plan(steps), self._task.calls)
+
+    def _with_and_without(self, steps: Sequence[int]) -> tuple[Errors, Errors]:
+        fitted = fit_correction(self._task.executor, self.plan(steps), self._fitted)
+        return self._errors(steps, fitted), self._errors(steps, None)
 
     def _errors(self, steps: Sequence[int], correction: Correction | None) -> Errors:
         task, calls = self._task, self._compared
