@@ -30,8 +30,10 @@ types: $(READY)
 	cp -Rp passes runtimes build/types/ttscompile/
 	cd build/types && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache -p ttscompile
 
+# On all cores, each with a file at a time; then, one by one, what takes times.
 pytest: $(READY)
-	$(BIN)/pytest
+	$(BIN)/pytest -n logical --dist loadfile --benchmark-disable -m "not alone and not soak"
+	$(BIN)/pytest -m "alone and not soak"
 
 benchmark: $(READY)
 	$(BIN)/pytest --benchmark-only

@@ -1,18 +1,16 @@
 """Recorded episodes as calls of the policy, for calibration. ``docs/design.md`` section 8 has the formats.
 
 An ``.npz`` with one array for each key of the observation and ``episode_ends [E]``: rows are calls ``[N, To, ...]``, in
-order; or, with ``{"frames": true}`` in its ``meta``, frames ``[F, ...]``, from which the windows are cut here.
+order; or, with ``{"frames": true}`` in its ``meta``, frames ``[F, ...]``, from which the windows are cut here. A zarr
+replay buffer of Diffusion Policy, an HDF5 file of robomimic and a LeRobot data set hold frames.
 """
 
 from __future__ import annotations
 
 import json
-import lzma
 import os
 import warnings
-import zipfile
-import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,22 +20,14 @@ import numpy.typing as npt
 
 from .config import ObservationSpec
 from .errors import TrajectoryError
+from .trajectories_frames import Frames, observation_frames, require_proportion
+from .trajectories_hdf5 import hdf5_frames
+from .trajectories_lerobot import lerobot_frames
+from .trajectories_zarr import zarr_frames
 
 Array = npt.NDArray[Any]
 
 ENDS, META = "episode_ends", "meta"
-
-_UNREADABLE = (
-    OSError,
-    EOFError,
-    ValueError,
-    KeyError,
-    zipfile.BadZipFile,
-    zlib.error,
-    lzma.LZMAError,
-    NotImplementedError,
-    MemoryError,
-)
 
 
 @dataclass(frozen=True)
@@ -59,14 +49,19 @@ class Episode:
 
 
 def load_trajectories(
-    paths: Sequence[str | os.PathLike[str]], observations: Mapping[str, ObservationSpec], action_steps: int
+    paths: Sequence[str | os.PathLike[str]],
+    observations: Mapping[str, ObservationSpec],
+    action_steps: int,
+    sources: Mapping[str, Sequence[str]] | None = None,
 ) -> list[Episode]:
     """Read episodes from files.
 
     Args:
-        paths: ``.npz`` files; never unpickled.
+        paths: files or directories; never unpickled.
         observations: what one call of the policy takes.
         action_steps: how many actions of a chunk are executed: the frames between two calls.
+        sources: by key of the observation, the arrays of a recording of frames that it is made of, in order, where they
+            are called otherwise; ``NAME:N`` are the first N numbers of one.
 
     Returns:
         The episodes in the order of the files. Rows after the last end of an episode are left out, with a warning.
@@ -78,23 +73,26 @@ def load_trajectories(
         paths = [paths]
     if not paths:
         raise TrajectoryError("no trajectory files were given. Name at least one .npz with recorded episodes.")
-    return [episode for path in paths for episode in _read(Path(path), observations, action_steps)]
+    return [episode for path in paths for episode in _read(Path(path), observations, action_steps, sources or {})]
 
 
-def _read(path: Path, observations: Mapping[str, ObservationSpec], action_steps: int) -> list[Episode]:
+def _read(
+    path: Path, observations: Mapping[str, ObservationSpec], action_steps: int, sources: Mapping[str, Sequence[str]]
+) -> list[Episode]:
     """Episodes of one file."""
-    arrays = read_npz(path)
-    frames = _meta(path, arrays.pop(META, None))
-    if ENDS not in arrays:
-        raise TrajectoryError(f"{path}: has no array {ENDS!r}; it has {sorted(arrays)}. Add {ENDS} [E]: {_ENDS_ARE}.")
-    ends = _ends(path, arrays.pop(ENDS))
-    extra, missing = sorted(set(arrays) - set(observations)), sorted(set(observations) - set(arrays))
-    if missing:
+    other = _other_format(path)
+    held, frames = _npz(path) if other is None else (other(path), True)
+    if sources and not frames:
         raise TrajectoryError(
-            f"{path}: expected an array for each key of the observation, {sorted(observations)}; {missing} are missing,"
-            f" and it has {sorted(arrays)}. Record the observations under the keys that the policy was trained with."
+            f"{path}: its rows are calls of the policy, and {sorted(sources)} are to be made of other arrays, which is"
+            " for frames. Save each key of the observation as an array of its own."
         )
-    if extra:
+    if unknown := sorted(set(sources) - set(observations)):
+        raise TrajectoryError(f"the policy observes {sorted(observations)}; found arrays for {unknown}.")
+    ends = _ends(path, held.ends)
+    arrays = observation_frames(path, held, observations, sources)
+    used = {part.partition(":")[0] for key in observations for part in sources.get(key, (key,))}
+    if other is None and (extra := sorted(set(held.names) - used)):
         warnings.warn(f"{path}: arrays {extra} are no keys of the observation, and are not used.", stacklevel=4)
     rows = {len(arrays[key]) if arrays[key].ndim else 0 for key in observations}
     if len(rows) != 1:
@@ -113,9 +111,19 @@ def _read(path: Path, observations: Mapping[str, ObservationSpec], action_steps:
     for number, (start, end) in enumerate(zip([0, *ends[:-1]], ends, strict=True)):
         part = {key: array[start:end] for key, array in checked.items()}
         if frames:
-            part = {key: _windows(array, observations[key].shape[0], action_steps) for key, array in part.items()}
+            part = {key: _windows(array, observations[key].frames, action_steps) for key, array in part.items()}
         episodes.append(Episode(f"{path.name}[{number}]", part))
     return episodes
+
+
+def _npz(path: Path) -> tuple[Frames, bool]:
+    """What an ``.npz`` holds, and whether its rows are frames rather than calls."""
+    arrays = read_npz(path)
+    frames = _meta(path, arrays.pop(META, None))
+    if ENDS not in arrays:
+        raise TrajectoryError(f"{path}: has no array {ENDS!r}; it has {sorted(arrays)}. Add {ENDS} [E]: {_ENDS_ARE}.")
+    ends = arrays.pop(ENDS)
+    return Frames(sorted(arrays), arrays.__getitem__, ends), frames
 
 
 _ENDS_ARE = "for each episode the row after its last, increasing"
@@ -129,14 +137,11 @@ def read_npz(path: Path) -> dict[str, Array]:
     """
     if not path.exists():
         raise TrajectoryError(f"{path}: does not exist. Give the .npz file of a recording.")
-    other = _other_format(path)
-    if other is not None:
-        raise TrajectoryError(
-            f"{path}: is {other}, which this version does not read yet. Save the observations as an .npz: one array for"
-            f" each key of the observation, and {ENDS} [E]."
-        )
     if not path.is_file():
-        raise TrajectoryError(f"{path}: expected an .npz file; found something else.")
+        raise TrajectoryError(
+            f"{path}: expected an .npz, a zarr replay buffer of Diffusion Policy, an HDF5 file of robomimic or a"
+            " LeRobot data set; found a directory that is none of these."
+        )
     try:
         with path.open("rb") as handle:  # numpy leaves it open where it finds no archive
             file = np.load(handle, allow_pickle=False)
@@ -145,22 +150,29 @@ def read_npz(path: Path) -> dict[str, Array]:
                     f"{path}: expected an .npz with several arrays; found a single one. Use np.savez."
                 )
             with file:
+                # Nothing has been decompressed yet.
+                require_proportion(path, sum(info.file_size for info in file.zip.infolist()), path.stat().st_size)
                 return {name: np.asarray(file[name]) for name in file.files}
-    except _UNREADABLE as error:
+    except TrajectoryError:
+        raise
+    except Exception as error:  # numpy parses the headers as Python text, and raises whatever its parts raise
         raise TrajectoryError(
-            f"{path}: cannot be read as .npz ({error}): no such file, truncated, or with Python objects in it, which"
-            " are never loaded. Record it again with np.savez and plain arrays."
+            f"{path}: cannot be read as .npz ({str(error)[:200]}): no such file, truncated, or with Python objects in"
+            " it, which are never loaded. Record it again with np.savez and plain arrays."
         ) from error
 
 
-def _other_format(path: Path) -> str | None:
+def _other_format(path: Path) -> Callable[[Path], Frames] | None:
+    """What reads a file that is no ``.npz``."""
     name = path.name.lower()
+    if not path.exists():
+        return None
     if name.endswith((".zarr", ".zarr.zip")) or (path / ".zgroup").exists() or (path / "zarr.json").exists():
-        return "a zarr store"
+        return zarr_frames
     if name.endswith((".hdf5", ".h5")):
-        return "an HDF5 file"
+        return hdf5_frames
     if (path / "meta" / "info.json").exists():
-        return "a LeRobot dataset directory"
+        return lerobot_frames
     return None
 
 
@@ -195,6 +207,7 @@ def _ends(path: Path, ends: Array) -> list[int]:
 
 def _checked(path: Path, key: str, array: Array, spec: ObservationSpec, frames: bool) -> Array:
     """The array in the specification's dtype, of its shape, and finite."""
+    frames = frames and spec.frames is not None
     shape, what = (spec.shape[1:], "[F, *frame]") if frames else (spec.shape, "[N, *shape]")
     if array.shape[1:] != shape:
         hint = ""
@@ -222,11 +235,13 @@ def _checked(path: Path, key: str, array: Array, spec: ObservationSpec, frames: 
     return cast
 
 
-def _windows(frames: Array, length: int, stride: int) -> Array:
-    """What the policy saw when it was called: the last ``length`` frames, every ``stride`` frames.
+def _windows(frames: Array, length: int | None, stride: int) -> Array:
+    """What the policy saw when it was called: the last ``length`` frames, every ``stride`` frames; None: the newest.
 
     At the start of an episode the first frame stands for those before it, as in Diffusion Policy's environments.
     """
     calls = np.arange(0, len(frames), stride)
+    if length is None:
+        return frames[calls]
     windows: Array = frames[np.maximum(calls[:, None] + np.arange(1 - length, 1), 0)]
     return windows

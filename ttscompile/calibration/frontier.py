@@ -49,6 +49,7 @@ def compare(
     sparsities: Sequence[float],
     others: Sequence[Path] = (),
     *,
+    observation: Mapping[str, Sequence[str]] | None = None,
     calls: int = 32,
     learned: int = LEARNED,
     threads: int = 1,
@@ -63,6 +64,7 @@ def compare(
         trajectories: recorded episodes, see ``ttscompile.trajectories``.
         strategies: names; each finds a plan for each sparsity.
         sparsities: shares of the cells to reuse.
+        observation: see ``ttscompile.calibrate``.
         others: artifacts of the same policy, for instance with other samplers; all their plans take part.
         calls: held-out calls, at most.
         learned: calls that strategies learn from, at most.
@@ -85,7 +87,7 @@ def compare(
     compared = {_unique(other.name, others): load_artifact(other) for other in others}
     for name, other in compared.items():
         _require_same_policy(artifact, other, name)
-    episodes = load_trajectories(trajectories, spec.observations, spec.chunk.stop - spec.chunk.start)
+    episodes = load_trajectories(trajectories, spec.observations, spec.chunk.stop - spec.chunk.start, observation)
     if len(episodes) < 2:
         raise CalibrationError(
             "the trajectories hold one episode; expected at least two: one is held out. Record more."

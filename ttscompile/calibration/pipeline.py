@@ -5,16 +5,18 @@ from __future__ import annotations
 import hashlib
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from ..artifact.load import Artifact, load_artifact
-from ..artifact.write import PRUNER, update_calibration
+from ..artifact.plan_records import PRUNER
+from ..artifact.write import update_calibration
 from ..correction import FEATURES
 from ..errors import CalibrationError
+from ..golden import record_plans
 from ..trajectories import Episode, load_trajectories
 from .budget import ERROR, LATENCY, Budget, Goal, cells_of, goal_of
 from .calls import Actions, Calls, split_episodes
@@ -61,6 +63,7 @@ def calibrate(
     threads: int = 1,
     max_minutes: float = 15.0,
     validation_fraction: float = 0.25,
+    observation: Mapping[str, Sequence[str]] | None = None,
     max_intervals: int | None = None,
     progress: bool = True,
 ) -> CalibrationResult:
@@ -77,7 +80,7 @@ def calibrate(
 
     Args:
         path: the artifact's directory.
-        trajectories: ``.npz`` files, see ``ttscompile.trajectories``.
+        trajectories: recordings: ``.npz``, zarr, HDF5 or LeRobot data sets, see ``ttscompile.trajectories``.
         target_sparsity: share of the cells to reuse; 0.95 if no budget is given.
         strategy: how the plan is found, see ``ttscompile.calibration.strategies``.
         seed: of the split, the noise and the search.
@@ -89,6 +92,7 @@ def calibrate(
         threads: of the calls that are timed for ``latency_ms``.
         max_minutes: after this time the best plan so far is taken. Also decides how many calls are used.
         validation_fraction: of the episodes.
+        observation: by key, the arrays of a recording that it is made of, where they are called otherwise.
         max_intervals: an end that does not depend on the machine's speed; None for the strategy's own.
         progress: show a bar on standard error.
 
@@ -111,7 +115,7 @@ def calibrate(
             f"{path}: only a directory can be calibrated. Unzip the artifact and give the directory."
         )
     budget = _known_budget(artifact, goal, strategy, validation_fraction, max_minutes)
-    episodes = load_trajectories(trajectories, spec.observations, spec.chunk.stop - spec.chunk.start)
+    episodes = load_trajectories(trajectories, spec.observations, spec.chunk.stop - spec.chunk.start, observation)
     if len(episodes) < 2:
         raise CalibrationError(
             "the trajectories hold one episode; expected at least two: a plan is judged on episodes that it was not"
@@ -194,6 +198,7 @@ def _write(
         {**result.record(), **notes, "named_steps": dict(named.steps)},
         corrections=corrections,
         model_identity=artifact.manifest.model_identity,
+        golden=record_plans,
     )
 
 

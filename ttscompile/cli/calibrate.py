@@ -7,8 +7,9 @@ from pathlib import Path
 import click
 
 import ttscompile
-from ttscompile.cli.output import artifact_argument, json_option, only_results_on_stdout, print_json, results
-from ttscompile.cli.summary import document, print_summary
+from ttscompile.cli.output import artifact_argument, json_option, only_results_on_stdout, print_json, progress, results
+from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
+from ttscompile.cli.summary import document, few_steps, print_summary
 
 STRATEGIES = (
     "tts",
@@ -26,33 +27,9 @@ STRATEGIES = (
 """``calibration.strategies.NAMES``; written again, since importing that takes torch and a second."""
 
 
-class FilesCommand(click.Command):
-    """Lets ``--trajectories`` and ``--with`` take every word up to the next option, which click's own cannot."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """As click does, with the option repeated before every word."""
-        expanded: list[str] = []
-        taking = ""
-        for arg in args:
-            if taking and not arg.startswith("-"):
-                expanded += [taking, arg]
-                continue
-            taking = arg if arg in ("--trajectories", "--with") else ""
-            if not taking:
-                expanded.append(arg)
-        return super().parse_args(ctx, expanded)
-
-
 @click.command(cls=FilesCommand)
 @artifact_argument
-@click.option(
-    "--trajectories",
-    required=True,
-    multiple=True,
-    type=click.Path(path_type=Path),
-    metavar="FILE...",
-    help="Recordings of episodes, .npz; every word up to the next option.",
-)
+@trajectories_options()
 @click.option("--target-sparsity", type=float, help="Share of the cells to reuse; 0.95 if no budget is given.")
 @click.option(
     "--target-flops",
@@ -92,6 +69,7 @@ class FilesCommand(click.Command):
 def calibrate(
     directory: Path,
     trajectories: tuple[Path, ...],
+    sources: Sources,
     target_sparsity: float | None,
     target_flops: float | None,
     latency_ms: float | None,
@@ -109,10 +87,13 @@ def calibrate(
     artifact gets 'safe', which computes twice as much, and 'fast', which computes half. Exit status 1: the budget was
     not kept.
     """
+    if (warning := few_steps(document(directory))) is not None:  # before minutes of work
+        progress().print(f"warning: {warning}", markup=False, soft_wrap=True)
     with only_results_on_stdout():
         ttscompile.calibrate(
             directory,
             trajectories=list(trajectories),
+            observation=sources,
             target_sparsity=target_sparsity,
             strategy=strategy,
             seed=seed,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from ttscompile.cli.calibrate import STRATEGIES, FilesCommand
+from ttscompile.cli.calibrate import STRATEGIES
 from ttscompile.cli.output import (
     artifact_argument,
     json_option,
@@ -19,6 +19,7 @@ from ttscompile.cli.output import (
     share,
     table,
 )
+from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
 from ttscompile.errors import RuntimeUnavailableError
 from ttscompile.machine import fingerprint, one_line
 from ttscompile.plots_frontier import plot_frontier
@@ -50,14 +51,7 @@ def _sparsities(_: click.Context, __: click.Parameter, value: str) -> tuple[floa
 
 @click.command(cls=FilesCommand)
 @artifact_argument
-@click.option(
-    "--trajectories",
-    required=True,
-    multiple=True,
-    type=click.Path(path_type=Path),
-    metavar="FILE...",
-    help="Recordings of episodes, .npz; every word up to the next option.",
-)
+@trajectories_options()
 @click.option(
     "--strategies",
     default="tts,bac,interval",
@@ -86,6 +80,7 @@ def _sparsities(_: click.Context, __: click.Parameter, value: str) -> tuple[floa
 def compare(
     directory: Path,
     trajectories: tuple[Path, ...],
+    sources: Sources,
     strategies: tuple[str, ...],
     sparsities: tuple[float, ...],
     others: tuple[Path, ...],
@@ -118,6 +113,7 @@ def compare(
             strategies,
             sparsities,
             others,
+            observation=sources,
             calls=calls,
             learned=learned_calls,
             threads=threads,

@@ -1,0 +1,248 @@
+"""Data sets as users have them, written with the libraries that write them, and read as the calls of a policy."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numcodecs
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as parquet
+import pytest
+import zarr
+from PIL import Image
+
+from ttscompile import trajectories_frames
+from ttscompile.config import ObservationSpec
+from ttscompile.errors import TrajectoryError
+from ttscompile.trajectories import Episode, load_trajectories
+
+LOW = {"obs": ObservationSpec((2, 8))}
+IMAGES = {"image": ObservationSpec((2, 3, 5, 4)), "state": ObservationSpec((2, 5))}
+SOURCES = {"obs": ("keypoint", "state:2")}
+ENDS = [5, 9]
+
+
+def arrays() -> dict[str, np.ndarray]:
+    draw = np.random.default_rng(0)
+    return {
+        "keypoint": draw.standard_normal((9, 3, 2)).astype(np.float32),
+        "state": draw.standard_normal((9, 5)).astype(np.float32),
+        "img": draw.integers(0, 256, (9, 5, 4, 3), np.uint8),
+    }
+
+
+def as_npz(path: Path) -> Path:
+    meta = np.array('{"frames": true}')
+    held = arrays()
+    np.savez(path / "it.npz", keypoint=held["keypoint"], state=held["state"], episode_ends=np.array(ENDS), meta=meta)
+    return path / "it.npz"
+
+
+def as_zarr(path: Path, version: int = 2, compressor: Any = "auto", zipped: bool = False, **more: np.ndarray) -> Path:
+    """As the replay buffers that Diffusion Policy publishes."""
+    target = path / "it.zarr"
+    group = zarr.open_group(str(target), mode="w", zarr_format=version)
+    given = {} if compressor == "auto" else {"compressors": compressor}
+    for name, array in {**arrays(), **more}.items():
+        group.create_array(f"data/{name}", data=array, chunks=(4, *array.shape[1:]), **given)
+    group.create_array("meta/episode_ends", data=np.array(ENDS))
+    return Path(shutil.make_archive(str(target), "zip", target)) if zipped else target
+
+
+def as_hdf5(path: Path) -> Path:
+    """As robomimic writes them; episode 10 comes after episode 2."""
+    with h5py.File(path / "it.hdf5", "w") as file:
+        for demo, begin, end in (("demo_2", 0, ENDS[0]), ("demo_10", *ENDS)):
+            for name, array in arrays().items():
+                file.create_dataset(f"data/{demo}/obs/{name}", data=array[begin:end], compression="gzip")
+            file[f"data/{demo}/actions"] = np.zeros((end - begin, 2))
+    return path / "it.hdf5"
+
+
+def png(image: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def as_lerobot(path: Path, features: dict[str, Any] | None = None) -> Path:
+    """Two tables, the rows of the second episode backwards."""
+    root = path / "it"
+    (root / "meta").mkdir(parents=True)
+    (root / "meta" / "info.json").write_text(json.dumps({"codebase_version": "v3.0", "features": features or {}}))
+    held = arrays()
+    for number, rows in enumerate((range(5), range(8, 4, -1))):
+        table = {
+            "keypoint": [held["keypoint"][i].tolist() for i in rows],
+            "state": pa.FixedSizeListArray.from_arrays(held["state"][list(rows)].ravel(), 5),
+            "img": [{"bytes": png(held["img"][i]), "path": None} for i in rows],
+            "episode_index": [number] * len(rows),
+            "frame_index": [i - 5 * number for i in rows],
+            "task_name": ["push"] * len(rows),
+        }
+        file = root / "data" / "chunk-000" / f"file-{number:03d}.parquet"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        parquet.write_table(pa.table(table), file)
+    return root
+
+
+WRITERS = {
+    "npz": as_npz,
+    "zarr 2": as_zarr,
+    "zarr 3": lambda path: as_zarr(path, 3),
+    "zarr 2, blosc, zipped": lambda path: as_zarr(path, 2, numcodecs.Blosc("zstd"), zipped=True),
+    "hdf5": as_hdf5,
+    "lerobot": as_lerobot,
+}
+
+
+def windows(frames: np.ndarray, action_steps: int) -> list[np.ndarray]:
+    """By hand: the frame of a call and the one before it; the first stands for the one before the first."""
+    found = []
+    for begin, end in zip([0, *ENDS], ENDS, strict=False):
+        calls = range(begin, end, action_steps)
+        found.append(np.stack([frames[[max(i - 1, begin), i]] for i in calls]))
+    return found
+
+
+def require_equal(episodes: list[Episode], key: str, expected: list[np.ndarray]) -> None:
+    assert len(episodes) == len(expected) == 2
+    for episode, one in zip(episodes, expected, strict=True):
+        np.testing.assert_allclose(episode.observations[key], one, rtol=1e-6)
+
+
+@pytest.mark.parametrize("format", WRITERS)
+def test_an_observation_is_joined_from_the_arrays_of_a_recording(format: str, tmp_path: Path) -> None:
+    held = arrays()
+    frames = np.concatenate([held["keypoint"].reshape(9, 6), held["state"][:, :2]], axis=1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("warnings.warn", lambda *_, **__: pytest.fail("a warning"))
+        episodes = load_trajectories([WRITERS[format](tmp_path)], LOW, 3, SOURCES)
+    require_equal(episodes, "obs", windows(frames, 3))
+
+
+@pytest.mark.parametrize("format", ["zarr 2", "zarr 3", "hdf5", "lerobot"])
+def test_images_come_as_the_policy_takes_them(format: str, tmp_path: Path) -> None:
+    episodes = load_trajectories([WRITERS[format](tmp_path)], IMAGES, 2, {"image": ("img",)})
+    held = arrays()
+    require_equal(episodes, "image", windows(np.moveaxis(held["img"], -1, 1).astype(np.float32) / 255, 2))
+    require_equal(episodes, "state", windows(held["state"], 2))
+
+
+@pytest.mark.parametrize("format", WRITERS)
+def test_what_is_missing_is_named_beside_what_there_is(format: str, tmp_path: Path) -> None:
+    with pytest.raises(TrajectoryError, match=r"no array 'obs' .* it has .*keypoint, .*state.*--observation obs=NAME"):
+        load_trajectories([WRITERS[format](tmp_path)], LOW, 3)
+
+
+@pytest.mark.parametrize("part", ["state:0", "state:6", "state:x", "state:"])
+def test_more_numbers_than_there_are_cannot_be_taken(part: str, tmp_path: Path) -> None:
+    with pytest.raises(TrajectoryError, match=f"'{part}' .* how many of the 5 numbers of 'state' are taken"):
+        load_trajectories([as_npz(tmp_path)], LOW, 3, {"obs": ("keypoint", part)})
+
+
+def test_calls_are_not_joined(tmp_path: Path) -> None:
+    np.savez(tmp_path / "calls.npz", a=np.zeros((3, 2, 4)), b=np.zeros((3, 2, 4)), episode_ends=np.array([3]))
+    with pytest.raises(TrajectoryError, match="its rows are calls of the policy"):
+        load_trajectories([tmp_path / "calls.npz"], LOW, 3, {"obs": ("a", "b")})
+
+
+def test_an_array_for_no_key_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(TrajectoryError, match=r"observes \['obs'\]; found arrays for \['observation'\]"):
+        load_trajectories([as_npz(tmp_path)], LOW, 3, {"observation": ("state",)})
+
+
+class Payload:
+    """Creates a file if it is ever unpickled."""
+
+    def __init__(self, target: Path) -> None:
+        self.target = target
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.touch, (self.target,)
+
+
+@pytest.mark.parametrize("declared", ["|O", "<f4"])
+def test_a_zarr_codec_that_unpickles_is_never_run(declared: str, tmp_path: Path) -> None:
+    target, store = tmp_path / "touched", as_zarr(tmp_path)
+    array = store / "data" / "state"
+    payload = np.empty(4, object)
+    payload[:] = Payload(target)
+    (array / "0.0").write_bytes(numcodecs.Pickle().encode(payload))
+    meta = json.loads((array / ".zarray").read_text())
+    meta |= {"dtype": declared, "filters": [{"id": "pickle", "protocol": 5}], "compressor": None, "fill_value": 0}
+    (array / ".zarray").write_text(json.dumps(meta))
+    with pytest.raises(TrajectoryError):
+        load_trajectories([store], LOW, 3, SOURCES)
+    assert not target.exists()
+
+
+def test_a_zarr_array_of_nothing_but_its_size_is_refused(tmp_path: Path) -> None:
+    store = as_zarr(tmp_path)
+    shutil.rmtree(store / "data" / "state")
+    zarr.open_group(str(store))["data"].create_array("state", shape=(10**9, 5), chunks=(1000, 5), dtype="f4")
+    with pytest.raises(TrajectoryError, match="in proportion to a file of"):
+        load_trajectories([store], LOW, 3, SOURCES)
+
+
+def test_data_of_other_files_is_not_read(tmp_path: Path) -> None:
+    path = as_hdf5(tmp_path)
+    (tmp_path / "secret").write_bytes(bytes(100))
+    with h5py.File(path, "r+") as file:
+        del file["data/demo_2/obs/state"]
+        file.create_dataset("data/demo_2/obs/state", (5, 5), "f4", external=[(str(tmp_path / "secret"), 0, 100)])
+    with pytest.raises(TrajectoryError, match="with its data in other files; expected numbers in the file itself"):
+        load_trajectories([path], LOW, 3, SOURCES)
+    with h5py.File(path, "r+") as file:
+        del file["data/demo_2/obs/state"]
+        file["data/demo_2/obs/state"] = h5py.ExternalLink("other.hdf5", "/state")
+    with pytest.raises(TrajectoryError, match="is a link to another file"):
+        load_trajectories([path], LOW, 3, SOURCES)
+
+
+def test_videos_are_refused_by_name(tmp_path: Path) -> None:
+    root = as_lerobot(tmp_path, {"top": {"dtype": "video", "shape": [3, 5, 4]}})
+    with pytest.raises(TrajectoryError, match="'top' is a video, which is not decoded. Save its frames as images"):
+        load_trajectories([root], {"image": ObservationSpec((2, 3, 5, 4))}, 2, {"image": ("top",)})
+
+
+@pytest.mark.parametrize(("part", "message"), [("task_name", "is string; expected numbers"), ("nested", "no array")])
+def test_columns_of_text_are_refused(part: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(TrajectoryError, match=message):
+        load_trajectories([as_lerobot(tmp_path)], LOW, 3, {"obs": (part,)})
+
+
+@pytest.mark.parametrize("format", ["zarr 2", "zarr 2, blosc, zipped", "hdf5", "lerobot"])
+def test_damage_is_one_error(format: str, tmp_path: Path) -> None:
+    """Every file cut in two, one after the other."""
+    path = WRITERS[format](tmp_path)
+    files = [path] if path.is_file() else [f for f in sorted(path.rglob("*")) if f.is_file()]
+    for file in files:
+        content = file.read_bytes()
+        file.write_bytes(content[: len(content) // 2])
+        try:
+            episodes = load_trajectories([path], LOW, 3, SOURCES)
+            assert "img" in str(file) or "attrs" in file.name or len(episodes) == 2  # not read, or of no consequence
+        except TrajectoryError as error:
+            assert str(path) in str(error)  # noqa: PT017
+        file.write_bytes(content)
+    assert len(load_trajectories([path], LOW, 3, SOURCES)) == 2
+
+
+@pytest.mark.parametrize("format", ["hdf5", "lerobot"])
+def test_arrays_out_of_proportion_are_refused(format: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trajectories_frames, "FREE_BYTES", 0)
+    monkeypatch.setattr(trajectories_frames, "MAX_RATIO", 0)
+    with pytest.raises(TrajectoryError, match="in proportion"):
+        load_trajectories([WRITERS[format](tmp_path)], LOW, 3, SOURCES)
+
+
+def test_a_directory_that_is_no_data_set_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(TrajectoryError, match="found a directory that is none of these"):
+        load_trajectories([tmp_path], LOW, 3)

@@ -1,0 +1,69 @@
+"""Options of the commands that read recorded episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+Sources = dict[str, tuple[str, ...]]
+"""By key of the observation, the arrays of a recording that it is made of; see ``ttscompile.trajectories``."""
+
+
+class FilesCommand(click.Command):
+    """Lets ``--trajectories`` and ``--with`` take every word up to the next option, which click's own cannot."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """As click does, with the option repeated before every word."""
+        expanded: list[str] = []
+        taking = ""
+        for arg in args:
+            if taking and not arg.startswith("-"):
+                expanded += [taking, arg]
+                continue
+            taking = arg if arg in ("--trajectories", "--with") else ""
+            if not taking:
+                expanded.append(arg)
+        return super().parse_args(ctx, expanded)
+
+
+def _sources(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> Sources:
+    found: Sources = {}
+    for value in values:
+        key, equals, names = value.partition("=")
+        parts = tuple(name.strip() for name in names.split(","))
+        if not (equals and key and all(parts)):
+            raise click.BadParameter(f"{value!r}: expected KEY=NAME,NAME:N, for instance obs=keypoint,state:2.")
+        if key in found:
+            raise click.BadParameter(f"{key!r} is given twice.")
+        found[key] = parts
+    return found
+
+
+def trajectories_options(required: bool = True) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """``--trajectories`` as ``trajectories: tuple[Path, ...]`` and ``--observation`` as ``sources: Sources``."""
+
+    def with_options(command: Callable[..., Any]) -> Callable[..., Any]:
+        files = click.option(
+            "--trajectories",
+            required=required,
+            multiple=True,
+            type=click.Path(path_type=Path),
+            metavar="FILE...",
+            help="Recordings of episodes: .npz, a zarr replay buffer of Diffusion Policy, an HDF5 file of robomimic, a"
+            " LeRobot data set; every word up to the next option.",
+        )
+        observation = click.option(
+            "--observation",
+            "sources",
+            multiple=True,
+            callback=_sources,
+            metavar="KEY=NAME,NAME:N",
+            help="What a key of the observation is made of, where the arrays of a recording of frames are called"
+            " otherwise: joined in this order; NAME:N are the first N numbers of one.",
+        )
+        return files(observation(command))
+
+    return with_options

@@ -1,0 +1,65 @@
+"""A Diffusion Policy replay buffer: a zarr group with ``data/NAME [F, ...]`` and ``meta/episode_ends [E]``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .errors import TrajectoryError
+from .trajectories_frames import Array, Frames, require_package, require_proportion
+
+CODECS = frozenset({"blosc", "bz2", "delta", "gzip", "lz4", "lzma", "shuffle", "zlib", "zstd", "bytes", "crc32c"})
+"""Compression that only computes. zarr also knows codecs that unpickle what they read."""
+
+
+def zarr_frames(path: Path) -> Frames:
+    """Open a replay buffer, a directory or zipped.
+
+    Raises:
+        TrajectoryError: not one, damaged, or in an encoding that is not read.
+    """
+    try:
+        import zarr
+    except ModuleNotFoundError as error:
+        raise require_package(path, "zarr") from error
+    try:
+        store: Any = zarr.storage.ZipStore(path, mode="r") if path.is_file() else str(path)
+        group = zarr.open_group(store, mode="r")
+        data, ends = group["data"], group["meta/episode_ends"]
+        names = tuple(sorted(name for name, _ in data.arrays()))
+    except Exception as error:  # zarr raises whatever its stores and parsers raise
+        raise TrajectoryError(
+            f"{path}: cannot be read as a replay buffer of Diffusion Policy ({_short(error)}); expected a zarr group"
+            " with data/NAME [F, ...] and meta/episode_ends [E]."
+        ) from error
+    size = path.stat().st_size if path.is_file() else sum(f.stat().st_size for f in path.rglob("*") if f.is_file())
+    return Frames(names, lambda name: _read(path, data[name], size), _read(path, ends, size))
+
+
+def _read(path: Path, array: Any, size: int) -> Array:
+    """All of an array, if nothing but numbers and compression is in it."""
+    kind, codecs = np.dtype(array.dtype).kind, _codecs(array.metadata)
+    if kind not in "biuf" or not codecs <= CODECS:
+        what = f"compressed by {', '.join(sorted(codecs - CODECS))}" if kind in "biuf" else f"of dtype {array.dtype}"
+        raise TrajectoryError(
+            f"{path}: {array.path!r} is {what}; expected numbers, compressed by one of {', '.join(sorted(CODECS))}."
+            " Write it again with another compressor, or save the observations as an .npz."
+        )
+    require_proportion(path, array.nbytes, size)
+    try:
+        return np.asarray(array[:])
+    except Exception as error:  # truncated chunks and the like
+        raise TrajectoryError(f"{path}: {array.path!r} is damaged ({_short(error)}). Copy it again.") from error
+
+
+def _codecs(metadata: Any) -> set[str]:
+    """Names of whatever turns stored bytes into numbers, of either version of the format."""
+    if metadata.zarr_format == 2:
+        return {str(one.codec_id) for one in (*(metadata.filters or ()), metadata.compressor) if one is not None}
+    return {str(one.to_dict()["name"]).removeprefix("numcodecs.") for one in metadata.codecs}
+
+
+def _short(error: Exception) -> str:
+    return f"{type(error).__name__}: {str(error)[:160]}"
