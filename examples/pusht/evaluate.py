@@ -1,6 +1,6 @@
 """Evaluate policies on numbered seeds of Push-T, all on the same initial states and with the same noise.
 
-    python examples/pusht/evaluate.py build/pusht/compiled:dense build/pusht/compiled --episodes 48
+    python examples/pusht/evaluate.py build/pusht/compiled:dense build/pusht/compiled --episodes 48 --jobs 4
 
 The score of an episode is the original's reward: the best coverage of the goal, divided by the 0.95 that counts as
 success, at most 1. Differences are taken episode by episode, against the first variant.
@@ -12,6 +12,7 @@ import dataclasses
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,17 @@ import click
 import numpy as np
 from bootstrap import Estimate, estimate, paired_difference
 from episodes import Episodes
+from jobs import fill_cache
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 from rollout import EpisodeCache, Rollout, run_episodes
+from score_plot import Timed, plot_scores, time_calls
 from variants import Variant, first_seed_option, open_variant, results_console, run, runtime_option, threads_option
+
+from ttscompile.machine import fingerprint, one_line
+
+TIMED_CALLS = 15
 
 
 @dataclass(frozen=True)
@@ -121,13 +128,15 @@ def _columns(rollout: Rollout) -> tuple[list[float], list[float], list[float]]:
     return [e.score for e in episodes], [e.best_coverage for e in episodes], [float(e.success) for e in episodes]
 
 
-def evaluation_table(evaluations: Sequence[Evaluation], seeds: Sequence[int]) -> Table:
-    """The figures as a table, with 95 % intervals."""
+def evaluation_table(evaluations: Sequence[Evaluation], seeds: Sequence[int], timed: Sequence[Timed] = ()) -> Table:
+    """The figures as a table, with 95 % intervals; and times, if any were taken."""
     table = Table(title=f"Push-T, {len(seeds)} episodes, seeds {seeds[0]}..{seeds[-1]}, mean and 95 % interval")
     table.add_column("variant")
     for column in ("score", "best coverage", "success", "score, difference", "success, difference", "sparsity"):
         table.add_column(column, justify="right")
-    for e in evaluations:
+    if timed:
+        table.add_column("ms a call", justify="right")
+    for e, time in zip_longest(evaluations, timed):
         table.add_row(
             e.label,
             str(e.score),
@@ -136,6 +145,7 @@ def evaluation_table(evaluations: Sequence[Evaluation], seeds: Sequence[int]) ->
             "" if e.score_difference is None else str(e.score_difference),
             "" if e.success_difference is None else str(e.success_difference),
             "" if e.sparsity is None else f"{e.sparsity:.1%}",
+            *(() if time is None else (f"{time.median:.1f}",)),
         )
     return table
 
@@ -155,6 +165,13 @@ def evaluation_table(evaluations: Sequence[Evaluation], seeds: Sequence[int]) ->
     help="Where episodes are kept, by what was computed, and taken from.",
 )
 @click.option("--no-cache", is_flag=True, help="Run all episodes, and keep none.")
+@click.option("--jobs", default=1, show_default=True, type=click.IntRange(1), help="Processes that run episodes.")
+@click.option(
+    "--plot",
+    "picture",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="Draw score against the latency of a call, which is measured after the episodes.",
+)
 @click.option("--json", "as_json", is_flag=True, help="One JSON document instead of a table.")
 def main(
     variants: tuple[str, ...],
@@ -165,9 +182,13 @@ def main(
     threads: int,
     cache: Path,
     no_cache: bool,
+    jobs: int,
+    picture: Path | None,
     as_json: bool,
 ) -> None:
     """Compare artifacts and plans: DIR takes the artifact's own plan, DIR:dense computes everything."""
+    if jobs > 1 and no_cache:
+        raise click.UsageError("--jobs hands episodes over through the cache: leave out --no-cache.")
     opened = [open_variant(text, runtime, threads) for text in variants]
     seeds = range(first_seed, first_seed + episodes)
     caches = [None if no_cache else Episodes(cache, v, runtime) for v in opened]
@@ -177,11 +198,22 @@ def main(
         def finished(label: str, count: int) -> None:
             progress.update(tasks[label], completed=count)
 
+        if jobs > 1:
+            fill_cache(variants, seeds, batch, runtime, cache, jobs, finished)
         evaluations = evaluate(opened, seeds, batch, finished, caches)
+    timed = [] if picture is None else time_calls(opened, evaluations[0].rollout.episodes[0].windows[0], TIMED_CALLS)
+    machine = fingerprint()
+    if picture is not None:
+        plural = "s" * (threads > 1)
+        title = f"Push-T, {len(seeds)} paired episodes; {threads} thread{plural} a call\n{one_line(machine)}"
+        plot_scores(variants, [e.score for e in evaluations], timed, picture, title)
     if as_json:
-        click.echo(json.dumps([e.to_json() for e in evaluations], indent=2))
+        figures = [e.to_json() for e in evaluations]
+        for each, time in zip(figures, timed, strict=False):
+            each["latency_ms"] = dataclasses.asdict(time)
+        click.echo(json.dumps({"machine": machine, "threads": threads, "variants": figures}, indent=2))
     else:
-        results_console().print(evaluation_table(evaluations, seeds))
+        results_console().print(evaluation_table(evaluations, seeds, timed))
     for e in evaluations:
         if e.legalised:
             click.echo(f"warning: {e.label}: {e.legalised} cells of its plans were illegal and were replaced", err=True)

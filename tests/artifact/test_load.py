@@ -243,6 +243,7 @@ def test_unknown_names_are_errors(written: Path) -> None:
         artifact.schedule("fast")
 
 
+@pytest.mark.alone
 def test_loading_forty_megabytes(tmp_path: Path, benchmark: Any) -> None:
     program = tiny_program()
     pieces = program.pieces

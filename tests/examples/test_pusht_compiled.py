@@ -72,7 +72,9 @@ def test_scripts_run_as_they_stand(compiled_pusht, tmp_path):
         assert file["obs"].shape == (rows, 2, 20)
     # Nothing but the document on standard output, and the seed's episode is the recorded one.
     output = run("evaluate.py", f"{compiled_pusht}:dense", "--episodes", 1, "--first-seed", 0, "--json")
-    (evaluation,) = json.loads(output)
+    document = json.loads(output)
+    (evaluation,) = document["variants"]
+    assert document["machine"]["cores"] >= 1
     assert evaluation["sparsity"] == 0.0
     assert evaluation["episodes"][0]["calls"] == rows
     assert 0 <= evaluation["score"]["mean"] <= 1

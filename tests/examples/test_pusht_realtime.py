@@ -12,6 +12,8 @@ from rollout import NoiseShape
 
 import ttscompile
 
+pytestmark = pytest.mark.alone
+
 
 class Info:
     """Of the Push-T policy, without a policy."""

@@ -12,6 +12,8 @@ from ttscompile.runtimes.executor.jitter import measure_jitter
 
 from .simulation import FakeClock, ScriptedPolicy
 
+pytestmark = pytest.mark.alone
+
 MOST = 20e-6
 """Seconds that ``action`` may take, median."""
 HZ, ROUNDS = 500, 3000

@@ -41,6 +41,8 @@ from .serving import (
 )
 from .simulation import FakeClock
 
+pytestmark = pytest.mark.alone
+
 if importlib.util.find_spec("websockets") is None:
     pytest.skip(
         "NO SERVER TESTS: websockets is not installed; pip install 'ttscompile[serve]'", allow_module_level=True

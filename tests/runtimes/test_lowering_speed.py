@@ -11,6 +11,8 @@ from ttscompile.runtimes.lowering import LoweringCache, lower_plan
 
 from .plans import random_plan
 
+pytestmark = pytest.mark.alone
+
 STEPS, GROUPS = 100, [0, 1, 2] * 8
 
 

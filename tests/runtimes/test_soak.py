@@ -15,6 +15,8 @@ from .conftest import MakeArtifact
 from .soak import EPISODE, median_slope
 from .toys import toy_program
 
+pytestmark = pytest.mark.alone
+
 SOAK = Path(__file__).with_name("soak.py")
 
 

@@ -11,6 +11,8 @@ from pytest_benchmark.fixture import BenchmarkFixture
 import ttscompile
 from ttscompile.lattice import uniform_plan
 
+pytestmark = pytest.mark.alone
+
 OBSERVATION = np.random.default_rng(0).uniform(100, 400, (1, 2, 20)).astype(np.float32)
 
 

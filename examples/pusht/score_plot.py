@@ -1,0 +1,87 @@
+"""Score against latency: what a variant's speed costs on the task, with intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+from bootstrap import Estimate
+from rollout import seeded_noise
+from variants import Variant
+
+WARM_UP = 2
+
+
+@dataclass(frozen=True)
+class Timed:
+    """Time of a call of one variant, one stream, warm: median and 90th percentile in ms."""
+
+    label: str
+    median: float
+    p90: float
+
+
+def time_calls(variants: Sequence[Variant], window: np.ndarray, calls: int) -> list[Timed]:
+    """Time calls of all variants in turn, call by call, so that whatever else the machine does hits all of them.
+
+    Args:
+        variants: to time.
+        window: an observation ``[To, Do]``.
+        calls: of each, warm-up apart.
+    """
+    took: list[list[float]] = [[] for _ in variants]
+    for variant in variants:
+        variant.policy.reset()
+    for number in range(WARM_UP + calls):
+        for variant, times in zip(variants, took, strict=True):
+            noise = seeded_noise(variant.noise, [0], number)
+            given = {} if variant.plan is None else {"plan": variant.plan}
+            began = perf_counter()
+            variant.policy.predict_action({"obs": window[None]}, noise=noise, **given)
+            times.append(1000 * (perf_counter() - began))
+    found = []
+    for variant, times in zip(variants, took, strict=True):
+        warm = times[WARM_UP:]
+        found.append(Timed(variant.label, float(np.median(warm)), float(np.quantile(warm, 0.9))))
+    return found
+
+
+def plot_scores(
+    names: Sequence[str], scores: Sequence[Estimate], timed: Sequence[Timed], path: Path, title: str
+) -> None:
+    """Draw score and its 95 % interval against latency, and write the picture.
+
+    Args:
+        names: of the variants; the first is the baseline, whose interval is a band.
+        scores: one a variant.
+        timed: one a variant.
+        path: of the picture.
+        title: over it.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import LogFormatter
+
+    figure = Figure(figsize=(8.0, 5.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    axes.axhspan(scores[0].low, scores[0].high, color="#dddddd", zorder=0, label=f"{names[0]}, 95 % interval")
+    axes.axhline(scores[0].mean, color="#888888", linewidth=1, zorder=0)
+    for name, score, time in zip(names, scores, timed, strict=True):
+        errors = [[score.mean - score.low], [score.high - score.mean]]
+        axes.errorbar([time.median], [score.mean], yerr=errors, fmt="o", capsize=3, markersize=5)
+        axes.annotate(name, (time.median, score.mean), xytext=(6, 5), textcoords="offset points", fontsize=8)
+    axes.set_xscale("log")
+    axes.xaxis.set_major_formatter(LogFormatter())
+    axes.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
+    axes.set_xlabel("latency of a call, ms (median)")
+    axes.set_ylabel("score, mean and 95 % interval")
+    axes.margins(x=0.15)
+    axes.grid(which="both", color="#eeeeee", linewidth=0.5)
+    axes.set_axisbelow(True)
+    axes.set_title(title, fontsize=8, loc="left")
+    axes.legend(loc="lower right", fontsize=8, frameon=False)
+    figure.savefig(path, dpi=150, metadata={"Software": None} if path.suffix == ".png" else None)

@@ -1,0 +1,74 @@
+"""Score against latency, and episodes on several processes."""
+
+import numpy as np
+import pytest
+from bootstrap import Estimate
+from episodes import Episodes
+from jobs import fill_cache
+from rollout import NoiseShape
+from score_plot import Timed, plot_scores, time_calls
+from variants import Variant, open_variant
+
+from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.write import update_calibration
+from ttscompile.lattice import uniform_plan
+
+
+class Sleeper:
+    """A policy of a known latency, which counts."""
+
+    def __init__(self, log, name):
+        self.log, self.name = log, name
+
+    def reset(self, seed=None):
+        self.log.append((self.name, "reset"))
+
+    def predict_action(self, obs_dict, *, noise, plan="default"):
+        self.log.append((self.name, plan, float(noise.initial[0, 0, 0])))
+
+
+def test_calls_are_timed_in_turn_with_equal_noise():
+    log = []
+    shape = NoiseShape(3, (4, 2), True)
+    variants = [Variant("a", Sleeper(log, "a"), None, shape), Variant("b", Sleeper(log, "b"), "dense", shape)]
+    found = time_calls(variants, np.zeros((2, 20), np.float32), calls=3)
+    assert [one.label for one in found] == ["a", "b"]
+    assert all(0 < one.median <= one.p90 for one in found)
+    assert log[:2] == [("a", "reset"), ("b", "reset")]
+    calls = log[2:]
+    assert [call[:2] for call in calls] == [("a", "default"), ("b", "dense")] * 5
+    assert [a[2] == b[2] for a, b in zip(calls[::2], calls[1::2], strict=True)] == [True] * 5
+    assert len({call[2] for call in calls}) == 5
+
+
+def test_the_picture_is_the_same_file_twice(tmp_path):
+    scores = [Estimate(0.9, 0.85, 0.95), Estimate(0.8, 0.7, 0.88)]
+    for name in ("one.png", "two.png"):
+        plot_scores(
+            ["dense", "sparse"], scores, [Timed("dense", 600, 620), Timed("sparse", 36, 40)], tmp_path / name, "T"
+        )
+    assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
+
+
+@pytest.mark.slow
+def test_processes_fill_the_cache_with_the_episodes_of_one(compiled_pusht, tmp_path):
+    """Two short-lived processes against this one; only what is missing is run."""
+    import shutil
+
+    artifact = tmp_path / "sparse"
+    shutil.copytree(compiled_pusht, artifact)
+    manifest = load_artifact(artifact).manifest
+    plan = uniform_plan(manifest.steps, len(manifest.blocks), 1)
+    update_calibration(artifact, None, {"one": plan}, "one", {"strategy": "interval"})
+    text, told = f"{artifact}:one", []
+    fill_cache(
+        [text], [7, 8], 1, "onnxruntime", tmp_path / "cache", 2, lambda label, count: told.append((label, count))
+    )
+    assert told == [(text, 0), (text, 1), (text, 2)]
+    cache = Episodes(tmp_path / "cache", open_variant(text, "onnxruntime", 1), "onnxruntime")
+    assert [cache.read(seed).seed for seed in (7, 8)] == [7, 8]
+    told.clear()
+    fill_cache(
+        [text], [7, 8], 1, "onnxruntime", tmp_path / "cache", 2, lambda label, count: told.append((label, count))
+    )
+    assert told == [(text, 2)]
