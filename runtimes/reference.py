@@ -25,9 +25,9 @@ from ttscompile.ir.program import Binding, Pieces, Program
 from ttscompile.lattice import PlanArray, Source, check_plan, require_legal
 
 from .criterion import Criterion
-from .reference_correction import apply as apply_correction
-from .reference_correction import empty_history
+from .inpainting import Known
 from .reference_reuse import Caches, Cell, RolloutCache, reuse, stream_axis
+from .reference_sampler import Carried, advance, begin, hold
 
 
 @dataclass(frozen=True)
@@ -194,15 +194,15 @@ class ReferenceModel:
         """The network's output ``[B, T, D]`` at step k from the residual stream after the last block."""
         return self._tail(self._bind(self._pieces.tail, stream, k, contexts))[0]
 
-    def advance(self, sample: Tensor, prediction: Tensor, noise: Tensor | None, k: int) -> Tensor:
-        """The sampler: the sample of step k + 1 (``config.SamplerTable`` has the formula)."""
-        table = self._sampler
-        row = {name: float(getattr(table, name)[k]) for name in table.COLUMNS}
-        clean = row["sample_to_x0"] * sample + row["out_to_x0"] * prediction
-        if table.clip is not None:
-            clean = clean.clamp(-table.clip, table.clip)
-        following = row["x0_to_next"] * clean + row["sample_to_next"] * sample + row["out_to_next"] * prediction
-        return following if noise is None else following + row["noise_to_next"] * noise
+    def begin(self, initial: Tensor) -> Carried:
+        """What the sampler carries to step 0, from the sample ``[B, T, D]``."""
+        return begin(self._sampler, initial)
+
+    def advance(
+        self, carried: Carried, prediction: Tensor, noise: Tensor | None, k: int, correction: Correction | None = None
+    ) -> Carried:
+        """The sampler: what is carried to step k + 1 (see ``reference_sampler``)."""
+        return advance(self._sampler, carried, prediction, noise, k, correction)
 
     def empty_cache(self, streams: int) -> RolloutCache:
         """The rollout cache at the start of an episode."""
@@ -219,6 +219,7 @@ class ReferenceModel:
         write_gradients: bool = True,
         keep_samples: bool = False,
         correction: Correction | None = None,
+        known: Known | None = None,
     ) -> Rollout:
         """One call: K steps from noise to sample.
 
@@ -237,6 +238,7 @@ class ReferenceModel:
                 by taking the written value to be ``g * computed + (1 - g) * old``. Values do not change.
             keep_samples: return the sample after every step.
             correction: of the sampler's steps; None for none.
+            known: what a prefix makes known of the samples; None for nothing.
 
         Raises:
             IllegalPlanError: gates that are not one-hot, of the wrong shape, or that read what was never computed.
@@ -245,20 +247,19 @@ class ReferenceModel:
         one_hot, plan = self._gates(gates, contexts.streams)
         require_legal(plan, self.groups, cache.written)
         caches = Caches(rollout=dict(cache.residuals))
-        sample, samples, history = initial, [], empty_history(initial)
+        carried, samples = hold(self.begin(initial), known, 0), []
         for k in range(self.steps):
-            stream = self.stem(sample, k, contexts)
+            stream = self.stem(carried.sample, k, contexts)
             for b in range(self.blocks):
                 cell = Cell(k, b, self.groups[b], plan[:, k, b], one_hot[:, k, b], self._types[b])
                 stream = stream + reuse(cell, self._candidate(cell, stream, contexts), caches, write_gradients)
             prediction = self.tail(stream, k, contexts)
-            following = self.advance(sample, prediction, None if noise is None else noise[k], k)
-            if correction is not None:
-                following, history = apply_correction(correction, k, following, sample, prediction, history)
-            sample = following
+            carried = self.advance(carried, prediction, None if noise is None else noise[k], k, correction)
+            carried = hold(carried, known, k + 1)
             if keep_samples:
-                samples.append(sample)
-        return Rollout(sample, RolloutCache(caches.rollout, cache.written | (plan == Source.COMPUTE)), tuple(samples))
+                samples.append(carried.sample)
+        kept = RolloutCache(caches.rollout, cache.written | (plan == Source.COMPUTE))
+        return Rollout(carried.sample, kept, tuple(samples))
 
     def decided_rollout(
         self,
@@ -279,9 +280,9 @@ class ReferenceModel:
         decisions = criterion.begin(self.steps, self.blocks, contexts.streams)
         plan = np.full((contexts.streams, self.steps, self.blocks), Source.COMPUTE, np.int8)
         caches = Caches(rollout=dict(cache.residuals))
-        sample, axis = initial, stream_axis(self._types[0])
+        carried, axis = self.begin(initial), stream_axis(self._types[0])
         for k in range(self.steps):
-            stream = self.stem(sample, k, contexts)
+            stream = self.stem(carried.sample, k, contexts)
             feature = stream if criterion.always == 0 else torch.zeros_like(stream)
             for b in range(self.blocks):
                 if b == criterion.always:
@@ -293,8 +294,8 @@ class ReferenceModel:
                 if b < criterion.always:
                     feature = feature + residual
             prediction = self.tail(stream, k, contexts)
-            sample = self.advance(sample, prediction, None if noise is None else noise[k], k)
-        return Rollout(sample, RolloutCache(caches.rollout, cache.written | (plan == Source.COMPUTE))), plan
+            carried = self.advance(carried, prediction, None if noise is None else noise[k], k)
+        return Rollout(carried.sample, RolloutCache(caches.rollout, cache.written | (plan == Source.COMPUTE))), plan
 
     def _candidate(self, cell: Cell, stream: Tensor, contexts: Contexts) -> Tensor | None:
         """The computed residual of all streams, or of those that take it with zeros for the others; None if none do."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ttscompile.correction import HISTORY, Correction
+from ttscompile.correction import HISTORY
 
 
 def empty_history(sample: Tensor) -> Tensor:
@@ -35,12 +35,3 @@ def correct(weights: Tensor, bias: Tensor, sample: Tensor, prediction: Tensor, h
 def remember(sample: Tensor, prediction: Tensor, history: Tensor) -> Tensor:
     """The history after an anchor."""
     return torch.cat([sample, prediction, history[:, : history.shape[1] // 2]], dim=1)
-
-
-def apply(
-    correction: Correction, k: int, following: Tensor, sample: Tensor, prediction: Tensor, history: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Sample and history after step k, from the sample that the sampler makes without correction."""
-    weights, bias = torch.tensor(correction.weights[k]), torch.tensor(correction.bias[k])
-    corrected = following + correct(weights, bias, sample, prediction, history)
-    return corrected, remember(sample, prediction, history) if correction.anchors[k] else history

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from .runtimes.base import CallReport
     from .runtimes.executor import AsyncExecutor, ExecutorSettings, GuardLimits
     from .runtimes.policy import CompiledPolicy, PolicyInfo, load
+    from .samplers_flow import flow_matching_table
+    from .verification import Verification, verify
 
 __version__ = "0.1.0"
 
@@ -37,12 +39,15 @@ __all__ = [
     "SamplerTable",
     "Source",
     "TtscompileError",
+    "Verification",
     "__version__",
     "calibrate",
     "compile_denoiser",
     "convert",
+    "flow_matching_table",
     "legalize",
     "load",
+    "verify",
 ]
 
 _HOMES = {
@@ -60,11 +65,14 @@ _HOMES = {
     "SamplerTable": "config",
     "Source": "lattice",
     "TtscompileError": "errors",
+    "Verification": "verification",
     "calibrate": "calibration",
     "compile_denoiser": "driver",
     "convert": "driver",
+    "flow_matching_table": "samplers_flow",
     "legalize": "lattice",
     "load": "runtimes.policy",
+    "verify": "verification",
 }
 
 

@@ -56,17 +56,24 @@ class Affine:
 class SamplerTable:
     """One denoising loop as numbers: row k takes the sample from step k to k + 1.
 
-    With network output ``out``::
+    With network output ``out``, and S memories of the sample's shape that are zeros before step 0::
 
-        x0   = clip(sample_to_x0[k] * x + out_to_x0[k] * out, -clip, clip)
-        next = x0_to_next[k] * x0 + sample_to_next[k] * x + out_to_next[k] * out + noise_to_next[k] * noise
+        x0        = clip(sample_to_x0[k] * x + out_to_x0[k] * out, -clip, clip)
+        next      = x0_to_next[k] * x0 + sample_to_next[k] * x + out_to_next[k] * out + noise_to_next[k] * noise
+                    + sum over s: memory_to_next[k, s] * memory[s]
+        memory[s] = to_memory[k, s] . [x0, x, out, memory[0], ..., memory[S - 1]]       all s at once, after ``next``
 
-    The tables are computed at compile time from diffusers' scheduler (``ttscompile.samplers``); all float32 ``[K]``.
+    The tables are computed at compile time: from diffusers' scheduler (``ttscompile.samplers``), or for flow matching
+    from the method's definition (``ttscompile.samplers_flow``). Columns are float32 ``[K]``. A multistep solver keeps
+    earlier predictions in memories; a Runge-Kutta method, of which each evaluation is a step of its own here, what its
+    stages have in common.
 
     Attributes:
-        name: ``ddpm`` or ``ddim``, for people.
+        name: ``ddpm``, ``ddim``, ``dpmsolver++``, ``euler`` or ``rk4``, for people.
         timesteps: float32 ``[K]`` or int64 ``[K]``: what the network is given, in order of execution.
         clip: bound on the predicted sample; None for no bound.
+        memory_to_next: float32 ``[K, S]``; empty where S = 0.
+        to_memory: float32 ``[K, S, 3 + S]``; empty where S = 0.
     """
 
     name: str
@@ -78,6 +85,8 @@ class SamplerTable:
     out_to_next: FloatArray
     noise_to_next: FloatArray
     clip: float | None
+    memory_to_next: FloatArray = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    to_memory: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 3), np.float32))
 
     COLUMNS = ("sample_to_x0", "out_to_x0", "x0_to_next", "sample_to_next", "out_to_next", "noise_to_next")
 
@@ -92,6 +101,25 @@ class SamplerTable:
             if column.shape != timesteps.shape or not np.isfinite(column).all():
                 raise SpecError(f"sampler column {name} must hold {len(timesteps)} finite numbers; found {column}.")
             object.__setattr__(self, name, column)
+        memory_to_next, to_memory = (np.asarray(getattr(self, n), np.float32) for n in ("memory_to_next", "to_memory"))
+        if not memory_to_next.size and not to_memory.size:
+            memory_to_next, to_memory = (np.zeros((len(timesteps), 0, *rest), np.float32) for rest in ((), (3,)))
+        count = memory_to_next.shape[-1]
+        expected = ((len(timesteps), count), (len(timesteps), count, 3 + count))
+        if (memory_to_next.shape, to_memory.shape) != expected:
+            raise SpecError(
+                f"a sampler of {len(timesteps)} steps with S memories has memory_to_next [K, S] and to_memory"
+                f" [K, S, 3 + S]; found {memory_to_next.shape} and {to_memory.shape}."
+            )
+        if not (np.isfinite(memory_to_next).all() and np.isfinite(to_memory).all()):
+            raise SpecError("sampler memories must have finite coefficients.")
+        object.__setattr__(self, "memory_to_next", memory_to_next)
+        object.__setattr__(self, "to_memory", to_memory)
+
+    @property
+    def memories(self) -> int:
+        """S, how many arrays of the sample's shape are carried from step to step beside it."""
+        return int(self.memory_to_next.shape[1])
 
     @property
     def steps(self) -> int:
@@ -112,11 +140,18 @@ class ObservationSpec:
         shape: shape of one stream's array, for instance ``(To, Do)``.
         normalizer: applied over the last axis before the network sees it; None to pass as it is.
         dtype: numpy name of the dtype that callers must give.
+        window: whether the first axis, where there are several, is time: the last To frames. A key without frames, such
+            as an instruction, is what it is at the time of the call.
+        bounds: the smallest and largest value that there can be, each a number or one for each entry of the last axis;
+            None if that is not known. Integers outside them are refused: they are rows of an embedding. Random
+            observations are drawn within them. Kept as tuples.
     """
 
     shape: tuple[int, ...]
     normalizer: Affine | None = None
     dtype: str = "float32"
+    window: bool = True
+    bounds: tuple[float | tuple[float, ...], float | tuple[float, ...]] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "shape", tuple(int(n) for n in self.shape))
@@ -126,6 +161,34 @@ class ObservationSpec:
             raise SpecError(
                 f"normaliser has {len(self.normalizer.scale)} entries for an observation of shape {self.shape}."
             )
+        if self.bounds is not None:
+            low, high = (np.atleast_1d(np.asarray(value, np.float64)) for value in self.bounds)
+            fits = low.shape == high.shape and low.shape in ((1,), self.shape[-1:])
+            if not (fits and np.isfinite([low, high]).all() and (low <= high).all()):
+                raise SpecError(
+                    f"bounds of an observation of shape {self.shape} must be two finite numbers in order, or two rows"
+                    f" of {self.shape[-1]}; found {self.bounds}."
+                )
+            object.__setattr__(self, "bounds", (tuple(low.tolist()), tuple(high.tolist())))
+
+    @property
+    def frames(self) -> int | None:
+        """To, the number of frames that the first axis holds; None without such an axis."""
+        return self.shape[0] if self.window and len(self.shape) > 1 else None
+
+    def draw(self, rng: np.random.Generator) -> npt.NDArray[np.generic]:
+        """One stream's random observation ``[1, *shape]`` of the specified dtype, not normalised.
+
+        Uniform within ``bounds``; without them within what the normaliser maps to -1..1, or in -1..1.
+        """
+        shape = (1, *self.shape)
+        low, high = (np.asarray(value) for value in self.bounds or (-1.0, 1.0))
+        if self.bounds is not None and np.dtype(self.dtype).kind in "iub":
+            return rng.integers(low.astype(np.int64), high.astype(np.int64), shape, endpoint=True).astype(self.dtype)
+        drawn = rng.uniform(low, high, shape).astype(np.float32)
+        if self.bounds is None and self.normalizer is not None:
+            drawn = self.normalizer.unnormalize(drawn)
+        return drawn.astype(self.dtype)
 
 
 @dataclass(frozen=True)
@@ -137,12 +200,15 @@ class ChunkSpec:
         start: first executed step of the chunk (``To - 1`` for Diffusion Policy).
         stop: one past the last executed step.
         normalizer: its inverse is applied to the actions; None to return them as they are.
+        ranged: whether the normaliser maps the range of the actions in training to -1..1, so that no action should be
+            far outside; not one by mean and deviation, or by quantiles.
     """
 
     action_dim: int
     start: int
     stop: int
     normalizer: Affine | None = None
+    ranged: bool = True
 
     def __post_init__(self) -> None:
         if not 0 <= self.start < self.stop or self.action_dim < 1:
@@ -156,7 +222,7 @@ class PolicySpec:
     Attributes:
         sample: shape ``(T, D)`` of one stream's noisy sample.
         observations: condition inputs in the order of the module's keyword arguments; the keys are the keys of the
-            observation dictionary that ``predict_action`` takes.
+            observation dictionary that ``predict_action`` takes. Dots in a key are underscores in its argument's name.
         sampler: the denoising loop.
         chunk: from sample to actions.
         sample_argument: name of the module's sample argument.
@@ -179,9 +245,13 @@ class PolicySpec:
         if not self.observations:
             raise SpecError("a policy needs at least one observation: a condition input of the denoiser.")
         taken = {self.sample_argument, self.timestep_argument}
-        for key in self.observations:
-            if key in taken or not key.isidentifier():
-                raise SpecError(f"observation key {key!r} must be an identifier other than {sorted(taken)}.")
+        for key, argument in self.arguments.items():
+            if argument in taken or not all(part.isidentifier() for part in key.split(".")):
+                raise SpecError(
+                    f"observation key {key!r} must be an identifier, or several with dots between them, and its"
+                    f" argument {argument!r} none of {sorted(taken)}."
+                )
+            taken.add(argument)
         horizon, channels = self.sample
         if self.chunk.stop > horizon or self.chunk.action_dim > channels:
             raise SpecError(
@@ -192,6 +262,11 @@ class PolicySpec:
         if normalizer is not None and len(normalizer.scale) != self.chunk.action_dim:
             found = len(normalizer.scale)
             raise SpecError(f"action normaliser has {found} entries for {self.chunk.action_dim} channels.")
+
+    @property
+    def arguments(self) -> Mapping[str, str]:
+        """By observation key: the name of the module's argument that it is given as."""
+        return {key: key.replace(".", "_") for key in self.observations}
 
 
 @dataclass(frozen=True)

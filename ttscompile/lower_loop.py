@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from onnx import GraphProto, ModelProto
 
-from .ir.advance import X0_COLUMNS
+from .ir.advance import MEMORY, X0_COLUMNS
 from .ir.program import Program
 from .lower_contexts import Contexts
 from .lower_graph_writer import GraphWriter, Weights, sequence, tensor
@@ -37,9 +37,10 @@ class LoopInputs:
     Attributes:
         initial: sample at step 0, ``[B, T, D]``.
         offset: of the sampler's updates, ``[K, D, B, T]``.
-        update: matrices of the sampler's updates, ``[K, G, R, T]``.
+        update: matrices of the sampler's updates, ``[K, G, R, (1 + S) T]``.
         anchors: bool ``[K]``; after these steps sample and prediction enter the history.
         history: before step 0, ``[D, B, 4 T]``.
+        memory: of the sampler, before step 0: ``[D, B, S T]``; None if it has none.
         rows: rollout cache ``[R, E]``, with a residual as a row of E numbers.
         index: int64 ``[K, N]``; which row is the residual of a cell.
     """
@@ -49,21 +50,23 @@ class LoopInputs:
     update: str
     anchors: str
     history: str
+    memory: str | None
     rows: str
     index: str
 
 
 @dataclass(frozen=True)
 class _State:
-    """What a step hands to the next; the sample as ``[D, B, T]``."""
+    """What a step hands to the next; the sample as ``[D, B, T]``; ``memory`` is empty or the sampler's memories."""
 
     sample: str
     stream: str
     history: str
+    memory: tuple[str, ...]
 
     @property
     def values(self) -> tuple[str, ...]:
-        return (self.sample, self.stream, self.history)
+        return (self.sample, self.stream, self.history, *self.memory)
 
 
 @dataclass(frozen=True)
@@ -119,7 +122,8 @@ class DenoisingLoop:
         self._none = main.op("ConstantOfShape", main.op("Concat", main.constant([0]), width, axis=0))
         count = main.constant([len(self._groups)])
         table = main.op("ConstantOfShape", main.op("Concat", count, width, axis=0))
-        first = _State(main.op("Transpose", inputs.initial, perm=[2, 0, 1]), stream, inputs.history)
+        memory = (inputs.memory,) if inputs.memory is not None else ()
+        first = _State(main.op("Transpose", inputs.initial, perm=[2, 0, 1]), stream, inputs.history, memory)
         carried = [*first.values, table, main.op("SequenceEmpty")]
         body = self._computed_step()
         state = main.ops("Loop", [plan.computed_steps, "", *carried], len(carried), body=body)
@@ -261,21 +265,24 @@ class DenoisingLoop:
 
     def _fresh_state(self, w: GraphWriter) -> _State:
         """Names for what a body carries."""
-        return _State(w.fresh("sample"), w.fresh("stream"), w.fresh("history"))
+        memory = (w.fresh(MEMORY),) if self._sampler.memories else ()
+        return _State(w.fresh("sample"), w.fresh("stream"), w.fresh("history"), memory)
 
     def _advance(self, w: GraphWriter, state: _State, k: str) -> _State:
         """Tail, sampler and the next step's stem."""
         by_step = {"offset": self._inputs.offset, "update": self._inputs.update, **self._x0_columns}
         feeds = {"stream": state.stream, "sample": state.sample, "history": state.history}
+        feeds |= zip([MEMORY] * len(state.memory), state.memory, strict=True)
         feeds |= {name: w.op("Gather", values, k) for name, values in by_step.items()}
         for value in self._models["advance"].graph.input:
             if value.name not in feeds:
                 where, _, name = value.name.partition(".")
                 graph, at = (self._pieces.tail, k) if where == "tail" else (self._pieces.stem, self._following(w, k))
                 feeds[value.name] = self._contexts.value(w, name, at, graph.inputs[name])
-        sample, stream, prediction = w.inline(self._models["advance"], feeds, self._weights)
+        sample, stream, prediction, *memory = w.inline(self._models["advance"], feeds, self._weights)
         is_anchor = w.op("Gather", self._inputs.anchors, k)
-        return _State(sample, stream, self._remembered(w, is_anchor, state.sample, prediction, state.history))
+        history = self._remembered(w, is_anchor, state.sample, prediction, state.history)
+        return _State(sample, stream, history, tuple(memory))
 
     def _remembered(self, w: GraphWriter, is_anchor: str, sample: str, prediction: str, history: str) -> str:
         """The history after a step: sample and prediction enter it if the step is an anchor, and the oldest leave."""

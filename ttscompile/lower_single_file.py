@@ -40,7 +40,7 @@ import numpy as np
 from onnx import ModelProto, ValueInfoProto, helper
 
 from .config import PolicySpec
-from .correction import FEATURES, HISTORY, groups_of, no_correction
+from .correction import FEATURES, HISTORY, no_correction
 from .errors import LoweringError
 from .ir.graph import TensorType
 from .ir.program import Program
@@ -48,7 +48,7 @@ from .lower_contexts import Contexts
 from .lower_graph_writer import GraphWriter, Weights, tensor
 from .lower_loop import GROUP, DenoisingLoop, LoopInputs
 from .lower_plan import LoweredPlan, lower_plan
-from .update import diagonals
+from .update import columns, diagonals, rows
 
 CORRECTION, CORRECTION_BIAS, ANCHORS = "correction", "correction_bias", "correction_anchors"
 """Inputs of the whole call that carry a schedule's correction."""
@@ -88,9 +88,11 @@ def lower_single_file(program: Program, models: Mapping[str, ModelProto], weight
     for name, array in ((ANCHORS, given.anchors), (CORRECTION, given.weights), (CORRECTION_BIAS, given.bias)):
         inputs.append(tensor(name, array.dtype, array.shape))
         main.default(name, array)
-    update, offset, history = _update(main, spec, streams)
+    update, offset = _update(main, spec, streams)
+    history, memories = _zeros(main, spec, streams, HISTORY), spec.sampler.memories
+    memory = _zeros(main, spec, streams, memories) if memories else None
     loop = DenoisingLoop(main, program, models, weights, contexts)
-    values = LoopInputs("initial_noise", offset, update, ANCHORS, history, stored, "rollout_index")
+    values = LoopInputs("initial_noise", offset, update, ANCHORS, history, memory, stored, "rollout_index")
     sample, residuals = loop.write(plan, values)
     _write_actions(main, sample, spec)
     main.rename(plan.executed, "executed_plan")
@@ -151,37 +153,32 @@ def _normalized(main: GraphWriter, key: str, spec: PolicySpec) -> str:
     return main.op("Add", scaled, main.constant(each.normalizer.offset, np.float32))
 
 
-def _update(main: GraphWriter, spec: PolicySpec, streams: str) -> tuple[str, str, str]:
-    """``ttscompile.update`` in ONNX: matrices of all steps, offsets of all steps, and the history before step 0."""
+def _update(main: GraphWriter, spec: PolicySpec, streams: str) -> tuple[str, str]:
+    """``ttscompile.update`` in ONNX: matrices of all steps, and offsets of all steps."""
     (horizon, dimensions), sampler = spec.sample, spec.sampler
-    groups, eye = groups_of(sampler.steps, spec.sample), np.eye(horizon, dtype=np.float32)
-    parts, end = [], 0
-    for place, column in diagonals(sampler).items():
-        diagonal = main.constant(column[:, None, None, None] * eye, np.float32)
-        if place == FEATURES:  # the correction has no rows for it
-            parts.append(_slice(main, CORRECTION, end * horizon, FEATURES * horizon))
-            end = FEATURES
-            shape = main.constant([sampler.steps, groups, horizon, horizon])
-            parts.append(main.op("Expand", diagonal, shape))
-        else:
-            part = _slice(main, CORRECTION, place * horizon, (place + 1) * horizon)
-            parts.append(main.op("Add", part, diagonal))
-            end = place + 1
-    if end < FEATURES:
-        parts.append(_slice(main, CORRECTION, end * horizon, FEATURES * horizon))
-    update = main.op("Concat", *parts, axis=2)
+    high, wide = rows(sampler, horizon), columns(sampler, horizon)
+    places = np.zeros((sampler.steps, 1, high // horizon, 1, wide // horizon, 1), np.float32)
+    for (read, written), column in diagonals(sampler).items():
+        places[:, 0, read, 0, written, 0] = column
+    each = main.constant(np.eye(horizon)[:, None], np.float32)
+    own = main.op("Mul", main.constant(places, np.float32), each)
+    own = main.op("Reshape", own, main.constant([sampler.steps, 1, high, wide]))
+    pads = [0, 0, 0, 0, 0, 0, high - FEATURES * horizon, wide - horizon]  # the correction's weights are at the top left
+    update = main.op("Add", main.op("Pad", CORRECTION, main.constant(pads)), own)
     sizes = main.constant([sampler.steps, dimensions]), streams, main.constant([horizon])
     offset = main.op("Expand", CORRECTION_BIAS, main.op("Concat", *sizes, axis=0))
     if sampler.stochastic:
         noise = main.op("Transpose", "step_noise", perm=[0, 3, 1, 2])
         scale = main.constant(sampler.noise_to_next[:, None, None, None], np.float32)
         offset = main.op("Add", main.op("Mul", noise, scale), offset)
-    shape = main.op("Concat", main.constant([dimensions]), streams, main.constant([HISTORY * horizon]), axis=0)
-    return update, offset, main.op("ConstantOfShape", shape)
+    return update, offset
 
 
-def _slice(main: GraphWriter, value: str, start: int, stop: int) -> str:
-    return main.op("Slice", value, *(main.constant([n]) for n in (start, stop, 2)))
+def _zeros(main: GraphWriter, spec: PolicySpec, streams: str, count: int) -> str:
+    """``[D, B, count * T]``."""
+    horizon, dimensions = spec.sample
+    shape = main.op("Concat", main.constant([dimensions]), streams, main.constant([count * horizon]), axis=0)
+    return main.op("ConstantOfShape", shape)
 
 
 def _width(main: GraphWriter) -> str:

@@ -2,7 +2,8 @@
 
 The maths of DDPM and DDIM is not written down here a second time: every coefficient is measured on the scheduler
 itself, in float64, and the finished table is held against it on random inputs. Whatever does not have the form of
-``SamplerTable`` (thresholding, multistep histories, scaled inputs, learned variances) is refused.
+``SamplerTable`` (dynamic thresholding, scaled inputs, learned variances) is refused. DPM-Solver++, which remembers, is
+measured in ``samplers_multistep``; flow matching needs no scheduler (``samplers_flow``).
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import torch
 
 from .config import SamplerTable
 from .errors import SpecError
+from .samplers_multistep import multistep_table, set_timesteps
 
 _SHAPE = (2, 3, 4)  # of a probe; small, with no two sizes equal, so that a broadcast along the wrong axis shows
 _FAR = 2.0**30  # an input this large saturates any clip that is there; its inverse stays inside any
@@ -58,8 +60,8 @@ class _Probe:
             x0, following = result.pred_original_sample, result.prev_sample
         except Exception as error:
             raise SpecError(
-                f"sampler {self.name}: its step at timestep {int(timestep)} failed: {error} Use a DDPM or DDIM"
-                f" scheduler; arguments given to step: {sorted(self._step_arguments)}."
+                f"sampler {self.name}: its step at timestep {int(timestep)} failed: {error} Use a DDPM, DDIM or"
+                f" DPMSolverMultistep scheduler; arguments given to step: {sorted(self._step_arguments)}."
             ) from error
         if x0 is None or not (torch.isfinite(x0).all() and torch.isfinite(following).all()):
             raise SpecError(
@@ -142,7 +144,8 @@ def _verify(
         raise SpecError(
             f"sampler {probe.name} does not have the form next = p * clip(a * x + b * out) + q * x + r * out + n *"
             f" noise at timestep {int(timestep)}: a random input is off by {error:.1e} (largest term {scale:.1e})."
-            " Thresholding, multistep and dynamic samplers are not supported; use DDPM or DDIM."
+            " Use DDPM, DDIM or DPM-Solver++ (DPMSolverMultistepScheduler); of other multistep and dynamic samplers"
+            " nothing is known."
         )
     return following
 
@@ -150,8 +153,12 @@ def _verify(
 def _refuse_known(scheduler: Any) -> None:
     """Refuse by name what probing would refuse by number."""
     name, config = type(scheduler).__name__, scheduler.config
-    if config.get("thresholding"):
-        raise SpecError(f"sampler {name}: thresholding=True depends on the whole sample; set it to False.")
+    # With a largest value of 1, dynamic thresholding is a plain clip to -1..1.
+    if config.get("thresholding") and not (_is_multistep(scheduler) and config.get("sample_max_value") == 1):
+        raise SpecError(
+            f"sampler {name}: thresholding=True depends on the whole sample; set it to False, or for DPM-Solver++"
+            " sample_max_value to 1, which makes it a clip."
+        )
     if str(config.get("variance_type", "")).startswith("learned"):
         raise SpecError(
             f"sampler {name}: variance_type={config['variance_type']!r} needs a network with twice the channels;"
@@ -160,8 +167,14 @@ def _refuse_known(scheduler: Any) -> None:
     deviation = float(getattr(scheduler, "init_noise_sigma", 1.0))
     if deviation != 1.0:
         raise SpecError(
-            f"sampler {name} starts from noise of standard deviation {deviation:g}; expected 1. Use DDPM or DDIM."
+            f"sampler {name} starts from noise of standard deviation {deviation:g}; expected 1. Use DDPM, DDIM or"
+            " DPM-Solver++."
         )
+
+
+def _is_multistep(scheduler: Any) -> bool:
+    """Whether it is diffusers' DPMSolverMultistepScheduler or made from it."""
+    return "DPMSolverMultistepScheduler" in {base.__name__ for base in type(scheduler).__mro__}
 
 
 def sampler_table(
@@ -184,25 +197,30 @@ def sampler_table(
     probe = _Probe(scheduler, step_arguments or {})
     _refuse_known(scheduler)
     try:
-        scheduler.set_timesteps(steps)
+        set_timesteps(scheduler, steps)
     except Exception as error:
         raise SpecError(f"sampler {probe.name}: {steps} denoising steps are not possible: {error}") from error
     timesteps = torch.as_tensor(scheduler.timesteps)
     if timesteps.shape != (steps,):
-        raise SpecError(f"sampler {probe.name} has {len(timesteps)} timesteps for {steps} steps; use DDPM or DDIM.")
+        raise SpecError(
+            f"sampler {probe.name} has {len(timesteps)} timesteps for {steps} steps; use another number of steps or"
+            " timestep spacing, or another sampler: DDPM, DDIM, DPM-Solver++."
+        )
 
     x = _draw(1)
     out = _draw(2)
     rescale = getattr(scheduler, "scale_model_input", None)
     if rescale is not None and not torch.equal(rescale(x, timesteps[0]), x):
-        raise SpecError(f"sampler {probe.name} rescales the sample before the network; use DDPM or DDIM.")
+        raise SpecError(f"sampler {probe.name} rescales the sample before the network; use DDPM, DDIM or DPM-Solver++.")
+    if _is_multistep(scheduler):
+        return multistep_table(scheduler, steps, name or probe.name, step_arguments or {})
     rows = [_probe_step(probe, timestep) for timestep in timesteps]
     clips = {row.clip for row in rows}
     if len(clips) != 1:
         raise SpecError(f"sampler {probe.name} clips x0 at {clips}, not alike at every step.")
 
     # A chain in order of execution, from fresh timesteps: a scheduler that remembers earlier outputs fails here.
-    scheduler.set_timesteps(steps)
+    set_timesteps(scheduler, steps)
     for k, (timestep, row) in enumerate(zip(timesteps, rows, strict=True)):
         x = _verify(probe, timestep, row, x, _draw(100 + k), seed=1000 + k)
     # And single steps, where x0 is inside its bound and where it is outside.

@@ -1,13 +1,16 @@
 """One step of the sampler and its correction as one matrix product, beside what is not linear.
 
     denoised    = clip(sample_to_x0[k] * sample_k + out_to_x0[k] * prediction_k)          only where the sampler clips
-    features_k  = [sample_k, prediction_k, history_k, denoised]                           [D, B, R]
-    sample_k+1  = features_k @ matrices[k] + offsets[k]                                   [D, B, T]
+    features_k  = [sample_k, prediction_k, history_k, denoised, memory_k]                 [D, B, R]
+    product     = features_k @ matrices[k]                                                [D, B, (1 + S) T]
+    sample_k+1  = product[:T] + offsets[k]                                                [D, B, T]
+    memory_k+1  = product[T:]                                                             [D, B, S T]
 
-R is ``7 T``, or ``6 T`` where nothing is clipped. The matrix is the correction's with the sampler's coefficients added
-on diagonals; the offset is the noise that the step adds and the correction's bias, known before the loop. So the update
-is three small operations in the place of a dozen. Everything has the action dimensions first: no operation has to turn
-its arguments.
+R is ``(7 + S) T``, or ``(6 + S) T`` where nothing is clipped; S is the number of the sampler's memories, mostly 0. The
+matrix is the correction's with the sampler's coefficients added on diagonals; the offset is the noise that the step
+adds and the correction's bias, known before the loop. So the update is three small operations in the place of a dozen.
+Everything has the action dimensions first: no operation has to turn its arguments. The correction reads and corrects
+samples, never memories.
 """
 
 from __future__ import annotations
@@ -15,7 +18,7 @@ from __future__ import annotations
 import numpy as np
 
 from .config import FloatArray, SamplerTable
-from .correction import FEATURES, Correction
+from .correction import FEATURES, Correction, correction_flops
 
 
 def clips(sampler: SamplerTable) -> bool:
@@ -25,30 +28,57 @@ def clips(sampler: SamplerTable) -> bool:
 
 def rows(sampler: SamplerTable, horizon: int) -> int:
     """R."""
-    return (FEATURES + clips(sampler)) * horizon
+    return (FEATURES + clips(sampler) + sampler.memories) * horizon
 
 
-def diagonals(sampler: SamplerTable) -> dict[int, FloatArray]:
-    """The sampler's coefficients ``[K]``, by the place in the features of what they multiply, in units of T."""
-    if clips(sampler):
-        return {0: sampler.sample_to_next, 1: sampler.out_to_next, FEATURES: sampler.x0_to_next}
+def columns(sampler: SamplerTable, horizon: int) -> int:
+    """``(1 + S) T``."""
+    return (1 + sampler.memories) * horizon
+
+
+def update_flops(sampler: SamplerTable, sample: tuple[int, int]) -> int:
+    """FLOPs of one update of one stream with its correction, multiply and add counted as two.
+
+    Args:
+        sampler: of the policy.
+        sample: ``(T, D)``.
+    """
+    memories = sampler.memories
+    return correction_flops(sample) * (FEATURES + memories) * (1 + memories) // FEATURES
+
+
+def diagonals(sampler: SamplerTable) -> dict[tuple[int, int], FloatArray]:
+    """The sampler's coefficients ``[K]``, by the places of what they multiply and of what they add to, in units of T.
+
+    The places of features are those of ``features_k``; the result at place 0 is the sample, at 1 + s a memory.
+    """
     wide = {name: getattr(sampler, name).astype(np.float64) for name in sampler.COLUMNS}
-    sample = wide["sample_to_next"] + wide["x0_to_next"] * wide["sample_to_x0"]
-    out = wide["out_to_next"] + wide["x0_to_next"] * wide["out_to_x0"]
-    return {0: sample.astype(np.float32), 1: out.astype(np.float32)}
+    memories, clipped = sampler.memories, clips(sampler)
+    own = [wide["x0_to_next"], wide["sample_to_next"], wide["out_to_next"]]
+    results = [np.concatenate([np.stack(own, 1), sampler.memory_to_next.astype(np.float64)], 1)]
+    results += [sampler.to_memory[:, s].astype(np.float64) for s in range(memories)]
+    found = {}
+    for place, (x0, sample, out, *kept) in enumerate(map(np.transpose, results)):
+        if clipped:
+            found[FEATURES, place] = x0
+        else:
+            sample, out = sample + x0 * wide["sample_to_x0"], out + x0 * wide["out_to_x0"]
+        found |= {(0, place): sample, (1, place): out}
+        found |= {(FEATURES + clipped + s, place): column for s, column in enumerate(kept)}
+    return {places: column.astype(np.float32) for places, column in found.items()}
 
 
 def matrices(sampler: SamplerTable, correction: Correction) -> FloatArray:
-    """The matrix of each step, float32 ``[K, G, R, T]``.
+    """The matrix of each step, float32 ``[K, G, R, (1 + S) T]``.
 
     Args:
         sampler: of the policy.
         correction: of the plan.
     """
     steps, groups, linear, horizon = correction.weights.shape
-    result = np.zeros((steps, groups, rows(sampler, horizon), horizon), np.float32)
-    result[:, :, :linear] = correction.weights
+    result = np.zeros((steps, groups, rows(sampler, horizon), columns(sampler, horizon)), np.float32)
+    result[:, :, :linear, :horizon] = correction.weights
     each = np.arange(horizon)
-    for place, column in diagonals(sampler).items():
-        result[:, :, place * horizon + each, each] += column[:, None, None]
+    for (read, written), column in diagonals(sampler).items():
+        result[:, :, read * horizon + each, written * horizon + each] += column[:, None, None]
     return result

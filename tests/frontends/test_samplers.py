@@ -13,23 +13,28 @@ from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultist
 from diffusers.schedulers.scheduling_euler_discrete import EulerDiscreteScheduler
 from diffusers.schedulers.scheduling_lcm import LCMScheduler
 from diffusers.schedulers.scheduling_pndm import PNDMScheduler
+from diffusers.schedulers.scheduling_unipc_multistep import UniPCMultistepScheduler
 
 from ttscompile.config import SamplerTable
 from ttscompile.errors import SpecError
 from ttscompile.samplers import sampler_table
+from ttscompile.samplers_multistep import set_timesteps
 
 BETAS: dict[str, Any] = {"num_train_timesteps": 50, "beta_schedule": "squaredcos_cap_v2"}
 
 
 def chain_of_table(table: SamplerTable, start: torch.Tensor, outs: torch.Tensor, draws: torch.Tensor) -> torch.Tensor:
     """The loop that every runtime executes, in float32."""
-    x = start
+    x, memory = start, torch.zeros(table.memories, *start.shape)
     for k in range(table.steps):
         a, b, p, q, r, n = (float(getattr(table, column)[k]) for column in table.COLUMNS)
         x0 = a * x + b * outs[k]
         if table.clip is not None:
             x0 = x0.clamp(-table.clip, table.clip)
+        terms = torch.cat([torch.stack([x0, x, outs[k]]), memory])
         x = p * x0 + q * x + r * outs[k] + n * draws[k]
+        x = x + torch.tensordot(torch.from_numpy(table.memory_to_next[k]), memory, 1)
+        memory = torch.tensordot(torch.from_numpy(table.to_memory[k]), terms, 1)
     return x
 
 
@@ -190,7 +195,10 @@ def test_bounds_that_differ_are_refused() -> None:
         (DDPMScheduler, {"thresholding": True}, "thresholding=True"),
         (DDPMScheduler, {"variance_type": "learned_range"}, "variance_type='learned_range'"),
         (DDIMScheduler, {"rescale_betas_zero_snr": True, "timestep_spacing": "trailing"}, "not finite"),
-        (DPMSolverMultistepScheduler, {}, "DPMSolverMultistepScheduler"),
+        (DPMSolverMultistepScheduler, {"thresholding": True, "sample_max_value": 1.5}, "makes it a clip"),
+        (DPMSolverMultistepScheduler, {"variance_type": "learned"}, "variance_type='learned'"),
+        (DPMSolverMultistepScheduler, {"timestep_spacing": "leading", "num_train_timesteps": 10}, "1 different noise"),
+        (UniPCMultistepScheduler, {}, "UniPCMultistepScheduler: its step at timestep"),
         (EulerDiscreteScheduler, {}, "standard deviation"),
         (LCMScheduler, {"original_inference_steps": 20}, "LCMScheduler: its step at timestep"),
         (PNDMScheduler, {}, "19 timesteps for 10 steps"),
@@ -213,3 +221,117 @@ def test_impossible_settings(steps: int, arguments: dict[str, Any], message: str
     """More steps than were trained; DDIM's eta for DDPM."""
     with pytest.raises(SpecError, match=message):
         sampler_table(DDPMScheduler(**BETAS), steps, step_arguments=arguments)
+
+
+DPM: dict[str, Any] = {"num_train_timesteps": 100, "beta_schedule": "squaredcos_cap_v2"}
+RDT: dict[str, Any] = {
+    "num_train_timesteps": 1000,
+    "beta_schedule": "squaredcos_cap_v2",
+    "prediction_type": "sample",
+}
+"""The scheduler of RDT-1B, which takes five steps."""
+
+MULTISTEP: list[tuple[dict[str, Any], int, int]] = [
+    ({}, 16, 1),
+    ({"thresholding": True}, 16, 1),
+    ({"thresholding": True, "timestep_spacing": "leading", "steps_offset": 1}, 10, 1),
+    ({"thresholding": True, "timestep_spacing": "trailing"}, 20, 1),
+    ({"thresholding": True, "timestep_spacing": "trailing"}, 1, 0),
+    ({"solver_order": 1}, 8, 0),
+    ({"solver_order": 3}, 12, 2),
+    ({"solver_type": "heun"}, 8, 1),
+    ({"prediction_type": "v_prediction"}, 8, 1),
+    (RDT, 5, 1),
+    ({"final_sigmas_type": "sigma_min"}, 8, 1),
+    ({"euler_at_final": True, "lower_order_final": False}, 16, 1),
+    ({"use_karras_sigmas": True, "beta_schedule": "linear"}, 8, 1),
+    ({"algorithm_type": "sde-dpmsolver++", "thresholding": True}, 8, 1),
+]
+
+
+@pytest.mark.parametrize(("settings", "steps", "memories"), MULTISTEP)
+def test_multistep_tables_give_what_the_scheduler_gives(settings: dict[str, Any], steps: int, memories: int) -> None:
+    """Whole loops of DPM-Solver++ in float32; what a step remembers of the ones before is in the table's memories."""
+    scheduler = DPMSolverMultistepScheduler(**(DPM | settings))
+    table = sampler_table(scheduler, steps, name="dpmsolver++")
+    set_timesteps(scheduler, steps)
+    assert table.timesteps.tolist() == scheduler.timesteps.tolist()
+    assert (table.memories, table.clip) == (memories, 1.0 if "thresholding" in settings else None)
+    assert table.stochastic == ("algorithm_type" in settings)
+    generator = torch.Generator().manual_seed(4)
+    start, outs = torch.randn(2, 4, 3, generator=generator), torch.randn(steps, 2, 4, 3, generator=generator)
+    draws = torch.randn(outs.shape, generator=generator)
+    x = start
+    for k, timestep in enumerate(scheduler.timesteps):
+        x = scheduler.step(outs[k], timestep, x, variance_noise=draws[k]).prev_sample
+    found = chain_of_table(table, start, outs, draws)
+    scale = 1 + float(
+        np.abs(table.sample_to_x0).max()
+    )  # unclipped, the first prediction is up to 2,000 times the noise
+    torch.testing.assert_close(found, x, rtol=1e-5, atol=2e-6 * scale)
+
+
+def test_second_order_is_the_formula() -> None:
+    """One row of DPM-Solver++ (2M) against algorithm 2 of Lu et al. (arXiv 2211.01095), by hand.
+
+    ``x_next = sigma_next / sigma x - alpha_next (exp(-h) - 1) ((1 + 1 / (2 r)) x0 - 1 / (2 r) x0_before)``
+    """
+    scheduler = DPMSolverMultistepScheduler(**(DPM | {"thresholding": True, "timestep_spacing": "trailing"}))
+    table = sampler_table(scheduler, 16)
+    k = 7
+    bars = [float(scheduler.alphas_cumprod[t]) for t in table.timesteps[k - 1 : k + 2]]
+    alpha, sigma = (np.sqrt([f(bar) for bar in bars]) for f in (lambda b: b, lambda b: 1 - b))
+    steps = np.diff(np.log(alpha / sigma))
+    gain, r = -alpha[2] * np.expm1(-steps[1]), steps[0] / steps[1]
+    assert table.sample_to_next[k] == pytest.approx(sigma[2] / sigma[1], rel=1e-4)
+    assert table.x0_to_next[k] == pytest.approx(gain * (1 + 1 / (2 * r)), rel=1e-4)
+    assert table.memory_to_next[k].tolist() == [pytest.approx(-gain / (2 * r), rel=1e-4)]
+    np.testing.assert_array_equal(table.to_memory[k], [[1, 0, 0, 0]])  # x0 is remembered, once
+    assert table.memory_to_next[0].tolist() == [0]  # the first step has nothing to remember
+
+
+class CurvedMultistep(DPMSolverMultistepScheduler):
+    """Adds a small square of the output."""
+
+    def step(self, model_output: Any, *args: Any, **kwargs: Any) -> Any:
+        result = super().step(model_output, *args, **kwargs)
+        result.prev_sample = result.prev_sample + 1e-3 * model_output**2
+        return result
+
+
+class LongMemory(DPMSolverMultistepScheduler):
+    """Keeps a trace of the first output for ever."""
+
+    first: Any = None
+
+    def set_timesteps(self, *args: Any, **kwargs: Any) -> None:
+        super().set_timesteps(*args, **kwargs)
+        self.first = None
+
+    def step(self, model_output: Any, *args: Any, **kwargs: Any) -> Any:
+        self.first = model_output if self.first is None else self.first
+        result = super().step(model_output, *args, **kwargs)
+        result.prev_sample = result.prev_sample + 1e-3 * self.first
+        return result
+
+
+@pytest.mark.parametrize("scheduler_class", [CurvedMultistep, LongMemory])
+def test_multistep_near_misses_are_refused(scheduler_class: type[Any]) -> None:
+    with pytest.raises(SpecError, match=f"{scheduler_class.__name__} does not have the form"):
+        sampler_table(scheduler_class(**DPM), 10)
+
+
+def test_leading_spacing_starts_too_low_and_dpm_solvers_lower_still() -> None:
+    """All start from pure noise; at the first timestep of ``leading`` the network expects less."""
+    found = {}
+    for scheduler_class in (DDIMScheduler, DPMSolverMultistepScheduler):
+        for spacing in ("leading", "trailing", "linspace"):
+            scheduler = scheduler_class(**(DPM | {"timestep_spacing": spacing}))
+            first = sampler_table(scheduler, 16).timesteps[0]
+            found[scheduler_class, spacing] = (first, float(scheduler.alphas_cumprod[first] ** 0.5))
+    assert [found[DDIMScheduler, spacing][0] for spacing in ("leading", "trailing", "linspace")] == [90, 99, 99]
+    solver = [found[DPMSolverMultistepScheduler, spacing] for spacing in ("leading", "trailing", "linspace")]
+    assert [first for first, _ in solver] == [80, 99, 99]
+    assert solver[0][1] > 0.29  # so much of the action the network expects in the sample, and finds none
+    assert found[DDIMScheduler, "leading"][1] == pytest.approx(0.14, abs=0.01)
+    assert solver[1][1] < 0.001

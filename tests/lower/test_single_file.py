@@ -27,11 +27,11 @@ from ttscompile.correction import Correction, no_correction
 from ttscompile.driver import compile_denoiser
 from ttscompile.errors import ArtifactError, LoweringError
 from ttscompile.ir.graph import Batch
-from ttscompile.ir.joint import JOINT
+from ttscompile.ir.joint import DENSE_STEP, JOINT
 from ttscompile.ir.program import Program
 from ttscompile.lattice import Source
 from ttscompile.lower import lower_program
-from ttscompile.lower_joint import join_blocks
+from ttscompile.lower_joint import chain_blocks, join_blocks
 from ttscompile.lower_precision import lower_precision
 from ttscompile.lower_single_file import lower_single_file
 from ttscompile.runtimes import open_runtime
@@ -206,7 +206,8 @@ def test_blocks_of_another_precision(tmp_path: Path) -> None:
     models = lower_program(program)
     lowered, weights, _ = lower_precision(models, program.weights, "int8")
     assert program.pieces is not None
-    lowered[JOINT] = join_blocks(program.pieces.blocks, {**models, **lowered})
+    own = {**models, **lowered}
+    lowered |= {JOINT: join_blocks(program.pieces.blocks, own), DENSE_STEP: chain_blocks(program.pieces.blocks, own)}
     write_artifact(program, models, tmp_path / "artifact", LoweredBlocks("int8", lowered, weights))
     model = lower_single_file(program, {**models, **lowered}, {**program.weights, **weights})
     policy = ttscompile.load(tmp_path / "artifact", precision="int8")

@@ -95,12 +95,12 @@ def everything_recorded(
 ) -> torch.Tensor:
     """The call as one differentiable formula: all candidates of all cells, recorded, mixed by the gates."""
     assert noise.steps is not None
-    x, steps = torch.from_numpy(noise.initial), torch.from_numpy(noise.steps)
+    carried, steps = MODEL.begin(torch.from_numpy(noise.initial)), torch.from_numpy(noise.steps)
     forward: dict[int, torch.Tensor] = {}
     timestep: dict[int, torch.Tensor] = {}
     zero = torch.zeros(())
     for k in range(MODEL.steps):
-        h = MODEL.stem(x, k, contexts)
+        h = MODEL.stem(carried.sample, k, contexts)
         for b, group in enumerate(MODEL.groups):
             g = [gates[:, k, b, source].reshape(-1, 1, 1) for source in Source]
             computed = MODEL.block(b, k, h, contexts)
@@ -110,8 +110,8 @@ def everything_recorded(
             write = g[0] if write_gradients else g[0].detach()
             forward[group] = write * computed + (1 - write) * old_forward
             timestep[b] = write * computed + (1 - write) * old_timestep
-        x = MODEL.advance(x, MODEL.tail(h, k, contexts), steps[k], k)
-    return x
+        carried = MODEL.advance(carried, MODEL.tail(h, k, contexts), steps[k], k)
+    return carried.sample
 
 
 @pytest.mark.parametrize("write_gradients", [True, False])

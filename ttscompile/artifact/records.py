@@ -7,13 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy.typing as npt
 
-from ..correction import correction_flops
+from ..config import SamplerTable
 from ..errors import ArtifactError
-from ..ir.advance import OUTPUTS, OWN_INPUTS
+from ..ir.advance import outputs, own_inputs
 from ..ir.flops import graph_flops
 from ..ir.graph import Graph, TensorType
-from ..ir.joint import JOINT, RESIDUAL, join
+from ..ir.idle import IDLE, TOTAL
+from ..ir.idle import OUTPUTS as IDLE_OUTPUTS
+from ..ir.joint import CONTEXT, DENSE_STEP, JOINT, OF_ALL_BLOCKS, RESIDUAL, STREAM, dense_step_outputs, join
 from ..ir.program import Binding, Pieces, Program
+from ..update import update_flops
 from .manifest import BlockRecord, ContextRecord, FlopsRecord, PieceRecord, Requires, block_name
 
 if TYPE_CHECKING:
@@ -81,7 +84,7 @@ def flops_record(program: Program) -> FlopsRecord:
         prologue=graph_flops(pieces.condition) + step,
         pruner=0 if pieces.pruner is None else graph_flops(pieces.pruner),
         stem=graph_flops(pieces.stem),
-        tail=graph_flops(pieces.tail) + correction_flops(program.spec.sample),
+        tail=graph_flops(pieces.tail) + update_flops(program.spec.sampler, program.spec.sample),
         blocks=tuple(map(graph_flops, pieces.blocks)),
     )
 
@@ -110,21 +113,21 @@ def context_records(program: Program, graphs: Mapping[str, Graph]) -> dict[str, 
 
 
 def piece_records(
-    graphs: Mapping[str, Graph], models: Mapping[str, ModelProto], files: Mapping[str, str]
+    graphs: Mapping[str, Graph], models: Mapping[str, ModelProto], files: Mapping[str, str], sampler: SamplerTable
 ) -> dict[str, PieceRecord]:
     """One record an ONNX model.
 
     Args:
         graphs: see ``piece_graphs``.
-        models: from ``lower_program``: the same names, but ``advance`` in place of ``tail``, and perhaps
-            ``blocks``.
+        models: from ``lower_program``: the same names, but ``advance`` in place of ``tail``, ``blocks``,
+            ``dense_step``, and perhaps ``idle``.
         files: file name of each model.
+        sampler: of the policy.
 
     Raises:
         ArtifactError: models and graphs do not have the same names, inputs or outputs.
     """
-    expected = [name for name in graphs if name != "tail"] + ["advance"]
-    expected += [JOINT] if JOINT in models else []
+    expected = [*(name for name in graphs if name != "tail"), "advance", *OF_ALL_BLOCKS, *[IDLE] * (IDLE in models)]
     if set(models) != set(expected):
         raise ArtifactError(f"expected the ONNX models {sorted(expected)}; found {sorted(models)}. {_REPORT}")
     records = {}
@@ -132,19 +135,19 @@ def piece_records(
         model = models[name].graph
         initialized = {tensor.name for tensor in model.initializer}
         inputs = tuple(value.name for value in model.input if value.name not in initialized)
-        outputs = tuple(value.name for value in model.output)
-        wanted = _interface(name, graphs)
-        if (set(inputs), outputs) != (set(wanted[0]), wanted[1]):
+        results = tuple(value.name for value in model.output)
+        wanted = _interface(name, graphs, sampler)
+        if (set(inputs), results) != (set(wanted[0]), wanted[1]):
             raise ArtifactError(
                 f"ONNX model {name!r}: expected inputs {list(wanted[0])} and outputs {list(wanted[1])}; found"
-                f" {list(inputs)} and {list(outputs)}. {_REPORT}"
+                f" {list(inputs)} and {list(results)}. {_REPORT}"
             )
         records[name] = PieceRecord(
             file=files[name],
             inputs=inputs,
             stream=_stream(name, graphs),
             contexts=_all_contexts(name, graphs),
-            outputs=outputs,
+            outputs=results,
         )
     return records
 
@@ -181,24 +184,38 @@ def _contexts(piece: str, graph: Graph) -> tuple[str, ...]:
 
 
 def _all_contexts(name: str, graphs: Mapping[str, Graph]) -> tuple[str, ...]:
-    parts: Iterable[str] = ("tail", "stem") if name == "advance" else () if name == JOINT else (name,)
+    parts: Iterable[str] = (name,)
+    if name in ("advance", JOINT, IDLE, DENSE_STEP):
+        parts = {"advance": ("tail", "stem"), DENSE_STEP: filter(_is_block, graphs)}.get(name, ())
     return tuple(dict.fromkeys(context for part in parts for context in _contexts(part, graphs[part])))
 
 
 def _stream(name: str, graphs: Mapping[str, Graph]) -> str | None:
-    if name in ("advance", JOINT):
-        return "stream"
-    return None if name in ("condition", "step", "pruner") else next(iter(graphs[name].inputs))
+    if name in ("advance", *OF_ALL_BLOCKS):
+        return STREAM
+    return None if name in ("condition", "step", "pruner", IDLE) else next(iter(graphs[name].inputs))
 
 
-def _interface(name: str, graphs: Mapping[str, Graph]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _interface(
+    name: str, graphs: Mapping[str, Graph], sampler: SamplerTable
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
     if name == JOINT:
-        blocks = (graph for block, graph in graphs.items() if block.startswith("block_"))
-        return join([tuple(graph.inputs.values())[1:] for graph in blocks]).inputs, (RESIDUAL,)
+        return join([tuple(graphs[block].inputs.values())[1:] for block in filter(_is_block, graphs)]).inputs, (
+            RESIDUAL,
+        )
+    if name == DENSE_STEP:
+        contexts = [CONTEXT + context for context in _all_contexts(name, graphs)]
+        return (STREAM, *contexts), dense_step_outputs(sum(map(_is_block, graphs)))
+    if name == IDLE:
+        return (TOTAL,), IDLE_OUTPUTS
     if name != "advance":
         return tuple(graphs[name].inputs), graphs[name].outputs
     contexts = [f"{part}.{context}" for part in ("tail", "stem") for context in _contexts(part, graphs[part])]
-    return (*OWN_INPUTS, *contexts), OUTPUTS
+    return (*own_inputs(sampler), *contexts), outputs(sampler)
+
+
+def _is_block(piece: str) -> bool:
+    return piece.startswith("block_")
 
 
 def _available(name: str, binding: Binding, kind: TensorType, pieces: Pieces, steps: int) -> bool:

@@ -5,6 +5,7 @@ Floats are written as the shortest decimal of the double that equals the float32
 
 from __future__ import annotations
 
+import math
 import re
 from typing import Any
 
@@ -42,7 +43,13 @@ def spec_to_json(spec: PolicySpec) -> dict[str, Any]:
         "sample_argument": spec.sample_argument,
         "timestep_argument": spec.timestep_argument,
         "observations": {
-            key: {"shape": list(o.shape), "dtype": o.dtype, "normalizer": _affine_to_json(o.normalizer)}
+            key: {
+                "shape": list(o.shape),
+                "dtype": o.dtype,
+                "normalizer": _affine_to_json(o.normalizer),
+                "window": o.window,
+                "bounds": _bounds_to_json(o),
+            }
             for key, o in spec.observations.items()
         },
         "chunk": {
@@ -50,6 +57,7 @@ def spec_to_json(spec: PolicySpec) -> dict[str, Any]:
             "start": spec.chunk.start,
             "stop": spec.chunk.stop,
             "normalizer": _affine_to_json(spec.chunk.normalizer),
+            "ranged": spec.chunk.ranged,
         },
         "sampler": _sampler_to_json(spec.sampler),
         "source": {key: spec.source[key] for key in sorted(spec.source)},
@@ -66,7 +74,7 @@ def spec_from_json(value: Value) -> PolicySpec:
     sample = [item.integer(1) for item in fields["sample"].items()]
     if len(sample) != 2:
         fields["sample"].fail("two sizes [T, D]")
-    chunk = fields["chunk"].keys("action_dim", "start", "stop", "normalizer")
+    chunk = fields["chunk"].keys("action_dim", "start", "stop", "normalizer", "ranged")
     try:
         return PolicySpec(
             sample=(sample[0], sample[1]),
@@ -77,6 +85,7 @@ def spec_from_json(value: Value) -> PolicySpec:
                 start=chunk["start"].integer(),
                 stop=chunk["stop"].integer(),
                 normalizer=_affine(chunk["normalizer"]),
+                ranged=chunk["ranged"].boolean(),
             ),
             sample_argument=fields["sample_argument"].text(),
             timestep_argument=fields["timestep_argument"].text(),
@@ -132,12 +141,24 @@ def _affine(value: Value) -> Affine | None:
         raise ArtifactError(f"{value.path}: {error} {REMEDY}") from error
 
 
+def _bounds_to_json(observation: ObservationSpec) -> list[list[float]] | None:
+    """Low and high as rows; ``ObservationSpec`` keeps tuples."""
+    return None if observation.bounds is None else [np.atleast_1d(each).tolist() for each in observation.bounds]
+
+
 def _observation(value: Value) -> ObservationSpec:
-    fields = value.keys("shape", "dtype", "normalizer")
+    fields = value.keys("shape", "dtype", "normalizer", "window", "bounds")
+    bounds = None
+    if not fields["bounds"].absent:
+        bounds = [tuple(item.number() for item in row.items()) for row in fields["bounds"].items()]
+        if len(bounds) != 2:
+            fields["bounds"].fail("two rows of numbers, low and high, or null")
     return ObservationSpec(
         shape=tuple(item.integer(1) for item in fields["shape"].items()),
         normalizer=_affine(fields["normalizer"]),
         dtype=fields["dtype"].text(*DTYPES),
+        window=fields["window"].boolean(),
+        bounds=None if bounds is None else (bounds[0], bounds[1]),
     )
 
 
@@ -147,11 +168,16 @@ def _sampler_to_json(sampler: SamplerTable) -> dict[str, Any]:
         "clip": None if sampler.clip is None else float(sampler.clip),
         "timesteps": {"dtype": str(sampler.timesteps.dtype), "values": sampler.timesteps.tolist()},
         **{name: floats_to_json(getattr(sampler, name)) for name in SamplerTable.COLUMNS},
+        "memory": {
+            "count": sampler.memories,
+            "to_next": floats_to_json(sampler.memory_to_next.ravel()),
+            "to_memory": floats_to_json(sampler.to_memory.ravel()),
+        },
     }
 
 
 def _sampler(value: Value) -> SamplerTable:
-    fields = value.keys("name", "clip", "timesteps", *SamplerTable.COLUMNS)
+    fields = value.keys("name", "clip", "timesteps", *SamplerTable.COLUMNS, "memory")
     timesteps = fields["timesteps"].keys("dtype", "values")
     if timesteps["dtype"].text("int64", "float32") == "int64":
         steps: npt.NDArray[Any] = np.array([item.integer(None) for item in timesteps["values"].items()], np.int64)
@@ -159,4 +185,21 @@ def _sampler(value: Value) -> SamplerTable:
         steps = floats(timesteps["values"])
     columns = {name: floats(fields[name]) for name in SamplerTable.COLUMNS}
     clip = None if fields["clip"].absent else fields["clip"].number()
-    return SamplerTable(name=fields["name"].text(), timesteps=steps, clip=clip, **columns)
+    memory = fields["memory"].keys("count", "to_next", "to_memory")
+    count = memory["count"].integer()
+    return SamplerTable(
+        name=fields["name"].text(),
+        timesteps=steps,
+        clip=clip,
+        memory_to_next=_shaped(memory["to_next"], (len(steps), count)),
+        to_memory=_shaped(memory["to_memory"], (len(steps), count, 3 + count)),
+        **columns,
+    )
+
+
+def _shaped(value: Value, shape: tuple[int, ...]) -> FloatArray:
+    """A flat list of float32 numbers as an array of this shape."""
+    numbers = floats(value)
+    if numbers.size != math.prod(shape):
+        value.fail(f"{math.prod(shape)} numbers, for the shape {list(shape)}")
+    return numbers.reshape(shape)

@@ -17,6 +17,7 @@ from torch import Tensor
 from ..correction import Correction, groups_of
 from ..lattice import BoolArray, PlanArray, Source
 from ..runtimes.reference_correction import correct, features, remember
+from ..runtimes.reference_sampler import Carried
 from .calls import Calls
 from .execute import Executor
 from .workers import workers
@@ -70,25 +71,27 @@ class _Lane:
         assert calls.path is not None
         self._executor, self._plan, self._calls, self._path = executor, plan, calls, calls.path
         self._state = executor.begin(calls, 1)
-        self._sample, self._history = self._state.sample, self._state.history
-        self._prediction = self._following = self._sample
+        self._carried = self._following = executor.model.begin(calls.initial)
+        self._prediction = calls.initial
 
     def predict(self, k: int) -> tuple[Tensor, Tensor]:
         """Features of step k, ``[D, n, 6 T]``, and what is missing after it without a correction, ``[D, n, T]``."""
         model, contexts, noise = self._executor.model, self._calls.contexts, self._calls.noise
-        stream = model.stem(self._sample, k, contexts)
+        sample, _, history = self._carried
+        stream = model.stem(sample, k, contexts)
         stream = self._executor.step(self._plan[k][None], k, stream, self._calls, self._state)
         self._prediction = model.tail(stream, k, contexts)
-        self._following = model.advance(self._sample, self._prediction, None if noise is None else noise[k], k)
-        missing = (self._path[:, k] - self._following).permute(2, 0, 1)
-        return features(self._sample, self._prediction, self._history), missing
+        self._following = model.advance(self._carried, self._prediction, None if noise is None else noise[k], k)
+        missing = (self._path[:, k] - self._following.sample).permute(2, 0, 1)
+        return features(sample, self._prediction, history), missing
 
     def advance(self, weight: Tensor, bias: Tensor, anchor: bool) -> None:
         """Go on with the correction of the step."""
-        sample, prediction, history = self._sample, self._prediction, self._history
-        self._sample = self._following + correct(weight, bias, sample, prediction, history)
-        if anchor:
-            self._history = remember(sample, prediction, history)
+        (sample, _, history), prediction, following = self._carried, self._prediction, self._following
+        corrected = following.sample + correct(weight, bias, sample, prediction, history)
+        self._carried = Carried(
+            corrected, following.memory, remember(sample, prediction, history) if anchor else history
+        )
 
 
 def _solve(read: Tensor, missing: Tensor, groups: int, ridge: float) -> tuple[Tensor, Tensor]:

@@ -22,8 +22,7 @@ from ..correction import Correction
 from ..errors import IllegalPlanError
 from ..lattice import BoolArray, PlanArray, Source
 from ..runtimes.reference import ReferenceModel
-from ..runtimes.reference_correction import apply as apply_correction
-from ..runtimes.reference_correction import empty_history
+from ..runtimes.reference_sampler import Carried
 from .calls import Calls, Selector
 
 
@@ -124,13 +123,12 @@ class Executor:
 
     def _loop(self, plans: PlanArray, calls: Calls, path: list[Tensor] | None = None) -> Tensor:
         """All steps of streams, plan by plan; the sample after each goes to ``path``."""
-        state = self.begin(calls, len(plans))
-        sample, history = state.sample, state.history
+        state, carried = self.begin(calls, len(plans)), self.model.begin(calls.initial)
         total: Tensor | None = None  # what all blocks add together, as long as nothing is computed
         previous: PlanArray | None = None
         for k in range(self.model.steps):
             row = plans[:, k]
-            stem = self.model.stem(sample, k, calls.contexts)
+            stem = self.model.stem(carried.sample, k, calls.contexts)
             if total is not None and previous is not None and np.array_equal(row, previous):
                 stream = stem + total
             else:
@@ -139,23 +137,19 @@ class Executor:
                 total = None if computes or not self.alike else stream - stem
                 previous = None if computes else row
             prediction = self.model.tail(stream, k, calls.contexts)
-            sample, history = self.advance(sample, prediction, history, calls, k)
+            carried = self.advance(carried, prediction, calls, k)
             if path is not None:
-                path.append(sample)
-        return sample
+                path.append(carried.sample)
+        return carried.sample
 
     def begin(self, calls: Calls, plans: int) -> State:
-        """The state of the loop before step 0; ``calls`` are those of all plans."""
+        """The caches before step 0; ``calls`` are those of all plans."""
         return State(calls, plans, len(self.axes))
 
-    def advance(
-        self, sample: Tensor, prediction: Tensor, history: Tensor, calls: Calls, k: int
-    ) -> tuple[Tensor, Tensor]:
-        """Sample and history after step k."""
-        following = self.model.advance(sample, prediction, None if calls.noise is None else calls.noise[k], k)
-        if self.correction is None:
-            return following, history
-        return apply_correction(self.correction, k, following, sample, prediction, history)
+    def advance(self, carried: Carried, prediction: Tensor, calls: Calls, k: int) -> Carried:
+        """What the sampler carries to step k + 1."""
+        noise = None if calls.noise is None else calls.noise[k]
+        return self.model.advance(carried, prediction, noise, k, self.correction)
 
     def step(self, row: PlanArray, k: int, stream: Tensor, calls: Calls, state: State) -> Tensor:
         """All blocks of one step, where ``row [C, blocks]`` says what each plan does."""
@@ -177,13 +171,12 @@ class Executor:
 
 
 class State:
-    """Sample, history and caches of ``plans x calls`` streams."""
+    """Caches of ``plans x calls`` streams."""
 
     def __init__(self, calls: Calls, plans: int, blocks: int) -> None:
         self._plans, self._each = plans, calls.count // plans
         self.forward: dict[int, Tensor] = {}
         self.timestep: list[Tensor | None] = [None] * blocks
-        self.sample, self.history = calls.initial, empty_history(calls.initial)
 
     def streams(self, plans: BoolArray) -> Tensor:
         """Numbers of the streams of these plans."""

@@ -82,8 +82,9 @@ class Families:
             self._longest = max(self._longest, self._clock.elapsed() - start)
             self._state.progress["seconds"] = self._clock.elapsed()
             self._state.save()
-        normalised, units = known[key]
-        return normalised, units
+        with self._state.reading():
+            normalised, units = known[key]
+            return float(normalised), float(units)
 
 
 def budget_of_error(families: Families, goal: Goal, steps: int, blocks: int) -> Budget:

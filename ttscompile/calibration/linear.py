@@ -24,7 +24,6 @@ import torch
 from torch import Tensor
 
 from ..lattice import BoolArray, PlanArray, Source
-from ..runtimes.reference_correction import empty_history
 from .calls import Actions, Calls
 from .execute import Executor
 
@@ -110,9 +109,8 @@ def _reach(executor: Executor, actions: Actions, plan: PlanArray, calls: Calls, 
     """``LinearModel.reach`` of a few calls; ``probes`` is ``[N, R, size]``."""
     rank, count = probes.shape[1], calls.count
     streams = executor.selector.calls(calls, np.tile(np.arange(count), rank))
-    sample = streams.initial.clone().requires_grad_()
-    history = empty_history(sample)
     model, axes = executor.model, executor.axes
+    carried = model.begin(streams.initial.clone().requires_grad_())
     shape = (len(axes), model.steps)
     candidates: list[list[Tensor]] = [[] for _ in axes]
     passed: list[
@@ -121,7 +119,7 @@ def _reach(executor: Executor, actions: Actions, plan: PlanArray, calls: Calls, 
     position = np.zeros(shape, np.int64)
     cache: dict[int, Tensor] = {}
     for k, row in enumerate(plan):
-        stream = model.stem(sample, k, streams.contexts)
+        stream = model.stem(carried.sample, k, streams.contexts)
         computes = bool((row == Source.COMPUTE).any()) or not executor.alike
         for b, axis in enumerate(axes):
             if row[b] == Source.COMPUTE:
@@ -139,8 +137,8 @@ def _reach(executor: Executor, actions: Actions, plan: PlanArray, calls: Calls, 
             position[:, k] = len(passed)
             passed.append(stream)
         prediction = model.tail(stream, k, streams.contexts)
-        sample, history = executor.advance(sample, prediction, history, streams, k)
-    executed = actions.executed(sample).reshape(rank, count, -1)
+        carried = executor.advance(carried, prediction, streams, k)
+    executed = actions.executed(carried.sample).reshape(rank, count, -1)
     gradients = torch.autograd.grad((executed * probes.transpose(0, 1)).sum(), passed)
     reach = np.empty((*shape, model.steps, count * rank), np.float32)
     for b, axis in enumerate(axes):

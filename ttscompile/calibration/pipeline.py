@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..artifact.ceiling import few_steps
 from ..artifact.load import Artifact, load_artifact
 from ..artifact.plan_records import PRUNER
 from ..artifact.write import update_calibration
@@ -145,6 +146,8 @@ def calibrate(
     executor = Executor(artifact)
     sets = draw_calls(executor, spec, episodes, split, limit, min(JUDGED, limit // 2), seed)
     with Bar(progress) as bar:
+        if (warning := few_steps(artifact.manifest)) is not None:
+            bar.warn(warning)
         sets = {name: with_targets(executor, name, calls, state, clock, bar) for name, calls in sets.items()}
         kinds = tuple(block.kind for block in artifact.manifest.blocks)
         task = Task(executor, Actions(spec), sets["calibration"], len(kinds), seed, artifact.pruner, kinds)

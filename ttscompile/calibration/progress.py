@@ -36,6 +36,11 @@ class Bar:
     ) -> None:
         self._progress.stop()
 
+    def warn(self, what: str) -> None:
+        """Say something beside the bar."""
+        if not self._progress.disable:
+            self._progress.console.print(f"warning: {what}", markup=False, soft_wrap=True)
+
     def stage(self, what: str, total: int, done: int = 0) -> None:
         """Begin something of ``total`` parts, ``done`` of which were done before."""
         self._progress.update(self._task, description=what, total=total, completed=done, note="", left="")

@@ -29,7 +29,8 @@ def search_plan(search: Strategy, state: StateFile, clock: Clock, bar: Bar, most
     count = search.intervals if most is None else min(most, search.intervals)
     first = int(state.progress.get("intervals", 0))
     if first:
-        search.restore(state.get("strategy"))
+        with state.reading():
+            search.restore(state.get("strategy"))
     bar.stage("search", count, first)
     number, longest, cut = first, 0.0, False
     while number < count and not search.done:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ import numpy.typing as npt
 
 from ..artifact import tensors
 from ..artifact.files import replace_file
+from ..artifact.strict_json import Value, check_depth
 from ..errors import ArtifactError, CalibrationError
 
 Array = npt.NDArray[Any]
@@ -19,7 +22,9 @@ Array = npt.NDArray[Any]
 FILE = "calibration-state.safetensors"
 """Never listed in the manifest: an artifact is complete without it, and it is removed when calibration ends."""
 
-_SETTINGS, _PROGRESS = "json/settings", "json/progress"
+MAX_TEXT_BYTES = 16 * 2**20
+
+_SETTINGS, _PROGRESS, _CHECKSUM = "json/settings", "json/progress", "sha256"
 
 
 class StateFile:
@@ -53,21 +58,25 @@ class StateFile:
             return False
         try:
             arrays = {name: np.array(array) for name, array in tensors.read(self._path).items()}
-            settings, progress = (bytes(arrays.pop(name)).decode() for name in (_SETTINGS, _PROGRESS))
-            self.progress = dict(json.loads(progress))
-        except (ArtifactError, KeyError, ValueError) as error:
+            found_sum = arrays.pop(_CHECKSUM, np.zeros(0)).tobytes()
+            if found_sum != _checksum(arrays):
+                raise ArtifactError("expected the checksum of its content; found another: it was damaged")
+            settings, progress = (_members(arrays.pop(name, None), name) for name in (_SETTINGS, _PROGRESS))
+            _check_progress(Value(progress, _PROGRESS))
+        except (ArtifactError, ValueError) as error:
             raise CalibrationError(
                 f"{self._path}: cannot be read ({error}). Calibrate again without --resume: that begins anew."
             ) from error
-        if settings != self._settings:
-            found, asked = json.loads(settings), json.loads(self._settings)
-            differing = {key: (found.get(key), asked.get(key)) for key in asked if found.get(key) != asked.get(key)}
+        asked = json.loads(self._settings)
+        if settings != asked:
+            keys = [key for key in {**asked, **settings} if settings.get(key) != asked.get(key)]
+            differing = {key: (settings.get(key), asked.get(key)) for key in keys}
             told = "; ".join(f"{key} was {was}, now {now}" for key, (was, now) in differing.items())
             raise CalibrationError(
                 f"{self._path}: the calibration that was interrupted had other settings: {told}. Give the same ones to"
                 " resume it, or leave --resume out to begin anew."
             )
-        self.arrays = arrays
+        self.arrays, self.progress = arrays, progress
         return True
 
     def save(self) -> None:
@@ -78,8 +87,10 @@ class StateFile:
         """
         texts = {_SETTINGS: self._settings, _PROGRESS: json.dumps(self.progress, sort_keys=True)}
         content = {name: np.frombuffer(text.encode(), np.uint8) for name, text in texts.items()}
+        arrays = {**self.arrays, **content}
+        arrays[_CHECKSUM] = np.frombuffer(_checksum(arrays), np.uint8)
         try:
-            replace_file(self._path, tensors.serialize({**self.arrays, **content}))
+            replace_file(self._path, tensors.serialize(arrays))
         except OSError as error:
             raise CalibrationError(f"{self._path}: the state of the calibration cannot be written: {error}.") from error
 
@@ -87,6 +98,21 @@ class StateFile:
         """Forget everything."""
         self._path.unlink(missing_ok=True)
         self.arrays, self.progress = {}, {}
+
+    @contextmanager
+    def reading(self) -> Iterator[None]:
+        """Within the block an error is one of the state: it has everything that was written, and yet does not fit.
+
+        Raises:
+            CalibrationError: it does not.
+        """
+        try:
+            yield
+        except (LookupError, TypeError, ValueError, RuntimeError) as error:
+            raise CalibrationError(
+                f"{self._path}: does not fit this calibration ({str(error)[:200]}). Calibrate again without --resume:"
+                " that begins anew."
+            ) from error
 
     def put(self, prefix: str, arrays: Mapping[str, Array]) -> None:
         """Replace all arrays below a prefix."""
@@ -96,3 +122,39 @@ class StateFile:
     def get(self, prefix: str) -> dict[str, Array]:
         """All arrays below a prefix, by the rest of their names."""
         return {n.removeprefix(f"{prefix}/"): a for n, a in self.arrays.items() if n.startswith(f"{prefix}/")}
+
+
+def _checksum(arrays: Mapping[str, Array]) -> bytes:
+    """The sha256 of names, types and contents, whatever their order."""
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name!r} {array.dtype.str} {np.shape(arrays[name])}\n".encode())
+        digest.update(array.tobytes())
+    return digest.digest()
+
+
+def _members(array: Array | None, name: str) -> dict[str, Any]:
+    """The JSON object that an array holds as bytes; errors of plans may be NaN in it."""
+    content = b"" if array is None else array.tobytes()
+    if len(content) > MAX_TEXT_BYTES:
+        raise ArtifactError(f"{name}: expected at most {MAX_TEXT_BYTES} bytes; found {len(content)}")
+    try:
+        document = json.loads(content)
+    except RecursionError as error:
+        raise ArtifactError(f"{name}: is nested too deeply") from error
+    check_depth(document, name)
+    return {key: value.data for key, value in Value(document, name).members().items()}
+
+
+def _check_progress(progress: Value) -> None:
+    """Raise unless the numbers that every calibration reads are such numbers."""
+    members = progress.members()
+    if "seconds" in members and members["seconds"].number() < 0:
+        members["seconds"].fail("a time that is not negative")
+    if "intervals" in members:
+        members["intervals"].integer()
+    if "latency" in members:
+        fields = members["latency"].keys("cells", "measured")
+        fields["cells"].integer(1)
+        fields["measured"].members()

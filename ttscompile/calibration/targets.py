@@ -36,7 +36,10 @@ def with_targets(executor: Executor, name: str, calls: Calls, state: StateFile, 
     """
     known = state.get("targets").get(name)
     sample = calls.initial.shape[1:]
-    path = torch.empty(0, executor.model.steps, *sample) if known is None else torch.from_numpy(known)
+    path = torch.empty(0, executor.model.steps, *sample)
+    if known is not None:
+        with state.reading():
+            path = torch.cat([path, torch.from_numpy(known)])
     bar.stage(f"dense, {name}", calls.count, len(path))
     for found in dense_rounds(executor, calls, len(path)):
         path = torch.cat([path, *found])

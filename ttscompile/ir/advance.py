@@ -4,6 +4,7 @@
 
 The pieces are small; run one by one they cost more in calls than in arithmetic. Inside, the number of operations
 counts: samples are ``[D, B, T]``, so that the update is one product (``ttscompile.update``) and nothing is turned.
+What is carried from a step to the next comes in pairs ``NAME`` and ``NAME_next`` (``CARRIED``).
 Push-T, 1 thread: 41 us with samples ``[B, T, D]``, a product for each coefficient and one for the correction; 31 us so.
 """
 
@@ -15,7 +16,7 @@ from ttscompile.config import PolicySpec, SamplerTable
 from ttscompile.correction import HISTORY as HISTORY_ENTRIES
 from ttscompile.correction import groups_of
 from ttscompile.errors import LoweringError
-from ttscompile.update import clips, rows
+from ttscompile.update import clips, columns, rows
 
 from .graph import Argument, Batch, Graph, Node, Ref, TensorType
 
@@ -24,14 +25,25 @@ SAMPLE = "sample"
 OFFSET = "offset"
 HISTORY = "history"
 UPDATE = "update"
+MEMORY = "memory"
 SAMPLE_NEXT = "sample_next"
 STREAM_NEXT = "stream_next"
 PREDICTION = "prediction"
-OUTPUTS = (SAMPLE_NEXT, STREAM_NEXT, PREDICTION)
+MEMORY_NEXT = "memory_next"
+CARRIED = (SAMPLE, MEMORY)
+"""What the sampler carries from step to step: inputs NAME, outputs NAME_next. ``memory`` only where it has memories."""
 X0_COLUMNS = ("sample_to_x0", "out_to_x0")
 """Columns of the sampler's table that are inputs of their own."""
-OWN_INPUTS = (STREAM, SAMPLE, OFFSET, HISTORY, UPDATE, *X0_COLUMNS)
-"""Inputs that are no contexts."""
+
+
+def own_inputs(sampler: SamplerTable) -> tuple[str, ...]:
+    """Inputs that are no contexts, in order."""
+    return (STREAM, SAMPLE, OFFSET, HISTORY, UPDATE, *X0_COLUMNS, *[MEMORY] * bool(sampler.memories))
+
+
+def outputs(sampler: SamplerTable) -> tuple[str, ...]:
+    """Outputs, in order."""
+    return (SAMPLE_NEXT, STREAM_NEXT, PREDICTION, *[MEMORY_NEXT] * bool(sampler.memories))
 
 
 def fuse_advance(tail: Graph, stem: Graph, spec: PolicySpec) -> Graph:
@@ -47,9 +59,10 @@ def fuse_advance(tail: Graph, stem: Graph, spec: PolicySpec) -> Graph:
 
     Returns:
         A graph with the inputs ``stream``, ``sample`` and ``offset`` ``[D, B, T]``, ``history`` ``[D, B, 4 T]``,
-        ``update`` ``[G, R, T]``, ``sample_to_x0`` and ``out_to_x0`` ``[1]``, the tail's contexts as ``tail.NAME`` (of
-        this step) and the stem's as ``stem.NAME`` (of the next); outputs ``sample_next``, ``stream_next`` and
-        ``prediction``. Samples and prediction are ``[D, B, T]``.
+        ``update`` ``[G, R, (1 + S) T]``, ``sample_to_x0`` and ``out_to_x0`` ``[1]``, where the sampler has S > 0
+        memories ``memory`` ``[D, B, S T]``, the tail's contexts as ``tail.NAME`` (of this step) and the stem's as
+        ``stem.NAME`` (of the next); outputs ``sample_next``, ``stream_next``, ``prediction`` and with memories
+        ``memory_next``. Samples and prediction are ``[D, B, T]``.
 
     Raises:
         LoweringError: a constant of the program has the name of one of these inputs.
@@ -59,12 +72,13 @@ def fuse_advance(tail: Graph, stem: Graph, spec: PolicySpec) -> Graph:
     inputs |= {f"tail.{name}": tail.inputs[name] for name in tail_contexts}
     inputs |= {f"stem.{name}": stem.inputs[name] for name in stem_contexts}
     constants = {**tail.constants, **stem.constants}
-    if clash := sorted((constants.keys() & inputs.keys()) | (constants.keys() & set(OUTPUTS))):
+    results = outputs(spec.sampler)
+    if clash := sorted((constants.keys() & inputs.keys()) | (constants.keys() & set(results))):
         raise LoweringError(
             f"the module has weights called {clash}, which are names of the compiled loop's own values."
             " Rename these parameters or buffers in the module."
         )
-    taken = {*inputs, *constants, *OUTPUTS}
+    taken = {*inputs, *constants, *results}
     first = {n: n for n in tail.constants} | {n: f"tail.{n}" for n in tail_contexts} | {stream: STREAM}
     nodes, names = _moved(tail, "tail", first, taken)
     turned = inputs[SAMPLE]
@@ -78,19 +92,23 @@ def fuse_advance(tail: Graph, stem: Graph, spec: PolicySpec) -> Graph:
     result = names[stem.outputs[0]]
     stream_type = stem.types()[stem.outputs[0]]
     nodes.append(Node(STREAM_NEXT, "aten.clone.default", (Ref(result),), (), (stream_type,)))
-    return Graph(inputs, constants, tuple(nodes), OUTPUTS)
+    return Graph(inputs, constants, tuple(nodes), results)
 
 
 def _update_types(spec: PolicySpec) -> dict[str, TensorType]:
     (horizon, dimensions), sampler = spec.sample, spec.sampler
     sample = TensorType((dimensions, Batch(), horizon), "float32")
-    return {
+    update = (groups_of(sampler.steps, spec.sample), rows(sampler, horizon), columns(sampler, horizon))
+    types = {
         SAMPLE: sample,
         OFFSET: sample,
         HISTORY: TensorType((dimensions, Batch(), HISTORY_ENTRIES * horizon), "float32"),
-        UPDATE: TensorType((groups_of(sampler.steps, spec.sample), rows(sampler, horizon), horizon), "float32"),
+        UPDATE: TensorType(update, "float32"),
         **dict.fromkeys(X0_COLUMNS, TensorType((1,), "float32")),
     }
+    if sampler.memories:
+        types[MEMORY] = TensorType((dimensions, Batch(), sampler.memories * horizon), "float32")
+    return types
 
 
 def _moved(graph: Graph, prefix: str, names: Mapping[str, str], taken: set[str]) -> tuple[list[Node], dict[str, str]]:
@@ -113,14 +131,25 @@ class _Update:
         self.nodes: list[Node] = []
 
     def nodes_for(self, spec: PolicySpec) -> list[Node]:
-        """``sample_next`` of the inputs and the prediction."""
-        horizon, dimensions = spec.sample
+        """``sample_next`` and ``memory_next`` of the inputs and the prediction."""
+        (horizon, dimensions), sampler = spec.sample, spec.sampler
         parts = [SAMPLE, PREDICTION, HISTORY]
-        if clips(spec.sampler):
-            parts.append(self.denoised(spec.sampler))
-        type_ = TensorType((dimensions, self.type.shape[1], rows(spec.sampler, horizon)), "float32")
+        if clips(sampler):
+            parts.append(self.denoised(sampler))
+        if sampler.memories:
+            parts.append(MEMORY)
+
+        def of_size(size: int) -> TensorType:
+            return TensorType((dimensions, self.type.shape[1], size), "float32")
+
+        type_ = of_size(rows(sampler, horizon))
         features = self.write("update.features", "aten.cat.default", (tuple(map(Ref, parts)), 2), type_)
-        product = self.write("update.product", "aten.matmul.default", (Ref(features), Ref(UPDATE)))
+        stop = columns(sampler, horizon)
+        product = self.write("update.product", "aten.matmul.default", (Ref(features), Ref(UPDATE)), of_size(stop))
+        if sampler.memories:
+            arguments = (Ref(product), 2, horizon, stop)
+            self.nodes.append(Node(MEMORY_NEXT, "aten.slice.Tensor", arguments, (), (of_size(stop - horizon),)))
+            product = self.write("update.sample", "aten.slice.Tensor", (Ref(product), 2, 0, horizon))
         self.nodes.append(Node(SAMPLE_NEXT, "aten.add.Tensor", (Ref(product), Ref(OFFSET)), (), (self.type,)))
         return self.nodes
 

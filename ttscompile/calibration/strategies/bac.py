@@ -177,14 +177,14 @@ def dense_residuals(executor: Executor, calls: Calls) -> list[Tensor]:
     """Of each block, what it adds at every step of dense calls: ``[N, K, size]``."""
     model = executor.model
     kept: list[list[Tensor]] = [[] for _ in executor.axes]
-    sample = calls.initial
+    carried = model.begin(calls.initial)
     with torch.no_grad():
         for k in range(model.steps):
-            stream = model.stem(sample, k, calls.contexts)
+            stream = model.stem(carried.sample, k, calls.contexts)
             for b, axis in enumerate(executor.axes):
                 residual = model.block(b, k, stream, calls.contexts)
                 kept[b].append(residual.movedim(axis, 0).flatten(1))
                 stream = stream + residual
             prediction = model.tail(stream, k, calls.contexts)
-            sample = model.advance(sample, prediction, None if calls.noise is None else calls.noise[k], k)
+            carried = model.advance(carried, prediction, None if calls.noise is None else calls.noise[k], k)
     return [torch.stack(rows, 1) for rows in kept]

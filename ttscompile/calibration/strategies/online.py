@@ -66,10 +66,10 @@ def decide(executor: Executor, criterion: Criterion, calls: Calls) -> Decided:
     decisions = criterion.begin(model.steps, model.blocks, calls.count)
     cache: list[Tensor] = []
     rows: list[PlanArray] = []
-    sample = calls.initial
+    carried = model.begin(calls.initial)
     with torch.no_grad():
         for k in range(model.steps):
-            stem = stream = model.stem(sample, k, calls.contexts)
+            stem = stream = model.stem(carried.sample, k, calls.contexts)
             first: list[Tensor] = []
             for b in range(criterion.always):
                 first.append(model.block(b, k, stream, calls.contexts))
@@ -86,8 +86,8 @@ def decide(executor: Executor, criterion: Criterion, calls: Calls) -> Decided:
                     cache[b] = cache[b].index_copy(axes[b], streams, part)
                 stream = stream + cache[b]
             prediction = model.tail(stream, k, calls.contexts)
-            sample = model.advance(sample, prediction, None if calls.noise is None else calls.noise[k], k)
-    return Decided(np.stack(rows, 1), sample)
+            carried = model.advance(carried, prediction, None if calls.noise is None else calls.noise[k], k)
+    return Decided(np.stack(rows, 1), carried.sample)
 
 
 def fit_threshold(task: Task, criterion: Criterion, calls: Calls, low: float, high: float) -> Criterion:

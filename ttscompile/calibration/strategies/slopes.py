@@ -86,13 +86,13 @@ def _rollout(
 ) -> tuple[list[Tensor], list[Tensor]]:
     """Of each cell, what its block computes, and the gradient of the summed error in what it adds: ``[N, size]``."""
     model = executor.model
-    sample = calls.initial.clone().requires_grad_()
+    carried = model.begin(calls.initial.clone().requires_grad_())
     cache: dict[int, Tensor] = {}
     computed: list[Tensor] = []
     passed: list[Tensor] = []  # the stream after additions: its gradient is that of what was added just before
     position: list[int] = []
     for k, row in enumerate(plan):
-        stream = model.stem(sample, k, calls.contexts)
+        stream = model.stem(carried.sample, k, calls.contexts)
         computes = bool((row == Source.COMPUTE).any()) or not executor.alike
         for b, axis in enumerate(executor.axes):
             key = model.groups[b] if reuse == Source.FORWARD else b
@@ -110,8 +110,8 @@ def _rollout(
             position += [len(passed)] * len(row)
             passed.append(stream)
         prediction = model.tail(stream, k, calls.contexts)
-        sample = model.advance(sample, prediction, None if calls.noise is None else calls.noise[k], k)
-    error = (actions.executed(sample) - actions.executed(calls.targets)).abs().mean(-1).sum()
+        carried = model.advance(carried, prediction, None if calls.noise is None else calls.noise[k], k)
+    error = (actions.executed(carried.sample) - actions.executed(calls.targets)).abs().mean(-1).sum()
     gradients = torch.autograd.grad(error, passed)
     axes = executor.axes * model.steps
     return computed, [_rows(gradients[i], axis) for i, axis in zip(position, axes, strict=True)]

@@ -50,15 +50,15 @@ def dense_changes(executor: Executor, calls: Calls) -> tuple[Array, Array]:
         Two arrays ``[(K - 1) * N]``.
     """
     model, axis = executor.model, executor.axes[0]
-    sample, seen = calls.initial, []
+    carried, seen = model.begin(calls.initial), []
     with torch.no_grad():
         for k in range(model.steps):
-            stem = stream = model.stem(sample, k, calls.contexts)
+            stem = stream = model.stem(carried.sample, k, calls.contexts)
             for b in range(model.blocks):
                 stream = stream + model.block(b, k, stream, calls.contexts)
             seen.append([value.movedim(axis, 0).numpy() for value in (stem, stream)])
             prediction = model.tail(stream, k, calls.contexts)
-            sample = model.advance(sample, prediction, None if calls.noise is None else calls.noise[k], k)
+            carried = model.advance(carried, prediction, None if calls.noise is None else calls.noise[k], k)
     changes = [[relative_change(b, a) for a, b in zip(*pair, strict=True)] for pair in pairwise(seen)]
     before, after = (np.concatenate([pair[i] for pair in changes]) for i in range(2))
     return before, after

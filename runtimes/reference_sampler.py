@@ -1,0 +1,81 @@
+"""The sampler's step with torch, plain and differentiable: what is carried from step to step, and how it moves on."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ttscompile.config import SamplerTable
+from ttscompile.correction import Correction
+
+from .inpainting import Known
+from .reference_correction import correct, empty_history, remember
+
+
+class Carried(NamedTuple):
+    """What the sampler carries from one step to the next.
+
+    Attributes:
+        sample: ``[B, T, D]``.
+        memory: the sampler's S memories, ``[B, S, T, D]``.
+        history: of the correction, ``[B, 4 T, D]``.
+    """
+
+    sample: Tensor
+    memory: Tensor
+    history: Tensor
+
+
+def begin(table: SamplerTable, initial: Tensor) -> Carried:
+    """What is carried to step 0: the sample ``[B, T, D]``, and zeros."""
+    streams, *shape = initial.shape
+    return Carried(initial, initial.new_zeros(streams, table.memories, *shape), empty_history(initial))
+
+
+def advance(
+    table: SamplerTable,
+    carried: Carried,
+    prediction: Tensor,
+    noise: Tensor | None,
+    k: int,
+    correction: Correction | None = None,
+) -> Carried:
+    """What is carried to step k + 1 (``config.SamplerTable`` has the formula).
+
+    Args:
+        table: of the sampler.
+        carried: to step k.
+        prediction: the network's output at step k, ``[B, T, D]``.
+        noise: the draw used at step k, ``[B, T, D]``; None if the sampler is deterministic.
+        k: step.
+        correction: of the sampler's steps; None for none.
+    """
+    sample, memory, history = carried
+    row = {name: float(getattr(table, name)[k]) for name in table.COLUMNS}
+    clean = row["sample_to_x0"] * sample + row["out_to_x0"] * prediction
+    if table.clip is not None:
+        clean = clean.clamp(-table.clip, table.clip)
+    following = row["x0_to_next"] * clean + row["sample_to_next"] * sample + row["out_to_next"] * prediction
+    for s in range(table.memories):
+        following = following + float(table.memory_to_next[k, s]) * memory[:, s]
+    if noise is not None:
+        following = following + row["noise_to_next"] * noise
+    if table.memories:
+        terms = torch.cat([torch.stack([clean, sample, prediction], 1), memory], 1)
+        memory = torch.einsum("sr,brtd->bstd", torch.from_numpy(table.to_memory[k].copy()), terms)
+    if correction is not None:
+        weights, bias = torch.tensor(correction.weights[k]), torch.tensor(correction.bias[k])
+        following = following + correct(weights, bias, sample, prediction, history)
+        history = remember(sample, prediction, history) if correction.anchors[k] else history
+    return Carried(following, memory, history)
+
+
+def hold(carried: Carried, known: Known | None, k: int) -> Carried:
+    """What is carried to step k, or from the last, with what is known of the sample in its place."""
+    if known is None:
+        return carried
+    sample = carried.sample.clone()
+    sample[:, known.positions, known.channels] = torch.from_numpy(known.values[k])
+    return carried._replace(sample=sample)

@@ -1,0 +1,155 @@
+"""Flow-matching tables against plain integration in float64."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from ttscompile import SamplerTable, flow_matching_table
+from ttscompile.errors import SpecError
+
+Array = npt.NDArray[np.float64]
+Field = Callable[[Array, float], Array]
+
+
+def velocity(x: Array, t: float) -> Array:
+    """Not linear in the sample, and not in time."""
+    return np.sin(2 * x) + np.cos(3 * t) - 0.3 * x * t
+
+
+def by_table(table: SamplerTable, x: Array, field: Field) -> Array:
+    """The formula of ``SamplerTable``, word by word, in float64."""
+    memory = [np.zeros_like(x)] * table.memories
+    for k in range(table.steps):
+        out = field(x, float(table.timesteps[k]))
+        row = {name: float(getattr(table, name)[k]) for name in table.COLUMNS}
+        x0 = row["sample_to_x0"] * x + row["out_to_x0"] * out
+        if table.clip is not None:
+            x0 = np.clip(x0, -table.clip, table.clip)
+        following = row["x0_to_next"] * x0 + row["sample_to_next"] * x + row["out_to_next"] * out
+        following = following + sum(c * m for c, m in zip(table.memory_to_next[k], memory, strict=True))
+        terms = [x0, x, out, *memory]
+        memory = [sum((c * each for c, each in zip(of, terms, strict=True)), 0 * x) for of in table.to_memory[k]]
+        x = following
+    return x
+
+
+def euler(x: Array, times: Array, field: Field) -> Array:
+    for t, following in pairwise(times):
+        x = x + (following - t) * field(x, t)
+    return x
+
+
+def rk4(x: Array, times: Array, field: Field) -> Array:
+    for t, following in pairwise(times):
+        h = following - t
+        k1 = field(x, t)
+        k2 = field(x + h / 2 * k1, t + h / 2)
+        k3 = field(x + h / 2 * k2, t + h / 2)
+        k4 = field(x + h * k3, t + h)
+        x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    return x
+
+
+NOISE = np.random.default_rng(0).standard_normal((3, 4, 2))
+
+
+@pytest.mark.parametrize(("start", "end"), [(0.0, 1.0), (1.0, 0.0), (0.2, 0.9)])
+@pytest.mark.parametrize(("method", "integrate", "evaluations"), [("euler", euler, 1), ("rk4", rk4, 4)])
+@pytest.mark.parametrize("steps", [1, 7])
+def test_tables_integrate(start: float, end: float, method: Any, integrate: Any, evaluations: int, steps: int) -> None:
+    """Both conventions; the network is given times in order, each as often as it is evaluated there."""
+    table = flow_matching_table(steps, method, start=start, end=end)
+    assert (table.name, table.steps, table.stochastic) == (method, steps * evaluations, False)
+    assert table.timesteps.dtype == np.float32
+    assert table.timesteps[0] == np.float32(start)
+    times = np.linspace(start, end, steps + 1)
+    expected = integrate(NOISE, times, velocity)
+    np.testing.assert_allclose(by_table(table, NOISE, velocity), expected, rtol=1e-6, atol=1e-6)
+    if steps > 1:
+        other = integrate(NOISE, times[::-1], velocity)
+        assert np.abs(expected - other).max() > 0.1  # the direction matters to these numbers
+
+
+def test_rk4_is_of_fourth_order() -> None:
+    """Halving the steps divides the error by 16; Euler's by 2."""
+    exact = rk4(NOISE, np.linspace(0, 1, 2001), velocity)
+    ratios = {}
+    for method in ("euler", "rk4"):
+        one, half = (np.abs(by_table(flow_matching_table(n, method), NOISE, velocity) - exact).max() for n in (4, 8))
+        ratios[method] = one / half
+    assert 1.6 < ratios["euler"] < 2.6
+    assert 11 < ratios["rk4"] < 22
+
+
+@pytest.mark.parametrize("method", ["euler", "rk4"])
+def test_times_of_ones_own_and_scaled_timesteps(method: Any) -> None:
+    times = [1.0, 0.7, 0.3, 0.25, 0.0]
+    table = flow_matching_table(times, method, timestep_scale=1000.0)
+    assert table.timesteps[:: table.steps // 4].tolist() == [1000, 700, 300, 250]
+    found = by_table(table, NOISE, lambda x, t: velocity(x, t / 1000))
+    expected = {"euler": euler, "rk4": rk4}[method](NOISE, np.array(times), velocity)
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)
+
+
+def test_the_clipped_sample_is_where_the_velocity_leads() -> None:
+    """One step from 1 to 0: the sample at the end is ``clip(x - v)``; two steps go half of the way to it at first."""
+    (x, v) = np.array([0.5, 3.0]), np.array([0.3, -2.0])
+    assert by_table(flow_matching_table(1, start=1.0, end=0.0, clip=1.0), x, lambda x, t: v).tolist() == [
+        pytest.approx(0.2),
+        1.0,
+    ]
+    first = x + (np.clip(x - v, -1, 1) - x) / 2
+    second = np.clip(first - v / 2, -1, 1)
+    found = by_table(flow_matching_table(2, start=1.0, end=0.0, clip=1.0), x, lambda x, t: v)
+    np.testing.assert_allclose(found, second, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"steps": 0}, "0 flow-matching steps"),
+        ({"steps": True}, "True flow-matching steps"),
+        ({"steps": 4, "start": 1.0}, "all rise or all fall"),
+        ({"steps": [0.0, 0.5, 0.5, 1.0]}, "all rise or all fall"),
+        ({"steps": [0.0]}, "two or more"),
+        ({"steps": 4, "end": float("inf")}, "all rise or all fall"),
+        ({"steps": 4, "timestep_scale": float("nan")}, "timestep_scale"),
+        ({"steps": 4, "method": "heun"}, "expected one of euler, rk4"),
+        ({"steps": 4, "method": "rk4", "clip": 1.0}, "between the stages"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:invalid value")
+def test_what_is_refused(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(SpecError, match=message):
+        flow_matching_table(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("to_next", "to_memory", "message"),
+    [
+        ((4, 1), (4, 1, 3), r"\[K, S, 3 \+ S\]; found \(4, 1\) and \(4, 1, 3\)"),
+        ((3, 1), (4, 1, 4), r"found \(3, 1\)"),
+        ((4, 1), (4, 0, 3), r"found \(4, 1\)"),
+        ((4,), (4, 1, 4), r"found \(4,\)"),
+    ],
+)
+def test_memories_of_the_wrong_shape(to_next: tuple[int, ...], to_memory: tuple[int, ...], message: str) -> None:
+    columns = {name: np.zeros(4, np.float32) for name in SamplerTable.COLUMNS}
+    with pytest.raises(SpecError, match=message):
+        SamplerTable(
+            "mine", np.arange(4), clip=None, **columns, memory_to_next=np.zeros(to_next), to_memory=np.zeros(to_memory)
+        )
+
+
+def test_memories_that_are_not_finite() -> None:
+    columns = {name: np.zeros(1, np.float32) for name in SamplerTable.COLUMNS}
+    with pytest.raises(SpecError, match="finite"):
+        SamplerTable(
+            "mine", [0], clip=None, **columns, memory_to_next=np.full((1, 1), np.nan), to_memory=np.zeros((1, 1, 4))
+        )

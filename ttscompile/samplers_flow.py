@@ -1,0 +1,132 @@
+"""Flow matching as a table of numbers: ``dx/dt = v(x, t)``, integrated by Euler or by classical Runge-Kutta.
+
+Nothing is probed here: the methods are written down, and tests hold them against an integration in float64. Numpy only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from .config import SamplerTable
+from .errors import SpecError
+
+METHODS = ("euler", "rk4")
+
+
+def flow_matching_table(
+    steps: int | Sequence[float],
+    method: Literal["euler", "rk4"] = "euler",
+    *,
+    start: float = 0.0,
+    end: float = 1.0,
+    timestep_scale: float = 1.0,
+    clip: float | None = None,
+) -> SamplerTable:
+    """The denoising loop of a flow-matching policy whose network predicts the velocity ``v = dx/dt``.
+
+    The sample is noise at ``start`` and the action at ``end``. LeRobot's ``multi_task_dit`` goes from 0 to 1; SmolVLA,
+    pi0 and pi0.5 from 1 to 0: ``flow_matching_table(10, start=1.0, end=0.0)``.
+
+    With ``rk4`` a step of length h evaluates the network four times, and each evaluation is a step of the table, so
+    that plans decide about each of them: K = 4 N. Memories are the sample at the beginning of the step, and what the
+    stages so far make of the sample at its end::
+
+        v1 = v(x, t)              next = x + h/2 v1     memory = x, x + h/6 v1
+        v2 = v(next, t + h/2)     next = x + h/2 v2     memory = x, ... + h/3 v2
+        v3 = v(next, t + h/2)     next = x + h v3       memory = x, ... + h/3 v3
+        v4 = v(next, t + h)       next = ... + h/6 v4
+
+    Args:
+        steps: N, number of steps of equal length; or the N + 1 times themselves, from ``start`` to ``end``, which then
+            are not to be given.
+        method: ``euler`` or ``rk4``.
+        start: time at which the sample is noise.
+        end: time at which it is the action.
+        timestep_scale: the network is given ``time * timestep_scale``, as a float32.
+        clip: bound on the sample that the velocity leads to from where it is, ``x + (end - t) v``; Euler only.
+
+    Returns:
+        The table, of K = N (Euler) or K = 4 N (rk4) rows, deterministic.
+
+    Raises:
+        SpecError: no steps, times that do not go one way, a method that is not known, or a bound with rk4.
+    """
+    times = _times(steps, start, end)
+    if method not in METHODS:
+        raise SpecError(f"flow-matching method {method!r} is not known; expected one of {', '.join(METHODS)}.")
+    if not np.isfinite(timestep_scale):
+        raise SpecError(f"timestep_scale must be a finite number; found {timestep_scale}.")
+    if method == "euler":
+        return _euler(times, timestep_scale, clip)
+    if clip is not None:
+        raise SpecError("clip needs method 'euler': between the stages of rk4 there is no sample to bound.")
+    return _rk4(times, timestep_scale)
+
+
+def _times(steps: int | Sequence[float], start: float, end: float) -> npt.NDArray[np.float64]:
+    """The N + 1 times."""
+    if isinstance(steps, int):
+        if isinstance(steps, bool) or steps < 1:
+            raise SpecError(f"{steps!r} flow-matching steps are not possible; expected a positive whole number.")
+        times = start + (end - start) * np.arange(steps + 1) / steps
+    else:
+        times = np.asarray(steps, np.float64)
+    lengths = np.diff(times)
+    if times.ndim != 1 or len(times) < 2 or not np.isfinite(times).all() or not (lengths * lengths[0] > 0).all():
+        raise SpecError(f"flow-matching times must all rise or all fall, and be two or more; found {times.tolist()}.")
+    return times
+
+
+def _euler(times: npt.NDArray[np.float64], scale: float, clip: float | None) -> SamplerTable:
+    lengths = np.diff(times)
+    zero, one = np.zeros_like(lengths), np.ones_like(lengths)
+    left = times[-1] - times[:-1]
+    # x + h v = x0 h / left + x (1 - h / left) where x0 = x + left v; unclipped it is added directly.
+    share = zero if clip is None else lengths / left
+    return _table(
+        "euler",
+        times[:-1] * scale,
+        clip,
+        sample_to_x0=one,
+        out_to_x0=left,
+        x0_to_next=share,
+        sample_to_next=1 - share,
+        out_to_next=lengths if clip is None else zero,
+    )
+
+
+def _rk4(times: npt.NDArray[np.float64], scale: float) -> SamplerTable:
+    count, (h,) = len(times) - 1, (np.diff(times),)
+    own = np.arange(count)[:, None] * 4 + np.arange(4)
+    at = times[:-1, None] + h[:, None] * np.array([0, 0.5, 0.5, 1])
+    sample_to_next, out_to_next = np.zeros((2, 4 * count))
+    memory_to_next, to_memory = np.zeros((4 * count, 2)), np.zeros((4 * count, 2, 5))
+    sample_to_next[own[:, 0]] = 1
+    out_to_next[own] = h[:, None] * np.array([1 / 2, 1 / 2, 1, 1 / 6])
+    memory_to_next[own[:, 1:3], 0] = memory_to_next[own[:, 3], 1] = 1
+    x, out, base, result = 1, 2, 3, 4  # columns of ``to_memory``
+    to_memory[own[:, 0], :, x] = 1
+    to_memory[own[:, 1:3], 0, base] = to_memory[own[:, 1:3], 1, result] = 1
+    to_memory[own[:, :3], 1, out] = h[:, None] * np.array([1 / 6, 1 / 3, 1 / 3])
+    return _table(
+        "rk4",
+        at.ravel() * scale,
+        None,
+        sample_to_next=sample_to_next,
+        out_to_next=out_to_next,
+        memory_to_next=memory_to_next,
+        to_memory=to_memory,
+    )
+
+
+def _table(
+    name: str, timesteps: npt.NDArray[np.float64], clip: float | None, **columns: npt.NDArray[np.float64]
+) -> SamplerTable:
+    """With zeros for columns that are not given."""
+    zeros = {column: np.zeros(len(timesteps)) for column in SamplerTable.COLUMNS}
+    narrow = {column: np.asarray(values, np.float32) for column, values in (zeros | columns).items()}
+    return SamplerTable(name=name, timesteps=np.asarray(timesteps, np.float32), clip=clip, **narrow)
