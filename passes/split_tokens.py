@@ -137,6 +137,8 @@ class _Splitter:
         return name
 
     def _split_cat(self, node: Node) -> bool:
+        if self.bindings[node.name] is not Binding.STEP:
+            return False  # all of it leaves the loop as it is
         operands = node.args[0]
         assert isinstance(operands, tuple)
         names = [o.name for o in operands if isinstance(o, Ref)]

@@ -91,6 +91,13 @@ def _one(key: str, array: Array, spec: ObservationSpec) -> Array:
             f" .astype(np.{spec.dtype}), after making sure that its units are those of the training data."
         )
     check_finite(array, f"observation {key!r}", "Look for the sensor, or the division, that made it.")
+    if spec.bounds is not None and array.dtype.kind in "iu":
+        low, high = (np.asarray(each) for each in spec.bounds)
+        if (array < low).any() or (array > high).any():
+            raise ObservationError(
+                f"observation {key!r} must hold integers of {low.min():.0f} to {high.max():.0f}; found {array.min()} to"
+                f" {array.max()}. Tokens must come from the tokenizer that the policy was trained with."
+            )
     return array
 
 

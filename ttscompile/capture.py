@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import copy
+import inspect
 import operator
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import PurePath
 from typing import Any
 
@@ -16,6 +18,7 @@ import torch
 from torch import nn
 from torch.export.graph_signature import InputKind, OutputKind
 
+from .capture_batch import BATCHES, unify_batch
 from .config import PolicySpec
 from .errors import CaptureError
 from .ir.graph import GETITEM, Argument, Batch, Enum, Graph, Node, Ref, Size, TensorType
@@ -37,7 +40,8 @@ def capture(module: nn.Module, spec: PolicySpec) -> tuple[Graph, Weights]:
 
     Args:
         module: takes ``spec.sample_argument`` float32 ``[B, T, D]``, ``spec.timestep_argument`` ``[B]`` of the dtype of
-            ``spec.sampler.timesteps`` and every observation ``[B, ...]`` by keyword; returns one tensor ``[B, T, D]``.
+            ``spec.sampler.timesteps`` and every observation ``[B, ...]`` as the keyword that ``spec.arguments`` says;
+            returns one tensor ``[B, T, D]``.
         spec: the policy beside its network.
 
     Returns:
@@ -47,17 +51,32 @@ def capture(module: nn.Module, spec: PolicySpec) -> tuple[Graph, Weights]:
         CaptureError: torch.export failed, or the graph uses what the compiler cannot express; names the node.
     """
     module = copy.deepcopy(module).float().eval()
-    examples = _examples(spec)
-    batch = torch.export.Dim("B")
+    try:
+        return _Converter(*_traced(module, spec, EXAMPLE_STREAMS, symbolic=True)).convert(spec)
+    except CaptureError as error:
+        # torch.export cannot prove everything that is true of a symbolic batch; with numbers there is nothing to prove.
+        try:
+            (left, weights), (right, _) = (
+                _Converter(*_traced(module, spec, streams, symbolic=False)).convert(spec) for streams in BATCHES
+            )
+        except CaptureError:
+            raise error from error.__cause__
+    return unify_batch(left, right), weights
+
+
+def _traced(
+    module: nn.Module, spec: PolicySpec, streams: int, symbolic: bool
+) -> tuple[torch.export.ExportedProgram, dict[str, torch.Tensor]]:
+    """What torch.export makes of the module, and the example inputs."""
+    examples = _examples(spec, streams)
+    given = {spec.arguments.get(name, name): value for name, value in examples.items()}
     fastpath = torch.backends.mha.get_fastpath_enabled()
     torch.backends.mha.set_fastpath_enabled(False)  # the fused encoder layer is opaque to every pass
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), _masks_as_given():
             # torch.export warns about its own use of a deprecated class
             warnings.filterwarnings("ignore", message=".*LeafSpec.*", category=FutureWarning)
-            exported = torch.export.export(
-                module, (), kwargs=examples, dynamic_shapes={name: {0: batch} for name in examples}, strict=False
-            ).run_decompositions({})
+            return _export(module, given, symbolic).run_decompositions({}), examples
     except Exception as error:  # torch.export raises whatever the user's code or its own machinery raises
         raise CaptureError(
             f"torch.export could not capture {type(module).__name__}: {type(error).__name__}: {error}\n"
@@ -66,19 +85,52 @@ def capture(module: nn.Module, spec: PolicySpec) -> tuple[Graph, Weights]:
         ) from error
     finally:
         torch.backends.mha.set_fastpath_enabled(fastpath)
-    return _Converter(exported, examples).convert(spec)
 
 
-def _examples(spec: PolicySpec) -> dict[str, torch.Tensor]:
+@contextmanager
+def _masks_as_given() -> Iterator[None]:
+    """``nn.TransformerDecoder`` reads its mask's values to see whether it is causal; here the mask counts as given."""
+    layers = torch.nn.modules.transformer
+    detect = layers._detect_is_causal_mask
+    layers._detect_is_causal_mask = lambda mask, is_causal=None, size=None: is_causal is True
+    try:
+        yield
+    finally:
+        layers._detect_is_causal_mask = detect
+
+
+class _ByPosition(nn.Module):
+    """A module that takes ``**observations``, with its inputs by position: torch.export gives keywords no shapes."""
+
+    def __init__(self, module: nn.Module, names: list[str]) -> None:
+        super().__init__()
+        self.module, self.names = module, names
+
+    def forward(self, *inputs: torch.Tensor) -> Any:
+        """Inputs in the order of ``names``."""
+        return self.module(**dict(zip(self.names, inputs, strict=True)))
+
+
+def _export(module: nn.Module, examples: Mapping[str, torch.Tensor], symbolic: bool) -> torch.export.ExportedProgram:
+    """The module's graph; the first axis of every input varies if it is symbolic."""
+    axes = {0: torch.export.Dim("B")} if symbolic else {}
+    each: Any = dict.fromkeys(examples, axes)
+    if any(p.kind is p.VAR_KEYWORD for p in inspect.signature(module.forward).parameters.values()):
+        inputs, shapes = tuple(examples.values()), (tuple(each.values()),)
+        return torch.export.export(_ByPosition(module, list(examples)), inputs, dynamic_shapes=shapes, strict=False)
+    return torch.export.export(module, (), kwargs=dict(examples), dynamic_shapes=each, strict=False)
+
+
+def _examples(spec: PolicySpec, streams: int) -> dict[str, torch.Tensor]:
     generator = torch.Generator().manual_seed(0)
     examples = {
-        spec.sample_argument: torch.randn(EXAMPLE_STREAMS, *spec.sample, generator=generator),
+        spec.sample_argument: torch.randn(streams, *spec.sample, generator=generator),
         spec.timestep_argument: torch.full(
-            (EXAMPLE_STREAMS,), spec.sampler.timesteps[0].item(), dtype=torch.from_numpy(spec.sampler.timesteps).dtype
+            (streams,), spec.sampler.timesteps[0].item(), dtype=torch.from_numpy(spec.sampler.timesteps).dtype
         ),
     }
     for key, observation in spec.observations.items():
-        value = torch.randn(EXAMPLE_STREAMS, *observation.shape, generator=generator)
+        value = torch.randn(streams, *observation.shape, generator=generator)
         examples[key] = value.to(getattr(torch, observation.dtype))
     return examples
 
@@ -89,6 +141,7 @@ class _Converter:
     def __init__(self, exported: torch.export.ExportedProgram, examples: Mapping[str, torch.Tensor]) -> None:
         self.exported = exported
         self.examples = examples
+        self.symbolic = len(next(iter(examples.values()))) == EXAMPLE_STREAMS
         self.names: dict[torch.fx.Node, str] = {}
         self.symbol: Any = None
 
@@ -102,7 +155,7 @@ class _Converter:
         state = {**self.exported.state_dict, **self.exported.constants}
         placeholders = [n for n in self.exported.graph.nodes if n.op == "placeholder"]
         users = [n for n in placeholders if kinds[n.name].kind is InputKind.USER_INPUT]
-        self.symbol = self._batch_symbol(users[0])
+        self.symbol = self._batch_symbol(users[0]) if self.symbolic else None
         for fx_node, key in zip(users, self.examples, strict=True):
             self.names[fx_node] = key
             inputs[key] = self._type(fx_node, fx_node.meta["val"])
@@ -112,9 +165,13 @@ class _Converter:
             target = str(kinds[fx_node.name].target)
             if not fx_node.users:
                 continue
+            if target in inputs:
+                raise CaptureError(
+                    f"the module has a weight called {target}, as an observation is. Rename one of them."
+                )
             self.names[fx_node] = target
             constants[target] = self._type(fx_node, fx_node.meta["val"])
-            weights[target] = state[target].detach().cpu().contiguous().numpy().copy()
+            weights[target] = state[target].detach().cpu().contiguous().numpy()  # the module is a copy
         for fx_node in self.exported.graph.nodes:
             if fx_node.op == "call_function" and (node := self._node(fx_node)) is not None:
                 nodes.append(node)
@@ -160,6 +217,11 @@ class _Converter:
                 " Replace the custom or higher-order operation (cond, scan, autocast region) by plain tensor code."
             )
         values = value if isinstance(value, tuple | list) else (value,)
+        if any(v.is_complex() for v in values):
+            raise CaptureError(
+                f"%{fx_node.name} ({_source(fx_node)}) computes with complex numbers, which an artifact cannot hold."
+                " Write the rotary embedding with cosine and sine: left * cos - right * sin, right * cos + left * sin."
+            )
         self.names[fx_node] = fx_node.name
         return Node(
             name=fx_node.name,

@@ -46,9 +46,9 @@ class FrameSpec:
     def of(cls, specs: Mapping[str, ObservationSpec], steps: int) -> FrameSpec:
         """The frame of a policy whose window has ``steps`` frames.
 
-        A key is a history if its first axis has the length ``steps`` and is not its only one.
+        A key is a history if its first axis is time, and of the length ``steps``.
         """
-        history = frozenset(key for key, spec in specs.items() if len(spec.shape) > 1 and spec.shape[0] == steps)
+        history = frozenset(key for key, spec in specs.items() if spec.frames == steps)
         return cls(
             {key: spec.shape[1:] if key in history else spec.shape for key, spec in specs.items()},
             {key: spec.dtype for key, spec in specs.items()},

@@ -18,7 +18,12 @@ def random_inputs(artifact: Artifact, rng: np.random.Generator, streams: int) ->
     """Normalised observation and noise of one call."""
     spec = artifact.manifest.spec
     shape = (streams, *spec.sample)
-    obs = {key: rng.standard_normal((streams, *o.shape)).astype(o.dtype) for key, o in spec.observations.items()}
+    obs = {
+        key: rng.standard_normal((streams, *o.shape)).astype(o.dtype)
+        if o.bounds is None
+        else np.concatenate([o.draw(rng) for _ in range(streams)])
+        for key, o in spec.observations.items()
+    }
     initial = rng.standard_normal(shape, dtype=np.float32)
     return obs, Noise(initial, rng.standard_normal((spec.sampler.steps, *shape), dtype=np.float32))
 

@@ -62,6 +62,12 @@ class Value:
             self.fail(f"one of {', '.join(map(repr, allowed))}" if allowed else "a string")
         return self.data
 
+    def boolean(self) -> bool:
+        """True or false."""
+        if not isinstance(self.data, bool):
+            self.fail("true or false")
+        return self.data
+
     def integer(self, least: int | None = 0) -> int:
         """An integer, by default not negative; a boolean is none."""
         if not isinstance(self.data, int) or isinstance(self.data, bool):

@@ -10,8 +10,11 @@ from torch import nn
 from ..config import PolicySpec
 from ..errors import CheckpointError
 from .diffusion_policy import load_diffusion_policy
+from .lerobot import load_lerobot
+from .lerobot_config import is_lerobot
+from .refusals import refuse_directory
 
-FORMATS = ("auto", "diffusion_policy")
+FORMATS = ("auto", "diffusion_policy", "lerobot")
 
 
 def load_checkpoint_policy(
@@ -20,19 +23,26 @@ def load_checkpoint_policy(
     sampler: str | None = None,
     steps: int | None = None,
     spacing: str | None = None,
+    task: str | None = None,
+    encoders: str | os.PathLike[str] | None = None,
 ) -> tuple[nn.Module, PolicySpec]:
     """Load a trained policy without the code that trained it, and without running anything from the file.
 
     Args:
         path: the checkpoint.
         format: one of ``FORMATS``; ``auto`` tells by what is there.
-        sampler: ``ddpm`` or ``ddim`` on the same betas, in place of the checkpoint's own.
-        steps: number of denoising steps, in place of the checkpoint's own.
+        sampler: ``ddpm``, ``ddim`` or ``dpmsolver++`` on the same betas, in place of the checkpoint's own; of a
+            flow-matching policy ``euler`` or ``rk4``.
+        steps: number of denoising or integration steps, in place of the checkpoint's own.
         spacing: ``leading``, ``trailing`` or ``linspace`` timesteps, in place of the checkpoint's own.
+        task: of a LeRobot policy: the one instruction that is compiled in, so that the robot needs no tokenizer; None
+            makes its tokens an observation.
+        encoders: of a LeRobot policy: folder with the configurations (and tokenizers) of its CLIP encoders, where they
+            are neither in nor beside the checkpoint.
 
     Returns:
-        The denoiser in eval mode, ``forward(sample [B, T, D], timestep int64 [B], obs [B, To, Do] normalised)``, and
-        everything else about the policy.
+        The denoiser in eval mode, which takes the sample ``[B, T, D]``, the timestep ``[B]`` and the observations,
+        normalised as the second result says, and everything else about the policy.
 
     Raises:
         CheckpointError: unreadable, unsafe, or not a supported policy.
@@ -40,9 +50,22 @@ def load_checkpoint_policy(
     """
     if format not in FORMATS:
         raise CheckpointError(f"format {format!r} is not known; expected one of {', '.join(FORMATS)}.")
+    if format == "lerobot" or (format == "auto" and Path(path).is_dir()):
+        _require_lerobot(Path(path))
+        return load_lerobot(path, sampler=sampler, steps=steps, spacing=spacing, task=task, encoders=encoders)
+    if task is not None or encoders is not None:
+        raise CheckpointError(f"{path}: task and encoders are for LeRobot policies; this is one of Diffusion Policy.")
     if Path(path).is_dir():
-        raise CheckpointError(
-            f"{path} is a directory; expected a .ckpt file of Diffusion Policy. Policies saved as directories (LeRobot)"
-            " are not supported; build the denoiser yourself and use ttscompile.compile_denoiser(module, spec)."
-        )
+        refuse_directory(Path(path))
     return load_diffusion_policy(path, sampler=sampler, steps=steps, spacing=spacing)
+
+
+def _require_lerobot(path: Path) -> None:
+    """Raise unless there is a policy that lerobot saved."""
+    if not path.is_dir():
+        raise CheckpointError(
+            f"{path}: no such directory; expected one that lerobot's save_pretrained wrote, with config.json and"
+            " model.safetensors."
+        )
+    if not is_lerobot(path):
+        refuse_directory(path)

@@ -9,12 +9,13 @@ from torch import nn
 
 from ..config import Noise, PolicySpec
 from ..errors import ObservationError
+from .encoded import EncodedDenoiser
 
 EagerPolicy = Callable[[Mapping[str, torch.Tensor], Noise], torch.Tensor]
 
 
 def eager_policy(module: nn.Module, spec: PolicySpec) -> EagerPolicy:
-    """The loop as the original runs it: the whole network, condition encoder included, once a step.
+    """The loop as the original runs it: the whole network once a step, an observation encoder before it once a call.
 
     Args:
         module: as ``load_checkpoint_policy`` gives it.
@@ -35,21 +36,37 @@ def eager_policy(module: nn.Module, spec: PolicySpec) -> EagerPolicy:
                 f"noise.steps is None, but sampler {table.name} draws noise; expected [K, B, T, D], K = {table.steps}."
             )
         with torch.inference_mode():
+            evaluate = _evaluation(module, spec, observations)
             x = torch.from_numpy(noise.initial)
             draws = None if noise.steps is None else torch.from_numpy(noise.steps)
+            memory = [torch.zeros_like(x)] * table.memories
             for k, (to_x0, out_to_x0, x0_to_next, to_next, out_to_next, noise_to_next) in enumerate(rows):
-                inputs = {
-                    spec.sample_argument: x,
-                    spec.timestep_argument: timesteps[k].expand(x.shape[0]),
-                    **observations,
-                }
-                out = module(**inputs)
+                out = evaluate(x, timesteps[k].expand(x.shape[0]))
                 x0 = to_x0 * x + out_to_x0 * out
                 if table.clip is not None:
                     x0 = x0.clamp(-table.clip, table.clip)
-                x = x0_to_next * x0 + to_next * x + out_to_next * out
+                following = x0_to_next * x0 + to_next * x + out_to_next * out
+                for weight, kept in zip(table.memory_to_next[k].tolist(), memory, strict=True):
+                    following = following + weight * kept
                 if noise_to_next and draws is not None:
-                    x = x + noise_to_next * draws[k]
+                    following = following + noise_to_next * draws[k]
+                terms = (x0, x, out, *memory)
+                memory = [
+                    sum((weight * term for weight, term in zip(each, terms, strict=True)), torch.zeros(()))
+                    for each in table.to_memory[k].tolist()
+                ]
+                x = following
             return x
 
     return run
+
+
+def _evaluation(
+    module: nn.Module, spec: PolicySpec, observations: Mapping[str, torch.Tensor]
+) -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor]:
+    """One evaluation of the denoiser, a function of sample and timesteps, for these observations."""
+    named = {spec.arguments[key]: value for key, value in observations.items()}
+    if isinstance(module, EncodedDenoiser):
+        encoded, denoiser = module.encoder(named), module.denoiser
+        return lambda sample, timestep: denoiser(sample, timestep, encoded)
+    return lambda sample, timestep: module(**{spec.sample_argument: sample, spec.timestep_argument: timestep}, **named)

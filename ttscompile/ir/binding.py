@@ -20,21 +20,28 @@ def join(left: Binding, right: Binding) -> Binding:
 def bindings(graph: Graph, inputs: Mapping[str, Binding]) -> dict[str, Binding]:
     """Binding of every value.
 
-    A value without inputs whose shape has the batch in it (``zeros(B, 1, E)``) is no constant; it counts as a table,
-    whose rows are made for a batch of one.
+    A value without inputs whose shape has the batch in it (``zeros(B, 1, E)``, a class token for every image) is no
+    constant; by itself it counts as a table, whose rows are made for a batch of one. It does not make what reads it a
+    table: beside an observation it is made once a call, like that.
 
     Args:
         graph: any graph.
         inputs: binding of each of its inputs.
     """
     found = {**dict.fromkeys(graph.constants, Binding.CONSTANT), **inputs}
+    shaped: set[str] = set()  # of nothing but constants and the batch size
     for node in graph.nodes:
-        binding = Binding.TABLE if _batch_shaped(node) else Binding.CONSTANT
-        read = [found[name] for name in node.refs()]
-        if any(b is not Binding.CONSTANT for b in read):
-            binding = Binding.CONSTANT  # the batch size comes with the inputs
-        for other in read:
-            binding = join(binding, other)
+        read = list(node.refs())
+        if (_batch_shaped(node) or not shaped.isdisjoint(read)) and all(
+            found[name] is Binding.CONSTANT or name in shaped for name in read
+        ):
+            shaped.add(node.name)
+            found[node.name] = Binding.TABLE
+            continue
+        binding = Binding.CONSTANT
+        for name in read:
+            if name not in shaped:  # the batch size comes with the inputs
+                binding = join(binding, found[name])
         found[node.name] = binding
     return found
 

@@ -1,0 +1,112 @@
+"""Split a linear layer of concatenated features with different binding times into a sum of linear layers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from ttscompile.ir.binding import bindings
+from ttscompile.ir.graph import Argument, Node, Ref, TensorType
+from ttscompile.ir.program import Binding, Program
+
+from .base import Pass, PassResult
+
+_CAT, _LINEAR = "aten.cat.default", "aten.linear.default"
+
+
+class SplitFeatures(Pass):
+    """Let each part of a feature vector meet its columns of the weight at its own binding time.
+
+    The modulations of adaLN are linear in [timestep, observation]. Before::
+
+        %f = aten.cat.default([%time, %observation], 1)          # step
+        %m = aten.linear.default(%f, %w, %b)                     # step: all of it, for every step
+
+    After::
+
+        %m.part0 = aten.linear.default(%time, %w[:, :t], %b)     # a table in the artifact
+        %m.part1 = aten.linear.default(%observation, %w[:, t:])  # once a call
+        %m       = aten.add.Tensor(%m.part0, %m.part1)           # for every step, an addition
+
+    The result differs from the original by rounding only.
+    """
+
+    def requires(self, program: Program) -> None:
+        """The program is cut, its prologue is still whole."""
+        if program.pieces is None or program.pieces.bindings:
+            raise self.fail("runs between partition and hoist.")
+
+    def call(self, program: Program) -> PassResult:
+        """Split in the prologue."""
+        assert program.pieces is not None
+        prologue, spec = program.pieces.condition, program.spec
+        inputs = {spec.timestep_argument: Binding.TABLE, **dict.fromkeys(spec.observations, Binding.CONDITION)}
+        known, producers, types = bindings(prologue, inputs), prologue.producers(), prologue.types()
+        nodes: list[Node] = []
+        split = 0
+        for node in prologue.nodes:
+            parts = _parts(node, producers, types) if node.op == _LINEAR else []
+            if len({known[part] for part in parts}) < 2:
+                nodes.append(node)
+                continue
+            nodes += _sum(node, parts, types)
+            split += 1
+        if not split:
+            return PassResult(program, False)
+        new = replace(program.pieces, condition=replace(prologue, nodes=tuple(nodes)))
+        note = f"{split} linear layers of features with different binding times became sums"
+        return PassResult(replace(program, pieces=new), True, (note,))
+
+
+def _parts(node: Node, producers: Mapping[str, Node], types: Mapping[str, TensorType]) -> list[str]:
+    """The features that a linear layer reads, if they are concatenated along its last axis; else none."""
+    source, weight = node.args[0], node.args[1]
+    cat = producers.get(source.name) if isinstance(source, Ref) else None
+    if cat is None or cat.op != _CAT or not isinstance(weight, Ref) or len(types[weight.name].shape) != 2:
+        return []
+    axis = cat.args[1] if len(cat.args) > 1 else 0
+    if not isinstance(axis, int) or axis % len(cat.type.shape) != len(cat.type.shape) - 1:
+        return []
+    operands = cat.args[0]
+    assert isinstance(operands, tuple)
+    parts = [operand.name for operand in operands if isinstance(operand, Ref)]
+    return parts if all(isinstance(types[part].shape[-1], int) for part in parts) else []
+
+
+def _sum(node: Node, parts: list[str], types: Mapping[str, TensorType]) -> list[Node]:
+    """The nodes that make the layer's value from its parts."""
+    weight = node.args[1]
+    assert isinstance(weight, Ref)
+    rows = types[weight.name].shape[0]
+    nodes: list[Node] = []
+    start, total = 0, ""
+    for index, part in enumerate(parts):
+        size = types[part].shape[-1]
+        assert isinstance(size, int)
+        columns = Node(
+            f"{node.name}.columns{index}",
+            "aten.slice.Tensor",
+            (weight, 1, start, start + size),
+            (),
+            (TensorType((rows, size), types[weight.name].dtype),),
+            node.source,
+        )
+        bias: tuple[Argument, ...] = node.args[2:] if index == 0 else ()
+        shape = (*types[part].shape[:-1], rows)
+        linear = Node(
+            f"{node.name}.part{index}",
+            _LINEAR,
+            (Ref(part), Ref(columns.name), *bias),
+            (),
+            (TensorType(shape, node.type.dtype),),
+            node.source,
+        )
+        nodes += [columns, linear]
+        name = node.name if index == len(parts) - 1 else f"{node.name}.sum{index}"
+        if index:
+            nodes.append(Node(name, "aten.add.Tensor", (Ref(total), Ref(linear.name)), (), (node.type,), node.source))
+            total = name
+        else:
+            total = linear.name
+        start += size
+    return nodes

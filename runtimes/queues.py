@@ -1,0 +1,116 @@
+"""What ``select_action`` keeps between calls: the last To frames of each observation, and actions not executed yet.
+
+The semantics are LeRobot's: the first frame of an episode stands for those before it, and a chunk is executed to its
+end before the next one is computed.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ttscompile.config import FloatArray, ObservationSpec
+from ttscompile.errors import ObservationError
+
+from .arrays import Array, as_array, check_finite
+
+Frame = dict[str, Array]
+
+
+class Queues:
+    """Frames and actions of one episode.
+
+    Args:
+        specs: of the policy's observations.
+    """
+
+    def __init__(self, specs: Mapping[str, ObservationSpec]) -> None:
+        self._specs = specs
+        self._frames: dict[str, deque[Array]] = {}
+        self._actions: deque[FloatArray] = deque()
+
+    def reset(self) -> None:
+        """A new episode."""
+        self._frames, self._actions = {}, deque()
+
+    def push(self, batch: Mapping[str, Any]) -> None:
+        """Take one frame of every stream; the first of an episode fills the window.
+
+        Args:
+            batch: by key ``[B, ...]``, arrays or tensors: of a window's key one frame. Other keys are left alone.
+
+        Raises:
+            ObservationError: a key is missing or does not fit; nothing was taken.
+        """
+        frame = self._checked(batch)
+        for key, value in frame.items():
+            length = self._specs[key].frames or 1
+            if key not in self._frames:
+                self._frames[key] = deque([value] * length, maxlen=length)
+            self._frames[key].append(value)
+
+    def observation(self) -> Frame:
+        """The window as ``predict_action`` takes it: by key ``[B, To, ...]``; of a key without frames the newest."""
+        return {
+            key: frames[-1] if self._specs[key].frames is None else np.stack(frames, axis=1)
+            for key, frames in self._frames.items()
+        }
+
+    @property
+    def empty(self) -> bool:
+        """Whether every action was executed."""
+        return not self._actions
+
+    def extend(self, actions: FloatArray) -> None:
+        """Add a chunk of actions ``[B, Ta, Da]``."""
+        self._actions.extend(actions[:, k] for k in range(actions.shape[1]))
+
+    def pop(self) -> FloatArray:
+        """The next actions ``[B, Da]``."""
+        return self._actions.popleft()
+
+    def _checked(self, batch: Mapping[str, Any]) -> Frame:
+        """The frame as arrays of its own, which the caller may not change any more."""
+        names = sorted(self._specs)
+        if not isinstance(batch, Mapping):
+            raise ObservationError(
+                f"the batch is a {type(batch).__name__}; expected a dictionary with the keys {names}."
+            )
+        missing = [key for key in names if key not in batch]
+        if missing:
+            raise ObservationError(
+                f"the batch lacks {missing}; expected the keys {names}, found {sorted(map(str, batch))}."
+            )
+        frame = {
+            key: self._one(key, as_array(batch[key], f"observation {key!r}"), self._specs[key]) for key in self._specs
+        }
+        counts = {key: len(value) for key, value in frame.items()}
+        if self._frames:
+            counts["the frames before"] = len(next(iter(self._frames.values()))[-1])
+        if len(set(counts.values())) > 1:
+            raise ObservationError(
+                f"different numbers of streams: {counts}. The first axis of all must be the same, and may change only"
+                " after reset()."
+            )
+        return frame
+
+    @staticmethod
+    def _one(key: str, array: Array, spec: ObservationSpec) -> Array:
+        shape = spec.shape if spec.frames is None else spec.shape[1:]
+        expected = f"{spec.dtype} [B, {', '.join(map(str, shape))}]"
+        if array.shape[1:] != shape or array.ndim != len(shape) + 1 or len(array) < 1 or array.dtype != spec.dtype:
+            raise ObservationError(
+                f"one frame of observation {key!r} must be {expected}; found {array.dtype} {list(array.shape)}."
+                + (" A single stream needs a first axis of 1." if array.shape == shape else "")
+            )
+        check_finite(array, f"observation {key!r}", "Look for the sensor, or the division, that made it.")
+        return array.copy()
+
+
+def is_window(batch: Mapping[str, Any], specs: Mapping[str, ObservationSpec]) -> bool:
+    """Whether a batch holds whole windows ``[B, To, ...]`` rather than one frame ``[B, ...]`` of each."""
+    ranks = [(np.ndim(batch[key]), spec) for key, spec in specs.items() if spec.frames is not None and key in batch]
+    return all(rank == len(spec.shape) + 1 for rank, spec in ranks)

@@ -1,0 +1,157 @@
+"""Tiny LeRobot policies with random weights, saved as lerobot saves them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import save_file
+
+from ttscompile.frontends.clip_config import TextConfig, VisionConfig
+from ttscompile.frontends.lerobot import build_module
+from ttscompile.frontends.lerobot_config import read_lerobot_config
+from ttscompile.frontends.lerobot_processors import read_processors
+
+TO, DS, DA, SIDE = 2, 5, 3, 24
+
+VISION = {"hidden_size": 8, "intermediate_size": 12, "num_hidden_layers": 1, "num_attention_heads": 2}
+VISION |= {"image_size": 16, "patch_size": 8}
+TEXT = {"hidden_size": 8, "intermediate_size": 12, "num_hidden_layers": 1, "num_attention_heads": 2}
+TEXT |= {"vocab_size": 20, "max_position_embeddings": 9, "eos_token_id": 19}
+
+_BASE: dict[str, Any] = {
+    "type": "multi_task_dit",
+    "n_obs_steps": TO,
+    "horizon": 8,
+    "n_action_steps": 4,
+    "objective": "diffusion",
+    "noise_scheduler_type": "DDIM",
+    "num_train_timesteps": 20,
+    "num_inference_steps": 4,
+    "beta_schedule": "squaredcos_cap_v2",
+    "beta_start": 0.0001,
+    "beta_end": 0.02,
+    "prediction_type": "epsilon",
+    "clip_sample": True,
+    "clip_sample_range": 1.0,
+    "num_integration_steps": 3,
+    "integration_method": "euler",
+    "hidden_dim": 16,
+    "num_layers": 2,
+    "num_heads": 2,
+    "timestep_embed_dim": 8,
+    "use_positional_encoding": False,
+    "use_rope": True,
+    "rope_base": 10000.0,
+    "vision_encoder_name": "somebody/clip-small",
+    "text_encoder_name": "somebody/clip-small",
+    "use_separate_rgb_encoder_per_camera": False,
+    "image_resize_shape": None,
+    "image_crop_shape": [16, 16],
+    "tokenizer_max_length": 9,
+}
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write a JSON file."""
+    path.write_text(json.dumps(content), encoding="utf-8")
+
+
+def change_json(path: Path, **changes: Any) -> None:
+    """Change entries of a JSON file."""
+    write_json(path, json.loads(path.read_text(encoding="utf-8")) | changes)
+
+
+def save_policy(
+    folder: Path,
+    cameras: tuple[str, ...] = (),
+    modes: tuple[str, str, str] = ("MEAN_STD", "MIN_MAX", "MIN_MAX"),
+    renamed: dict[str, str] | None = None,
+    **changes: Any,
+) -> Path:
+    """Save a policy and, beside it, the configuration of its CLIP encoders.
+
+    Args:
+        folder: empty; the policy goes to ``folder / "policy"``.
+        cameras: names of the cameras, after ``observation.images.``.
+        modes: of normalising images, state and action.
+        renamed: ``rename_map`` of the preprocessor.
+        **changes: of ``config.json``.
+
+    Returns:
+        The directory of the policy.
+    """
+    directory, encoder = folder / "policy", folder / "clip-small"
+    directory.mkdir()
+    encoder.mkdir(exist_ok=True)
+    write_json(encoder / "config.json", {"model_type": "clip", "vision_config": VISION, "text_config": TEXT})
+    images = [f"observation.images.{name}" for name in cameras]
+    inputs = {"observation.state": {"type": "STATE", "shape": [DS]}}
+    inputs |= {key: {"type": "VISUAL", "shape": [3, SIDE, SIDE]} for key in images}
+    outputs = {"action": {"type": "ACTION", "shape": [DA]}}
+    write_json(directory / "config.json", _BASE | {"input_features": inputs, "output_features": outputs} | changes)
+
+    generator = torch.Generator().manual_seed(len(changes))
+    statistics = _statistics(generator, images)
+    normalizer = {
+        "eps": 1e-8,
+        "features": inputs | outputs,
+        "norm_map": dict(zip(("VISUAL", "STATE", "ACTION"), modes, strict=True)),
+    }
+    save_file(statistics, directory / "before.safetensors")
+    save_file(statistics, directory / "after.safetensors")
+    before = [
+        {"registry_name": "rename_observations_processor", "config": {"rename_map": renamed or {}}},
+        {"registry_name": "to_batch_processor", "config": {}},
+        {"registry_name": "device_processor", "config": {"device": "cpu", "float_dtype": None}},
+        {"registry_name": "normalizer_processor", "config": normalizer, "state_file": "before.safetensors"},
+    ]
+    after = [{"registry_name": "unnormalizer_processor", "config": normalizer, "state_file": "after.safetensors"}]
+    write_json(directory / "policy_preprocessor.json", {"name": "policy_preprocessor", "steps": before})
+    write_json(directory / "policy_postprocessor.json", {"name": "policy_postprocessor", "steps": after})
+    save_file(_weights(directory, generator), directory / "model.safetensors")
+    return directory
+
+
+def _statistics(generator: torch.Generator, images: list[str]) -> dict[str, torch.Tensor]:
+    """Every statistic of every feature; the last channel of state and action never changed."""
+    found = {}
+    for key, width in (("observation.state", DS), ("action", DA), *((image, 3) for image in images)):
+        shape = (width, 1, 1) if key in images else (width,)
+        low, spread = torch.randn(shape, generator=generator), torch.rand(shape, generator=generator) + 0.5
+        if key not in images:
+            spread[-1] = 0
+        found |= {f"{key}.min": low, f"{key}.max": low + spread, f"{key}.mean": low + spread / 2, f"{key}.std": spread}
+        found |= {
+            f"{key}.q01": low + 0.01,
+            f"{key}.q99": low + spread,
+            f"{key}.q10": low - 0.01,
+            f"{key}.q90": low + spread,
+        }
+    return found
+
+
+def _weights(directory: Path, generator: torch.Generator) -> dict[str, torch.Tensor]:
+    """Random weights under the names that lerobot with transformers 4 saves."""
+    config = read_lerobot_config_without_weights(directory)
+    processors = read_processors(directory, config.features)
+    vision = VisionConfig(**VISION) if config.cameras else None
+    module = build_module(config, processors, vision, TextConfig(**TEXT), None)
+    parts = {"noise_predictor.": module.denoiser, "observation_encoder.": module.encoder.observation_encoder}
+    found = {}
+    for prefix, part in parts.items():
+        for name, value in part.state_dict().items():
+            key = f"{prefix}{name}".replace("encoder.model.", "encoder.model.vision_model.")
+            key = key.replace(".text_encoder.text_encoder.", ".text_encoder.text_encoder.text_model.")
+            for i in range(9):
+                key = key.replace(f"vision_encoders.{i}.model.", f"vision_encoders.{i}.model.vision_model.")
+            found[key] = torch.randn(value.shape, generator=generator) * 0.4
+    return found
+
+
+def read_lerobot_config_without_weights(directory: Path) -> Any:
+    """The configuration, as it is read once the weights are there."""
+    (directory / "model.safetensors").touch()
+    return read_lerobot_config(directory)

@@ -1,0 +1,203 @@
+"""What a CLIP encoder is beside its weights, and where it is found: on this machine, never downloaded."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+from ..errors import CheckpointError
+
+_ACTIVATIONS = ("quick_gelu", "gelu")
+_MAX_BYTES = 16 * 2**20
+
+
+@dataclass(frozen=True)
+class TowerConfig:
+    """One encoder; the names are those of transformers' configuration.
+
+    Attributes:
+        hidden_size: width.
+        intermediate_size: width inside the feed-forward layers.
+        num_hidden_layers: layers.
+        num_attention_heads: attention heads.
+        hidden_act: ``quick_gelu`` or ``gelu``.
+        layer_norm_eps: of every layer normalisation.
+    """
+
+    hidden_size: int
+    intermediate_size: int
+    num_hidden_layers: int
+    num_attention_heads: int
+    hidden_act: str = "quick_gelu"
+    layer_norm_eps: float = 1e-5
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.type == "int" and (type(value) is not int or value < 1):
+                raise CheckpointError(f"CLIP's {field.name} is {value!r}; expected a positive whole number.")
+        if self.hidden_size % self.num_attention_heads:
+            raise CheckpointError(
+                f"CLIP's hidden_size = {self.hidden_size} is no multiple of num_attention_heads ="
+                f" {self.num_attention_heads}."
+            )
+        if self.hidden_act not in _ACTIVATIONS:
+            raise CheckpointError(f"CLIP's hidden_act is {self.hidden_act!r}; expected one of {_ACTIVATIONS}.")
+        if not isinstance(self.layer_norm_eps, float) or not 0 < self.layer_norm_eps < 1:
+            raise CheckpointError(
+                f"CLIP's layer_norm_eps is {self.layer_norm_eps!r}; expected a small positive number."
+            )
+
+
+@dataclass(frozen=True)
+class VisionConfig(TowerConfig):
+    """The image encoder: square images of ``image_size`` pixels in patches of ``patch_size``.
+
+    Defaults are what transformers takes for an entry that its file leaves out.
+    """
+
+    hidden_size: int = 768
+    intermediate_size: int = 3072
+    num_hidden_layers: int = 12
+    num_attention_heads: int = 12
+    image_size: int = 224
+    patch_size: int = 32
+    num_channels: int = 3
+
+    @property
+    def patches(self) -> int:
+        """Tokens of an image, without the class token."""
+        return (self.image_size // self.patch_size) ** 2
+
+
+@dataclass(frozen=True)
+class TextConfig(TowerConfig):
+    """The text encoder; defaults as for ``VisionConfig``."""
+
+    hidden_size: int = 512
+    intermediate_size: int = 2048
+    num_hidden_layers: int = 12
+    num_attention_heads: int = 8
+    vocab_size: int = 49408
+    max_position_embeddings: int = 77
+    eos_token_id: int = 49407
+
+
+def _openai(image: tuple[int, int, int, int], text: tuple[int, int], patch: int, size: int = 224) -> dict[str, Any]:
+    """Sizes of a released model: image layers, width, heads, pixels; text width and heads, always 12 layers."""
+    layers, width, heads, _ = image
+    return {
+        "vision_config": {
+            "hidden_size": width,
+            "intermediate_size": 4 * width,
+            "num_hidden_layers": layers,
+            "num_attention_heads": heads,
+            "image_size": size,
+            "patch_size": patch,
+        },
+        "text_config": {
+            "hidden_size": text[0],
+            "intermediate_size": 4 * text[0],
+            "num_hidden_layers": 12,
+            "num_attention_heads": text[1],
+            # What their configurations say; the end token, 49407, is the largest there is.
+            "eos_token_id": 2,
+        },
+    }
+
+
+_BASE, _LARGE = (12, 768, 12, 224), (24, 1024, 16, 224)
+
+RELEASED: Mapping[str, Mapping[str, Any]] = {
+    "openai/clip-vit-base-patch16": _openai(_BASE, (512, 8), 16),
+    "openai/clip-vit-base-patch32": _openai(_BASE, (512, 8), 32),
+    "openai/clip-vit-large-patch14": _openai(_LARGE, (768, 12), 14),
+    "openai/clip-vit-large-patch14-336": _openai(_LARGE, (768, 12), 14, 336),
+}
+"""Configurations of the released models: with these names nothing but the policy's own weights is needed."""
+
+Tower = TypeVar("Tower", bound=TowerConfig)
+
+
+def find_encoder(name: str, folders: Sequence[Path]) -> Path | None:
+    """The local directory of an encoder: ``name``, or its last part, in one of ``folders``, or one of them itself.
+
+    Args:
+        name: as the policy's configuration says it, ``openai/clip-vit-base-patch16`` or a path of another machine.
+        folders: in the order in which they are searched.
+    """
+    relative = Path(name)
+    names = [relative.name]
+    if not relative.is_absolute() and ".." not in relative.parts:
+        names.insert(0, name)
+    for folder in folders:
+        for candidate in (*(folder / each for each in names if each), folder):
+            if (candidate / "config.json").is_file() and _is_clip(candidate / "config.json"):
+                return candidate
+    return None
+
+
+def encoder_config(name: str, part: str, cls: type[Tower], folders: Sequence[Path]) -> Tower:
+    """The configuration of one encoder.
+
+    Args:
+        name: see ``find_encoder``.
+        part: ``vision_config`` or ``text_config``.
+        cls: of the result.
+        folders: see ``find_encoder``.
+
+    Raises:
+        CheckpointError: there is none on this machine, or it is not CLIP's.
+    """
+    found = find_encoder(name, folders)
+    if found is not None:
+        where, settings = str(found / "config.json"), read_json(found / "config.json")
+    elif name in RELEASED:
+        where, settings = name, dict(RELEASED[name])
+    else:
+        looked = ", ".join(dict.fromkeys(str(folder) for folder in folders))
+        raise CheckpointError(
+            f"the observation encoder {name!r} is not on this machine, and nothing is ever downloaded. Looked for a"
+            f" directory {name!r} or {Path(name).name!r} with a config.json in {looked}. Copy its config.json there"
+            " (and its tokenizer's files, to compile for one task), or name the folder that has it: encoders="
+            " in Python, --encoders on the command line."
+        )
+    if settings.get("model_type") == f"clip_{part.split('_')[0]}_model":
+        inner: Any = settings
+    else:
+        inner = settings.get(part)
+    if not isinstance(inner, dict):
+        raise CheckpointError(f"{where}: has no {part}; expected the configuration of a CLIP model.")
+    names = {field.name for field in fields(cls)}
+    try:
+        return cls(**{key: value for key, value in inner.items() if key in names})
+    except CheckpointError as error:
+        raise CheckpointError(f"{where}: {error}") from error
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object.
+
+    Raises:
+        CheckpointError: missing, unreadable, or something else.
+    """
+    if not path.is_file():
+        raise CheckpointError(f"{path}: no such file.")
+    if path.stat().st_size > _MAX_BYTES:
+        raise CheckpointError(f"{path}: {path.stat().st_size:,} bytes; a configuration has {_MAX_BYTES:,} at most.")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise CheckpointError(f"{path}: cannot be read as JSON: {error}. Copy the file again.") from error
+    if not isinstance(content, dict):
+        raise CheckpointError(f"{path}: holds a {type(content).__name__}; expected an object.")
+    return content
+
+
+def _is_clip(path: Path) -> bool:
+    """Whether a ``config.json`` is CLIP's: the policy's own directory has one, too."""
+    kind = read_json(path).get("model_type")
+    return isinstance(kind, str) and kind.startswith("clip")

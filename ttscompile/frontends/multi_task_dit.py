@@ -1,0 +1,283 @@
+"""LeRobot's multi-task DiT, rebuilt: denoiser and observation encoder.
+
+Written from the description of the network, with attribute names under which the weights that lerobot saves load as
+they are.
+
+Source: ``lerobot.policies.multi_task_dit`` of huggingface/lerobot 0.6, after Peebles and Xie, Scalable Diffusion Models
+with Transformers (arXiv 2212.09748): adaLN-Zero with six modulations a layer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from .clip import ClipText, ClipVision
+from .clip_config import TextConfig, VisionConfig
+from .image_geometry import ResizeCrop
+from .lerobot_processors import Normalizer
+from .transformer_for_diffusion import SinusoidalEmbedding
+
+
+@dataclass(frozen=True)
+class DiTConfig:
+    """Sizes and variant of the denoiser; the names are those of lerobot's configuration.
+
+    Attributes:
+        action_dim: channels of the sample.
+        horizon: T.
+        hidden_dim: width.
+        num_layers: layers, of an attention and a feed-forward block each.
+        num_heads: attention heads.
+        timestep_embed_dim: channels of the timestep's embedding.
+        use_positional_encoding: whether learned positions are added to the tokens.
+        use_rope: whether queries and keys are rotated by their position.
+        rope_base: of the frequencies of that rotation.
+    """
+
+    action_dim: int
+    horizon: int
+    hidden_dim: int
+    num_layers: int
+    num_heads: int
+    timestep_embed_dim: int
+    use_positional_encoding: bool
+    use_rope: bool
+    rope_base: float
+
+
+class _RotaryAttention(nn.Module):
+    """Self-attention whose queries and keys are rotated by position (RoFormer, arXiv 2104.09864)."""
+
+    cos: torch.Tensor
+    sin: torch.Tensor
+
+    def __init__(self, config: DiTConfig) -> None:
+        super().__init__()
+        width = config.hidden_dim
+        self.heads, self.head_width = config.num_heads, width // config.num_heads
+        self.qkv_proj, self.out_proj = nn.Linear(width, 3 * width), nn.Linear(width, width)
+        frequencies = config.rope_base ** -(torch.arange(0, self.head_width, 2).float() / self.head_width)
+        angles = torch.outer(torch.arange(config.horizon).float(), frequencies)
+        angles = torch.cat((angles, angles), dim=-1)
+        self.register_buffer("cos", angles.cos(), persistent=False)
+        self.register_buffer("sin", angles.sin(), persistent=False)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """``[B, T, width]`` -> the same."""
+        _, tokens, width = x.shape
+        qkv = self.qkv_proj(x).reshape(-1, tokens, 3, self.heads, self.head_width)
+        q, k, v = (qkv[:, :, i].transpose(1, 2) for i in range(3))
+        mixed = functional.scaled_dot_product_attention(self._rotate(q), self._rotate(k), v)
+        return self.out_proj(mixed.transpose(1, 2).reshape(-1, tokens, width))  # type: ignore[no-any-return]
+
+    def _rotate(self, x: torch.Tensor) -> torch.Tensor:
+        half = self.head_width // 2
+        turned = torch.cat((-x[..., half:], x[..., :half]), dim=-1)
+        return x * self.cos + turned * self.sin
+
+
+class _Layer(nn.Module):
+    """adaLN-Zero: both blocks are shifted, scaled and gated by what timestep and observation say."""
+
+    def __init__(self, config: DiTConfig, features: int) -> None:
+        super().__init__()
+        width = config.hidden_dim
+        self.rotary = config.use_rope
+        if config.use_rope:
+            self.attn = _RotaryAttention(config)
+        else:
+            self.multihead_attn = nn.MultiheadAttention(width, config.num_heads, batch_first=True)
+        self.norm1 = nn.LayerNorm(width, elementwise_affine=False, eps=1e-6)
+        self.norm2 = nn.LayerNorm(width, elementwise_affine=False, eps=1e-6)
+        self.mlp = nn.Sequential(nn.Linear(width, 4 * width), nn.GELU(approximate="tanh"), nn.Linear(4 * width, width))
+        self.adaLN_modulation = nn.Sequential(nn.SiLU(), nn.Linear(features, 6 * width))
+
+    def forward(self, x: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
+        """``[B, T, width]`` and ``[B, features]`` -> ``[B, T, width]``."""
+        made = self.adaLN_modulation(features).unsqueeze(1).chunk(6, dim=-1)
+        shift, scale, gate, mlp_shift, mlp_scale, mlp_gate = made
+        x = x + gate * self._attend(self.norm1(x) * (1 + scale) + shift)
+        return x + mlp_gate * self.mlp(self.norm2(x) * (1 + mlp_scale) + mlp_shift)  # type: ignore[no-any-return]
+
+    def _attend(self, x: torch.Tensor) -> torch.Tensor:
+        if self.rotary:
+            return self.attn(x)  # type: ignore[no-any-return]
+        return self.multihead_attn(x, x, x, need_weights=False)[0]  # type: ignore[no-any-return]
+
+
+class DiffusionTransformer(nn.Module):
+    """The denoiser: noisy actions, timestep and condition vector to a prediction.
+
+    Args:
+        config: sizes and variant.
+        condition_dim: channels of the condition vector.
+    """
+
+    def __init__(self, config: DiTConfig, condition_dim: int) -> None:
+        super().__init__()
+        time = config.timestep_embed_dim
+        self.time_mlp = nn.Sequential(
+            SinusoidalEmbedding(time), nn.Linear(time, 2 * time), nn.GELU(), nn.Linear(2 * time, time), nn.GELU()
+        )
+        self.input_proj = nn.Linear(config.action_dim, config.hidden_dim)
+        self.pos_embedding = (
+            nn.Parameter(torch.zeros(1, config.horizon, config.hidden_dim)) if config.use_positional_encoding else None
+        )
+        layers = (_Layer(config, time + condition_dim) for _ in range(config.num_layers))
+        self.transformer_blocks = nn.ModuleList(layers)
+        self.output_proj = nn.Linear(config.hidden_dim, config.action_dim)
+
+    def forward(self, sample: torch.Tensor, timestep: torch.Tensor, condition: torch.Tensor) -> torch.Tensor:
+        """``[B, T, Da]``, ``[B]`` and ``[B, C]`` -> ``[B, T, Da]``."""
+        features = torch.cat((self.time_mlp(timestep), condition), dim=-1)
+        x = self.input_proj(sample)
+        if self.pos_embedding is not None:
+            x = x + self.pos_embedding
+        for layer in self.transformer_blocks:
+            x = layer(x, features)
+        return self.output_proj(x)  # type: ignore[no-any-return]
+
+
+class _VisionEncoder(nn.Module):
+    def __init__(self, config: VisionConfig) -> None:
+        super().__init__()
+        self.model = ClipVision(config)
+
+    def forward(self, pixels: torch.Tensor) -> torch.Tensor:
+        return self.model(pixels)  # type: ignore[no-any-return]
+
+
+class _TextEncoder(nn.Module):
+    def __init__(self, config: TextConfig, width: int) -> None:
+        super().__init__()
+        self.text_encoder = ClipText(config)
+        self.projection = nn.Linear(config.hidden_size, width)
+
+    def forward(self, tokens: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+        return self.projection(self.text_encoder(tokens, mask))  # type: ignore[no-any-return]
+
+
+class ObservationEncoder(nn.Module):
+    """Window of observations and an instruction to the condition vector.
+
+    Each frame is [state, class tokens of all cameras, instruction]; the frames are concatenated, oldest first.
+
+    Args:
+        cameras: how many there are.
+        vision: of the image encoder; None without cameras.
+        text: of the text encoder.
+        text_width: channels of the instruction.
+        separate: whether each camera has an encoder of its own.
+        frames: To.
+    """
+
+    def __init__(
+        self,
+        cameras: int,
+        vision: VisionConfig | None,
+        text: TextConfig,
+        text_width: int,
+        separate: bool,
+        frames: int,
+    ) -> None:
+        super().__init__()
+        self.frames, self.cameras, self.separate = frames, cameras, separate
+        if vision is not None and separate:
+            self.vision_encoders = nn.ModuleList(_VisionEncoder(vision) for _ in range(cameras))
+        elif vision is not None:
+            self.vision_encoder = _VisionEncoder(vision)
+        self.text_encoder = _TextEncoder(text, text_width)
+
+    def forward(
+        self, state: torch.Tensor, images: Sequence[torch.Tensor], tokens: torch.Tensor, mask: torch.Tensor
+    ) -> torch.Tensor:
+        """The condition vector ``[B, C]``.
+
+        Args:
+            state: ``[B, To, Ds]``, normalised.
+            images: of each camera ``[B * To, 3, size, size]``, normalised.
+            tokens: int64 ``[B, L]``.
+            mask: bool ``[B, L]``, false for padding.
+        """
+        parts = [state]
+        if images:
+            parts.append(self._see(images))
+        sentence = self.text_encoder(tokens, mask)
+        parts.append(sentence.unsqueeze(1).expand(-1, self.frames, -1))
+        if sentence.shape[0] == 1:  # one instruction, known when the policy is compiled, for all streams
+            parts[-1] = parts[-1].expand(state.shape[0], -1, -1)
+        return torch.cat(parts, dim=-1).flatten(1)
+
+    def _see(self, images: Sequence[torch.Tensor]) -> torch.Tensor:
+        """Features of all cameras ``[B, To, cameras * width]``."""
+        if self.separate:
+            seen = [encoder(image) for encoder, image in zip(self.vision_encoders, images, strict=True)]
+            return torch.cat(seen, dim=-1).reshape(-1, self.frames, self.cameras * seen[0].shape[-1])
+        seen = self.vision_encoder(torch.stack(list(images), dim=1).flatten(0, 1))
+        return seen.reshape(-1, self.frames, self.cameras * seen.shape[-1])  # type: ignore[no-any-return]
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """The names by which ``ConditionEncoder`` is given its observations.
+
+    Attributes:
+        state: of the robot's state.
+        images: of the cameras, in the order of the policy.
+        tokens: of the instruction's tokens, and their mask; None where the instruction is compiled in.
+    """
+
+    state: str
+    images: tuple[str, ...]
+    tokens: tuple[str, str] | None
+
+
+class ConditionEncoder(nn.Module):
+    """Raw observations to the condition vector: normalised, cropped and encoded.
+
+    Args:
+        observation_encoder: CLIP and the projection.
+        inputs: names of the observations.
+        geometry: resizes and crops the frames of all cameras; None without cameras.
+        normalizers: of the state, and of each camera.
+        task: tokens int64 ``[1, L]`` and mask bool ``[1, L]`` of the one instruction that is compiled in; None where it
+            is an input.
+    """
+
+    task_tokens: torch.Tensor
+    task_mask: torch.Tensor
+
+    def __init__(
+        self,
+        observation_encoder: ObservationEncoder,
+        inputs: Inputs,
+        geometry: ResizeCrop | None,
+        normalizers: Sequence[Normalizer],
+        task: tuple[torch.Tensor, torch.Tensor] | None = None,
+    ) -> None:
+        super().__init__()
+        self.observation_encoder = observation_encoder
+        self.inputs, self.geometry = inputs, geometry
+        self.normalizers = nn.ModuleList(normalizers)
+        if task is not None:
+            self.register_buffer("task_tokens", task[0], persistent=False)
+            self.register_buffer("task_mask", task[1], persistent=False)
+
+    def forward(self, observations: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """Observations ``[B, ...]`` by the names of ``inputs`` -> ``[B, C]``."""
+        state = self.normalizers[0](observations[self.inputs.state])
+        images = []
+        for name, normalizer in zip(self.inputs.images, self.normalizers[1:], strict=True):
+            assert self.geometry is not None
+            # Normalised after the crop: pixels that nobody sees need no arithmetic.
+            images.append(normalizer(self.geometry(observations[name].flatten(0, 1))))
+        if self.inputs.tokens is None:
+            tokens, mask = self.task_tokens, self.task_mask
+        else:
+            tokens, mask = (observations[name] for name in self.inputs.tokens)
+        return self.observation_encoder(state, images, tokens, mask)  # type: ignore[no-any-return]
