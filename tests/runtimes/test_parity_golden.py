@@ -13,32 +13,45 @@ import pytest
 import ttscompile
 from ttscompile import Noise
 from ttscompile.artifact import load_artifact
+from ttscompile.ir.program import Program
 from ttscompile.lattice import Source
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy, PolicyInfo
 
+from ..families.support import record
 from .agreement import largest_difference, random_inputs
 from .plans import random_plan
 
 CHECKPOINTS = ("bert", "ddim8", "inpainting", "mlp_encoder_causal", "transformer_encoder_causal")
 EPISODES = ("timestep_95", "mixed_95", "mixed_80")
+FAMILIES = {
+    "pusht_dpt": "Diffusion Policy, low-dimensional transformer",
+    "transformer_encoder_causal": "the same, with a transformer as condition encoder",
+    "inpainting": "the same, with the observation in the sample",
+    "bert": "the same, encoder only",
+}
 RUNTIMES = ("onnxruntime", "reference")
 
 Compiled = Callable[[str], Path]
 
 
 @pytest.fixture(scope="module")
-def compiled(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Compiled:
-    """Artifact of a golden checkpoint by name, or of the Push-T policy; each is compiled once."""
+def converted(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[Path, Program]]:
+    """Artifact and program of a golden checkpoint by name, or of the Push-T policy; each is compiled once."""
 
     @cache
-    def compile_once(name: str) -> Path:
+    def compile_once(name: str) -> tuple[Path, Program]:
         folder = "policies" if name == "pusht_dpt" else "golden/diffusion_policy"
         directory = tmp_path_factory.mktemp("golden") / name
-        ttscompile.convert(shared / folder / f"{name}.ckpt", directory)
-        return directory
+        return directory, ttscompile.convert(shared / folder / f"{name}.ckpt", directory)
 
     return compile_once
+
+
+@pytest.fixture(scope="module")
+def compiled(converted: Callable[[str], tuple[Path, Program]]) -> Compiled:
+    """The artifact alone."""
+    return lambda name: converted(name)[0]
 
 
 def worst_of_range(found: npt.NDArray[np.float32], expected: npt.NDArray[np.float32], info: PolicyInfo) -> float:
@@ -63,6 +76,16 @@ def test_dense_is_the_original(compiled: Compiled, shared: Path, name: str, runt
     out = call(policy, recorded, plan="dense")
     assert worst_of_range(out["action_pred"], recorded["action_pred"], policy.info) < 1e-5
     assert worst_of_range(out["action"], recorded["action"], policy.info) < 1e-5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FAMILIES)
+def test_support_table(converted: Callable[[str], tuple[Path, Program]], name: str) -> None:
+    """What was found in each variant is what the README says."""
+    program = converted(name)[1]
+    table = program.spec.sampler
+    against = "actions that the original gave, 1e-5 of the range"
+    record(FAMILIES[name], against, f"{table.name} {table.steps}", program)
 
 
 @pytest.mark.slow

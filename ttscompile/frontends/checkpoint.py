@@ -7,9 +7,10 @@ own list is refused before a single object is built.
 
 from __future__ import annotations
 
+import itertools
 import os
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from torch.serialization import get_unsafe_globals_in_checkpoint, safe_globals
 from ..errors import CheckpointError
 
 _DEEPEST = 64  # nesting of a configuration; a real one has about 6 levels, a cycle has no end
+_MOST_VALUES = 100_000  # of a configuration; a real one has about 300, one whose parts are shared can have 2^60
 
 
 class _Inert:
@@ -108,6 +110,7 @@ def read_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
             f"{path}: not a torch checkpoint, or a truncated one: expected a zip archive as torch.save writes it, found"
             f" {path.stat().st_size} bytes without a zip directory. Copy the file again, or save it with torch >= 1.6."
         )
+    _require_stored(path)
     with safe_globals(_STAND_INS):
         try:
             unknown = sorted(get_unsafe_globals_in_checkpoint(path))
@@ -129,7 +132,51 @@ def read_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise CheckpointError(
             f"{path}: holds a {type(payload).__name__}; expected a dictionary with cfg and state_dicts."
         )
+    _require_own_data(path, payload)
     return payload
+
+
+def _require_stored(path: Path) -> None:
+    """Raise if reading the archive could take more memory than the file has bytes: ``torch.save`` never compresses."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            entries = archive.infolist()
+    except Exception as error:  # a damaged directory; of whatever kind
+        raise _unreadable(path, error) from error
+    compressed = [entry.filename for entry in entries if entry.compress_type != zipfile.ZIP_STORED]
+    total, size = sum(entry.file_size for entry in entries), path.stat().st_size
+    if compressed or total > size:
+        raise CheckpointError(
+            f"{path}: expected entries that are stored as they are, as torch.save writes them; found"
+            f" {len(compressed)} compressed ones and {total} bytes in a file of {size}. Save the checkpoint again."
+        )
+
+
+def _require_own_data(path: Path, payload: object) -> None:
+    """Raise unless every tensor is a plain one on the CPU with as many bytes behind it as its shape says.
+
+    A tensor of stride 0 has any shape on four bytes; the first operation on it takes the memory that it pretends to.
+    """
+    pending, seen = [payload], set()
+    while pending:
+        value = pending.pop()
+        if id(value) in seen:
+            continue
+        seen.add(id(value))
+        if isinstance(value, torch.Tensor):
+            plain = value.layout == torch.strided and value.device.type == "cpu" and not value.is_quantized
+            if not plain or value.numel() * value.element_size() > value.untyped_storage().nbytes():
+                raise CheckpointError(
+                    f"{path}: expected dense tensors with data of their own; found one of {value.dtype},"
+                    f" {value.layout}, {list(value.shape)} on {value.device.type}. Save the checkpoint again with"
+                    " tensors that are contiguous."
+                )
+        elif isinstance(value, dict):
+            pending += [*value.keys(), *value.values()]
+        elif isinstance(value, (list, tuple, set, frozenset)):
+            pending += value
+        elif isinstance(value, _Inert):
+            pending.append(getattr(value, "state", None))
 
 
 def _unreadable(path: Path, error: Exception) -> CheckpointError:
@@ -143,32 +190,38 @@ def _unreadable(path: Path, error: Exception) -> CheckpointError:
     )
 
 
-def plain_config(value: Any, where: str = "cfg", depth: int = 0) -> Any:
+def plain_config(value: Any, where: str = "cfg") -> Any:
     """Turn inert configuration objects into dictionaries, lists and scalars.
 
     Args:
         value: what ``read_checkpoint`` found, or a part of it; plain dictionaries and lists pass as they are.
         where: dotted name of ``value``, for messages.
-        depth: of ``value`` below the root.
 
     Returns:
         dict, list, str, int, float, bool or None, nested.
 
     Raises:
-        CheckpointError: an object of another type, a malformed one, or nesting without end.
+        CheckpointError: an object of another type, a malformed one, nesting without end, or more values than any
+            configuration has.
     """
+    return _plain(value, where, 0, itertools.count())
+
+
+def _plain(value: Any, where: str, depth: int, values: Iterator[int]) -> Any:
     if depth > _DEEPEST:
         raise CheckpointError(f"{where}: the configuration is nested deeper than {_DEEPEST} levels; it is malformed.")
+    if next(values) > _MOST_VALUES:
+        raise CheckpointError(f"{where}: the configuration has more than {_MOST_VALUES} values; it is malformed.")
     if isinstance(value, (_Container, _Node)):
         key = "_content" if isinstance(value, _Container) else "_val"
         state = getattr(value, "state", None)
         if not isinstance(state, dict) or key not in state:
             raise CheckpointError(f"{where}: a configuration object without {key}; the checkpoint is malformed.")
-        return plain_config(state[key], where, depth + 1)
+        return _plain(state[key], where, depth + 1, values)
     if isinstance(value, dict):
-        return {str(name): plain_config(item, f"{where}.{name}", depth + 1) for name, item in value.items()}
+        return {str(name): _plain(item, f"{where}.{name}", depth + 1, values) for name, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain_config(item, f"{where}[{i}]", depth + 1) for i, item in enumerate(value)]
+        return [_plain(item, f"{where}[{i}]", depth + 1, values) for i, item in enumerate(value)]
     if value is None or isinstance(value, (str, int, float, bool)):
         return value
     raise CheckpointError(

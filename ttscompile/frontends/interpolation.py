@@ -8,9 +8,10 @@ comparisons and if/else, read with ``ast`` and evaluated by hand; Python's ``eva
 from __future__ import annotations
 
 import ast
+import itertools
 import operator
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +21,8 @@ _REFERENCE = re.compile(r"\$\{([A-Za-z_]\w*(?:\.\w+|\[\d+\])*)\}")
 _EVAL = re.compile(r"\$\{eval:\s*(?:'([^']*)'|\"([^\"]*)\"|([^'\"]*))\s*\}", re.DOTALL)
 _LONGEST = 1000  # characters of an expression
 _LARGEST = 1e15  # magnitude of any number in it, so that no expression can take long
+_MOST_VALUES = 100_000  # that one key may resolve to: references to lists of references grow without bound
+_LONGEST_TEXT = 100_000  # characters of a resolved text, for the same reason
 
 _ARITHMETIC: Mapping[type[ast.AST], Callable[[Any, Any], Any]] = {
     ast.Add: operator.add,
@@ -123,7 +126,7 @@ class Config:
             CheckpointError: the value, or one inside it, cannot be resolved; names the key.
         """
         found, value = self._find(key)
-        return self._resolve(value, key, ()) if found else default
+        return self._resolve(value, key, (), itertools.count()) if found else default
 
     def require(self, key: str) -> Any:
         """The resolved value at a dotted key.
@@ -148,20 +151,24 @@ class Config:
                 return False, None
         return True, value
 
-    def _resolve(self, value: Any, key: str, seen: tuple[str, ...]) -> Any:
+    def _resolve(self, value: Any, key: str, seen: tuple[str, ...], values: Iterator[int]) -> Any:
+        if next(values) > _MOST_VALUES:
+            raise CheckpointError(
+                f"cfg.{key} refers to more than {_MOST_VALUES} values; the configuration is malformed."
+            )
         if isinstance(value, Mapping):
-            return {name: self._resolve(item, f"{key}.{name}", seen) for name, item in value.items()}
+            return {name: self._resolve(item, f"{key}.{name}", seen, values) for name, item in value.items()}
         if isinstance(value, list):
-            return [self._resolve(item, f"{key}[{i}]", seen) for i, item in enumerate(value)]
+            return [self._resolve(item, f"{key}[{i}]", seen, values) for i, item in enumerate(value)]
         if value == "???":
             raise CheckpointError(
                 f"cfg.{key} is '???', a value that was never given; set it and save the checkpoint again."
             )
         if isinstance(value, str) and "${" in value:
-            return self._interpolate(value, key, seen)
+            return self._interpolate(value, key, seen, values)
         return value
 
-    def _interpolate(self, text: str, key: str, seen: tuple[str, ...]) -> Any:
+    def _interpolate(self, text: str, key: str, seen: tuple[str, ...], values: Iterator[int]) -> Any:
         """Resolve one string: a lone reference keeps its type, references inside other text become text."""
         if key in seen:
             raise CheckpointError(f"cfg.{key} refers to itself: {' -> '.join((*seen, key))}.")
@@ -172,12 +179,16 @@ class Config:
             found, value = self._find(target)
             if not found:
                 raise CheckpointError(f"cfg.{key} is {text!r}, and the configuration has no key {target!r}.")
-            return self._resolve(value, target, seen)
+            return self._resolve(value, target, seen, values)
 
         lone = _REFERENCE.fullmatch(text)
         if lone:
             return look_up(lone)
         replaced = _REFERENCE.sub(lambda reference: str(look_up(reference)), text)
+        if len(replaced) > _LONGEST_TEXT:
+            raise CheckpointError(
+                f"cfg.{key} is longer than {_LONGEST_TEXT} characters; the configuration is malformed."
+            )
         expression = _EVAL.fullmatch(replaced)
         if expression:
             try:

@@ -1,0 +1,285 @@
+"""Diffusion Policy's transformer on images, against numbers that the original gave; see ``golden/make_hybrid.py``."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch
+from diffusers.schedulers.scheduling_ddim import DDIMScheduler
+
+import ttscompile
+from ttscompile.artifact import load_artifact
+from ttscompile.capture import capture
+from ttscompile.config import ChunkSpec, Noise, ObservationSpec, PolicySpec
+from ttscompile.errors import CheckpointError
+from ttscompile.frontends import diffusion_policy, load_checkpoint_policy
+from ttscompile.frontends.eager import eager_policy
+from ttscompile.frontends.encoded import EncodedDenoiser
+from ttscompile.frontends.robomimic_encoder import ResidualBlock
+from ttscompile.ir.flops import graph_flops
+from ttscompile.ir.program import Program
+from ttscompile.lower import lower_graph
+from ttscompile.runtimes import open_runtime
+from ttscompile.samplers import sampler_table
+
+from ..families.support import record
+from ..lower.sessions import run
+from ..runtimes.agreement import largest_difference
+from . import hybrid
+
+Recorded = dict[str, npt.NDArray[Any]]
+Payload = dict[str, Any]
+WRIST = "obs_encoder.obs_nets.wrist."
+
+
+def recorded(variant: str) -> Recorded:
+    """What the original gave."""
+    with np.load(Path(__file__).parent / "golden" / f"hybrid_{variant}.npz") as numbers:
+        return dict(numbers)
+
+
+@pytest.fixture(scope="module")
+def two_cameras() -> Payload:
+    """Not to be changed: copy the parts that a test changes."""
+    return hybrid.payload("two_cameras")
+
+
+@pytest.fixture
+def build(two_cameras: Payload) -> Callable[..., tuple[Any, Any]]:
+    """Build the policy of two cameras with changes to its weights and ``cfg.policy``, without a file."""
+
+    def run(weights: dict[str, Any] | None = None, without: str = "", **policy: Any) -> tuple[Any, Any]:
+        config = copy.deepcopy(two_cameras["cfg"])
+        config["policy"].update(policy)
+        kept = {k: v for k, v in two_cameras["state_dicts"]["ema_model"].items() if not without or without not in k}
+        return diffusion_policy.build(
+            {"cfg": config, "state_dicts": {"ema_model": kept | (weights or {})}}, None, None, None
+        )
+
+    return run
+
+
+@pytest.mark.parametrize("variant", hybrid.VARIANTS)
+def test_the_original_gave_the_same(variant: str, tmp_path: Path) -> None:
+    """Features of every observed step, and the actions of a whole call, from the file that is saved."""
+    torch.save(hybrid.payload(variant), tmp_path / "policy.ckpt")
+    module, spec = load_checkpoint_policy(tmp_path / "policy.ckpt")
+    numbers = recorded(variant)
+    assert list(spec.observations) == list(hybrid.VARIANTS[variant]["obs"])
+    observation = {}
+    for key, array in hybrid.observation(variant).items():
+        normalizer = spec.observations[key].normalizer
+        observation[key] = torch.from_numpy(array if normalizer is None else normalizer.normalize(array))
+    assert isinstance(module, EncodedDenoiser)
+    with torch.inference_mode():
+        features = module.encoder(observation).flatten(0, 1).numpy()
+    assert numbers["features"].std(axis=0).max() > 0.1
+    assert np.abs(features - numbers["features"]).max() < 1e-5
+    assert spec.sampler.timesteps.tolist() == numbers["timesteps"].tolist()
+    sample = eager_policy(module, spec)(observation, Noise(*hybrid.noise(variant))).numpy()
+    assert spec.chunk.normalizer is not None
+    actions = spec.chunk.normalizer.unnormalize(sample[..., : hybrid.ACTION])
+    tolerance = 1e-5 * np.ptp(numbers["action_pred"])
+    assert np.abs(actions - numbers["action_pred"]).max() < tolerance
+    assert np.abs(actions[:, spec.chunk.start : spec.chunk.stop] - numbers["action"]).max() < tolerance
+
+
+def test_the_encoder_runs_once_in_the_eager_loop(build: Callable[..., tuple[Any, Any]]) -> None:
+    """As the original's; otherwise a compiled policy would be compared with one that nobody runs."""
+    module, spec = build()
+    calls: list[int] = []
+    module.encoder.register_forward_hook(lambda *_: calls.append(1))
+    inputs = {key: torch.from_numpy(value) for key, value in hybrid.observation("two_cameras").items()}
+    eager_policy(module, spec)(inputs, Noise(*hybrid.noise("two_cameras")))
+    assert len(calls) == 1
+
+
+# Compiled
+
+COMPILED = "action_steps_only"
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Program, Path]:
+    """A policy with one camera and group norm, converted once."""
+    folder = tmp_path_factory.mktemp("hybrid")
+    torch.save(hybrid.payload(COMPILED), folder / "policy.ckpt")
+    return ttscompile.convert(folder / "policy.ckpt", folder / "compiled"), folder / "compiled"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
+def test_compiled_is_the_original(compiled: tuple[Program, Path], runtime: str) -> None:
+    """From images in 0..1 and raw positions to actions, through the artifact."""
+    numbers = recorded(COMPILED)
+    policy = ttscompile.load(compiled[1], runtime=runtime)
+    out = policy.predict_action(hybrid.observation(COMPILED), noise=Noise(*hybrid.noise(COMPILED)), plan="dense")
+    for name in ("action", "action_pred"):
+        assert np.abs(out[name] - numbers[name]).max() < 1e-5 * np.ptp(numbers["action_pred"])
+
+
+@pytest.mark.slow
+def test_both_runtimes_agree_on_random_plans(compiled: tuple[Program, Path]) -> None:
+    """Three calls of two streams."""
+    artifact = load_artifact(compiled[1])
+    runtimes = open_runtime(artifact, "onnxruntime"), open_runtime(artifact, "reference")
+    assert largest_difference(artifact, *runtimes, np.random.default_rng(0), 2, calls=3) < 1e-5
+
+
+@pytest.mark.slow
+def test_the_encoder_is_a_piece_of_its_own(compiled: tuple[Program, Path]) -> None:
+    """Every convolution is in the graph that runs once a call, and the dense FLOPs count it once."""
+    program, _ = compiled
+    pieces = program.pieces
+    assert pieces is not None and pieces.step is not None
+    assert sum("conv" in node.op for node in pieces.condition.nodes) == 21  # ResNet-18 has 20; and the keypoints
+    loop = (pieces.stem, *pieces.blocks, pieces.tail, pieces.step)
+    assert not any("conv" in node.op for graph in loop for node in graph.nodes)
+    every_step = sum(graph_flops(graph) for graph in loop) * hybrid.STEPS
+    assert 0 < program.dense_flops - graph_flops(pieces.condition) < 1.2 * every_step
+    record(
+        "Diffusion Policy, transformer on images (robomimic encoder)",
+        "actions and features that the original gave, 1e-5 of the range",
+        f"ddpm {hybrid.STEPS}",
+        program,
+    )
+
+
+def test_batch_norm_is_lowered() -> None:
+    """What the compiled policy above does not hold, in onnxruntime as in torch, for another batch size."""
+    torch.manual_seed(0)
+    layers = ResidualBlock(16, 32, 2, torch.nn.BatchNorm2d).eval()
+    for name, value in layers.state_dict().items():
+        if "running" in name:
+            value.uniform_(0.5, 1.5)
+    table = sampler_table(DDIMScheduler(num_train_timesteps=4), 2, name="ddim")
+    spec = PolicySpec((1, 1), {"image": ObservationSpec((16, 19, 14))}, table, ChunkSpec(1, 0, 1))
+    graph, weights = capture(_OnImages(layers), spec)
+    tensors = {name: torch.from_numpy(value) for name, value in weights.items()}
+    sample, image = torch.zeros(2, 1, 1), torch.rand(2, 16, 19, 14)
+    inputs = {"sample": sample, "timestep": torch.zeros(2, dtype=torch.int64), "image": image}
+    model = lower_graph(graph, "image")
+    read = {each.name for each in model.graph.input}
+    (found,) = run(model, tensors, {name: value for name, value in inputs.items() if name in read})
+    with torch.inference_mode():
+        expected = layers(image).mean((1, 2, 3)).reshape(2, 1, 1).numpy()
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+
+
+class _OnImages(torch.nn.Module):
+    """The mean of what layers make of an image, as a denoiser."""
+
+    def __init__(self, layers: torch.nn.Module) -> None:
+        super().__init__()
+        self.layers = layers
+
+    def forward(self, sample: torch.Tensor, timestep: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
+        """``[B, 1, 1]``."""
+        return sample + self.layers(image).mean((1, 2, 3)).reshape(-1, 1, 1)
+
+
+# Settings
+
+
+def test_random_crops_become_the_centre(build: Callable[..., tuple[Any, Any]]) -> None:
+    """Without eval_fixed_crop the original crops at random in evaluation, too; that ours does not is said."""
+    with pytest.warns(UserWarning, match=r"eval_fixed_crop is false.*takes the centre"):
+        module, _ = build(eval_fixed_crop=False)
+    # Margins of 5 and 7 pixels: 2.5 and 3.5 are rounded to even numbers.
+    assert {(c.top, c.left, c.height, c.width) for c in module.encoder.cameras} == {(2, 4, 36, 36)}
+
+
+def test_only_the_crop_matters(build: Callable[..., tuple[Any, Any]]) -> None:
+    """A change of any pixel outside the crop changes nothing, one inside does."""
+    module, _ = build()
+    camera = module.encoder.cameras[0]
+    image = torch.rand(1, 3, 41, 43)
+    outside, inside = image.clone(), image.clone()
+    outside[:, :, :2], outside[:, :, 38:], outside[:, :, :, :4], outside[:, :, :, 40:] = 0, 0, 0, 0
+    inside[:, :, 2] = 0
+    with torch.inference_mode():
+        features = camera(image)
+        assert torch.equal(camera(outside), features)
+        assert not torch.equal(camera(inside), features)
+
+
+def test_weights_that_are_there_once(build: Callable[..., tuple[Any, Any]], two_cameras: Payload) -> None:
+    """Without the second names, or without the first: the same policy."""
+    expected = build()[0].state_dict()
+    assert two_cameras["state_dicts"]["ema_model"][f"{WRIST}nets.0.nets.0.weight"].shape == (64, 3, 7, 7)
+    for without in (".nets.0.nets.", ".backbone."):
+        found = build(without=without)[0].state_dict()
+        assert all(torch.equal(found[key], expected[key]) for key in expected)
+
+
+@pytest.mark.parametrize(
+    ("weights", "message"),
+    [
+        ({f"{WRIST}nets.0.nets.0.weight": torch.zeros(64, 3, 7, 7)}, r"nets\.0\.weight differ: .* saved twice"),
+        (
+            {f"{WRIST}nets.1.nets.bias": torch.zeros(32)},
+            r"pool\.nets\.bias and \S+nets\.1\.nets\.bias differ|nets\.1\.nets\.bias and \S+pool\.nets\.bias differ",
+        ),
+        ({f"{WRIST}nets.3.bias": torch.zeros(65)}, r"nets\.3\.bias has shape \(65,\); expected \(64,\)"),
+        ({f"{WRIST}nets.3.bias": torch.full((64,), math.nan)}, r"nets\.3\.bias holds values that are not finite"),
+        ({f"{WRIST}nets.4.weight": torch.zeros(3)}, r"unexpected .*nets\.4\.weight"),
+        (
+            {"obs_encoder.obs_nets.third.nets.3.bias": torch.zeros(64)},
+            r"third\.nets\.3\.bias, which belong to no image",
+        ),
+        ({"obs_encoder.key_model_map.rgb.weight": torch.zeros(64)}, "another observation encoder; use"),
+        (
+            {f"{WRIST}pool.pos_x": torch.zeros(1, 4), f"{WRIST}nets.1.pos_x": torch.zeros(1, 4)},
+            r"pos_x is not the grid",
+        ),
+        (
+            {f"normalizer.params_dict.wrist.{name}": torch.ones(3) for name in ("scale", "offset")},
+            r"params_dict\.wrist has 3 entries; expected one for the whole image",
+        ),
+        ({"normalizer.params_dict.pos.scale": torch.ones(3)}, r"pos\.scale has shape \(3,\).* 4 channels"),
+    ],
+)
+def test_weights_that_do_not_fit(
+    build: Callable[..., tuple[Any, Any]], weights: dict[str, torch.Tensor], message: str
+) -> None:
+    """Each is named, with what was expected."""
+    with pytest.raises(CheckpointError, match=message):
+        build(weights)
+
+
+@pytest.mark.parametrize(
+    ("policy", "message"),
+    [
+        ({"obs_encoder_group_norm": False}, r"not those of robomimic's .*missing .*nets\.1\.running_mean"),
+        ({"obs_encoder_group_norm": 1}, r"obs_encoder_group_norm is 1; expected true or false"),
+        ({"crop_shape": [41, 30]}, r"crop_shape is \[41, 30\], and the images of 'wrist' are 41 x 43"),
+        ({"crop_shape": 36}, r"crop_shape is 36; expected \[height, width\] or null"),
+        ({"crop_shape": [20, 20]}, r"pos_x has shape \(1, 4\); expected \(1, 1\)"),
+        ({"shape_meta": None}, "shape_meta is missing or malformed"),
+        ({"shape_meta": {"obs": {}, "action": {"shape": [3]}}}, "names no observation"),
+        ({"shape_meta": {"obs": {"a": {"shape": [4]}}, "action": {"shape": [3, 2]}}}, r"action\.shape is \[3, 2\]"),
+        (
+            {"shape_meta": {"obs": {"a": {"shape": [4], "type": "depth"}}, "action": {"shape": [3]}}},
+            r"obs\.a\.type is 'depth'; expected rgb or low_dim",
+        ),
+        (
+            {"shape_meta": {"obs": {"a": {"shape": [4, 4], "type": "rgb"}}, "action": {"shape": [3]}}},
+            r"obs\.a\.shape is \[4, 4\]; expected \[C, H, W\]",
+        ),
+        ({"n_emb": 33}, r"cfg\.policy: n_emb = 33"),
+        ({"horizon": None}, r"cfg\.policy\.horizon is None"),
+        ({"obs_as_cond": "yes"}, r"cfg\.policy\.obs_as_cond is 'yes'"),
+        ({"share_rgb_model": True}, r"cfg\.policy has settings that are not known: share_rgb_model"),
+    ],
+)
+def test_settings_that_do_not_fit(build: Callable[..., tuple[Any, Any]], policy: dict[str, Any], message: str) -> None:
+    """Each is named, with what was expected."""
+    with pytest.raises(CheckpointError, match=message):
+        build(**policy)

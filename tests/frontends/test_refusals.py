@@ -1,0 +1,171 @@
+"""What is no policy that this compiler reads, in miniature: each is named, with how it was told and what to do."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from click.testing import CliRunner
+from safetensors.torch import save_file
+
+from ttscompile.cli import main
+from ttscompile.errors import CheckpointError
+from ttscompile.frontends import load_checkpoint_policy
+from ttscompile.frontends.refusals import (
+    DIRECTORIES,
+    ENTRIES,
+    POLICIES,
+    STATES,
+    refuse_directory,
+    refuse_payload,
+    refuse_policy,
+)
+
+W = torch.zeros(2)
+OWN_MODULE = r"compile_denoiser\(module, spec\)"
+
+PAYLOADS: list[tuple[dict[str, Any], str, str]] = [
+    ({"model": {"action_model": {"net.blocks.0.attn.qkv.weight": W}, "projector": {"a": W}}}, "CogACT", OWN_MODULE),
+    ({"model": {"llm_backbone": {"a": W}, "x_embedder": {"mlp.fc1.weight": W}}}, "HybridVLA", "inside its language"),
+    ({"parameter": {"blocks.0.weight": W}}, "Dita", "KV cache"),
+    ({"model.blocks.0.ffn.fc1.weight": W, "lang_adaptor.0.weight": W}, "weights of RDT", "dpmsolver"),
+    ({"model": {"noise_net.dec_pos": W, "noise_net.time_net.w": W}, "optim": {}}, "DiT-Policy", OWN_MODULE),
+    (
+        {"state_dict": {"model.inner_model.blocks.0.mlp.router.weight": W}, "pytorch-lightning_version": "2"},
+        "a mixture of experts",
+        "fixed choice for each step.*chosen by the data cannot",
+    ),
+    ({"joint_blocks.0.context_block.attn.qkv.weight": W}, r"two streams \(MM-DiT\)", "becomes one block"),
+    ({"transformer_blocks.0.attn.add_q_proj.weight": W}, r"two streams \(MM-DiT\)", "becomes one block"),
+    ({"model": {"down_modules.0.0.blocks.0.block.0.weight": W}}, "weights of a U-Net", "train_diffusion_transformer"),
+    ({"base.layers.0.q_proj.lora_A.weight": W}, "an adapter .LoRA.", "merge_and_unload"),
+    ({"blocks.0.weight": W, "head.bias": W}, "a plain dictionary of weights", "do not say how they are connected"),
+    ({}, "a plain dictionary of weights", r"its entries \(none\)"),
+]
+
+
+@pytest.mark.parametrize(("payload", "what", "remedy"), PAYLOADS)
+def test_torch_files(tmp_path: Path, payload: dict[str, Any], what: str, remedy: str) -> None:
+    """Told by an entry or by the name of a weight, which the message quotes."""
+    torch.save(payload, tmp_path / "model.pt")
+    with pytest.raises(CheckpointError, match=rf"{what}.*{remedy}") as caught:
+        load_checkpoint_policy(tmp_path / "model.pt")
+    message = str(caught.value)
+    assert message.startswith(f"{tmp_path / 'model.pt'}: no entry 'cfg'")
+    assert "(told by " in message
+    assert "\n" not in message
+
+
+NAMES = [
+    ("DiffusionUnetHybridImagePolicy", "a U-Net.*no residual stream.*train_diffusion_transformer"),
+    ("DP3", "3D Diffusion Policy, a U-Net"),
+    ("SimpleDP3", "3D Diffusion Policy, a U-Net"),
+    ("BETLowdimPolicy", "a policy without diffusion.*no denoising loop"),
+    ("RobomimicImagePolicy", "a policy without diffusion"),
+    (
+        "DiffusionTransformerTimmPolicy",
+        "a diffusion transformer with another observation encoder.*inside the module",
+    ),
+    ("MyPolicy", f"a policy of its own kind.*{OWN_MODULE}"),
+]
+
+
+@pytest.mark.parametrize(("name", "message"), NAMES)
+def test_other_policies(payload: Callable[..., Any], save: Callable[..., Path], name: str, message: str) -> None:
+    """Told by the class in the configuration."""
+    built = payload()
+    built["cfg"]["policy"]["_target_"] = f"some.package.{name}"
+    with pytest.raises(CheckpointError, match=rf"the policy is {name}: {message}"):
+        load_checkpoint_policy(save(built))
+
+
+DIRECTORY_FILES: list[tuple[list[str], str]] = [
+    (["adapter_config.json", "adapter_model.safetensors"], "PEFT adapter.*adapter_config.json.*Merge"),
+    (["step_10/pretrained_model/config.json"], "around what lerobot saved.*Give its folder pretrained_model"),
+    (["config.json", "example_batch.msgpack", "270000/default/checkpoint"], "an Octo model.*small MLP"),
+    (["params/_METADATA", "params/manifest.ocdbt", "assets/norm.json"], "a JAX checkpoint.*Convert it to PyTorch"),
+    (["model.msgpack"], "a JAX checkpoint"),
+    (["manifest.json", "weights.safetensors"], "compiled already.*ttscompile.load"),
+    (["checkpoints/latest.ckpt", ".hydra/config.yaml"], "a directory of checkpoints.*latest.ckpt"),
+    (["config.json", "model.safetensors"], r"a directory of weights .told by model\.safetensors"),
+    (["config.json=lang_adaptor", "pytorch_model.bin"], r"this is RDT .told by config\.json: lang_adaptor.*dpmsolver"),
+    (["config.json=model_type=gr00t_n1_5", "model.safetensors"], r"a GR00T model .told by config\.json: model_type"),
+    (["pytorch_model.bin"], "a directory of weights"),
+    (["README.md"], r"found README\.md; expected the config\.json and model\.safetensors"),
+    ([], "found nothing"),
+]
+
+
+def make(folder: Path, files: list[str]) -> None:
+    """Files that hold an empty object, or one entry, ``name=key=value``."""
+    for each in files:
+        name, _, entry = each.partition("=")
+        key, _, value = entry.partition("=")
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(json.dumps({key: value} if key else {}))
+
+
+@pytest.mark.parametrize(("files", "message"), DIRECTORY_FILES)
+def test_directories(tmp_path: Path, files: list[str], message: str) -> None:
+    """Told by the files in them."""
+    make(tmp_path, files)
+    with pytest.raises(CheckpointError, match=message) as caught:
+        load_checkpoint_policy(tmp_path)
+    assert str(caught.value).startswith(str(tmp_path))
+
+
+def test_files_that_torch_did_not_write(tmp_path: Path) -> None:
+    """Told by their first bytes or what is in the archive; a damaged archive is still called damaged."""
+    path = tmp_path / "policy.ckpt"
+    save_file({"a": W}, path)
+    with pytest.raises(CheckpointError, match="a safetensors file.*do not say how they are connected"):
+        load_checkpoint_policy(path)
+    path.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
+    with pytest.raises(CheckpointError, match="an HDF5 file"):
+        load_checkpoint_policy(path)
+    path.write_bytes(b"GGUF" + bytes(100))
+    with pytest.raises(CheckpointError, match="a GGUF file"):
+        load_checkpoint_policy(path)
+    for name, message in (
+        ("readme.txt", "torch.save did not write .*readme.txt"),
+        ("manifest.json", "compiled already"),
+    ):
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr(name, "hello")
+        with pytest.raises(CheckpointError, match=message):
+            load_checkpoint_policy(path)
+
+
+def test_every_row_is_reached(tmp_path: Path) -> None:
+    """By one of the cases above: a row behind another that matches more would never be."""
+    told = [said(refuse_payload, payload) for payload, *_ in PAYLOADS] + [
+        said(refuse_policy, name) for name, _ in NAMES
+    ]
+    for i, (files, _) in enumerate(DIRECTORY_FILES):
+        (tmp_path / str(i)).mkdir()
+        make(tmp_path / str(i), files)
+        told.append(said(refuse_directory, tmp_path / str(i)))
+    for row in (*POLICIES, *DIRECTORIES, *ENTRIES, *STATES):
+        assert any(f"{row.what}. {row.remedy}" in each or f"{row.what} (told by " in each for each in told), row.what
+        assert row.remedy.endswith(".")
+
+
+def said(refusal: Callable[[Any], Any], argument: Any) -> str:
+    """The message."""
+    with pytest.raises(CheckpointError) as caught:
+        refusal(argument)
+    return str(caught.value)
+
+
+def test_command_exits_with_2_and_one_line(tmp_path: Path) -> None:
+    """As every error about input does."""
+    save_file({"a": W}, tmp_path / "model.safetensors")
+    result = CliRunner().invoke(main, ["convert", str(tmp_path / "model.safetensors"), "-o", str(tmp_path / "out")])
+    assert result.exit_code == 2
+    assert "a safetensors file" in result.stderr
+    assert not (tmp_path / "out").exists()

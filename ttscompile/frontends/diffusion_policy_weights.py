@@ -1,0 +1,134 @@
+"""The weights of a Diffusion Policy checkpoint: which of them, whether they fit, and the normalisers among them."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from ..config import Affine
+from ..errors import CheckpointError
+from .transformer_for_diffusion import TransformerConfig, TransformerForDiffusion
+
+_NORMALIZER_KEY = re.compile(r"normalizer\.params_dict\.\w+\.(scale|offset|input_stats\.\w+)")
+_OTHER_KEY = re.compile(r"(model\.)?_dummy_variable|mask_generator\..*")
+_COUNTERS = ".num_batches_tracked"  # of batch norm, whole numbers, used by training only
+
+Weights = Mapping[str, torch.Tensor]
+
+
+def choose_weights(state_dicts: Any, use_ema: Any) -> tuple[Weights, str]:
+    """The weights that the original's evaluation takes, and their name.
+
+    Without ``use_ema`` in the configuration the averaged weights win, where there are any. Where the wanted ones are
+    absent the others are taken with a warning.
+    """
+    if not isinstance(state_dicts, dict):
+        raise CheckpointError(f"state_dicts is a {type(state_dicts).__name__}; expected a dictionary.")
+    if use_ema not in (True, False, None):
+        raise CheckpointError(f"cfg.training.use_ema is {use_ema!r}; expected true or false.")
+    wanted, other = ("model", "ema_model") if use_ema is False else ("ema_model", "model")
+    found = next((name for name in (wanted, other) if name in state_dicts), None)
+    if found is None:
+        raise CheckpointError(f"state_dicts holds {sorted(map(str, state_dicts))}; expected model or ema_model.")
+    if found != wanted and use_ema is not None:
+        warnings.warn(
+            f"the configuration asks for the weights {wanted!r} (training.use_ema = {use_ema}), which the checkpoint"
+            f" does not hold; using {found!r}.",
+            stacklevel=2,
+        )
+    weights = state_dicts[found]
+    if not isinstance(weights, dict):
+        raise CheckpointError(f"state_dicts.{found} is a {type(weights).__name__}; expected a dictionary of tensors.")
+    weights = {str(key): value for key, value in weights.items() if not str(key).endswith(_COUNTERS)}
+    for key, value in weights.items():
+        if not isinstance(value, torch.Tensor) or value.layout != torch.strided or not value.is_floating_point():
+            what = f"{value.dtype} tensor" if isinstance(value, torch.Tensor) else type(value).__name__
+            raise CheckpointError(f"weight {key} is a {what}; expected a dense floating-point tensor.")
+    return {key: value.detach().to(torch.float32) for key, value in weights.items()}, found
+
+
+def names_of(keys: list[str]) -> str:
+    """A few names and how many more there are."""
+    more = f" and {len(keys) - 6} more" if len(keys) > 6 else ""
+    return ", ".join(keys[:6]) + more
+
+
+def build_network(config: TransformerConfig, weights: Weights) -> TransformerForDiffusion:
+    """The network of a configuration, which is made only if the checkpoint has weights for one of its size.
+
+    Raises:
+        CheckpointError: it has not: whatever the configuration says, no more memory is taken than the file has.
+    """
+    total = sum(value.numel() for value in weights.values())
+    width, tokens = config.n_emb, config.trunk_tokens
+    channels = max(config.input_dim, config.output_dim, config.cond_dim)
+    parts = {
+        "n_emb": width * width,
+        "input_dim, output_dim or cond_dim": width * channels,
+        "horizon": max(width * tokens, tokens * tokens if config.causal_attn else 0),
+        "n_obs_steps": max(width * config.memory_tokens, tokens * config.memory_tokens if config.causal_attn else 0),
+        "n_layer or n_cond_layers": max(config.n_layer, config.n_cond_layers) * width,
+    }
+    for name, needed in parts.items():
+        if needed > total:
+            raise CheckpointError(
+                f"cfg.policy.model.{name} asks for at least {needed} weights; the checkpoint holds {total} in all. The"
+                " configuration describes another network than the one that was saved, or the file is incomplete."
+            )
+    return TransformerForDiffusion(config)
+
+
+def load_network(network: TransformerForDiffusion, weights: Weights) -> None:
+    """Fill the network; every weight must be there, of the right shape, finite, and nothing else may be there."""
+    expected = network.state_dict()
+    found = {key.removeprefix("model."): value for key, value in weights.items() if key.startswith("model.")}
+    found.pop("_dummy_variable", None)
+    missing = [f"model.{key}" for key in expected if key not in found]
+    extra = [f"model.{key}" for key in found if key not in expected]
+    extra += [
+        key
+        for key in weights
+        if not (key.startswith("model.") or _OTHER_KEY.fullmatch(key) or _NORMALIZER_KEY.fullmatch(key))
+    ]
+    if missing or extra:
+        parts = [f"missing {names_of(missing)}"] * bool(missing) + [f"unexpected {names_of(extra)}"] * bool(extra)
+        raise CheckpointError(
+            f"the weights do not fit the configuration: {'; '.join(parts)}. cfg.policy.model describes another network"
+            " than the one that was saved, or the file is incomplete."
+        )
+    for key, value in found.items():
+        if value.shape != expected[key].shape:
+            raise CheckpointError(
+                f"weight model.{key} has shape {tuple(value.shape)}; expected {tuple(expected[key].shape)} from"
+                " cfg.policy.model."
+            )
+        if key in ("mask", "memory_mask"):
+            if not torch.equal(value, expected[key]):
+                raise CheckpointError(f"model.{key} is not the causal mask of the original; the network was changed.")
+        elif not torch.isfinite(value).all():
+            count = int((~torch.isfinite(value)).sum())
+            raise CheckpointError(f"weight model.{key} holds {count} values that are not finite; training diverged.")
+    network.load_state_dict(found, strict=True)
+
+
+def affine(weights: Weights, key: str, width: int | None) -> Affine:
+    """The normaliser of one field, one entry a channel; as it is saved where ``width`` is None."""
+    vectors = {}
+    for name in ("scale", "offset"):
+        full = f"normalizer.params_dict.{key}.{name}"
+        if full not in weights:
+            raise CheckpointError(f"the weights hold no {full}; the policy was saved before its normaliser was set.")
+        vector = weights[full]
+        if not torch.isfinite(vector).all() or (name == "scale" and (vector == 0).any()):
+            raise CheckpointError(f"{full} is {vector.tolist()}; expected finite numbers, and no zero in a scale.")
+        if vector.ndim != 1 or len(vector) not in (1, width or len(vector)):
+            raise CheckpointError(
+                f"{full} has shape {tuple(vector.shape)}; expected one entry for each of {width} channels."
+            )
+        # An identity normaliser has a single entry for all channels.
+        vectors[name] = vector.expand(width or len(vector)).contiguous().numpy()
+    return Affine(scale=vectors["scale"], offset=vectors["offset"])

@@ -1,0 +1,248 @@
+"""What users bring that is not a policy this compiler reads: each named for what it is, with what to do instead.
+
+Tables of signs, tried in order, and one error. Nothing here loads anything: a sign is a class name in the
+configuration, an entry of a checkpoint, the name of a weight, a file in a directory, or the first bytes of a file.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import zipfile
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from itertools import chain, islice
+from pathlib import Path
+from typing import Any, NoReturn
+
+from ..errors import CheckpointError
+
+_BUILD = "Build the network with the code that trained it and use ttscompile.compile_denoiser(module, spec)"
+_HEAD = f"{_BUILD}: the action head is the module, and what the vision-language model gives it are its observations."
+_U_NET = (
+    "Its denoiser is not a transformer and has no residual stream whose blocks could be reused. Train a transformer"
+    " policy: Diffusion Policy's configurations named train_diffusion_transformer_*, or LeRobot's multi_task_dit."
+)
+_MOST_FILES = 10_000  # looked at in a directory; somebody may give the root of a disk
+_NO_LOOP = "There is no denoising loop to compile."
+_MERGE = "Merge it into its base model (PeftModel.merge_and_unload), save that policy, and convert the result."
+_WEIGHTS = (
+    "Weights do not say how they are connected. Convert what the training saved, which holds the configuration too; or"
+    " build the network, load them into it, and use ttscompile.compile_denoiser(module, spec)."
+)
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """One row of a table.
+
+    Attributes:
+        sign: pattern (of ``re``) that gives it away.
+        what: it is; the message says "this is" before it.
+        remedy: what the user can do, in whole sentences.
+    """
+
+    sign: str
+    what: str
+    remedy: str
+
+
+POLICIES = (
+    Refusal(r"unet", "a U-Net", _U_NET),
+    Refusal(r"dp3", "3D Diffusion Policy, a U-Net on point clouds", _U_NET),
+    Refusal(r"^(ibc|bet|robomimic)", "a policy without diffusion", _NO_LOOP),
+    Refusal(
+        r"transformer",
+        "a diffusion transformer with another observation encoder than the two that are read, low-dimensional and"
+        " robomimic's",
+        f"{_BUILD}, its observation encoder inside the module: hoisting takes it out of the loop.",
+    ),
+    Refusal(r"", "a policy of its own kind", f"If it has a transformer denoiser: {_BUILD}."),
+)
+"""By the class name of a configuration's ``policy``, in lower case."""
+
+DIRECTORIES = (
+    Refusal(
+        r"^manifest\.json$", "an artifact that is compiled already", "Load it with ttscompile.load, or calibrate it."
+    ),
+    Refusal(
+        r"^(example_batch|octo[^/]*)\.msgpack$",
+        "an Octo model",
+        "Octo denoises with a small MLP on one readout token, not with a transformer: no residuals worth reusing.",
+    ),
+    Refusal(
+        r"(^|/)(_METADATA|_CHECKPOINT_METADATA|manifest\.ocdbt)$|\.msgpack$",
+        "a JAX checkpoint (Orbax or msgpack)",
+        f"Convert it to PyTorch with the tool of its project (openpi: convert_jax_model_to_pytorch.py). {_BUILD}.",
+    ),
+    Refusal(
+        r"(^|/)pretrained_model/config\.json$",
+        "a directory around what lerobot saved",
+        "Give its folder pretrained_model.",
+    ),
+    Refusal(r"^config\.json: (lang|img|state)_adaptor\b", "RDT", f"{_HEAD} Its sampler is dpmsolver++."),
+    Refusal(r"^config\.json: model_type=gr00t", "a GR00T model", _HEAD),
+    Refusal(r"\.ckpt$", "a directory of checkpoints", "Give one of the files in it, checkpoints/latest.ckpt say."),
+    Refusal(r"\.(safetensors|bin|pth?)$", "a directory of weights", _WEIGHTS),
+)
+"""By the path of a file in a directory, three levels deep, or an entry of its ``config.json``."""
+
+ENTRIES = (
+    Refusal(r"^parameter$", "a checkpoint of Dita", f"{_HEAD} For Dita the prefix of its Llama, as a KV cache."),
+)
+"""By an entry of a torch checkpoint."""
+
+STATES = (
+    Refusal(
+        r"^(x_embedder|llm_backbone\.x_embedder)\b",
+        "a checkpoint of HybridVLA",
+        "It denoises inside its language model, in one sequence with the text: it has no action head to compile.",
+    ),
+    Refusal(r"^action_model\b", "a checkpoint of CogACT", f"{_HEAD} Guidance doubles the batch inside the module."),
+    Refusal(r"(^|\.)(state|lang|img)_adaptor\.", "weights of RDT", f"{_HEAD} Its sampler is dpmsolver++."),
+    Refusal(r"(^|\.)noise_net\.|(^|\.)time_net\.", "a checkpoint of DiT-Policy", _HEAD),
+    Refusal(
+        r"\.router\.|\.experts?\.\d+\.",
+        "a mixture of experts (MoDE, say)",
+        f"{_BUILD}. Experts chosen by the noise level alone become a fixed choice for each step if the module makes it"
+        " so; experts chosen by the data cannot be compiled.",
+    ),
+    Refusal(
+        r"\.add_[qkv]_proj\.|\.context_block\.|\.txt_(mlp|attn)",
+        "a transformer of two streams (MM-DiT)",
+        f"{_BUILD}. Two streams that attend to each other make no chain of additions: what lies between two points"
+        " that all paths cross becomes one block, and where there are none the compiler says so.",
+    ),
+    Refusal(r"(^|\.)(down|up)_modules\.|(^|\.)unet\.", "weights of a U-Net", _U_NET),
+    Refusal(r"\blora_[AB]\b", "an adapter (LoRA) without the weights that it adapts", _MERGE),
+    Refusal(r"", "a plain dictionary of weights", _WEIGHTS),
+)
+"""By the name of a weight; the first row that matches any of them. The last matches every checkpoint."""
+
+
+def refuse_policy(name: str) -> NoReturn:
+    """Refuse a Diffusion Policy checkpoint whose policy is another class.
+
+    Raises:
+        CheckpointError: always.
+    """
+    row = _first(POLICIES, [name.lower()])
+    raise CheckpointError(f"the policy is {name}: {row.what}. {row.remedy}")
+
+
+def refuse_payload(payload: Mapping[str, Any]) -> None:
+    """Refuse what a torch file holds unless it is a checkpoint of Diffusion Policy's workspace.
+
+    Raises:
+        CheckpointError: it has no ``cfg`` or no ``state_dicts``.
+    """
+    if "cfg" in payload and "state_dicts" in payload:
+        return
+    entries = sorted(map(str, payload))
+    missing = "cfg" if "cfg" not in payload else "state_dicts"
+    if "cfg" in payload or "state_dicts" in payload:
+        raise CheckpointError(
+            f"no entry {missing!r}; found {entries[:8]}. Expected all that Diffusion Policy's workspace saves: {{cfg,"
+            " state_dicts, pickles}. Take the file that the training wrote."
+        )
+    row = next((each for each in ENTRIES if _match(each, entries)), None)
+    how = f"its entry {_match(row, entries)}" if row else ""
+    if row is None:
+        names = sorted(_weight_names(payload))
+        row = _first(STATES, names)
+        how = f"the weight {_match(row, names)}" if row.sign else f"its entries {', '.join(entries[:6]) or '(none)'}"
+    raise CheckpointError(
+        f"no entry {missing!r}, so not a checkpoint of Diffusion Policy's workspace {{cfg, state_dicts, pickles}}: this"
+        f" is {row.what} (told by {how}). {row.remedy}"
+    )
+
+
+def refuse_file(path: Path) -> None:
+    """Refuse a file whose first bytes or entries say that it is no torch checkpoint; leave all others alone.
+
+    Raises:
+        CheckpointError: safetensors, HDF5, GGUF, a zipped artifact, or a zip archive that torch did not write.
+    """
+    if not path.is_file():
+        return
+    with path.open("rb") as file:
+        head = file.read(10)
+    if head[8:10] == b'{"' and int.from_bytes(head[:8], "little") < path.stat().st_size:
+        raise _refused(path, "a safetensors file", "a JSON header after its length", _WEIGHTS)
+    if head.startswith(b"\x89HDF\r\n"):
+        raise _refused(path, "an HDF5 file, data or Keras weights", "its first bytes", _WEIGHTS)
+    if head.startswith(b"GGUF"):
+        raise _refused(path, "a GGUF file, a quantised language model", "its first bytes", _NO_LOOP)
+    if not zipfile.is_zipfile(path):
+        return
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+    except (zipfile.BadZipFile, OSError, ValueError):
+        return  # a damaged archive, which the reader of checkpoints describes
+    if "manifest.json" in names:
+        raise _refused(path, "an artifact that is compiled already", "manifest.json", DIRECTORIES[0].remedy)
+    if not any(name.endswith("data.pkl") for name in names):
+        raise _refused(
+            path,
+            "a zip archive that torch.save did not write",
+            f"{', '.join(names[:4]) or 'no entries'}, and no data.pkl",
+            "Unpack it, and convert the checkpoint inside.",
+        )
+
+
+def refuse_directory(path: Path) -> NoReturn:
+    """Refuse a directory that no frontend reads; LeRobot's own policies have their say in ``lerobot_config``.
+
+    Raises:
+        CheckpointError: always.
+    """
+    every = chain.from_iterable(path.glob(level) for level in ("*", "*/*", "*/*/*"))
+    names = sorted(each.relative_to(path).as_posix() for each in islice(every, _MOST_FILES))
+    names += _entries(path / "config.json")
+    found = next((each for each in DIRECTORIES if _match(each, names)), None)
+    if found is not None:
+        raise _refused(path, found.what, str(_match(found, names)), found.remedy)
+    raise CheckpointError(
+        f"{path} is a directory without a policy that is read: found {', '.join(names[:6]) or 'nothing'}; expected the"
+        " config.json and model.safetensors of LeRobot's multi_task_dit, or give a .ckpt file of Diffusion Policy."
+        f" Otherwise: {_BUILD}."
+    )
+
+
+def _refused(path: Path, what: str, how: str, remedy: str) -> CheckpointError:
+    return CheckpointError(f"{path}: this is {what} (told by {how}). {remedy}")
+
+
+def _match(row: Refusal, names: Iterable[str]) -> str | None:
+    """The first name that the row's sign is in."""
+    return next((name for name in names if re.search(row.sign, name)), None)
+
+
+def _first(rows: Iterable[Refusal], names: list[str]) -> Refusal:
+    """The first row whose sign is in any of the names; the last rows of these tables match all."""
+    return next(row for row in rows if not row.sign or _match(row, names) is not None)
+
+
+def _weight_names(payload: Mapping[str, Any]) -> set[str]:
+    """Names of the weights, without the entries that hold them; CogACT's and HybridVLA's modules keep theirs."""
+    names: set[str] = set()
+    for key, value in payload.items():
+        if not isinstance(value, Mapping):
+            names.add(str(key))
+            continue
+        for inner, item in value.items():
+            if isinstance(item, Mapping):
+                names |= {f"{inner}.{name}" for name in item}
+            else:
+                names.add(str(inner))
+    return names
+
+
+def _entries(path: Path) -> list[str]:
+    """``config.json: key=value`` for the entries of a JSON file; none where it is not there or not one."""
+    try:
+        config = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return []
+    return [f"{path.name}: {key}={value}" for key, value in config.items()] if isinstance(config, dict) else []

@@ -1,0 +1,183 @@
+"""robomimic's observation encoder, rebuilt: centre crop, ResNet-18, spatial softmax, linear layer; one a camera.
+
+Written from the description of the networks, with attribute names under which the weights of an original checkpoint
+load. torchvision and robomimic are not needed.
+
+Source: robomimic 0.2 (Mandlekar et al., arXiv 2108.03298) as Diffusion Policy configures it; ResNet-18 of He et al.
+(arXiv 1512.03385); spatial softmax of Finn et al. (arXiv 1509.06113).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import nn
+
+KEYPOINTS = 32
+FEATURES = 64
+"""Width of a camera's features; both as in robomimic's image experiments, which Diffusion Policy takes over."""
+
+_STAGES = ((64, 1), (128, 2), (256, 2), (512, 2))  # channels and stride of the four stages, two blocks each
+_SHRINKS = 32
+
+Norm = Callable[[int], nn.Module]
+
+
+def group_norm(channels: int) -> nn.Module:
+    """What Diffusion Policy puts in the place of batch norm: groups of 16 channels."""
+    return nn.GroupNorm(channels // 16, channels)
+
+
+class ResidualBlock(nn.Module):
+    """``relu(x + norm(conv(relu(norm(conv(x))))))``; the shortcut is a strided 1 x 1 convolution where sizes change."""
+
+    def __init__(self, channels_in: int, channels: int, stride: int, norm: Norm) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(channels_in, channels, 3, stride, padding=1, bias=False)
+        self.bn1 = norm(channels)
+        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
+        self.bn2 = norm(channels)
+        self.downsample = None
+        if stride != 1 or channels_in != channels:
+            shortcut = nn.Conv2d(channels_in, channels, 1, stride, bias=False)
+            self.downsample = nn.Sequential(shortcut, norm(channels))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """``[N, channels_in, H, W]`` -> ``[N, channels, H / stride, W / stride]``, rounded up."""
+        shortcut = x if self.downsample is None else self.downsample(x)
+        inner = self.bn2(self.conv2(torch.relu(self.bn1(self.conv1(x)))))
+        return torch.relu(inner + shortcut)
+
+
+class ResNet18(nn.Module):
+    """ResNet-18 without its pooling and classifier; ``nets`` numbers the layers as the checkpoint does."""
+
+    def __init__(self, channels: int, norm: Norm) -> None:
+        super().__init__()
+        layers: list[nn.Module] = [
+            nn.Conv2d(channels, 64, 7, stride=2, padding=3, bias=False),
+            norm(64),
+            nn.ReLU(),
+            nn.MaxPool2d(3, stride=2, padding=1),
+        ]
+        width = 64
+        for channels_out, stride in _STAGES:
+            first = ResidualBlock(width, channels_out, stride, norm)
+            layers.append(nn.Sequential(first, ResidualBlock(channels_out, channels_out, 1, norm)))
+            width = channels_out
+        self.nets = nn.Sequential(*layers)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """``[N, C, H, W]`` -> ``[N, 512, H / 32, W / 32]``, rounded up."""
+        features: torch.Tensor = self.nets(x)
+        return features
+
+
+class SpatialSoftmax(nn.Module):
+    """Expected position, in -1..1, of each of 32 learned keypoints under a softmax over the image.
+
+    Args:
+        height, width: of the feature map.
+    """
+
+    temperature: torch.Tensor
+    pos_x: torch.Tensor
+    pos_y: torch.Tensor
+
+    def __init__(self, height: int, width: int) -> None:
+        super().__init__()
+        self.nets = nn.Conv2d(_STAGES[-1][0], KEYPOINTS, 1)
+        x, y = np.meshgrid(np.linspace(-1.0, 1.0, width), np.linspace(-1.0, 1.0, height))
+        self.register_buffer("temperature", torch.ones(1))
+        self.register_buffer("pos_x", torch.from_numpy(x.reshape(1, -1)).float())
+        self.register_buffer("pos_y", torch.from_numpy(y.reshape(1, -1)).float())
+
+    def forward(self, features: torch.Tensor) -> torch.Tensor:
+        """``[N, 512, height, width]`` -> ``[N, 64]``: x and y of keypoint 0, of keypoint 1, and so on."""
+        attention = (self.nets(features).flatten(2) / self.temperature).softmax(-1)
+        positions = torch.cat((self.pos_x, self.pos_y)).T
+        return torch.flatten(attention @ positions, 1)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """How the images of one observation key are taken in.
+
+    Attributes:
+        shape: ``(C, H, W)`` as they come.
+        crop: ``(height, width)`` of the centre that is looked at; None for the whole image.
+        scale: of the image's normaliser, one number for all of it.
+        offset: of the same.
+    """
+
+    shape: tuple[int, int, int]
+    crop: tuple[int, int] | None
+    scale: float = 1.0
+    offset: float = 0.0
+
+
+class CameraEncoder(nn.Module):
+    """Images of one camera to features: normalise, crop the centre, ResNet-18, spatial softmax, linear, ReLU."""
+
+    def __init__(self, camera: Camera, norm: Norm) -> None:
+        super().__init__()
+        self.camera = camera
+        channels, *size = camera.shape
+        height, width = camera.crop or size
+        # As torchvision's center_crop: halves are rounded to the even number.
+        self.top, self.left = (round((room - used) / 2) for room, used in zip(size, (height, width), strict=True))
+        self.height, self.width = height, width
+        self.backbone = ResNet18(channels, norm)
+        self.pool = SpatialSoftmax(math.ceil(height / _SHRINKS), math.ceil(width / _SHRINKS))
+        self.linear = nn.Linear(2 * KEYPOINTS, FEATURES)
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        """``[N, C, H, W]`` -> ``[N, 64]``."""
+        x = images
+        if self.camera.crop is not None:
+            x = x[:, :, self.top : self.top + self.height, self.left : self.left + self.width]
+        if (self.camera.scale, self.camera.offset) != (1.0, 0.0):
+            x = x * self.camera.scale + self.camera.offset
+        return torch.relu(self.linear(self.pool(self.backbone(x))))
+
+
+class ObservationEncoder(nn.Module):
+    """All keys of the observation to one vector for each observed step.
+
+    Args:
+        cameras: by key, those that are images.
+        low_dim: by key, the length of those that are not, flattened.
+        order: of all keys: of the features in the vector.
+        group_norm_in_place_of_batch_norm: which of the two the ResNets hold.
+    """
+
+    def __init__(
+        self,
+        cameras: Mapping[str, Camera],
+        low_dim: Mapping[str, int],
+        order: tuple[str, ...],
+        group_norm_in_place_of_batch_norm: bool,
+    ) -> None:
+        super().__init__()
+        self.order = order
+        self.width = FEATURES * len(cameras) + sum(low_dim.values())
+        norm = group_norm if group_norm_in_place_of_batch_norm else nn.BatchNorm2d
+        # A list, because a key may be any text and the name of a submodule may not.
+        self.cameras = nn.ModuleList(CameraEncoder(cameras[key], norm) for key in order if key in cameras)
+        self.position = {key: i for i, key in enumerate(key for key in order if key in cameras)}
+
+    def forward(self, observations: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """By key ``[B, To, ...]``, low-dimensional ones normalised -> ``[B, To, width]``."""
+        features = []
+        for key in self.order:
+            x = observations[key]
+            if key in self.position:
+                encoded = self.cameras[self.position[key]](x.flatten(0, 1))
+                features.append(encoded.reshape(x.shape[0], x.shape[1], FEATURES))
+            else:
+                features.append(x.flatten(2))
+        return torch.cat(features, dim=-1)
