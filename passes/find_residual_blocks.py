@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from ttscompile.errors import NoResidualBlocksError
-from ttscompile.ir.dataflow import between, dominators, reachable_from
+from ttscompile.ir.dataflow import between, dominators, reachable_from, reaching
 from ttscompile.ir.flops import node_flops
 from ttscompile.ir.graph import Graph, Node, Ref, TensorType
 from ttscompile.ir.program import Block
@@ -127,26 +127,27 @@ def _chain(graph: Graph, points: Sequence[str], links: list[_Link], declined: li
     stream_type = types[links[0].result]
     blocks: list[Block] = []
 
-    def add(stream: str, result: str, residual: str | None, reason: str = "") -> None:
+    def add(stream: str, result: str, residual: str | None, reason: str = "", hides: bool = False) -> None:
         nodes = between(graph, stream, residual if residual is not None else result)
-        kind = _kind(graph, nodes, stream)
+        kind = _kind(graph, nodes, stream, hides)
         blocks.append(Block(len(blocks), kind, stream, result, residual, stream_type, group=0, reason=reason))
 
     cursor = links[0].stream
     early = _first_of_type(points, types, stream_type, before=cursor)
     if early is not None and _hides_residuals(graph, early, cursor, stream_type):
-        add(early, cursor, None, "the chain starts late: a skip connection goes around the additions before it")
+        add(early, cursor, None, "the chain starts late: a skip connection goes around the additions before it", True)
     for link in links:
         if link.stream == cursor:
             add(cursor, link.result, link.residual)
         else:
             gap = between(graph, cursor, link.stream)
-            add(cursor, link.result, None, f"the stream is changed by {_describe(gap)} before the addition")
+            hides = _hides_residuals(graph, cursor, link.stream, stream_type)
+            add(cursor, link.result, None, f"the stream is changed by {_describe(gap)} before the addition", hides)
             declined.append(f"%{link.result}: merged with what comes before it; {blocks[-1].reason}")
         cursor = link.result
     late = _last_of_type(points, types, stream_type)
     if late != cursor and _hides_residuals(graph, cursor, late, stream_type):
-        add(cursor, late, None, "the chain ends early: a skip connection goes around the additions after it")
+        add(cursor, late, None, "the chain ends early: a skip connection goes around the additions after it", True)
     return blocks
 
 
@@ -181,12 +182,22 @@ def _describe(nodes: Sequence[Node]) -> str:
     return f"%{first.name} = {first.op} ({first.source or 'source unknown'}){more}"
 
 
-def _kind(graph: Graph, nodes: Sequence[Node], stream: str) -> str:
-    """``self_attention``, ``cross_attention``, ``feed_forward``, or a signature of the structure."""
+def _kind(graph: Graph, nodes: Sequence[Node], stream: str, hides: bool) -> str:
+    """``self_attention``, ``cross_attention``, ``feed_forward``, or a signature of the structure.
+
+    Args:
+        graph: the denoiser.
+        nodes: of the block.
+        stream: what flows into it.
+        hides: whether it is a coarse block of several residuals.
+    """
     types, producers = graph.types(), graph.producers()
     inside = {n.name for n in nodes} | {stream}
     attentions = []
+    around: set[str] = set()
     for node in nodes:
+        if node.op.startswith((_SDPA, *_SOFTMAX)):
+            around |= _around(graph, types, node)
         if node.op.startswith(_SDPA):
             keys = [a.name for a in node.args[1:2] if isinstance(a, Ref)]
         elif node.op.startswith(_SOFTMAX):
@@ -194,18 +205,32 @@ def _kind(graph: Graph, nodes: Sequence[Node], stream: str) -> str:
         else:
             continue
         attentions.append("self_attention" if any(k in inside for k in keys) else "cross_attention")
-    if len(attentions) == 1 and not _convolves(nodes):
-        return attentions[0]
-    contractions = sum(node_flops(n, types) > 0 for n in nodes)
-    if not attentions and contractions and not _convolves(nodes):
+    contractions = [n.name for n in nodes if node_flops(n, types) > 0]
+    convolves = any(_convolves(n, types) for n in nodes)
+    if len(attentions) == 1 and not convolves and not hides:
+        # What computes beside the attention, neither before it nor after, is the other branch of a parallel block.
+        return attentions[0] if around.issuperset(contractions) else f"{attentions[0]}+feed_forward"
+    if not attentions and contractions and not convolves and not hides:
         return "feed_forward"
     signature = hashlib.sha256("|".join(n.op for n in nodes).encode()).hexdigest()[:8]
     shape = f"{len(attentions)}attention_" if attentions else ""
     return f"{shape}{len(nodes)}ops_{signature}"
 
 
-def _convolves(nodes: Sequence[Node]) -> bool:
-    return any(n.op.startswith(("aten.conv", "aten.convolution")) for n in nodes)
+def _around(graph: Graph, types: dict[str, TensorType], attention: Node) -> set[str]:
+    """What is before or after an attention, of which a softmax alone is followed by the product with the values."""
+    after = reachable_from(graph, [attention.name])
+    products = [n.name for n in graph.nodes if n.name in after and node_flops(n, types) > 0]
+    product = attention.name if attention.op.startswith(_SDPA) or not products else products[0]
+    return reaching(graph, [product]) | reachable_from(graph, [product])
+
+
+def _convolves(node: Node, types: dict[str, TensorType]) -> bool:
+    """Whether a node mixes neighbours; a pointwise convolution is a linear layer of the channels."""
+    if not node.op.startswith("aten.conv"):
+        return False
+    weight = node.args[1]
+    return not isinstance(weight, Ref) or any(size != 1 for size in types[weight.name].shape[2:])
 
 
 def _key_operands(producers: dict[str, Node], softmax: Node) -> list[str]:
@@ -222,10 +247,13 @@ def _key_operands(producers: dict[str, Node], softmax: Node) -> list[str]:
 
 
 def _number(graph: Graph, blocks: Sequence[Block]) -> list[Block]:
-    """Give every block its FORWARD group: the blocks of its kind and shape."""
-    groups: dict[tuple[str, TensorType], int] = {}
+    """Give every block its FORWARD group: the blocks of its kind and shape.
+
+    The residual of a coarse block also holds what happens to the stream before the addition, so it is of another kind.
+    """
+    groups: dict[tuple[str, TensorType, bool], int] = {}
     numbered = []
     for block in blocks:
-        group = groups.setdefault((block.kind, block.type), len(groups))
+        group = groups.setdefault((block.kind, block.type, block.residual is None), len(groups))
         numbered.append(replace(block, group=group))
     return numbered

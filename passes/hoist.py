@@ -16,6 +16,7 @@ from ttscompile.ir.evaluate import Evaluator
 from ttscompile.ir.flops import graph_flops
 from ttscompile.ir.graph import Graph, Node, Ref, TensorType, backward_slice
 from ttscompile.ir.program import Binding, Pieces, Program
+from ttscompile.ir.rows import crossing_inputs, unfold
 
 from .base import Pass, PassResult
 
@@ -54,7 +55,8 @@ class Hoist(Pass):
         wanted = list(dict.fromkeys(n for g in _loop(pieces) for n in list(g.inputs)[1:]))
         types = prologue.types()
         at = {b: [n for n in wanted if known[n] is b] for b in Binding}
-        step, boundary = _step_graph(prologue, at[Binding.STEP], known)
+        step, boundary, prologue = _step_graph(prologue, at[Binding.STEP], known)
+        types, known = prologue.types(), bindings(prologue, inputs)
         early = {b: [n for n in boundary if known[n] is b] for b in (Binding.CONDITION, Binding.TABLE)}
         conditions = list(dict.fromkeys(at[Binding.CONDITION] + early[Binding.CONDITION]))
         tables = list(dict.fromkeys(at[Binding.TABLE] + at[Binding.CONSTANT] + early[Binding.TABLE]))
@@ -139,10 +141,15 @@ def _rename_contexts(pieces: Pieces, renamed: Mapping[str, str]) -> Pieces:
     return replace(pieces, stem=rename(pieces.stem), blocks=tuple(map(rename, pieces.blocks)), tail=rename(pieces.tail))
 
 
-def _step_graph(prologue: Graph, outputs: list[str], known: Mapping[str, Binding]) -> tuple[Graph | None, list[str]]:
-    """The graph of the step values, and the condition values and table rows that it reads."""
+def _step_graph(
+    prologue: Graph, outputs: list[str], known: Mapping[str, Binding]
+) -> tuple[Graph | None, list[str], Graph]:
+    """The graph of the step values, the condition values and table rows that it reads, and the prologue that has them.
+
+    What has several rows a stream is read with an axis of streams; see ``ir.rows``.
+    """
     if not outputs:
-        return None, []
+        return None, [], prologue
     types = prologue.types()
     early = {
         name: types[name]
@@ -152,7 +159,10 @@ def _step_graph(prologue: Graph, outputs: list[str], known: Mapping[str, Binding
         if known[name] in (Binding.TABLE, Binding.CONDITION)
     }
     step = backward_slice(prologue, tuple(outputs), early)
-    return step, list(step.inputs)
+    rows = unfold(prologue, step.inputs)
+    prologue = replace(prologue, nodes=(*prologue.nodes, *(one.leave() for one in rows.values())))
+    step = crossing_inputs(step, rows)
+    return step, list(step.inputs), prologue
 
 
 def _evaluate_tables(

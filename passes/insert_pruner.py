@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.ir.dataflow import dominators
+from ttscompile.ir.dataflow import dominators, reaching
 from ttscompile.ir.flops import graph_flops, node_flops
 from ttscompile.ir.graph import Argument, Batch, Graph, Node, Ref, TensorType
 from ttscompile.ir.program import Binding, Program
@@ -23,6 +23,9 @@ MASKED = -1e9
 MAX_SHARE = 0.01
 """The head may cost at most this share of the dense FLOPs."""
 
+MAX_FEATURE = 16384
+"""A feature with more numbers is averaged over its longest axes: the keys of a prefix cache are millions."""
+
 
 @dataclass(frozen=True)
 class InsertPruner(Pass):
@@ -34,7 +37,7 @@ class InsertPruner(Pass):
 
     After::
 
-        features = flatten and normalise the last value that all condition values come from
+        features = flatten and normalise the last value that all condition values come from, averaged if it is huge
         code     = tanh(linear(gelu(linear(features))))                          # [B, rank]
         logits   = pruner.base + (code * pruner.step) @ pruner.block + mask       # [B, K, blocks, 4]
 
@@ -60,8 +63,9 @@ class InsertPruner(Pass):
         condition, features = _features(program)
         types = condition.types()
         steps, blocks = program.spec.sampler.steps, len(program.blocks)
-        head = self._fitted([types[f] for f in features], steps, blocks, program.dense_flops)
-        parameters = head._parameters([types[f] for f in features], steps, blocks)
+        inputs = sum(math.prod(_read(types[f])) for f in features)
+        head = self._fitted(inputs, steps, blocks, program.dense_flops)
+        parameters = head._parameters(inputs, steps, blocks)
         graph = head._head({f: types[f] for f in features}, parameters, steps, blocks)
         pieces = replace(program.pieces, condition=condition, pruner=graph, features=features)
         pieces = replace(pieces, bindings={**pieces.bindings, **dict.fromkeys(features, Binding.CONDITION)})
@@ -73,9 +77,8 @@ class InsertPruner(Pass):
             notes.append(f"more than {MAX_SHARE:.0%} even at its smallest: on a policy this small sparsity hardly pays")
         return PassResult(new, True, tuple(notes))
 
-    def _fitted(self, features: Sequence[TensorType], steps: int, blocks: int, dense: int) -> InsertPruner:
+    def _fitted(self, inputs: int, steps: int, blocks: int, dense: int) -> InsertPruner:
         """This head, halved until it costs at most ``MAX_SHARE`` of a dense call or cannot shrink."""
-        inputs = sum(math.prod(t.at(1)) for t in features)
         head = self
         while head.rank > 1:
             contractions = inputs * head.width + head.width * head.rank + steps * head.rank * blocks * SOURCES
@@ -84,10 +87,7 @@ class InsertPruner(Pass):
             head = InsertPruner(rank=head.rank // 2, width=max(head.width // 2, 4))
         return head
 
-    def _parameters(
-        self, features: Sequence[TensorType], steps: int, blocks: int
-    ) -> dict[str, npt.NDArray[np.float32]]:
-        inputs = sum(math.prod(t.at(1)) for t in features)
+    def _parameters(self, inputs: int, steps: int, blocks: int) -> dict[str, npt.NDArray[np.float32]]:
         draw = np.random.default_rng(0)
 
         def normal(*shape: int, scale: float) -> npt.NDArray[np.float32]:
@@ -124,15 +124,17 @@ class InsertPruner(Pass):
 
         flat = []
         for i, (name, type_) in enumerate(features.items()):
-            size = math.prod(type_.at(1))
             value: Ref = Ref(name)
-            axis = type_.batch_axis
+            axis, shape, read = type_.batch_axis, _stream(type_), _read(type_)
+            size = math.prod(read)
             if axis:  # the batch first, whatever the layout of the encoder
-                shape = tuple(n for n in type_.at(1)[:axis] + type_.at(1)[axis + 1 :])
                 order = (axis, *(a for a in range(len(type_.shape)) if a != axis))
                 value = emit(f"batch_first{i}", "permute.default", shape, value, order)
+            if read != shape:
+                gone = tuple(a + 1 for a, (whole, left) in enumerate(zip(shape, read, strict=True)) if whole != left)
+                value = emit(f"average{i}", "mean.dim", read, value, gone, True)
             flat.append(emit(f"flat{i}", "reshape.default", (size,), value, (Batch(), size)))
-        width = sum(math.prod(t.at(1)) for t in features.values())
+        width = sum(math.prod(_read(t)) for t in features.values())
         joined = flat[0] if len(flat) == 1 else emit("joined", "cat.default", (width,), tuple(flat), 1)
         normed = emit("normed", "layer_norm.default", (width,), joined, (width,))
         hidden = emit("hidden", "linear.default", (self.width,), normed, _p("hidden.weight"), _p("hidden.bias"))
@@ -154,6 +156,21 @@ def _p(name: str) -> Ref:
     return Ref(f"pruner.{name}")
 
 
+def _stream(type_: TensorType) -> tuple[int, ...]:
+    """Sizes of one stream's feature, without the axis of streams."""
+    axis = type_.batch_axis
+    sizes = type_.at(1)
+    return sizes if axis is None else sizes[:axis] + sizes[axis + 1 :]
+
+
+def _read(type_: TensorType) -> tuple[int, ...]:
+    """What the head reads of it: the longest axes averaged, of size 1, until there are at most ``MAX_FEATURE``."""
+    sizes = list(_stream(type_))
+    while type_.dtype == "float32" and math.prod(sizes) > MAX_FEATURE:
+        sizes[sizes.index(max(sizes))] = 1
+    return tuple(sizes)
+
+
 def _features(program: Program) -> tuple[Graph, tuple[str, ...]]:
     """The condition graph and the values of it that the head reads.
 
@@ -164,12 +181,11 @@ def _features(program: Program) -> tuple[Graph, tuple[str, ...]]:
     assert pieces is not None
     graph = pieces.condition
     types, producers = graph.types(), graph.producers()
-    worked = False
     chosen: str | None = None
-    by_flops = {n.name: node_flops(n, types) for n in graph.nodes}
+    arithmetic = {n.name for n in graph.nodes if node_flops(n, types)}
     for name in dominators(graph, graph.inputs, graph.outputs):
-        worked = worked or by_flops.get(name, 0) > 0
         node = producers.get(name)
+        worked = not arithmetic.isdisjoint(reaching(graph, [name]))
         if worked and node is not None and len(node.types) == 1 and types[name].batch_axis is not None:
             chosen = name
     if chosen is not None:

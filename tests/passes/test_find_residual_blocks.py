@@ -148,6 +148,43 @@ def test_kind_of_attention_written_out_by_hand(own: bool, kind: str) -> None:
     assert kinds(_attention(own)) == [kind]
 
 
+def test_what_computes_beside_an_attention_is_in_its_name() -> None:
+    graph = _attention(keys_from_stream=True)
+    b = Builder()
+    b.inputs, b.nodes = dict(graph.inputs), list(graph.nodes[:-1])
+    beside = b.op("beside", "linear.default", (B, 4, 8), Ref("x"), b.constant("w", 8, 8))
+    both = b.op("both", "add.Tensor", (B, 4, 8), Ref("mixed"), beside)
+    assert kinds(b.graph(b.op("a", "add.Tensor", (B, 4, 8), Ref("x"), both))) == ["self_attention+feed_forward"]
+
+
+def test_values_that_are_projected_by_a_path_of_their_own_belong_to_the_attention() -> None:
+    b = Builder()
+    x = b.input("x", B, 4, 8)
+    scores = b.op("scores", "matmul.default", (B, 4, 4), x, b.op("keys", "transpose.int", (B, 8, 4), x, 1, 2))
+    weights = b.op("weights", "softmax.int", (B, 4, 4), scores, -1)
+    values = b.op("values", "linear.default", (B, 4, 8), x, b.constant("w", 8, 8))
+    mixed = b.op("mixed", "matmul.default", (B, 4, 8), weights, values)
+    assert kinds(b.graph(b.op("a", "add.Tensor", (B, 4, 8), x, mixed))) == ["self_attention"]
+
+
+@pytest.mark.parametrize(("kernel", "kind"), [(1, "feed_forward"), (3, "1ops_")])
+def test_a_pointwise_convolution_is_a_linear_layer(kernel: int, kind: str) -> None:
+    b = Builder()
+    x = b.input("x", B, 8, 4)
+    f = b.op("f", "conv1d.default", (B, 8, 4), x, b.constant("w", 8, 8, kernel))
+    (found,) = kinds(b.graph(b.op("a", "add.Tensor", (B, 8, 4), x, f)))
+    assert found.startswith(kind)
+
+
+def test_coarse_blocks_share_no_cache_with_plain_ones() -> None:
+    b = Builder()
+    h = b.residual("a0", b.input("x", B, 4, 8))
+    for i in (1, 2):
+        h = b.residual(f"a{i}", b.op(f"n{i}", "layer_norm.default", (B, 4, 8), h, (8,)))
+    table = find_residual_blocks(b.graph(h), "x")
+    assert [(block.kind, block.group) for block in table.blocks] == [("feed_forward", g) for g in (0, 1, 1)]
+
+
 def test_unknown_structures_get_equal_signatures_for_equal_structure() -> None:
     b = Builder()
     h = b.input("x", B, 4, 8)

@@ -217,8 +217,8 @@ def test_stages_are_explained() -> None:
     told: dict[str, tuple[str, ...]] = {}
     transform(TokenDecoder().eval(), spec(), explain=lambda stage, notes: told.update({stage: notes}))
     assert list(told) == [
-        "capture", "CleanUp", "find_residual_blocks", "Partition", "SplitTokens", "Hoist",
-        "InsertPruner", "InsertReuse",
+        "capture", "CleanUp", "CutCopies", "WidenAttention", "RegroupSums", "find_residual_blocks", "Partition",
+        "UnfoldBatch", "SplitTokens", "SplitFeatures", "Hoist", "InsertPruner", "InsertReuse",
     ]  # fmt: skip
     assert "6 blocks: self_attention, cross_attention, feed_forward" in told["find_residual_blocks"][0]
     assert any("left in the loop" in note for note in told["Hoist"])
@@ -262,6 +262,28 @@ def test_pruner_shrinks_until_it_costs_one_percent_and_says_when_it_cannot() -> 
     notes: list[str] = []
     transform(BareObservation().eval(), spec(), explain=lambda _, lines: notes.extend(lines))
     assert any("more than 1% even at its smallest" in note for note in notes)
+
+
+class LongObservation(nn.Module):
+    """Reads the observation as it is, and there is much of it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.ff = nn.Linear(2, 2)
+
+    def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
+        return sample + self.ff(sample * obs[:, :4, :2] * obs[:, -4:, -2:])
+
+
+def test_pruner_averages_a_feature_that_is_huge() -> None:
+    program = transform(LongObservation().eval(), toy_spec(obs=(600, 40)))
+    assert program.pieces is not None and program.pieces.pruner is not None
+    assert program.weights["pruner.hidden.weight"].shape[1] == 40
+    (feature,) = program.pieces.features
+    obs = torch.randn(2, 600, 40)
+    (logits,) = _run(program, program.pieces.pruner, {feature: obs})
+    (same,) = _run(program, program.pieces.pruner, {feature: obs.mean(1, keepdim=True).expand(-1, 600, -1)})
+    torch.testing.assert_close(logits, same)
 
 
 class NoResidual(nn.Module):

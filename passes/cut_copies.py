@@ -1,0 +1,126 @@
+"""Cut a doubled batch into its copies without a size that only the call knows: ONNX wants numbers to cut at."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from ttscompile.ir.graph import GETITEM, Argument, Batch, Node, Ref, TensorType
+from ttscompile.ir.program import Program
+
+from .base import Pass, PassResult
+
+_RESHAPE = "aten.reshape.default"
+_SPLITS = ("aten.split.Tensor", "aten.split_with_sizes.default", "aten.chunk.default")
+
+
+class CutCopies(Pass):
+    """Select whole copies of the batch by their number.
+
+    Before::
+
+        %given = aten.slice.Tensor(%both, 0, 0, B)                      # %both : [2*B, T, D]
+        %free  = aten.slice.Tensor(%both, 0, B, 2*B)                    # or split, or chunk
+
+    After::
+
+        %both.copies = aten.reshape.default(%both, [2, B, T, D])
+        %given       = aten.select.int(%both.copies, 0, 0)
+        %free        = aten.select.int(%both.copies, 0, 1)
+    """
+
+    def requires(self, program: Program) -> None:
+        """The program has no block table yet."""
+        if program.blocks:
+            raise self.fail("runs before find_residual_blocks.")
+
+    def call(self, program: Program) -> PassResult:
+        """Rewrite in the denoiser."""
+        graph = program.denoiser
+        types, producers = graph.types(), graph.producers()
+        nodes: list[Node] = []
+        made: set[str] = set()
+        cut = 0
+        for node in graph.nodes:
+            found = _slice(node, types) if node.op == "aten.slice.Tensor" else _item(node, producers, types)
+            if found is None:
+                nodes.append(node)
+                continue
+            source, axis, start, stop = found
+            cut += 1
+            nodes += _cut(node, types[source], source, axis, start, stop, made)
+        if not cut:
+            return PassResult(program, False)
+        read = {name for node in nodes for name in node.refs()} | set(graph.outputs)
+        kept = tuple(n for n in nodes if n.op not in _SPLITS or n.name in read)
+        new = replace(program, denoiser=replace(graph, nodes=kept))
+        return PassResult(new, True, (f"{cut} cuts of a multiple of the batch",))
+
+
+_Found = tuple[str, int, int, int]
+"""What is cut, the axis, and the first copy and the one after the last."""
+
+
+def _axis(type_: TensorType, argument: Argument) -> int | None:
+    if not isinstance(argument, int):
+        return None
+    axis = argument % len(type_.shape)
+    return axis if isinstance(type_.shape[axis], Batch) else None
+
+
+def _multiple(size: Argument, of: Batch) -> int | None:
+    """How many batches a boundary lies from the start."""
+    if isinstance(size, Batch):
+        return size.multiple
+    if size is None or (isinstance(size, int) and size >= 2**31):
+        return of.multiple
+    return 0 if size == 0 else None
+
+
+def _slice(node: Node, types: Mapping[str, TensorType]) -> _Found | None:
+    source = node.args[0]
+    assert isinstance(source, Ref)
+    axis = _axis(types[source.name], node.args[1] if len(node.args) > 1 else 0)
+    if axis is None or (len(node.args) > 4 and node.args[4] != 1):
+        return None
+    whole = types[source.name].shape[axis]
+    assert isinstance(whole, Batch)
+    start = _multiple(node.args[2] if len(node.args) > 2 and node.args[2] is not None else 0, whole)
+    stop = _multiple(node.args[3] if len(node.args) > 3 else None, whole)
+    if start is None or stop is None or (start, stop) == (0, whole.multiple):
+        return None
+    return source.name, axis, start, stop
+
+
+def _item(node: Node, producers: Mapping[str, Node], types: Mapping[str, TensorType]) -> _Found | None:
+    """One part of a split."""
+    if node.op != GETITEM or not isinstance(node.args[0], Ref) or not isinstance(node.args[1], int):
+        return None
+    split = producers.get(node.args[0].name)
+    if split is None or split.op not in _SPLITS or not isinstance(split.args[0], Ref):
+        return None
+    source = split.args[0].name
+    axis = _axis(types[source], split.args[2] if len(split.args) > 2 else 0)
+    if axis is None:
+        return None
+    sizes = [part.shape[axis] for part in split.types]
+    if not all(isinstance(size, Batch) for size in sizes):
+        return None
+    multiples = [size.multiple for size in sizes if isinstance(size, Batch)]
+    start = sum(multiples[: node.args[1]])
+    return source, axis, start, start + multiples[node.args[1]]
+
+
+def _cut(node: Node, type_: TensorType, source: str, axis: int, start: int, stop: int, made: set[str]) -> list[Node]:
+    whole = type_.shape[axis]
+    assert isinstance(whole, Batch)
+    shape = (*type_.shape[:axis], whole.multiple, Batch(), *type_.shape[axis + 1 :])
+    copies, nodes = f"{source}.copies{axis}", []
+    if copies not in made:
+        made.add(copies)
+        nodes.append(Node(copies, _RESHAPE, (Ref(source), shape), (), (replace(type_, shape=shape),), node.source))
+    if stop - start == 1:
+        return [*nodes, Node(node.name, "aten.select.int", (Ref(copies), axis, start), (), node.types, node.source)]
+    some = replace(type_, shape=(*shape[:axis], stop - start, *shape[axis + 1 :]))
+    part = Node(f"{node.name}.part", "aten.slice.Tensor", (Ref(copies), axis, start, stop), (), (some,), node.source)
+    return [*nodes, part, Node(node.name, _RESHAPE, (Ref(part.name), node.type.shape), (), node.types, node.source)]

@@ -1,0 +1,47 @@
+"""What every family has to pass."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from tests.runtimes.agreement import largest_difference
+from ttscompile.artifact import load_artifact
+from ttscompile.ir.flops import graph_flops
+from ttscompile.ir.program import Program
+from ttscompile.runtimes import open_runtime
+
+GOLDEN = Path(__file__).parent / "golden"
+
+Arrays = dict[str, np.ndarray]
+
+
+def golden(name: str) -> Arrays:
+    """What the original made; see ``golden/README.md``."""
+    with np.load(GOLDEN / f"{name}.npz") as file:
+        return dict(file)
+
+
+def kinds(program: Program) -> dict[str, int]:
+    """How many blocks of each kind were found; a signature without what changes with the version of torch."""
+    return dict(Counter(re.sub(r"\d+ops_\w+$", "region", block.kind) for block in program.blocks))
+
+
+def in_loop(program: Program) -> float:
+    """Share of the dense FLOPs that are left in the loop."""
+    pieces = program.pieces
+    assert pieces is not None
+    steps = program.spec.sampler.steps
+    return sum(graph_flops(g) for g in (pieces.stem, *pieces.blocks, pieces.tail)) * steps / program.dense_flops
+
+
+def assert_runtimes_agree(folder: Path, streams: tuple[int, ...] = (1, 3)) -> None:
+    """Random legal plans, one for each stream, give the same samples in both runtimes."""
+    artifact = load_artifact(folder)
+    left, right = open_runtime(artifact, "onnxruntime"), open_runtime(artifact, "reference")
+    rng = np.random.default_rng(0)
+    for count in streams:
+        assert largest_difference(artifact, left, right, rng, count, calls=3) < 1e-5

@@ -1,0 +1,91 @@
+"""CogACT's action model with its guidance: the batch is doubled, with the cognition token and with the learned none.
+
+Parameters are called as in the original. Token 0 is the sum of timestep and condition.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+
+class _Attention(nn.Module):
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.qkv, self.proj = nn.Linear(width, 3 * width), nn.Linear(width, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        q, k, v = (part.unflatten(-1, (self.heads, -1)).transpose(1, 2) for part in self.qkv(x).chunk(3, -1))
+        return self.proj(functional.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
+
+
+class _Mlp(nn.Module):
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.fc1, self.fc2 = nn.Linear(width, 4 * width), nn.Linear(4 * width, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.fc2(functional.gelu(self.fc1(x), approximate="tanh"))
+
+
+class _Layer(nn.Module):
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.attn, self.mlp = _Attention(width, heads), _Mlp(width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = x + self.attn(functional.layer_norm(x, x.shape[-1:], eps=1e-6))
+        return x + self.mlp(functional.layer_norm(x, x.shape[-1:], eps=1e-6))
+
+
+class _Linear(nn.Module):
+    def __init__(self, features: int, width: int) -> None:
+        super().__init__()
+        self.linear = nn.Linear(features, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.linear(x)
+
+
+class _Time(nn.Module):
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.mlp = nn.Sequential(nn.Linear(256, width), nn.SiLU(), nn.Linear(width, width))
+
+    def forward(self, t: Tensor) -> Tensor:
+        angle = t[:, None].float() * torch.exp(-math.log(10000) * torch.arange(128, dtype=torch.float32) / 128)
+        return self.mlp(torch.cat([angle.cos(), angle.sin()], -1))
+
+
+class CogACTHead(nn.Module):
+    """``forward_with_cfg``, which doubles the batch, on a batch that is not doubled yet.
+
+    Inputs: ``sample [B, T, D]``, ``timestep [B]``, ``cognition [B, 1, .]``.
+    """
+
+    def __init__(
+        self, width: int, heads: int, layers: int, horizon: int, actions: int, cognition: int, guidance: float
+    ) -> None:
+        super().__init__()
+        self.guidance = guidance
+        self.x_embedder, self.t_embedder, self.z_embedder = _Linear(actions, width), _Time(width), nn.Module()
+        self.z_embedder.linear = nn.Linear(cognition, width)
+        self.z_embedder.uncondition = nn.Parameter(torch.zeros(1, cognition))
+        self.positional_embedding = nn.Parameter(torch.zeros(horizon + 1, width))
+        self.blocks = nn.ModuleList(_Layer(width, heads) for _ in range(layers))
+        self.final_layer = _Linear(width, actions)
+
+    def forward(self, sample: Tensor, timestep: Tensor, cognition: Tensor) -> Tensor:
+        none = self.z_embedder.uncondition[None].expand(len(sample), -1, -1)
+        z = self.z_embedder.linear(torch.cat([cognition, none], 0))
+        c = self.t_embedder(torch.cat([timestep, timestep], 0))[:, None] + z
+        x = torch.cat([c, self.x_embedder(torch.cat([sample, sample], 0))], 1) + self.positional_embedding
+        for layer in self.blocks:
+            x = layer(x)
+        x = self.final_layer(functional.layer_norm(x, x.shape[-1:], eps=1e-6))[:, 1:]
+        given, free = torch.split(x, len(x) // 2, dim=0)
+        return free + self.guidance * (given - free)

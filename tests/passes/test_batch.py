@@ -1,0 +1,147 @@
+"""Doubled batches: copies are cut by their number, and what crosses between pieces has an axis of streams."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import nn
+
+from tests.passes.graphs import B, Builder
+from tests.passes.specs import toy_spec
+from ttscompile.capture import capture
+from ttscompile.capture_batch import unify_batch
+from ttscompile.driver import transform
+from ttscompile.errors import CaptureError, PassError
+from ttscompile.ir.evaluate import evaluate
+from ttscompile.ir.graph import Batch, Graph, Node, Ref, TensorType
+from ttscompile.ir.program import Program
+from ttscompile.ir.rows import unfold
+from ttscompile.passes.cut_copies import CutCopies
+from ttscompile.passes.widen_attention import WidenAttention
+
+TWICE = (Batch(2), 4, 2)
+
+
+class Doubled(nn.Module):
+    """A residual on a batch that ``double`` makes of the sample, and ``halve`` makes one of again."""
+
+    def __init__(self, double: Callable[[torch.Tensor], torch.Tensor], halve: Callable[..., torch.Tensor]) -> None:
+        super().__init__()
+        self.ff, self.double, self.halve = nn.Linear(2, 2), double, halve
+
+    def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
+        x = self.double(sample) * self.double(obs)[:, None, :2]
+        x = x + torch.tanh(self.ff(x)) * self.double(timestep)[:, None, None]
+        return self.halve(x + self.ff(x))
+
+
+HALVES: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
+    "slices": lambda x: x[: len(x) // 2] - 0.3 * x[len(x) // 2 :],
+    "split": lambda x: torch.sub(*torch.split(x, len(x) // 2)),
+    "chunk": lambda x: torch.sub(*x.chunk(2)),
+}
+
+
+@pytest.mark.parametrize("halve", HALVES)
+def test_copies_are_cut_by_their_number(halve: str) -> None:
+    module = Doubled(lambda x: torch.cat([x, x]), HALVES[halve]).eval()
+    graph, weights = capture(module, toy_spec())
+    result = CutCopies()(Program(toy_spec(), graph, weights))
+    cut = result.program.denoiser
+    assert result.modified
+    assert not any(
+        isinstance(a, Batch) for n in cut.nodes if n.op.startswith(("aten.slice", "aten.split")) for a in n.args
+    )
+    inputs = {"sample": torch.randn(3, 4, 2), "timestep": torch.arange(3), "obs": torch.randn(3, 3)}
+    with torch.no_grad():
+        expected = module(*inputs.values())
+    found = evaluate(cut, {n: torch.from_numpy(w) for n, w in weights.items()}, inputs)[0]
+    torch.testing.assert_close(found, expected)
+
+
+@pytest.mark.parametrize(
+    ("double", "shape"),
+    [
+        (lambda x: torch.cat([x, x]), (2, B, 4, 2)),
+        (lambda x: x.repeat(2, *(1,) * (x.dim() - 1)), (2, B, 4, 2)),
+        (lambda x: torch.stack([x, x], 1).flatten(0, 1), (B, 2, 4, 2)),
+        (lambda x: torch.stack([x, x], 0).flatten(0, 1), (2, B, 4, 2)),
+    ],
+)
+def test_the_stream_of_a_doubled_batch_has_an_axis_of_streams(
+    double: Callable[[torch.Tensor], torch.Tensor], shape: tuple[object, ...]
+) -> None:
+    halve = HALVES["chunk"] if shape[0] == 2 else lambda x: x.unflatten(0, (-1, 2)).sum(1)
+    program = transform(Doubled(double, halve).eval(), toy_spec())
+    assert {block.type.shape for block in program.blocks} == {shape}
+    assert len(program.blocks) == 2
+    assert program.pieces is not None
+    for piece in (*program.pieces.blocks, program.pieces.tail):
+        assert all(type_.batch_axis is not None for type_ in piece.inputs.values())
+
+
+def test_rows_of_unknown_order_are_refused() -> None:
+    b = Builder()
+    both = b.op("both", "index_select.default", TWICE, b.input("x", B, 4, 2), 0, b.constant("order", 6))
+    with pytest.raises(PassError, match=r"%both : float32\[2\*B, 4, 2\] has several rows a stream"):
+        unfold(b.graph(both), ["both"])
+
+
+def test_values_with_an_axis_of_streams_are_left_alone() -> None:
+    b = Builder()
+    assert unfold(b.graph(b.op("y", "neg.default", (2, B), b.input("x", 2, B))), ["x", "y"]) == {}
+
+
+def graph(size: int, argument: object = 1) -> Graph:
+    node = Node("y", "aten.slice.Tensor", (Ref("x"), 0, 0, argument), (), (TensorType((size,), "float32"),), "a.py:1")  # type: ignore[arg-type]
+    return Graph({"x": TensorType((size,), "float32")}, {}, (node,), ("y",))
+
+
+def test_sizes_that_grow_with_the_batch_are_multiples_of_it() -> None:
+    found = unify_batch(graph(10, 5), graph(14, 7))
+    assert found.inputs["x"].shape == (Batch(2),) and found.nodes[0].args[3] == Batch()
+
+
+def test_what_depends_on_the_batch_otherwise_is_refused() -> None:
+    with pytest.raises(CaptureError, match=r"%y \(a.py:1\) is 6 for a batch of 5 and 8 for 7"):
+        unify_batch(graph(5, 6), graph(7, 8))
+    with pytest.raises(CaptureError, match="has the argument True or False"):
+        unify_batch(graph(5, True), graph(7, False))
+
+
+class Branches(nn.Module):
+    """Does something else for many streams."""
+
+    def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
+        y = sample.chunk(len(sample), 0)[0] if len(sample) > 5 else sample
+        return y.expand(sample.shape) * obs[:, :1, None]
+
+
+def test_a_module_that_looks_at_the_number_of_streams_is_refused() -> None:
+    with pytest.raises(CaptureError):
+        capture(Branches(), toy_spec())
+
+
+@pytest.mark.parametrize("mask", [None, (4, 4), (B, 4, 4)])
+def test_attention_without_heads_gets_one(mask: tuple[object, ...] | None) -> None:
+    b = Builder()
+    x = b.input("sample", B, 4, 2)
+    seen = None if mask is None else b.input("mask", *mask)  # type: ignore[arg-type]
+    y = b.op("y", "scaled_dot_product_attention.default", (B, 4, 2), x, x, x, seen)
+    result = WidenAttention()(Program(toy_spec(), b.graph(y), {}))
+    wide = result.program.denoiser
+    (attention,) = [n for n in wide.nodes if n.op.startswith("aten.scaled_dot")]
+    assert attention.type.shape == (B, 1, 4, 2) and result.modified
+    values = {"sample": torch.randn(3, 4, 2)}
+    if mask is not None:
+        values["mask"] = torch.randn(4, 4) if len(mask) == 2 else torch.randn(3, 4, 4)
+    torch.testing.assert_close(evaluate(wide, {}, values), evaluate(b.graph(y), {}, values))
+
+
+def test_attention_with_heads_is_left_alone() -> None:
+    b = Builder()
+    x = b.input("sample", B, 2, 4, 2)
+    y = b.op("y", "scaled_dot_product_attention.default", (B, 2, 4, 2), x, x, x)
+    assert not WidenAttention()(Program(toy_spec(), b.graph(y), {})).modified

@@ -1,0 +1,64 @@
+"""Regrouping of sums: what is added to the stream becomes one value; nothing else is touched."""
+
+from __future__ import annotations
+
+import torch
+
+from tests.passes.graphs import B, Builder
+from tests.passes.specs import toy_spec
+from ttscompile.ir.evaluate import evaluate
+from ttscompile.ir.graph import Graph, Ref
+from ttscompile.ir.program import Program
+from ttscompile.passes.find_residual_blocks import find_residual_blocks
+from ttscompile.passes.regroup_sums import RegroupSums
+
+SHAPE = (B, 4, 8)
+
+
+def regrouped(graph: Graph) -> tuple[Graph, bool]:
+    weights = {n: torch.randn(t.at(1)).numpy() for n, t in graph.constants.items()}
+    result = RegroupSums()(Program(toy_spec(sample=(4, 8)), graph, weights))
+    value = {"sample": torch.randn(2, 4, 8)}
+    tensors = {n: torch.from_numpy(w) for n, w in weights.items()}
+    before, after = (evaluate(g, tensors, value)[0] for g in (graph, result.program.denoiser))
+    torch.testing.assert_close(after, before)
+    return result.program.denoiser, result.modified
+
+
+def branches(builder: Builder, count: int) -> tuple[Ref, list[Ref]]:
+    x = builder.input("sample", *SHAPE)
+    return x, [builder.op(f"f{i}", "linear.default", SHAPE, x, builder.constant(f"w{i}", 8, 8)) for i in range(count)]
+
+
+def test_parallel_branches_become_one_residual() -> None:
+    b = Builder()
+    x, (f, g, h) = branches(b, 3)
+    total = b.op("s", "add.Tensor", SHAPE, x, f)
+    total = b.op("y", "add.Tensor", SHAPE, b.op("t", "add.Tensor", SHAPE, g, total), h)
+    graph, modified = regrouped(b.graph(total))
+    (block,) = find_residual_blocks(graph, "sample").blocks
+    assert modified and block.stream == "sample" and block.residual == "y.branches1"
+
+
+def test_two_blocks_in_a_row_stay_two() -> None:
+    b = Builder()
+    h = b.residual("a1", b.residual("a0", b.input("sample", *SHAPE)))
+    _, modified = regrouped(b.graph(h))
+    assert not modified
+
+
+def test_a_sum_that_something_else_reads_stays() -> None:
+    b = Builder()
+    x, (f, g) = branches(b, 2)
+    part = b.op("s", "add.Tensor", SHAPE, x, f)
+    total = b.op("y", "add.Tensor", SHAPE, part, g)
+    _, modified = regrouped(b.graph(b.op("z", "mul.Tensor", SHAPE, total, part)))
+    assert not modified
+
+
+def test_a_position_is_no_branch() -> None:
+    b = Builder()
+    x, (f,) = branches(b, 1)
+    placed = b.op("s", "add.Tensor", SHAPE, b.constant("position", 1, 4, 8), f)
+    _, modified = regrouped(b.graph(b.op("y", "add.Tensor", SHAPE, placed, x)))
+    assert not modified
