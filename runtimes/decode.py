@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
+from itertools import islice
 
 import numpy as np
 
 from ttscompile.lattice import BoolArray
 
+from .idle import WORTH, IdleSteps
 from .lowering import Add, Lowered
 from .onnxruntime_sessions import Array
 from .workspace import Workspace
@@ -21,15 +24,15 @@ def decode_first(work: Workspace, keep: BoolArray) -> None:
         keep: bool ``[K, blocks]``; computed residuals that go into the rollout cache.
     """
     work.begin()
-    stream = work.stream
-    np.copyto(stream, work.fresh)
-    for b, kept in enumerate(keep[0].tolist()):
-        work.run(0, b)
-        residual = work.current[b]
-        np.add(stream, residual, stream)
-        if kept:
-            np.copyto(work.rollout.entry(b), residual)
-    work.advance(0)
+    _run_dense(work, 0, keep)
+
+
+def _run_dense(work: Workspace, k: int, keep: BoolArray) -> None:
+    """A step that computes all blocks."""
+    work.run_dense(k)
+    for b in np.flatnonzero(keep[k]).tolist():
+        np.copyto(work.rollout.entry(k * len(work.current) + b), work.current[b])
+    work.advance(k)
 
 
 def decode_rest(work: Workspace, lowered: Sequence[Lowered], keep: BoolArray) -> None:
@@ -51,29 +54,64 @@ def _together(work: Workspace, lowered: Lowered, keep: BoolArray) -> None:
     blocks = len(work.current)
     entries = {cell: work.rollout.entry(cell) for cell in np.flatnonzero(lowered.rollout).tolist()}
     lane = _Lane(lowered, work.stream, work.current, work.table, work.sums(lowered.slots), entries)
-    gaps, stream, current, run = iter(lowered.gaps[blocks + 1 :]), lane.stream, lane.current, work.run
-    fresh = _flat(work.fresh, 0)
-    kept = keep.reshape(-1).tolist()
-    cells = iter(lowered.cells[blocks:])
-    for k, count in enumerate(lowered.counts[1:], start=1):
-        before = fresh  # the first operation of a step takes the stream from there
-        for _ in range(count):
-            gap, cell = next(gaps), next(cells)
-            if gap is not None:
-                lane.add(gap, before)
-            elif before is fresh:
-                np.copyto(stream, fresh)
-            before = stream
-            b = cell - k * blocks
-            run(k, b)
-            residual = current[b]
-            np.add(stream, residual, stream)
-            if kept[cell]:
-                np.copyto(work.rollout.entry(cell), work.current[b])
-        gap = next(gaps)
+    k, done, steps = 1, blocks, len(lowered.counts)
+    while k < steps:
+        count = lowered.counts[k]
+        if work.idle is not None and lowered.idle[k] >= WORTH:
+            k = _pass_idle(work, work.idle, lane, k, done)
+            continue
+        if count == blocks:
+            _run_dense(work, k, keep)
+        else:
+            _run_some(work, lane, k, done, keep[k].tolist())
+        k, done = k + 1, done + count
+
+
+def _run_some(work: Workspace, lane: _Lane, k: int, done: int, kept: Sequence[bool]) -> None:
+    """A step that computes some blocks, or none.
+
+    Args:
+        work: at step k.
+        lane: of all streams.
+        k: the step.
+        done: how many cells were computed before it.
+        kept: by block, whether its residual goes into the rollout cache.
+    """
+    lowered, stream, current, blocks = lane.lowered, lane.stream, lane.current, len(kept)
+    count = lowered.counts[k]
+    gaps = lowered.gaps[done + k : done + k + count + 1]
+    fresh = before = _flat(work.fresh, 0)  # the first operation takes the stream from there
+    for gap, cell in zip(gaps, lowered.cells[done : done + count], strict=False):
         if gap is not None:
             lane.add(gap, before)
-        work.advance(k)
+        elif before is fresh:
+            np.copyto(stream, fresh)
+        before = stream
+        b = cell - k * blocks
+        work.run(k, b)
+        residual = current[b]
+        np.add(stream, residual, stream)
+        if kept[b]:
+            np.copyto(work.rollout.entry(cell), work.current[b])
+    if gaps[-1] is not None:
+        lane.add(gaps[-1], before)
+    work.advance(k)
+
+
+def _pass_idle(work: Workspace, idle: IdleSteps, lane: _Lane, k: int, done: int) -> int:
+    """Steps in a row without a computed block, from k on; the step that follows them."""
+    lowered, total = lane.lowered, _flat(idle.total, 0)
+    stop = k + lowered.idle[k]
+    work.enter_idle(k)
+    while k < stop:
+        gap, count = lowered.gaps[done + k], lowered.alike[k]
+        assert gap is not None
+        np.copyto(total, lane.total(gap))
+        idle.prepare()
+        work.run_idle(k, k + count)
+        k += count
+    work.leave_idle(stop)
+    return stop
 
 
 def _apart(work: Workspace, lowered: Sequence[Lowered], keep: BoolArray) -> None:
@@ -86,8 +124,14 @@ def _apart(work: Workspace, lowered: Sequence[Lowered], keep: BoolArray) -> None
     for k, b, s in np.argwhere(np.stack([one.computed for one in lowered], axis=2)).tolist():
         takers[k][b].append(s)
     for k, step in enumerate(takers[1:], start=1):
-        np.copyto(work.stream, work.fresh)
-        for b, some in enumerate(step):
+        whole = step[0] if all(some == step[0] for some in step) else []  # these compute all blocks, the others none
+        if len(whole) < everyone:
+            np.copyto(work.stream, work.fresh)
+        if whole:
+            _run_dense_apart(work, [lanes[s] for s in whole], whole, k, keep)
+            for s in whole:
+                deque(islice(gaps[s], blocks), 0)  # there are none
+        for b, some in enumerate([] if whole else step):
             if not some:
                 continue
             for s in some:
@@ -108,6 +152,21 @@ def _apart(work: Workspace, lowered: Sequence[Lowered], keep: BoolArray) -> None
         work.advance(k)
 
 
+def _run_dense_apart(work: Workspace, lanes: Sequence[_Lane], streams: Sequence[int], k: int, keep: BoolArray) -> None:
+    """All blocks at step k for these streams, all of the batch or some."""
+    if len(streams) == work.streams:
+        work.run_dense(k)
+    else:
+        after, *residuals = work.run_dense_some(k, streams)
+        for i, lane in enumerate(lanes):
+            np.copyto(lane.stream, after[i].reshape(lane.stream.shape))
+            for own, residual in zip(lane.current, residuals, strict=True):
+                np.copyto(own, residual[i].reshape(own.shape))
+    for b in np.flatnonzero(keep[k]).tolist():
+        for s, lane in zip(streams, lanes, strict=True):
+            np.copyto(work.rollout.of_stream(k * len(lane.current) + b, s), lane.current[b].reshape(lane.shape))
+
+
 class _Lane:
     """What the instructions of one plan work on: the whole batch, or one stream of it, as views.
 
@@ -123,7 +182,7 @@ class _Lane:
     def __init__(
         self, lowered: Lowered, stream: Array, current: Array, table: Array, sums: Array, entries: dict[int, Array]
     ) -> None:
-        self.shape = stream.shape
+        self.lowered, self.shape = lowered, stream.shape
         self.stream, self.current = _flat(stream, 0), _flat(current, 1)
         self._table, self._sums = _flat(table, 1), _flat(sums, 1)
         self._summed = self._table if lowered.table else self.current
@@ -138,16 +197,20 @@ class _Lane:
         entries = {cell: work.rollout.of_stream(cell, s) for cell in np.flatnonzero(lowered.rollout).tolist()}
         return cls(lowered, np.moveaxis(work.stream, axis, 0)[s], current, table, sums, entries)
 
-    def add(self, gap: Add, before: Array) -> None:
-        """The stream becomes ``before`` and a sum, which is made first if it is new."""
+    def total(self, gap: Add) -> Array:
+        """The sum of a gap, which is made first if it is new."""
         slot, start, stop, due = gap
-        total = self._sums[slot]
+        total: Array = self._sums[slot]
         if start != stop:
             for i in range(*due):  # faster than numpy's indexing by arrays at any length
                 source = self._from[i]
                 self._table[self._rows[i]] = self.current[~source] if source < 0 else self._entries[source]
             np.add.reduce(self._summed[start:stop], axis=0, out=total)
-        np.add(before, total, self.stream)
+        return total
+
+    def add(self, gap: Add, before: Array) -> None:
+        """The stream becomes ``before`` and a sum."""
+        np.add(before, self.total(gap), self.stream)
 
     def add_next(self, gap: Add | None) -> None:
         """``add`` to the stream, if any block is reused in this gap."""

@@ -58,6 +58,8 @@ class Lowered:
         load_rows: rows of the table that are loaded, in order.
         load_from: what each of them takes: an entry of the rollout cache by its flat index, or ``~b`` for the last
             residual that block b computed in this call.
+        idle: for each step, how many steps from it on have no computed block; 0 if it has one.
+        alike: for each step without a computed block, how many such steps from it on add the same sum.
         computed: bool ``[K, blocks]``.
         rollout: bool ``[K, blocks]``; entries of the rollout cache that the plan reads, so that it is legal in an
             episode that has written them.
@@ -71,8 +73,15 @@ class Lowered:
     table: bool
     load_rows: tuple[int, ...]
     load_from: tuple[int, ...]
+    idle: tuple[int, ...]
+    alike: tuple[int, ...]
     computed: BoolArray
     rollout: BoolArray
+
+    @property
+    def partial(self) -> bool:
+        """Whether a step computes some of its blocks, and not all of them."""
+        return any(0 < count < self.computed.shape[1] for count in self.counts)
 
 
 def lower_plan(plan: PlanArray, groups: Sequence[int]) -> Lowered:
@@ -98,9 +107,9 @@ def lower_plan(plan: PlanArray, groups: Sequence[int]) -> Lowered:
     starts, stops = np.flatnonzero(begins), np.flatnonzero(ends) + 1
     borrows = bool((plan == Source.FORWARD).any())
     cells = resolved.cell.reshape(-1)
-    first = _first_alike(_in_order(cells, begins | computed) if borrows else cells, starts.tolist(), stops.tolist())
-    new = np.asarray(first, dtype=np.int64) == np.arange(len(first))
-    slot, slots = _slots(first)
+    first = _first_alike(_in_order(cells, begins | computed) if borrows else cells, starts, stops)
+    new = first == np.arange(len(first))
+    slot, slots = _slots(first.tolist())
 
     table = borrows or bool(resolved.rollout.any())
     loaded = load = load_stop = np.zeros(0, dtype=np.int64)
@@ -111,11 +120,17 @@ def lower_plan(plan: PlanArray, groups: Sequence[int]) -> Lowered:
     rows = starts % blocks
     stop = np.where(new, rows + stops - starts, rows)
     due = zip(load.tolist(), load_stop.tolist(), strict=True) if table else repeat((0, 0))
-    adds = map(Add, slot, rows.tolist(), stop.tolist(), due)
+    adds = map(Add._make, zip(slot, rows.tolist(), stop.tolist(), due, strict=False))
     done = np.cumsum(computed)
     gaps: list[Add | None] = [None] * (steps + int(done[-1]))
     for position, add in zip((done[starts] + starts // blocks).tolist(), adds, strict=True):
         gaps[position] = add
+    idle = ~computed.any(axis=1)
+    maker = np.full(steps, -1)
+    maker[idle] = first[np.searchsorted(starts, np.flatnonzero(idle) * blocks)]
+    joined, same = np.zeros((2, steps), np.bool_)
+    joined[:-1] = idle[:-1] & idle[1:]
+    same[:-1] = joined[:-1] & (maker[:-1] == maker[1:])
     source = np.where(resolved.rollout.reshape(-1)[loaded], cells[loaded], ~(cells[loaded] % blocks))
     return Lowered(
         counts=tuple(computed.sum(axis=1).tolist()),
@@ -126,9 +141,18 @@ def lower_plan(plan: PlanArray, groups: Sequence[int]) -> Lowered:
         table=table,
         load_rows=tuple((loaded % blocks).tolist()),
         load_from=tuple(source.tolist()),
+        idle=tuple((_ahead(joined) * idle).tolist()),
+        alike=tuple((_ahead(same) * idle).tolist()),
         computed=computed,
         rollout=resolved.rollout,
     )
+
+
+def _ahead(joined: BoolArray) -> IntArray:
+    """For each element how many from it on belong together; ``joined`` says it of an element and the next one."""
+    ends, each = np.flatnonzero(~joined), np.arange(len(joined))
+    length: IntArray = ends[np.searchsorted(ends, each)] - each + 1
+    return length
 
 
 def _in_order(cells: IntArray, begins: BoolArray) -> IntArray:
@@ -144,7 +168,7 @@ def _in_order(cells: IntArray, begins: BoolArray) -> IntArray:
     return np.sort(gap * len(cells) + cells) % len(cells)
 
 
-def _first_alike(keys: IntArray, starts: list[int], stops: list[int]) -> list[int]:
+def _first_alike(keys: IntArray, starts: IntArray, stops: IntArray) -> IntArray:
     """For each gap the first gap that adds the same residuals, which may be itself.
 
     Args:
@@ -152,11 +176,9 @@ def _first_alike(keys: IntArray, starts: list[int], stops: list[int]) -> list[in
         starts: where the gaps begin.
         stops: where they end.
     """
-    content, size = keys.tobytes(), keys.itemsize
-    seen: dict[bytes, int] = {}
-    return [
-        seen.setdefault(content[size * i : size * j], n) for n, (i, j) in enumerate(zip(starts, stops, strict=True))
-    ]
+    content, seen = keys.tobytes(), dict[bytes, int]()
+    bounds = zip((keys.itemsize * starts).tolist(), (keys.itemsize * stops).tolist(), strict=True)
+    return np.array([seen.setdefault(content[i:j], n) for n, (i, j) in enumerate(bounds)], dtype=np.int64)
 
 
 def _slots(first: list[int]) -> tuple[list[int], int]:

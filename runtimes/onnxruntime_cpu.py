@@ -1,4 +1,4 @@
-"""The product on the CPU: numpy and onnxruntime, one session a piece, plans lowered to short lists of instructions.
+"""The product on the CPU: numpy and onnxruntime, a session a piece, plans lowered to short lists of instructions.
 
     caller's thread    prologue | stem, dense step 0            | steps 1..K-1
     helper             --------   pruner, its plan, lowering     --------------
@@ -37,9 +37,10 @@ from .base import (
     settle_plan,
 )
 from .decode import decode_first, decode_rest
+from .inpainting import known_samples
 from .liveness import readable_rollout
 from .lowering import Lowered, LoweringCache
-from .onnxruntime_sessions import open_sessions
+from .onnxruntime_sessions import open_blocks, open_sessions
 from .workspace import Workspace
 
 if TYPE_CHECKING:
@@ -84,16 +85,20 @@ class OnnxRuntime:
     def __init__(self, artifact: Artifact, threads: int = 1) -> None:
         self._manifest = artifact.manifest
         self._tables = artifact.tables
-        self._sessions = open_sessions(artifact, threads)
+        self._artifact, self._threads = artifact, threads
         self._groups = self._manifest.groups
         self._lowering = LoweringCache(self._groups)
+        self._schedules = tuple(self._lowering.lower(plan) for plan in artifact.schedules.values())
+        pruned = any(plan.kind == "pruner" for plan in self._manifest.plans.values())
+        self._blocks = pruned or any(one.partial for one in self._schedules)  # whether single blocks have sessions
+        self._sessions = open_sessions(artifact, threads, self._blocks)
         self._readable = readable_rollout(artifact)
         self._corrections = tuple(artifact.corrections.values())
         self._matrices = False  # whether one was ever given
         self._written: BoolArray | None = None
         self._dropped: BoolArray | None = None  # computed in this episode, and not kept
         self._helper = ThreadPoolExecutor(1, "ttscompile-pruner") if "pruner" in self._manifest.pieces else None
-        self._slots = max((self._lowering.lower(plan).slots for plan in artifact.schedules.values()), default=0)
+        self._slots = max((one.slots for one in self._schedules), default=0)
         self._workspace = self._open_workspace(1)
 
     @property
@@ -124,10 +129,12 @@ class OnnxRuntime:
         plan_name: str | None = None,
         repair: bool = False,
         correction: Correction | None = None,
+        prefix: FloatArray | None = None,
     ) -> tuple[FloatArray, CallReport]:
         """Denoise one chunk; see ``base.Runtime.predict``."""
         spec = self._manifest.spec
         streams = check_call(self.streams, noise, spec.sample, spec.sampler)
+        known = known_samples(spec, prefix, noise.initial)
         cells = (streams, spec.sampler.steps, len(self._groups))
         written = np.zeros(cells, dtype=np.bool_) if self._written is None else self._written
         dropped = np.zeros(cells, dtype=np.bool_) if self._dropped is None else self._dropped
@@ -139,17 +146,20 @@ class OnnxRuntime:
         if self._workspace.streams != streams:
             del self._workspace  # give the old memory back first
             self._workspace = self._open_workspace(streams)
+        if settled is not None:
+            self._require_blocks(settled.lowered)
         work = self._workspace
         keep_all = self._matrices or plan_name == DENSE
         keep = np.ones_like(self._readable) if keep_all else self._readable
 
         start = time.perf_counter()
         self.reset()  # a call that fails ends the episode: its residuals stand beside those of earlier ones
-        work.start(obs, noise, correction)
+        work.start(obs, noise, correction, known)
         prologue = time.perf_counter()
         waited = 0.0
         if settled is None:
             settled, waited = self._prune_beside_first_step(work, written, keep)
+            self._require_blocks(settled.lowered)
         else:
             decode_first(work, keep)
         decode_rest(work, settled.lowered, keep)
@@ -212,6 +222,13 @@ class OnnxRuntime:
                 require_legal(plans, self._groups, written)
         return _Settled(plans, lowered, legalised)
 
+    def _require_blocks(self, lowered: tuple[Lowered, ...]) -> None:
+        """Open the sessions of single blocks, if these plans are the first to need them."""
+        if not self._blocks and any(one.partial or one is not lowered[0] for one in lowered):
+            self._sessions |= open_blocks(self._artifact, self._threads)
+            self._workspace.bind_blocks()
+            self._blocks = True
+
     def _open_workspace(self, streams: int) -> Workspace:
         """The workspace of a batch size, after a step on zeros.
 
@@ -222,6 +239,9 @@ class OnnxRuntime:
         work.sums(self._slots)
         for correction in self._corrections:
             work.prepare(correction)
+        for lowered in self._schedules:
+            for k in np.flatnonzero(lowered.computed.all(axis=1)).tolist():
+                work.bind_dense(k)
         for cell in np.flatnonzero(self._readable).tolist():
             work.rollout.entry(cell)
         spec = self._manifest.spec

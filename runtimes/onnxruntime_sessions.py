@@ -4,24 +4,30 @@ onnxruntime's global thread pool would be shared by all sessions, but it is a fa
 cannot change, its workers spin, and every other session of the process that wants threads of its own is refused. A
 robot runs other things beside the policy. So threads belong to sessions.
 
-With one thread there is a session a block, on the caller's thread. With more, one session holds all blocks
-(``ir.joint``) and its threads, ``threads - 1`` of them, stay awake from one block to the next: they look for work for
-``SPIN_US`` after each, and then sleep. Between calls nothing runs. ``docs/decisions.md`` has the figures.
+Steps that compute all blocks run in one session, at any number of threads. Single blocks are in sessions of their own
+with one thread, the caller's. With more, one session holds all of them (``ir.joint``). Its threads and those of the
+whole steps, ``threads - 1`` each, stay awake from one block to the next: they look for work for ``SPIN_US`` after each,
+and then sleep. Between calls nothing runs. ``docs/decisions.md`` has the figures.
+
+A session keeps its weights as its products read them, so sessions of single blocks, which most calibrated plans do not
+need, are opened when some plan does.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from ttscompile.artifact.files import verify
 from ttscompile.artifact.manifest import PieceRecord, block_name
 from ttscompile.errors import ArtifactError, RuntimeUnavailableError
 from ttscompile.ir.graph import TensorType
-from ttscompile.ir.joint import JOINT, RESIDUAL, STREAM, Joint, join
+from ttscompile.ir.idle import IDLE
+from ttscompile.ir.joint import JOINT, OF_ALL_BLOCKS, RESIDUAL, STREAM, Joint, join
 
 from .precision import EXACT_INTEGERS, needs_care
 
@@ -31,7 +37,7 @@ if TYPE_CHECKING:
 Array: TypeAlias = npt.NDArray[Any]
 
 
-SINGLE_THREADED = frozenset({"stem", "advance", "pruner"})
+SINGLE_THREADED = frozenset({"stem", "advance", "pruner", IDLE})
 """Pieces too small for a second thread."""
 
 SPIN_US = 50
@@ -56,24 +62,49 @@ def import_onnxruntime() -> Any:
     return onnxruntime
 
 
-def open_sessions(artifact: Artifact, threads: int) -> dict[str, Any]:
+def open_sessions(artifact: Artifact, threads: int, blocks: bool = True) -> dict[str, Any]:
     """What runs each ONNX piece of the artifact, by name: an ``InferenceSession``, or a ``JointBlock``.
 
-    With one thread all run on the caller's thread and make none. With more, all blocks are in one session, unless the
-    artifact was written before there was a piece for that: then each has threads of its own, which do not spin.
+    With one thread all run on the caller's thread and make none.
+
+    Args:
+        artifact: loaded and checked.
+        threads: of arithmetic.
+        blocks: single blocks, too; else ``open_blocks`` may open them later.
 
     Raises:
         RuntimeUnavailableError: onnxruntime is missing, or other code has made its global thread pool.
         ArtifactError: onnxruntime refuses a graph.
     """
+    single = {block_name(b) for b in range(len(artifact.manifest.blocks))}
+    sessions = _open(artifact, set(artifact.manifest.pieces) - single - {JOINT}, threads)
+    return sessions | _open_blocks(artifact, threads) if blocks else sessions
+
+
+def open_blocks(artifact: Artifact, threads: int) -> dict[str, Any]:
+    """What runs single blocks, by name, some time after the artifact was loaded.
+
+    Raises:
+        ArtifactError: the artifact on disk is no longer the one that was loaded, or onnxruntime refuses a graph.
+    """
+    for name, record in artifact.manifest.files.items():
+        verify(artifact.path / name, record)
+    return _open_blocks(artifact, threads)
+
+
+def _open_blocks(artifact: Artifact, threads: int) -> dict[str, Any]:
+    if threads > 1:
+        return dict(_joint_blocks(artifact, _open(artifact, {JOINT}, threads)[JOINT]))
+    return _open(artifact, {block_name(b) for b in range(len(artifact.manifest.blocks))}, threads)
+
+
+def _open(artifact: Artifact, pieces: Iterable[str], threads: int) -> dict[str, Any]:
     ort = import_onnxruntime()
     sessions: dict[str, Any] = {}
     careful = needs_care(artifact.manifest.precision_name)
-    pieces = set(artifact.manifest.pieces)
-    blocks = {block_name(b) for b in range(len(artifact.manifest.blocks))}
-    for piece in sorted(pieces - (blocks if threads > 1 and JOINT in pieces else {JOINT})):
+    for piece in sorted(pieces):
         path = artifact.onnx_path(piece)
-        options = _options(ort, 1 if piece in SINGLE_THREADED else threads, piece == JOINT, careful)
+        options = _options(ort, 1 if piece in SINGLE_THREADED else threads, piece in OF_ALL_BLOCKS, careful)
         try:
             sessions[piece] = ort.InferenceSession(
                 str(path), options, providers=["CPUExecutionProvider"], enable_fallback=0
@@ -88,8 +119,7 @@ def open_sessions(artifact: Artifact, threads: int) -> dict[str, Any]:
                 f"{path}: onnxruntime {ort.__version__} cannot load this graph: {error} Install the version that the"
                 f" artifact asks for (>= {artifact.manifest.requires.onnxruntime}), or convert the checkpoint again."
             ) from error
-    joint = sessions.pop(JOINT, None)
-    return sessions if joint is None else sessions | _joint_blocks(artifact, joint)
+    return sessions
 
 
 def _options(ort: Any, threads: int, spin: bool, careful: bool) -> Any:
@@ -185,13 +215,35 @@ class Bound:
             self._binding.bind_output(name, "cpu", 0, array.dtype.type, array.shape, array.ctypes.data)
 
     def run(self) -> None:
-        """Run once."""
-        self._session.run_with_iobinding(self._binding)
+        """Run once.
+
+        Raises:
+            ArtifactError: the graph does not do what the manifest says.
+        """
+        try:
+            self._session.run_with_iobinding(self._binding)
+        except Exception as error:  # onnxruntime's own classes, and what it raises itself
+            raise failed(error) from error
 
 
 def run_named(session: Any, outputs: Sequence[str], inputs: Mapping[str, Array]) -> dict[str, Array]:
-    """Run a session on arrays of the moment; its outputs by name."""
-    return dict(zip(outputs, session.run(list(outputs), dict(inputs)), strict=True))
+    """Run a session on arrays of the moment; its outputs by name.
+
+    Raises:
+        ArtifactError: the graph does not do what the manifest says.
+    """
+    try:
+        return dict(zip(outputs, session.run(list(outputs), dict(inputs)), strict=True))
+    except Exception as error:
+        raise failed(error) from error
+
+
+def failed(error: Exception) -> ArtifactError:
+    """The error of a graph that onnxruntime loads and cannot run."""
+    return ArtifactError(
+        f"onnxruntime cannot run a graph of the artifact: {str(error).strip()[:500]} The graph does not fit the"
+        " manifest, or there is too little memory. Convert the checkpoint again."
+    )
 
 
 def repeat_streams(array: Array, axis: int | None, streams: int) -> Array:

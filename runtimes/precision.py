@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -101,8 +101,8 @@ def compare(
         if not np.isfinite(samples).all():
             raise ObservationError(
                 f"the policy's action is not a number: {_count_bad(samples[1])} of its values in precision {FP32!r},"
-                f" {_count_bad(samples[0])} in that of the artifact. Convert with precision {FP32!r}; where it fails too,"
-                " look for NaN in the checkpoint and in the recorded observations."
+                f" {_count_bad(samples[0])} in that of the artifact. Convert with precision {FP32!r}; where it fails"
+                " too, look for NaN in the checkpoint and in the recorded observations."
             )
         pairs.append((samples[0], samples[1]))
     return pairs
@@ -121,8 +121,8 @@ def random_calls(spec: PolicySpec, count: int) -> Iterator[Call]:
     """Normalised observations and noise, the same at every time."""
     for number in range(count):
         rng = np.random.default_rng((number, 8))
-        obs = {
-            key: rng.uniform(-1, 1, (1, *one.shape)).astype(np.float32 if one.normalizer is not None else one.dtype)
+        obs: dict[str, npt.NDArray[Any]] = {
+            key: one.draw(rng) if one.normalizer is None else rng.uniform(-1, 1, (1, *one.shape)).astype(np.float32)
             for key, one in spec.observations.items()
         }
         initial = rng.standard_normal((1, *spec.sample), dtype=np.float32)

@@ -22,11 +22,13 @@ from .errors import LoweringError
 from .ir.advance import fuse_advance
 from .ir.evaluate import resolve_op
 from .ir.graph import Argument, Batch, Enum, Graph, Node, Ref, TensorType
-from .ir.joint import JOINT
+from .ir.idle import IDLE
+from .ir.joint import DENSE_STEP, JOINT
 from .ir.layout import sink_layout
 from .ir.program import Pieces, Program
 from .lower_attention import flatten_attention
-from .lower_joint import join_blocks
+from .lower_idle import lower_idle
+from .lower_joint import chain_blocks, join_blocks
 from .lower_onnx import name_model, only
 
 OPSET = 23
@@ -57,8 +59,9 @@ def lower_program(program: Program) -> dict[str, onnx.ModelProto]:
 
     Returns:
         By name: ``condition``, ``step`` (if any), ``pruner`` (if any), ``stem``, ``block_00``, ``block_01``..,
-        ``advance`` (tail, sampler update and stem in one; see ``ir.advance``) and ``blocks`` (all blocks in one; see
-        ``ir.joint``). Graphs of the same structure are exported once.
+        ``advance`` (tail, sampler update and stem in one; see ``ir.advance``), ``blocks`` and ``dense_step`` (all
+        blocks in one; see ``ir.joint``) and, if stem and tail allow it, ``idle`` (see ``ir.idle``). Graphs of the same
+        structure are exported once.
 
     Raises:
         LoweringError: as ``lower_graph``; or the program has not been partitioned.
@@ -67,7 +70,9 @@ def lower_program(program: Program) -> dict[str, onnx.ModelProto]:
         raise LoweringError("the program has no pieces to lower: run the passes up to insert_reuse first.")
     advance = fuse_advance(program.pieces.tail, program.pieces.stem, program.spec)
     models = _lower({**_pieces(program.pieces), "advance": advance})
-    return {**models, JOINT: join_blocks(program.pieces.blocks, models)}
+    whole = {JOINT: join_blocks(program.pieces.blocks, models), DENSE_STEP: chain_blocks(program.pieces.blocks, models)}
+    idle, _ = lower_idle(program.pieces, program.weights, OPSET)
+    return {**models, **whole} if idle is None else {**models, **whole, IDLE: idle}
 
 
 def structural_key(graph: Graph) -> str:

@@ -1,14 +1,14 @@
-"""One ONNX model that holds all residual blocks and runs one of them; see ``ir.joint``."""
+"""ONNX models that hold all residual blocks: one runs any of them, the other all in a row; see ``ir.joint``."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from onnx import GraphProto, ModelProto, NodeProto, ValueInfoProto, helper
+from onnx import GraphProto, ModelProto, NodeProto, TensorProto, ValueInfoProto, helper
 
 from .ir.graph import Batch, Graph, TensorType
-from .ir.joint import JOINT, RESIDUAL, STREAM, halves, join
+from .ir.joint import CONTEXT, DENSE_STEP, JOINT, RESIDUAL, STREAM, dense_step_outputs, halves, join
 
 
 def join_blocks(blocks: Sequence[Graph], models: Mapping[str, ModelProto]) -> ModelProto:
@@ -47,6 +47,43 @@ def join_blocks(blocks: Sequence[Graph], models: Mapping[str, ModelProto]) -> Mo
     root = branch(0, len(own), 0)
     inputs = [_tensor(name, TensorType((), "bool")) for name in joint.switches]
     inputs += [_tensor(name, type_) for name, type_ in ((STREAM, stream), *joint.slots)]
+    graph = GraphProto(name=JOINT, node=root.node, input=inputs, output=[result], initializer=root.initializer)
+    return _model(own, graph)
+
+
+def chain_blocks(blocks: Sequence[Graph], models: Mapping[str, ModelProto]) -> ModelProto:
+    """The model of a step that computes all blocks.
+
+    Args:
+        blocks: their graphs, in order; the stream is the first input, contexts the others.
+        models: of the blocks, by name; others are not looked at.
+    """
+    own = [models[f"block_{i:02d}"] for i in range(len(blocks))]
+    stream = next(iter(blocks[0].inputs.values()))
+    contexts = {name: type_ for graph in blocks for name, type_ in list(graph.inputs.items())[1:]}
+    nodes: list[NodeProto] = []
+    weights: dict[str, TensorProto] = {}
+    before = STREAM
+    last, *residuals = dense_step_outputs(len(blocks))
+    for b, (block, model, residual) in enumerate(zip(blocks, own, residuals, strict=True)):
+        inputs = [before, *(CONTEXT + name for name in list(block.inputs)[1:])]
+        leaf = _leaf(model, tuple(block.inputs), inputs, _tensor(residual, stream), f"b{b}")
+        small = {tensor.name: f"b{b}.{tensor.name}" for tensor in leaf.initializer if tensor.raw_data}
+        for tensor in leaf.initializer:
+            tensor.name = small.get(tensor.name, tensor.name)
+            weights[tensor.name] = tensor
+        for node in leaf.node:
+            node.input[:] = [small.get(value, value) for value in node.input]
+        after = last if b == len(blocks) - 1 else f"{STREAM}.{b}"
+        nodes += [*leaf.node, helper.make_node("Add", [before, residual], [after], name=f"add.{b}")]
+        before = after
+    given = [_tensor(STREAM, stream), *(_tensor(CONTEXT + name, type_) for name, type_ in contexts.items())]
+    made = [_tensor(name, stream) for name in (last, *residuals)]
+    graph = GraphProto(name=DENSE_STEP, node=nodes, input=given, output=made, initializer=weights.values())
+    return _model(own, graph)
+
+
+def _model(own: Sequence[ModelProto], graph: GraphProto) -> ModelProto:
     domains: dict[str, int] = {}
     for entry in (entry for model in own for entry in model.opset_import):
         domains[entry.domain] = max(entry.version, domains.get(entry.domain, 0))
@@ -54,7 +91,7 @@ def join_blocks(blocks: Sequence[Graph], models: Mapping[str, ModelProto]) -> Mo
         ir_version=max(model.ir_version for model in own),
         producer_name="ttscompile",
         opset_import=[helper.make_opsetid(domain, version) for domain, version in sorted(domains.items())],
-        graph=GraphProto(name=JOINT, node=root.node, input=inputs, output=[result], initializer=root.initializer),
+        graph=graph,
     )
 
 

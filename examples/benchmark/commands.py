@@ -2,27 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-
 import click
-from rich.console import Console
-
-import ttscompile
-
-
-def run(command: click.Command) -> None:
-    """Run a program; an error of ttscompile is its message and exit status 2."""
-    try:
-        command()
-    except ttscompile.TtscompileError as error:
-        click.echo(f"error: {error}", err=True)
-        sys.exit(2)
-
-
-def results_console() -> Console:
-    """Standard output; wide enough for the tables where it is no terminal."""
-    console = Console(highlight=False)
-    return console if console.is_terminal else Console(highlight=False, width=150)
 
 
 def numbers(_: click.Context, __: click.Parameter, value: str | None) -> tuple[int, ...] | None:

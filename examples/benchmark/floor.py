@@ -17,6 +17,8 @@ from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import block_name
 from ttscompile.cli.timing import Contestant, Measurement, random_calls
 from ttscompile.lattice import PlanArray, plan_flops
+from ttscompile.runtimes.idle import WORTH
+from ttscompile.runtimes.lowering import lower_plan
 from ttscompile.runtimes.onnxruntime_sessions import Bound, open_sessions
 from ttscompile.runtimes.workspace import Workspace
 
@@ -40,19 +42,32 @@ def blocks_contestant(directory: Path, threads: int) -> Contestant:
     return Contestant(FLOOR, "", call, lambda: None, manifest.spec, total)
 
 
-def tails_contestant(directory: Path, threads: int) -> Contestant:
-    """Tail, sampler and the next step's stem of all K steps, with no block between them."""
+def tails_contestant(directory: Path, threads: int, plan: PlanArray) -> Contestant:
+    """Tail, sampler and the next step's stem of all K steps of a plan, with no block and no sum between them."""
     artifact = load_artifact(directory)
     manifest = artifact.manifest
-    work = Workspace(manifest, open_sessions(artifact, threads), artifact.tables, 1)
+    work = Workspace(manifest, open_sessions(artifact, threads, blocks=False), artifact.tables, 1)
     ((obs, noise),) = random_calls(manifest.spec, 1, seed=0)
     for key, spec in manifest.spec.observations.items():
         obs[key] = obs[key] if spec.normalizer is None else spec.normalizer.normalize(obs[key])
     work.start(obs, noise, None)
 
+    lowered = lower_plan(plan, manifest.groups)
+
     def call(*_: object) -> None:
-        for k in range(manifest.steps):
-            work.advance(k)
+        k = 0
+        while k < manifest.steps:
+            if work.idle is None or lowered.idle[k] < WORTH:
+                work.advance(k)
+                k += 1
+                continue
+            work.enter_idle(k)
+            stop = k + lowered.idle[k]
+            while k < stop:
+                work.idle.prepare()
+                work.run_idle(k, k + lowered.alike[k])
+                k += lowered.alike[k]
+            work.leave_idle(stop)
 
     total = float(manifest.steps * (manifest.flops.stem + manifest.flops.tail))
     return Contestant(TAILS, "", call, lambda: None, manifest.spec, total)

@@ -23,7 +23,7 @@ from typing import Any
 
 import click
 import numpy as np
-from commands import numbers, results_console, run
+from commands import numbers
 from floor import FLOOR, TAILS, blocks_contestant, floor_ms, tails_contestant
 from networks import PUSHT, Network, sampler_of, store_plans
 from rich.progress import Progress
@@ -32,7 +32,7 @@ from rounds import DENSE, EAGER, Effort, eager_contestant, measure_in_passes, ro
 
 import ttscompile
 from ttscompile.artifact.load import Artifact, load_artifact
-from ttscompile.cli.output import only_results_on_stdout, print_json, progress, table
+from ttscompile.cli.output import identity_of, only_results_on_stdout, print_json, progress, results_console, run, table
 from ttscompile.cli.timing import Contestant, Measurement, original_network, plan_contestant, random_calls
 from ttscompile.lattice import PlanArray
 from ttscompile.machine import fingerprint, one_line
@@ -145,7 +145,7 @@ def time_calls(
                 plan_contestant(DENSE, policies[0], "dense", spec),
                 plan_contestant(OURS, policies[1], of.plan_name, spec),
                 blocks_contestant(of.directory, threads),
-                tails_contestant(of.directory, threads),
+                tails_contestant(of.directory, threads, of.plan),
             ]
         groups[1].append(longer)
         on_round = announce("timing", rounds_of(groups, settings.effort))
@@ -319,6 +319,7 @@ def judge_and_tell(of: Subject, settings: Settings, as_json: bool) -> int:
         ]
         print_json(
             {
+                "identity": identity_of(of.directory),
                 "machine": fingerprint(),
                 "settings": asdict(settings),
                 "plan": of.plan_name,

@@ -17,7 +17,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import click
-from commands import numbers, results_console, run
+from commands import numbers
 from drawing import draw
 from floor import FLOOR, blocks_contestant, floor_ms
 from networks import PUSHT_WIDTH, Network, compile_with_plans, plan_name, pusht_network, random_network
@@ -36,7 +36,7 @@ from rounds import (
 
 import ttscompile
 from ttscompile.artifact.load import load_artifact
-from ttscompile.cli.output import only_results_on_stdout, print_json, progress, table
+from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results_console, run, table
 from ttscompile.cli.timing import Contestant, Measurement, plan_contestant
 from ttscompile.errors import RuntimeUnavailableError
 from ttscompile.machine import fingerprint, one_line

@@ -31,6 +31,7 @@ from variants import noise_shape, results_console, run
 import ttscompile
 from ttscompile import Source
 from ttscompile.artifact.load import load_artifact
+from ttscompile.cli.output import print_identity
 from ttscompile.machine import fingerprint, one_line
 from ttscompile.runtimes.policy import PolicyInfo
 
@@ -291,11 +292,12 @@ def main(
         measurements = measure(contestants, noise_shape(info), runs, lambda: progress.advance(task))
     shares = fixed_shares(artifact)
     if as_json:
-        click.echo(json.dumps(to_json(measurements, shares, threads), indent=2))
+        click.echo(json.dumps({"identity": info.identity, **to_json(measurements, shares, threads)}, indent=2))
         return
     console = results_console()
     console.print(speed_table(measurements, threads))
     console.print("of the dense FLOPs: " + ", ".join(f"{name} {share:.2%}" for name, share in shares.items()))
+    print_identity(info.identity, console)
     console.print(one_line(fingerprint()), highlight=False)
 
 

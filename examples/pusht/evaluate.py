@@ -28,6 +28,7 @@ from rollout import EpisodeCache, Rollout, run_episodes
 from score_plot import Timed, plot_scores, time_calls
 from variants import Variant, first_seed_option, open_variant, results_console, run, runtime_option, threads_option
 
+from ttscompile.cli.output import identity_of
 from ttscompile.machine import fingerprint, one_line
 
 TIMED_CALLS = 15
@@ -203,17 +204,20 @@ def main(
         evaluations = evaluate(opened, seeds, batch, finished, caches)
     timed = [] if picture is None else time_calls(opened, evaluations[0].rollout.episodes[0].windows[0], TIMED_CALLS)
     machine = fingerprint()
+    identities = [identity_of(Path(text.partition(":")[0])) for text in variants]
     if picture is not None:
         plural = "s" * (threads > 1)
         title = f"Push-T, {len(seeds)} paired episodes; {threads} thread{plural} a call\n{one_line(machine)}"
         plot_scores(variants, [e.score for e in evaluations], timed, picture, title)
     if as_json:
-        figures = [e.to_json() for e in evaluations]
+        figures = [{"identity": one, **e.to_json()} for one, e in zip(identities, evaluations, strict=True)]
         for each, time in zip(figures, timed, strict=False):
             each["latency_ms"] = dataclasses.asdict(time)
         click.echo(json.dumps({"machine": machine, "threads": threads, "variants": figures}, indent=2))
     else:
         results_console().print(evaluation_table(evaluations, seeds, timed))
+        for text, identity in zip(variants, identities, strict=True):
+            click.echo(f"{text}: identity {identity[:12]}")
     for e in evaluations:
         if e.legalised:
             click.echo(f"warning: {e.label}: {e.legalised} cells of its plans were illegal and were replaced", err=True)

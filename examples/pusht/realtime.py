@@ -33,6 +33,7 @@ from variants import noise_shape, results_console, run
 
 import ttscompile
 from ttscompile import AsyncExecutor, ExecutorSettings
+from ttscompile.cli.output import identity_of, print_identity
 from ttscompile.errors import DeadlineMissedError
 from ttscompile.machine import fingerprint, one_line
 from ttscompile.runtimes.policy import PolicyInfo
@@ -286,7 +287,9 @@ def main(
                 trace = output / f"trace-{label.split()[0]}-{hz:g}hz.json"
                 runs.append(drive(label, policy, hz, 60 * minutes, first_seed, max_hold, trace))
     machine = fingerprint()
-    document = {"machine": machine, "threads": threads, "runs": [asdict(each) for each in runs]}
+    identity = identity_of(artifact)
+    figures = [asdict(each) for each in runs]
+    document = {"identity": identity, "machine": machine, "threads": threads, "runs": figures}
     (output / "realtime.json").write_text(json.dumps(document, indent=1, allow_nan=False))
     plot_traces(
         {f"{each.label}, {each.hz:g} Hz": output / each.trace for each in runs}, output / "realtime.png", window
@@ -295,6 +298,7 @@ def main(
     results.print(runs_table(runs))
     for each in runs:
         results.print(f"{each.label}, {each.hz:g} Hz: {each.feasibility}", markup=False, highlight=False)
+    print_identity(identity, results)
     results.print(one_line(machine), highlight=False)
     if any(each.missed_ticks for each in runs if each.label == COMPILED):
         sys.exit(1)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import click
-from rich.console import Console
 from rollout import NoiseShape, Policy
 
 import ttscompile
+from ttscompile.cli.output import results_console as results_console
+from ttscompile.cli.output import run as run
 from ttscompile.runtimes.policy import PolicyInfo
 
 
@@ -29,21 +29,6 @@ class Variant:
     policy: Policy
     plan: str | None
     noise: NoiseShape
-
-
-def run(command: click.Command) -> None:
-    """Run a script's command; an error of ttscompile is its message and exit status 2."""
-    try:
-        command()
-    except ttscompile.TtscompileError as error:
-        click.echo(f"error: {error}", err=True)
-        sys.exit(2)
-
-
-def results_console() -> Console:
-    """Standard output; wide enough for the tables where it is no terminal."""
-    console = Console()
-    return console if console.is_terminal else Console(width=160)
 
 
 def noise_shape(info: PolicyInfo) -> NoiseShape:

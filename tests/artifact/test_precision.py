@@ -20,7 +20,9 @@ from ttscompile.artifact.precision import LoweredBlocks
 from ttscompile.artifact.strict_json import Value
 from ttscompile.artifact.write import update_calibration, write_artifact
 from ttscompile.errors import ArtifactError
+from ttscompile.ir.joint import DENSE_STEP, JOINT
 from ttscompile.lattice import uniform_plan
+from ttscompile.lower_joint import chain_blocks, join_blocks
 from ttscompile.lower_precision import lower_precision
 
 ERROR = PrecisionError(calls=8, mean=0.25, p90=0.5, largest=1.5, tolerance=0.03)
@@ -28,8 +30,10 @@ ERROR = PrecisionError(calls=8, mean=0.25, p90=0.5, largest=1.5, tolerance=0.03)
 
 def lowered(seed: int = 0) -> LoweredBlocks:
     program = tiny_program(seed)
+    assert program.pieces is not None
     models, weights, _ = lower_precision(tiny_models(program), program.weights, "int8")
-    return LoweredBlocks("int8", models, weights, ERROR)
+    whole = {JOINT: join_blocks(program.pieces.blocks, models), DENSE_STEP: chain_blocks(program.pieces.blocks, models)}
+    return LoweredBlocks("int8", {**models, **whole}, weights, ERROR)
 
 
 def write(directory: Path, blocks: LoweredBlocks | None) -> Path:
@@ -45,7 +49,7 @@ def int8(tmp_path: Path) -> Path:
 
 def test_fp32_stays_and_the_rest_comes_beside_it(int8: Path, tmp_path: Path) -> None:
     plain, both = contents(write(tmp_path / "fp32", None)), contents(int8)
-    own = {"weights_int8.safetensors", "block_00_int8.onnx", "block_01_int8.onnx"}
+    own = {"weights_int8.safetensors", *(f"{name}_int8.onnx" for name in ("block_00", "block_01", JOINT, DENSE_STEP))}
     assert set(both) - set(plain) == own
     assert {name for name in plain if plain[name] != both[name]} == {"manifest.json"}
     assert b'"precision"' not in plain["manifest.json"], "an fp32 artifact is what it was before there was another"
@@ -143,10 +147,8 @@ def decoded(manifest: Manifest, change: Change) -> Manifest:
         (lambda p: p.update(weights="weights.safetensors"), "which nothing else uses"),
         (lambda p: p.update(weights="block_00_int8.onnx"), "which nothing else uses"),
         (lambda p: p.update(models={}), "expected models of some of the blocks block_00, block_01"),
-        (
-            lambda p: p["models"].update(blocks="blocks_int8.onnx"),
-            "a model called 'blocks' exactly when there is a piece",
-        ),
+        (lambda p: p["models"].pop("blocks"), "expected models called blocks and dense_step too"),
+        (lambda p: p["models"].pop("dense_step"), "expected models called blocks and dense_step too"),
         (lambda p: p.update(models=[]), "precision.models: expected an object"),
         (lambda p: p["models"].update(stem="stem_int8.onnx"), "expected models of some of the blocks"),
         (lambda p: p["models"].update(block_00="block_01_int8.onnx"), "which nothing else uses"),

@@ -10,7 +10,9 @@ from onnx.helper import make_graph, make_model, make_node, make_opsetid, make_te
 from ttscompile.artifact.manifest import block_name
 from ttscompile.config import Affine, ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
 from ttscompile.ir.graph import Batch, Graph, Node, Ref, TensorType
+from ttscompile.ir.joint import DENSE_STEP, JOINT
 from ttscompile.ir.program import Binding, Block, Pieces, Program, Reuse
+from ttscompile.lower_joint import chain_blocks, join_blocks
 
 STEPS, HORIZON, CHANNELS, WIDTH, MEMORY = 3, 4, 2, 16, 8
 
@@ -177,7 +179,8 @@ def tiny_models(program: Program) -> dict[str, ModelProto]:
             *project(f"r_{i}", f"in_{i}", f"block.{i}.weight"),
         ]
         models[block_name(i)] = model(graph, nodes)
-    return models
+    blocks = pieces.blocks
+    return {**models, JOINT: join_blocks(blocks, models), DENSE_STEP: chain_blocks(blocks, models)}
 
 
 def project(result: str, x: str, weight: str) -> list[NodeProto]:

@@ -81,12 +81,21 @@ def test_the_floors_blocks_compute_numbers(tiny: tuple[Path, dict[float, np.ndar
 
 
 def test_tails_take_every_step(tiny: tuple[Path, dict[float, np.ndarray]], monkeypatch: pytest.MonkeyPatch) -> None:
-    steps = []
-    contestant = floor.tails_contestant(tiny[0], 1)
-    advance = floor.Workspace.advance
+    directory, plans = tiny
+    steps: list[int] = []
+    advance, idle = floor.Workspace.advance, floor.Workspace.run_idle
+
+    def run_idle(self: floor.Workspace, first: int, stop: int) -> None:
+        steps.extend(range(first, stop))
+        idle(self, first, stop)
+
     monkeypatch.setattr(floor.Workspace, "advance", lambda self, k: (steps.append(k), advance(self, k)))
-    contestant.call({}, None)
-    assert steps == list(range(8))
+    monkeypatch.setattr(floor.Workspace, "run_idle", run_idle)
+    for plan in plans.values():
+        contestant = floor.tails_contestant(directory, 1, plan)
+        contestant.call({}, None)
+        assert steps == list(range(8))
+        steps.clear()
 
 
 def test_passes_are_pooled_and_every_group_has_its_threads() -> None:

@@ -178,7 +178,7 @@ def test_program(monkeypatch: pytest.MonkeyPatch) -> None:
     pieces = compiled.pieces
     assert pieces is not None
     models = lower_program(compiled)
-    assert list(models) == ["condition", "stem", "block_00", "block_01", "block_02", "advance", "blocks"]
+    assert list(models) == ["condition", "stem", "block_00", "block_01", "block_02", "advance", "blocks", "dense_step"]
     (export,) = exports  # of everything at once
     linear = [node for node in export.graph.nodes if node.target is torch.ops.aten.linear.default]
     assert len(linear) == 7  # stem, 2 in block_00, 2 in block_01, tail and stem; block_02 is block_00 with other names

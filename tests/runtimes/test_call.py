@@ -16,8 +16,8 @@ import pytest
 from ttscompile import Noise, Source
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.write import update_calibration
-from ttscompile.errors import IllegalPlanError
-from ttscompile.lattice import dense_plan
+from ttscompile.errors import ArtifactError, IllegalPlanError
+from ttscompile.lattice import dense_plan, uniform_plan
 from ttscompile.runtimes import Runtime, open_runtime
 from ttscompile.runtimes.onnxruntime_cpu import OnnxRuntime
 from ttscompile.runtimes.reference import ReferenceModel
@@ -71,21 +71,21 @@ def test_step_0_does_not_wait_for_the_pruner(pruned: Artifact, monkeypatch: pyte
     runtime = open_runtime(pruned)
     expected = call(runtime, pruned, 0)
     done_first, real = threading.Event(), Workspace.logits
-    last = Workspace.run
+    last = Workspace.run_dense
 
     def late(self: Workspace) -> np.ndarray:
         assert done_first.wait(timeout=30), "step 0 waits for the pruner"
         return real(self)
 
-    def run(self: Workspace, k: int, b: int) -> None:
-        last(self, k, b)
-        if (k, b) == (0, 4):
+    def run(self: Workspace, k: int) -> None:
+        last(self, k)
+        if k == 0:
             done_first.set()
 
     runtime.reset()
     with monkeypatch.context() as patched:
         patched.setattr(Workspace, "logits", late)
-        patched.setattr(Workspace, "run", run)
+        patched.setattr(Workspace, "run_dense", run)
         sample, report = runtime.predict(*random_inputs(pruned, np.random.default_rng(0), 2))
     assert np.array_equal(sample, expected)
     timings = report.timings
@@ -142,8 +142,9 @@ def test_a_prologue_that_fails_ends_the_episode(
     with monkeypatch.context() as patched:
         patched.setattr(Workspace, "start", fail)
         patched.setattr(ReferenceModel, "prologue", fail)
-        with pytest.raises(Failure):
+        with pytest.raises((Failure, ArtifactError)) as caught:
             call(runtime, toy_artifact, 0, dense)
+    assert isinstance(caught.value, Failure) or isinstance(caught.value.__cause__, Failure)
     assert runtime.streams is None
     with pytest.raises(IllegalPlanError, match="never computed"):
         call(runtime, toy_artifact, 0, reuse)
@@ -174,20 +175,61 @@ def test_two_runtimes_work_at_the_same_time(pruned: Artifact) -> None:
     assert all(np.array_equal(a, b) for x, y in zip(alone, together, strict=True) for a, b in zip(x, y, strict=True))
 
 
-def test_a_first_call_binds_nothing(toy_artifact: Artifact, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("whole_steps", [True, False])
+def test_a_first_call_with_a_schedule_binds_nothing(
+    make_artifact: MakeArtifact, monkeypatch: pytest.MonkeyPatch, whole_steps: bool
+) -> None:
     """What a session is bound to is settled at load; a call that binds costs many times a warm one."""
-    from ttscompile.runtimes import workspace
+    from ttscompile.runtimes import bound_block, workspace
 
-    runtime = open_runtime(toy_artifact)
-    obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), 1)
+    schedule = uniform_plan(5, 5, 2)
+    if not whole_steps:
+        schedule[3, 1] = Source.COMPUTE
+    path = make_artifact(toy_program(normed=True)).path
+    update_calibration(path, None, {"mine": schedule}, "mine", {"strategy": "tts"})
+    artifact = load_artifact(path)
+    runtime = open_runtime(artifact)
+    assert isinstance(runtime, OnnxRuntime)
+    assert ("block_00" in runtime._sessions) is not whole_steps
+    obs, noise = random_inputs(artifact, np.random.default_rng(0), 1)
 
     def bind(*_: object) -> None:
         raise AssertionError("a session was bound during a call")
 
-    monkeypatch.setattr(workspace, "Bound", bind)
+    for module, name in ((workspace, "Bound"), (workspace, "BoundBlock"), (bound_block, "BoundBlock")):
+        monkeypatch.setattr(module, name, bind)
     for _ in range(2):
-        assert runtime.predict(obs, noise, dense_plan(5, 5))[1].computed == (25,)
+        runtime.predict(obs, noise, schedule, plan_name="mine")
         runtime.reset()
+
+
+def test_single_blocks_are_opened_by_the_first_plan_that_needs_them(make_artifact: MakeArtifact) -> None:
+    artifact = make_artifact(toy_program())
+    runtime, other = open_runtime(artifact), open_runtime(artifact, "reference")
+    assert isinstance(runtime, OnnxRuntime)
+    obs, noise = random_inputs(artifact, np.random.default_rng(0), 1)
+    runtime.predict(obs, noise, uniform_plan(5, 5, 3))
+    assert "block_00" not in runtime._sessions
+    runtime.reset()
+    partial = uniform_plan(5, 5, 3)
+    partial[4, 2] = Source.COMPUTE
+    np.testing.assert_allclose(
+        runtime.predict(obs, noise, partial)[0], other.predict(obs, noise, partial)[0], rtol=1e-5, atol=1e-6
+    )
+    assert "block_00" in runtime._sessions
+
+
+def test_single_blocks_of_an_artifact_that_has_changed_since_are_refused(make_artifact: MakeArtifact) -> None:
+    artifact = make_artifact(toy_program())
+    runtime = open_runtime(artifact)
+    obs, noise = random_inputs(artifact, np.random.default_rng(0), 1)
+    partial = uniform_plan(5, 5, 3)
+    partial[4, 2] = Source.COMPUTE
+    path = artifact.onnx_path("block_02")
+    path.write_bytes(path.read_bytes()[:-1] + b"?")
+    with pytest.raises(ArtifactError, match=r"block_02\.onnx: expected sha256"):
+        runtime.predict(obs, noise, partial)
+    assert runtime.predict(obs, noise, uniform_plan(5, 5, 3))[1].computed == (15,)
 
 
 def test_a_workspace_is_given_back_when_the_batch_changes(toy_artifact: Artifact) -> None:

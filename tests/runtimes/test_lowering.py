@@ -20,6 +20,16 @@ from .plans import random_plan
 C, F, T, R = Source.COMPUTE, Source.FORWARD, Source.TIMESTEP, Source.ROLLOUT
 
 
+class FakeIdle:
+    """What ``runtimes.idle`` is to the loop: a total that is taken in."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.total, self.prepared = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+
+    def prepare(self) -> None:
+        self.prepared[:] = self.total
+
+
 class FakeWorkspace:
     """The interface of ``Workspace`` over a numpy block function: a stream is a vector, several are a batch.
 
@@ -41,6 +51,9 @@ class FakeWorkspace:
         self.table = np.full((blocks, *shape), np.nan, np.float32)
         self.rollout = RolloutStore(shape, axis)
         self.runs: list[tuple[int, int, tuple[int, ...]]] = []
+        self.dense: list[int] = []
+        self.idle = FakeIdle(shape) if rng.random() < 0.8 else None
+        self.idled: list[int] = []
 
     def toy(self, s: int) -> Toy:
         """The policy of stream s."""
@@ -58,6 +71,36 @@ class FakeWorkspace:
 
     def sums(self, count: int) -> np.ndarray:
         return np.full((count, *self.stream.shape), np.nan, np.float32)
+
+    def run_dense(self, k: int) -> None:
+        self.dense.append(k)
+        self.stream[:] = self.fresh
+        for b in range(len(self.groups)):
+            self.run(k, b)
+            self.stream += self.current[b]
+
+    def run_dense_some(self, k: int, streams: list[int]) -> list[np.ndarray]:
+        h = np.moveaxis(self.fresh, self.axis, 0)[streams].astype(np.float64)
+        residuals = []
+        for b in range(len(self.groups)):
+            self.runs.append((k, b, tuple(streams)))
+            residuals.append(np.stack([self.toy(s).block(h[i], k, b) for i, s in enumerate(streams)]))
+            h = h + residuals[-1]
+        return [h, *residuals]
+
+    def enter_idle(self, k: int) -> None:
+        assert self.idle is not None
+        self.idle.prepared[:] = np.nan
+
+    def run_idle(self, first: int, stop: int) -> None:
+        assert self.idle is not None
+        for k in range(first, stop):
+            self.stream[:] = self.fresh + self.idle.prepared
+            self.advance(k)
+            self.idled.append(k)
+
+    def leave_idle(self, k: int) -> None:
+        self.stream[:] = np.nan
 
     def run(self, k: int, b: int) -> None:
         everyone = list(range(self.streams))
@@ -99,7 +142,11 @@ def test_instructions_do_what_section_2_says(
         if shared:
             plans = np.repeat(plans[:1], streams, axis=0)
         work.x = rng.standard_normal((streams, 3, 4))
-        work.runs.clear()
+        if rng.random() < 0.5:  # many steps in a row without a computed block
+            plans[:, rng.random(steps) < 0.8] = T
+            plans[:, 0] = C
+        for log in (work.runs, work.dense, work.idled):
+            log.clear()
         decode_first(work, keep)  # type: ignore[arg-type]
         decode_rest(work, [cache.lower(plan) for plan in plans], keep)  # type: ignore[arg-type]
         expected = [episode.call(work.x[s], plans[s]) for s, episode in enumerate(episodes)]
@@ -107,6 +154,9 @@ def test_instructions_do_what_section_2_says(
         ran = sorted((s, k, b) for k, b, some in work.runs for s in some)
         assert ran == sorted(map(tuple, np.argwhere(plans == C).tolist()))  # nothing else, and nothing twice
         assert len(work.runs) == np.count_nonzero((plans == C).any(axis=0))  # together where several compute
+        some = (plans == C).any(axis=(0, 2))
+        assert set(work.dense) == set(np.flatnonzero((plans == C).all(axis=(0, 2))))
+        assert not some[work.idled].any()
         written |= (plans == C) & keep
 
 

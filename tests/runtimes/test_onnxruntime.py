@@ -246,8 +246,8 @@ def test_a_graph_that_onnxruntime_refuses_is_an_artifact_error(
     make_artifact: MakeArtifact, capfd: pytest.CaptureFixture[str]
 ) -> None:
     artifact = make_artifact(toy_program())
-    artifact.onnx_path("block_02").write_bytes(b"no graph")
-    with pytest.raises(ArtifactError, match=r"block_02\.onnx.*cannot load"):
+    artifact.onnx_path("dense_step").write_bytes(b"no graph")
+    with pytest.raises(ArtifactError, match=r"dense_step\.onnx.*cannot load"):
         open_runtime(artifact)
     assert capfd.readouterr().out == ""
 

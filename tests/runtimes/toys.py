@@ -87,13 +87,16 @@ def toy_program(
     seed: int = 0,
     pruner: bool = True,
     sequence_first: bool = False,
+    normed: bool = False,
+    horizon: int = 3,
 ) -> Program:
     """A policy with contexts of every binding, in which every block matters.
 
     Block b is ``tanh(h W_b + c_b)`` where c_b is a table row, a condition value or a step value, in turn.
-    With ``sequence_first`` the stream is ``[T, B, W]`` rather than ``[B, T, W]``.
+    With ``sequence_first`` the stream is ``[T, B, W]`` rather than ``[B, T, W]``. With ``normed`` the tail begins with
+    a LayerNorm, and idle steps have a piece of their own.
     """
-    horizon, channels, width = 3, 2, 4
+    channels, width = 2, 4
     rng = np.random.default_rng(seed)
     stream = f32(horizon, B, width) if sequence_first else f32(B, horizon, width)
     wide = f32(1, B, width) if sequence_first else f32(B, 1, width)
@@ -110,6 +113,9 @@ def toy_program(
         "pruner.mask": (np.arange(steps * blocks * 4) < blocks * 4) * np.tile([0, -1e9, -1e9, -1e9], steps * blocks),
         **{f"block.{b}.w": rng.standard_normal((width, width)) / np.sqrt(width) for b in range(blocks)},
     }
+    if normed:
+        scales = np.random.default_rng((seed, 1))
+        weights |= {"norm.w": scales.uniform(0.5, 1.5, width), "norm.b": scales.standard_normal(width)}
     tables = {"row": rng.standard_normal((steps, *wide.at(1))), "time": rng.standard_normal((steps, *wide.at(1)))}
     contexts = ("row", "cond", "stepped")
 
@@ -129,8 +135,12 @@ def toy_program(
     lift = node("h", "linear.default", in_order, Ref("sample"), Ref("stem.w"))
     stem_nodes = (lift, turned("h0", "h", stream)) if sequence_first else (lift,)
     last = f"h{blocks}"
-    back = (turned("t", last, in_order),) if sequence_first else ()
-    head = node("out", "linear.default", sample, Ref("t" if sequence_first else last), Ref("tail.w"))
+    arguments = (Ref(last), (width,), Ref("norm.w"), Ref("norm.b"), 1e-5, False)
+    norm = (node("n", "layer_norm.default", stream, *arguments),) if normed else ()
+    unturned = "n" if normed else last
+    back = (*norm, turned("t", unturned, in_order)) if sequence_first else norm
+    head = node("out", "linear.default", sample, Ref("t" if sequence_first else unturned), Ref("tail.w"))
+    of_norm = {"norm.w": f32(width), "norm.b": f32(width)} if normed else {}
     logits = f32(B, steps, blocks, 4)
     flat = f32(B, steps * blocks * 4)
     squeezed = f32(B, width)
@@ -157,7 +167,7 @@ def toy_program(
         else None,
         stem=Graph({"sample": sample}, {"stem.w": f32(width, channels)}, stem_nodes, (stem_nodes[-1].name,)),
         blocks=tuple(block(b) for b in range(blocks)),
-        tail=Graph({last: stream}, {"tail.w": f32(channels, width)}, (*back, head), ("out",)),
+        tail=Graph({last: stream}, {"tail.w": f32(channels, width), **of_norm}, (*back, head), ("out",)),
         pruner=Graph(
             {"cond": wide},
             {n: f32(*np.shape(weights[n])) for n in ("pruner.w", "pruner.b", "pruner.mask")},
@@ -186,7 +196,7 @@ def toy_program(
         sampler=sampler(
             steps, noise, sample_to_x0=1.0, out_to_x0=-0.3, x0_to_next=0.4, sample_to_next=0.6, out_to_next=0.2
         ),
-        chunk=ChunkSpec(channels, 1, 3, Affine(np.array([0.5, 4.0]), np.array([1.0, -1.0]))),
+        chunk=ChunkSpec(channels, 1, horizon, Affine(np.array([0.5, 4.0]), np.array([1.0, -1.0]))),
     )
     return assemble(spec, pieces, kinds, stream, weights)
 
@@ -212,10 +222,20 @@ def as_functions(program: Program, obs: npt.NDArray[np.float32], noise: npt.NDAr
         context = (row[k], cond, weights["step.w"] @ (cond + time[k]))[b % 3]
         return np.tanh(h @ weights[f"block.{b}.w"].T + context)
 
+    memory: list[npt.NDArray[np.float64]] = []
+
     def advance(h: npt.NDArray[np.float64], x: npt.NDArray[np.float64], k: int) -> npt.NDArray[np.float64]:
+        if k == 0:
+            memory[:] = [np.zeros_like(x)] * table.memories
         out = h @ weights["tail.w"].T
         clean = table.sample_to_x0[k] * x + table.out_to_x0[k] * out
+        if table.clip is not None:
+            clean = np.clip(clean, -table.clip, table.clip)
         following = table.x0_to_next[k] * clean + table.sample_to_next[k] * x + table.out_to_next[k] * out
+        for s, kept in enumerate(memory):
+            following = following + table.memory_to_next[k, s] * kept
+        terms = [clean, x, out, *memory]
+        memory[:] = [sum((c * term for c, term in zip(row, terms, strict=True)), 0 * x) for row in table.to_memory[k]]
         return following if noise is None else following + table.noise_to_next[k] * noise[k]
 
     return Toy(tuple(block.group for block in program.blocks), stem, block, advance)

@@ -7,6 +7,10 @@ with one session for all blocks they can. Its graph is a tree of ``If`` nodes ov
                   |                 +-- block 1
                   +-- which.1 --If--+-- block 2
                                     +-- block 3
+
+Steps that compute all blocks have a graph of their own, in which nothing is between one block and the next::
+
+    stream --block 0--> residual.0, stream + residual.0 --block 1--> residual.1, ... --> stream_next
 """
 
 from __future__ import annotations
@@ -20,6 +24,19 @@ JOINT = "blocks"
 """Name of the piece."""
 
 STREAM, RESIDUAL = "stream", "residual"
+
+DENSE_STEP = "dense_step"
+"""Name of the piece of whole steps. Its inputs are ``stream`` and the contexts of all blocks, as ``context.NAME``."""
+
+STREAM_NEXT, CONTEXT = "stream_next", "context."
+
+OF_ALL_BLOCKS = (JOINT, DENSE_STEP)
+"""Pieces that hold all blocks once more."""
+
+
+def dense_step_outputs(blocks: int) -> tuple[str, ...]:
+    """The stream after the last block, and what each of them added."""
+    return (STREAM_NEXT, *(f"{RESIDUAL}.{b:02d}" for b in range(blocks)))
 
 
 @dataclass(frozen=True)

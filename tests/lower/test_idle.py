@@ -1,0 +1,118 @@
+"""What idle steps need of a total: exact where stem and tail have the form, and no model where they almost have it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.runtimes.toys import B, f32, node, toy_program
+from ttscompile.ir.evaluate import evaluate
+from ttscompile.ir.graph import Graph, Node, Ref
+from ttscompile.ir.idle import OUTPUTS, TOTAL
+from ttscompile.ir.program import Pieces, Program
+from ttscompile.lower import OPSET
+from ttscompile.lower_idle import lower_idle
+
+from .sessions import session
+
+STREAM, SAMPLE = f32(B, 3, 4), f32(B, 3, 2)
+WEIGHTS = {"mix": f32(3, 3), "position": f32(3, 4), "scale": f32(3, 1), "norm.w": f32(4), "norm.b": f32(4)}
+
+
+def pieces_of(program: Program) -> Pieces:
+    assert program.pieces is not None
+    return program.pieces
+
+
+def values_of(program: Program) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    more = {name: rng.standard_normal(type_.at(1)).astype(np.float32) for name, type_ in WEIGHTS.items()}
+    return {**more, **{name: np.asarray(value) for name, value in program.weights.items()}}
+
+
+@pytest.mark.parametrize("sequence_first", [False, True])
+@pytest.mark.parametrize("size", [1e-3, 1.0, 300.0])
+def test_the_prediction_is_the_tails(sequence_first: bool, size: float) -> None:
+    program = toy_program(normed=True, sequence_first=sequence_first)
+    pieces, weights = pieces_of(program), values_of(program)
+    model, why = lower_idle(pieces, weights, OPSET)
+    assert (model is None, why) == (False, "")
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal((5, 3, 2)).astype(np.float32)
+    total = (size * rng.standard_normal(pieces.stem.types()[pieces.stem.outputs[0]].at(5))).astype(np.float32)
+    base, product, shift = session(model, {}).run(list(OUTPUTS), {TOTAL: total})
+    y = np.einsum("ed,dbt->ebt", product, x.transpose(2, 0, 1)) + base
+    found = y[3:] / np.sqrt((y[:3] ** 2).sum(axis=0)) + shift
+    tensors = {name: torch.from_numpy(value) for name, value in weights.items()}
+    stream = evaluate(pieces.stem, tensors, {"sample": torch.from_numpy(x)})[0] + torch.from_numpy(total)
+    expected = evaluate(pieces.tail, tensors, {next(iter(pieces.tail.inputs)): stream})[0]
+    np.testing.assert_allclose(found, expected.numpy().transpose(2, 0, 1), rtol=1e-4, atol=1e-5)
+
+
+def tail(*nodes: object, **constants: object) -> Graph:
+    return Graph({"h": STREAM}, {"tail.w": f32(2, 4), **constants}, nodes, ("out",))  # type: ignore[arg-type]
+
+
+NORM = node("n", "layer_norm.default", STREAM, Ref("h"), (4,), None, None, 1e-5, False)
+
+
+def head_of(value: str) -> Node:
+    return node("out", "linear.default", SAMPLE, Ref(value), Ref("tail.w"))
+
+
+LIFT = node("l", "linear.default", STREAM, Ref("sample"), Ref("stem.w"))
+
+
+def stem(*nodes: object, **constants: object) -> Graph:
+    return Graph({"sample": SAMPLE}, {"stem.w": f32(4, 2), **constants}, (LIFT, *nodes), ("h0" if nodes else "l",))  # type: ignore[arg-type]
+
+
+def test_a_norm_without_weights_and_a_stem_with_positions_have_the_form() -> None:
+    program = toy_program(normed=True)
+    moved = stem(node("h0", "add.Tensor", STREAM, Ref("l"), Ref("position")), position=f32(3, 4))
+    pieces = replace(pieces_of(program), stem=moved, tail=tail(NORM, head_of("n")))
+    assert lower_idle(pieces, values_of(program), OPSET)[0] is not None
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"stem": stem(node("h0", "tanh.default", STREAM, Ref("l")))}, "not known to be affine"),
+        ({"stem": stem(node("h0", "mul.Tensor", STREAM, Ref("l"), Ref("l")))}, "not known to be affine"),
+        (
+            {"stem": stem(node("h0", "matmul.default", STREAM, Ref("mix"), Ref("l")), mix=f32(3, 3))},
+            "every token of sample alike",
+        ),
+        (
+            {"stem": stem(node("h0", "mul.Tensor", STREAM, Ref("l"), Ref("scale")), scale=f32(3, 1))},
+            "every token of sample alike",
+        ),
+        ({"tail": tail(head_of("h"))}, "does not begin with a LayerNorm"),
+        ({"tail": tail(NORM, node("g", "gelu.default", STREAM, Ref("n")), head_of("g"))}, "not known to be affine"),
+        (
+            {"tail": tail(NORM, node("s", "add.Tensor", STREAM, Ref("n"), Ref("h")), head_of("s"))},
+            "does not begin with a LayerNorm",
+        ),
+        (
+            {
+                "tail": tail(
+                    node("n", "layer_norm.default", STREAM, Ref("h"), (3, 4), None, None, 1e-5, False), head_of("n")
+                )
+            },
+            "is not over the 4 numbers",
+        ),
+        (
+            {"tail": Graph({"h": STREAM, "c": f32(B, 1, 4)}, {"tail.w": f32(2, 4)}, (NORM, head_of("n")), ("out",))},
+            "values of the observation or the step",
+        ),
+    ],
+)
+def test_near_misses_have_no_model(change: dict[str, Graph], why: str) -> None:
+    program = toy_program(normed=True)
+    pieces = replace(pieces_of(program), **change)
+    model, reason = lower_idle(pieces, values_of(program), OPSET)
+    assert model is None
+    assert why in reason

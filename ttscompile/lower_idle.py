@@ -1,0 +1,219 @@
+"""The ONNX model of what idle steps need of a total; see ``ir.idle``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from onnx import ModelProto, helper
+
+from .ir.evaluate import evaluate
+from .ir.graph import Argument, Batch, Graph, Node, Ref, TensorType
+from .ir.idle import BASE, IDLE, PRODUCT, SHIFT, TOTAL
+from .ir.program import Pieces
+from .lower_graph_writer import GraphWriter, tensor
+from .lower_onnx import IR_VERSION
+
+Wide = npt.NDArray[np.float64]
+Weights = Mapping[str, npt.NDArray[np.generic]]
+
+_SUMS = frozenset({"aten.add.Tensor", "aten.sub.Tensor"})
+_PRODUCTS = frozenset({"aten.mul.Tensor", "aten.matmul.default", "aten.mm.default", "aten.bmm.default"})
+_OF_THE_FIRST = frozenset(
+    f"aten.{op}"
+    for op in (
+        *("linear.default", "div.Tensor", "neg.default", "clone.default", "contiguous.default", "reshape.default"),
+        *("view.default", "_unsafe_view.default", "permute.default", "transpose.int", "t.default", "unsqueeze.default"),
+        *("squeeze.dim", "expand.default", "slice.Tensor", "select.int"),
+    )
+)
+"""Linear in their first argument if nothing else depends on the input."""
+
+_NORM = "aten.layer_norm.default"
+
+
+class _Declined(Exception):
+    """Why stem or tail do not have the form."""
+
+
+@dataclass(frozen=True)
+class _Affine:
+    """``y[t] = x[t] @ matrix + constant[t]``.
+
+    Attributes:
+        matrix: ``[n, m]``.
+        constant: ``[T, m]``.
+    """
+
+    matrix: Wide
+    constant: Wide
+
+
+def lower_idle(pieces: Pieces, weights: Weights, opset: int) -> tuple[ModelProto | None, str]:
+    """The model, or None and why there is none.
+
+    Args:
+        pieces: of the program.
+        weights: values of the constants.
+        opset: of the model.
+    """
+    try:
+        return _lower(pieces, weights, opset), ""
+    except _Declined as reason:
+        return None, str(reason)
+
+
+def _lower(pieces: Pieces, weights: Weights, opset: int) -> ModelProto:
+    if len(pieces.stem.inputs) > 1 or len(pieces.tail.inputs) > 1:
+        raise _Declined("stem or tail read values of the observation or the step")
+    (sample,), (kind,) = pieces.stem.inputs.values(), pieces.tail.inputs.values()
+    tokens = sample.shape[1] if len(sample.shape) == 3 else None
+    if kind.shape[:2] not in ((Batch(), tokens), (tokens, Batch())) or len(kind.shape) != 3:
+        raise _Declined(f"the residual stream is {kind}, and the sample {sample}: not one vector for each token")
+    turned = kind.shape[0] != Batch()  # tokens first
+    stem = _affine(_wide(pieces.stem), weights, turned_out=turned)
+    norm, rest = _split_at_norm(pieces.tail)
+    head = _affine(_wide(rest), weights, turned_in=turned)
+    dimensions, width = stem.matrix.shape
+    if dimensions >= width:
+        raise _Declined(f"the sample has {dimensions} dimensions, and the stream no more than {width}")
+    scale, shift, eps = _norm_arguments(norm, weights, width)
+    head = _Affine(scale[:, None] * head.matrix, head.constant + shift @ head.matrix)
+    return _write(kind, turned, stem, head, eps, opset)
+
+
+def _write(kind: TensorType, turned: bool, stem: _Affine, head: _Affine, eps: float, opset: int) -> ModelProto:
+    dimensions, width = stem.matrix.shape
+    centred = stem.matrix - stem.matrix.mean(axis=1, keepdims=True)
+    basis, triangle = np.linalg.qr(centred.T)
+    root = np.sqrt(width)
+    w = GraphWriter()
+    total = w.op("Transpose", TOTAL, perm=[1, 0, 2]) if turned else TOTAL
+    offset = w.op("Add", total, w.constant(stem.constant[None], np.float32))
+    last = w.constant([-1])
+    u = w.op("Sub", offset, w.op("ReduceMean", offset, last))
+    projected = w.op("MatMul", u, w.constant(basis, np.float32))
+    across = w.op("Sub", u, w.op("MatMul", projected, w.constant(basis.T, np.float32)))
+    variance = w.op("Div", w.op("ReduceSumSquare", across, last), w.constant(width, np.float32))
+    deviation = w.op("Sqrt", w.op("Add", variance, w.constant(eps, np.float32)))
+    along = w.op("Div", projected, w.constant(root, np.float32))
+    numerator = w.op("MatMul", u, w.constant(head.matrix, np.float32))
+    rows = w.op("Concat", along, deviation, numerator, axis=2)
+    w.rename(w.op("Transpose", rows, perm=[2, 0, 1]), BASE)
+    product = np.concatenate([triangle / root, np.zeros((1, dimensions)), (centred @ head.matrix).T])
+    w.rename(w.constant(product, np.float32), PRODUCT)
+    w.rename(w.constant(head.constant.T[:, None], np.float32), SHIFT)
+    tokens, size = len(stem.constant), len(product)
+    outputs = [
+        tensor(BASE, np.float32, [size, "B", tokens]),
+        tensor(PRODUCT, np.float32, product.shape),
+        tensor(SHIFT, np.float32, [dimensions, 1, tokens]),
+    ]
+    given = tensor(TOTAL, np.float32, [n if isinstance(n, int) else str(n) for n in kind.shape])
+    return ModelProto(
+        ir_version=IR_VERSION,
+        producer_name="ttscompile",
+        opset_import=[helper.make_opsetid("", opset)],
+        graph=w.graph(IDLE, outputs, [given]),
+    )
+
+
+def _affine(graph: Graph, weights: Weights, turned_in: bool = False, turned_out: bool = False) -> _Affine:
+    """What an affine graph does to every token of its input.
+
+    Its operations say that it is affine; that all tokens meet the same matrix, and no token another, is tried on random
+    numbers, of which an affine map that is another one agrees with none.
+
+    Args:
+        graph: of one input and one output, float64.
+        weights: values of the constants.
+        turned_in: the input has its tokens first.
+        turned_out: the output has.
+    """
+    _require_affine(graph)
+    ((name, kind),) = graph.inputs.items()
+    if missing := sorted(set(graph.constants) - set(weights)):
+        raise _Declined(f"the constants {missing} have no values")
+    values = {n: torch.from_numpy(np.asarray(weights[n], np.float64)) for n in graph.constants}
+
+    def call(x: torch.Tensor) -> torch.Tensor:
+        y = evaluate(graph, values, {name: x.transpose(0, 1) if turned_in else x})[0]
+        return y.transpose(0, 1) if turned_out else y
+
+    one = kind.at(1)
+    tokens, inner = (one[0] if turned_in else one[1]), one[2]
+    zeros = torch.zeros((1, tokens, inner), dtype=torch.float64, requires_grad=True)
+    constant = call(zeros)
+    if constant.ndim != 3 or constant.shape[:2] != (1, tokens):
+        raise _Declined(f"{graph.outputs[0]} is {list(constant.shape)}, not one vector for each of {tokens} tokens")
+    if inner <= constant.shape[2]:
+        inputs = torch.eye(inner, dtype=torch.float64)[:, None].expand(inner, tokens, inner)
+        matrix = (call(inputs) - constant)[:, 0]
+    else:
+        outputs = constant[0, 0]
+        columns = [torch.autograd.grad(each, zeros, retain_graph=True)[0][0, 0] for each in outputs]
+        matrix = torch.stack(columns, dim=1)
+    trial = torch.randn((2, tokens, inner), dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    if not torch.allclose(call(trial), trial @ matrix + constant, rtol=1e-9, atol=1e-9):
+        raise _Declined(f"{graph.outputs[0]} does not treat every token of {name} alike and for itself")
+    return _Affine(matrix.detach().numpy(), constant.detach().numpy()[0])
+
+
+def _require_affine(graph: Graph) -> None:
+    moving = set(graph.inputs)
+    for node in graph.nodes:
+        moved = [name for name in node.refs() if name in moving]
+        if not moved:
+            continue
+        of_first = isinstance(node.args[0], Ref) and moved == [node.args[0].name]
+        product = node.op in _PRODUCTS and len(moved) == 1
+        if not (node.op in _SUMS or product or (node.op in _OF_THE_FIRST and of_first)):
+            raise _Declined(f"{node} is not known to be affine")
+        moving.add(node.name)
+    if graph.outputs[0] not in moving:
+        raise _Declined(f"{graph.outputs[0]} does not depend on {next(iter(graph.inputs))}")
+
+
+def _split_at_norm(tail: Graph) -> tuple[Node, Graph]:
+    """The LayerNorm that the stream enters first, and the tail after it."""
+    ((name, _),) = tail.inputs.items()
+    users = tail.users()[name]
+    if len(users) != 1 or users[0].op != _NORM or users[0].args[0] != Ref(name):
+        raise _Declined(f"the tail does not begin with a LayerNorm of its input, but with {users[0]}")
+    norm = users[0]
+    rest = tuple(node for node in tail.nodes if node is not norm)
+    read = {ref for node in rest for ref in node.refs()}
+    constants = {name: type_ for name, type_ in tail.constants.items() if name in read}
+    return norm, replace(tail, inputs={norm.name: norm.type}, constants=constants, nodes=rest)
+
+
+def _norm_arguments(norm: Node, weights: Weights, width: int) -> tuple[Wide, Wide, float]:
+    """Scale ``[W]``, shift ``[W]`` and epsilon."""
+    shape, scale, shift, eps = (*norm.args[1:5], *(None, None, 1e-5)[len(norm.args) - 2 :])[:4]
+    if shape != (width,) or norm.kwargs or not isinstance(eps, float):
+        raise _Declined(f"{norm} is not over the {width} numbers of a token")
+
+    def value(argument: Argument, without: float) -> Wide:
+        if isinstance(argument, Ref) and argument.name in weights:
+            return np.asarray(weights[argument.name], np.float64)
+        if argument is None:
+            return np.full(width, without)
+        raise _Declined(f"{norm} takes what is no constant")
+
+    return value(scale, 1.0), value(shift, 0.0), eps
+
+
+def _wide(graph: Graph) -> Graph:
+    """The graph in float64."""
+
+    def wide(types: Mapping[str, TensorType]) -> dict[str, TensorType]:
+        return {name: replace(t, dtype="float64") if t.dtype == "float32" else t for name, t in types.items()}
+
+    nodes = tuple(
+        replace(n, types=tuple(replace(t, dtype="float64") if t.dtype == "float32" else t for t in n.types))
+        for n in graph.nodes
+    )
+    return replace(graph, inputs=wide(graph.inputs), constants=wide(graph.constants), nodes=nodes)
