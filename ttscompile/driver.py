@@ -19,22 +19,31 @@ from .capture import capture
 from .config import FP32, PolicySpec
 from .errors import ArtifactError
 from .frontends import load_checkpoint_policy
-from .ir.flops import graph_flops
-from .ir.joint import JOINT
+from .frontends.encoded import EncodedDenoiser
+from .golden import record_original
+from .ir.dataflow import reachable_from
+from .ir.flops import graph_flops, node_flops
+from .ir.graph import Graph
+from .ir.joint import DENSE_STEP, JOINT
 from .ir.program import Program
 from .ir.verify import verify
 from .lower import lower_program
-from .lower_joint import join_blocks
+from .lower_joint import chain_blocks, join_blocks
 from .lower_precision import lower_precision, require_precision
 from .lower_single_file import lower_single_file
 from .passes.base import Pass
 from .passes.clean_up import CleanUp
+from .passes.cut_copies import CutCopies
 from .passes.find_residual_blocks import find_residual_blocks
 from .passes.hoist import Hoist
 from .passes.insert_pruner import InsertPruner
 from .passes.insert_reuse import InsertReuse
 from .passes.partition import Partition
+from .passes.regroup_sums import RegroupSums
+from .passes.split_features import SplitFeatures
 from .passes.split_tokens import SplitTokens
+from .passes.unfold_batch import UnfoldBatch
+from .passes.widen_attention import WidenAttention
 from .runtimes.precision import measure_precision
 
 if TYPE_CHECKING:
@@ -56,6 +65,8 @@ def convert(
     sampler: str | None = None,
     steps: int | None = None,
     spacing: str | None = None,
+    task: str | None = None,
+    encoders: str | os.PathLike[str] | None = None,
     precision: str = FP32,
     single_file: str | os.PathLike[str] | None = None,
     explain: Explain = _silent,
@@ -65,10 +76,16 @@ def convert(
     Args:
         checkpoint: a file or directory that the training code saved.
         directory: where the artifact goes; an artifact that is there is replaced, anything else is left alone.
-        format: ``auto`` or ``diffusion_policy``.
-        sampler: ``ddpm`` or ``ddim`` in place of the checkpoint's own; None keeps it.
+        format: ``auto``, ``diffusion_policy`` or ``lerobot``.
+        sampler: ``ddpm``, ``ddim`` or ``dpmsolver++`` in place of the checkpoint's own; None keeps it.
         steps: number of denoising steps; None keeps the checkpoint's.
-        spacing: ``leading``, ``trailing`` or ``linspace``: the timesteps that fewer steps visit; None: as trained.
+        spacing: ``leading``, ``trailing`` or ``linspace``: the timesteps that fewer steps visit. None: the checkpoint's
+            own, or diffusers' default (``leading`` of DDIM); of ``dpmsolver++`` in place of another sampler
+            ``trailing``, or ``leading`` for a policy that predicts noise without a bound on the sample.
+        task: of a LeRobot policy: the one instruction that is compiled in, so that the robot needs no tokenizer; None
+            makes its tokens an observation.
+        encoders: of a LeRobot policy: folder with its CLIP encoders' configurations, where they are neither in nor
+            beside the checkpoint. Nothing is ever downloaded.
         precision: of the weights of residual blocks: ``fp32`` or ``int8``; see ``compile_denoiser``.
         single_file: where one ONNX file of the whole call goes too, for programs without ttscompile; None for none.
             ``ttscompile.lower_single_file`` describes its inputs and outputs.
@@ -79,7 +96,9 @@ def convert(
     """
     if precision != FP32:
         require_precision(precision)  # before minutes of work
-    module, spec = load_checkpoint_policy(checkpoint, format=format, sampler=sampler, steps=steps, spacing=spacing)
+    module, spec = load_checkpoint_policy(
+        checkpoint, format=format, sampler=sampler, steps=steps, spacing=spacing, task=task, encoders=encoders
+    )
     return compile_denoiser(module, spec, directory, precision=precision, single_file=single_file, explain=explain)
 
 
@@ -121,7 +140,9 @@ def compile_denoiser(
     # Made before anything is written: a program that has no single file leaves no artifact without one.
     whole = None if single_file is None else _lower_whole(program, models, blocks)
     if directory is not None:
-        manifest = write_artifact(program, models, directory, blocks)
+        golden = record_original(module, program)
+        explain("record_original", (f"{len(golden.steps)} of {spec.sampler.steps} steps, {golden.streams} streams",))
+        manifest = write_artifact(program, models, directory, blocks, golden)
         explain("write", (f"identity {manifest.identity[:12]}",))
     if whole is not None and single_file is not None:
         _write(Path(single_file), whole)
@@ -154,7 +175,8 @@ def _lower_blocks(
     """Residual blocks of another precision than fp32, and the error that they make."""
     lowered, weights, notes = lower_precision(models, program.weights, precision)
     assert program.pieces is not None
-    lowered[JOINT] = join_blocks(program.pieces.blocks, {**models, **lowered})
+    own = {**models, **lowered}
+    lowered |= {JOINT: join_blocks(program.pieces.blocks, own), DENSE_STEP: chain_blocks(program.pieces.blocks, own)}
     blocks = LoweredBlocks(precision, lowered, weights)
     with TemporaryDirectory() as folder:
         write_artifact(program, models, folder, blocks)
@@ -169,17 +191,37 @@ def transform(module: nn.Module, spec: PolicySpec, *, explain: Explain = _silent
     graph, weights = capture(module, spec)
     megabytes = sum(w.nbytes for w in weights.values()) / 1e6
     explain("capture", (f"{len(graph.nodes)} operations, {megabytes:.1f} MB of weights",))
-    program = Program(spec, graph, weights, dense_flops=graph_flops(graph) * spec.sampler.steps)
+    program = Program(spec, graph, weights, dense_flops=_dense_flops(module, graph, spec))
     verify(program)
-    program = _run(CleanUp(), program, explain)
+    for first in (CleanUp(), CutCopies(), WidenAttention(), RegroupSums()):
+        program = _run(first, program, explain)
     table = find_residual_blocks(program.denoiser, spec.sample_argument)
     kinds = ", ".join(dict.fromkeys(block.kind for block in table.blocks))
     explain("find_residual_blocks", (f"{len(table.blocks)} blocks: {kinds}", *table.declined))
     program = replace(program, blocks=table.blocks)
-    for each in (Partition(), SplitTokens(), CleanUp(), Hoist(), InsertPruner(), InsertReuse(), CleanUp()):
+    for each in (
+        Partition(),
+        UnfoldBatch(),
+        SplitTokens(),
+        SplitFeatures(),
+        CleanUp(),
+        Hoist(),
+        InsertPruner(),
+        InsertReuse(),
+        CleanUp(),
+    ):
         program = _run(each, program, explain)
     verify(program)
     return program
+
+
+def _dense_flops(module: nn.Module, graph: Graph, spec: PolicySpec) -> int:
+    """FLOPs of a call as the original makes it: the whole graph at every step, but an observation encoder once."""
+    once = 0
+    if isinstance(module, EncodedDenoiser):
+        types, loop = graph.types(), reachable_from(graph, [spec.sample_argument, spec.timestep_argument])
+        once = sum(node_flops(node, types) for node in graph.nodes if node.name not in loop)
+    return (graph_flops(graph) - once) * spec.sampler.steps + once
 
 
 def _run(each: Pass, program: Program, explain: Explain) -> Program:

@@ -90,6 +90,7 @@ class ExecutorStatistics:
 
     Attributes:
         plan: that the next call runs.
+        identity: of the artifact; empty for a policy that is none.
         ticks: actions that were given out, held ones included.
         holds: of these, the last action given out again because there was no other.
         starved: times that there was no action and none could be held, so that ``action`` raised. Before the first
@@ -116,6 +117,7 @@ class ExecutorStatistics:
     """
 
     plan: str
+    identity: str
     ticks: int
     holds: int
     starved: int
@@ -180,7 +182,8 @@ class Recorder:
         return {"last_refusal": self.last_refusal, "counts": counts, "samples": samples}
 
 
-def statistics(plan: str, copied: dict[str, Any]) -> ExecutorStatistics:
+def statistics(plan: str, copied: dict[str, Any], identity: str = "") -> ExecutorStatistics:
     """Statistics from what ``Recorder.copy`` gave."""
     summaries: dict[str, Any] = {name: summary(*sample) for name, sample in copied["samples"].items()}
-    return ExecutorStatistics(plan=plan, last_refusal=copied["last_refusal"], **copied["counts"], **summaries)
+    told = {"plan": plan, "identity": identity, "last_refusal": copied["last_refusal"]}
+    return ExecutorStatistics(**told, **copied["counts"], **summaries)

@@ -27,10 +27,12 @@ class Trace:
 
     Args:
         events: that are kept; the oldest go first. 0 keeps none.
+        identity: of the artifact; empty for a policy that is none.
     """
 
-    def __init__(self, events: int) -> None:
+    def __init__(self, events: int, identity: str = "") -> None:
         self.on = events > 0
+        self._identity = identity
         self._events: deque[Event] = deque(maxlen=events)
 
     def span(
@@ -77,6 +79,7 @@ class Trace:
         ]
         return {
             "displayTimeUnit": "ms",
+            "otherData": {"identity": self._identity},
             "traceEvents": [
                 *({"ph": "M", "name": what, "pid": 1, "tid": tid, "args": {"name": name}} for what, tid, name in names),
                 *(_as_json(event, zero) for event in events),

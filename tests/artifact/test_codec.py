@@ -174,7 +174,7 @@ def test_contents_that_are_refused(manifest: Manifest, edit: Change, message: st
         codec.decode(change(manifest, edit))
 
 
-@pytest.mark.parametrize("version", [0, 1, 99, "2", 2.0, True, None])
+@pytest.mark.parametrize("version", [0, 1, 2, 99, "2", 2.0, True, None])
 def test_another_schema_version_says_what_to_do(manifest: Manifest, version: object) -> None:
     content = change(manifest, lambda d: d.update(schema_version=version, ttscompile_version="7.8.9"))
     with pytest.raises(ArtifactError, match=r"Convert the checkpoint again .* install ttscompile==7\.8\.9"):
@@ -182,8 +182,8 @@ def test_another_schema_version_says_what_to_do(manifest: Manifest, version: obj
 
 
 def test_a_future_schema_is_named_before_anything_else_is_read() -> None:
-    content = dump({"format": "ttscompile artifact", "schema_version": 3, "new": "thing"})
-    with pytest.raises(ArtifactError, match="schema_version: expected 2, .*; found 3"):
+    content = dump({"format": "ttscompile artifact", "schema_version": 4, "new": "thing"})
+    with pytest.raises(ArtifactError, match="schema_version: expected 3, .*; found 4"):
         codec.decode(content)
 
 

@@ -15,10 +15,14 @@ from .codec import MAX_MANIFEST_BYTES, decode
 from .manifest import MANIFEST
 
 MAX_ENTRIES = 4096
-MAX_RATIO = 200
+MAX_RATIO = 20
 """Deflate reaches 1000 on zeros; real weights 1.1. Beyond this, and beyond ``FREE_BYTES``, it is a bomb."""
 FREE_BYTES = 256 * 2**20
+CHUNK = 2**20
+METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""What ``zip`` writes. The others that Python reads cost much more memory or time for a byte of the archive."""
 
+_ENCRYPTED = 0x1
 _AGAIN = "Zip the artifact's directory again, or give the directory itself."
 
 
@@ -57,7 +61,7 @@ def unpack(path: Path) -> Unpacked:
     try:
         with zipfile.ZipFile(path) as archive:
             _extract(archive, path, unpacked.path)
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError) as error:
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError, OSError) as error:
         unpacked.remove()
         raise ArtifactError(f"{path}: not a zip file that can be read: {error}. {_AGAIN}") from error
     except BaseException:
@@ -74,9 +78,8 @@ def _extract(archive: zipfile.ZipFile, path: Path, folder: Path) -> None:
             " checkpoint, convert it first with 'ttscompile convert'."
         )
     allowed = max(FREE_BYTES, MAX_RATIO * path.stat().st_size)
-    content = _member(archive, entries[MANIFEST], min(entries[MANIFEST].file_size, MAX_MANIFEST_BYTES), path)
-    (folder / MANIFEST).write_bytes(content)
-    manifest = decode(content, f"{path}: {MANIFEST}")
+    _copy(archive, entries[MANIFEST], min(entries[MANIFEST].file_size, MAX_MANIFEST_BYTES), path, folder / MANIFEST)
+    manifest = decode((folder / MANIFEST).read_bytes(), f"{path}: {MANIFEST}")
     total = sum(record.bytes for record in manifest.files.values())
     if total > allowed:
         raise ArtifactError(
@@ -85,7 +88,7 @@ def _extract(archive: zipfile.ZipFile, path: Path, folder: Path) -> None:
     for name, record in manifest.files.items():
         if name not in entries:
             raise ArtifactError(f"{path}: the file {name} is missing; {MANIFEST} lists it. {_AGAIN}")
-        (folder / name).write_bytes(_member(archive, entries[name], record.bytes, path))
+        _copy(archive, entries[name], record.bytes, path, folder / name)
 
 
 def _entries(archive: zipfile.ZipFile, path: Path) -> dict[str, zipfile.ZipInfo]:
@@ -99,8 +102,13 @@ def _entries(archive: zipfile.ZipFile, path: Path) -> dict[str, zipfile.ZipInfo]
         name = PurePosixPath(info.filename)
         if name.is_absolute() or ".." in name.parts or "\\" in info.filename or ":" in info.filename:
             raise ArtifactError(f"{path}: entry {info.filename!r} leaves the archive; found in no artifact. {_AGAIN}")
-        if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
+        if kind not in (0, stat.S_IFREG, stat.S_IFDIR) or not info.filename:
             raise ArtifactError(f"{path}: entry {info.filename!r} is a link or a device, not a file. {_AGAIN}")
+        if info.compress_type not in METHODS or info.flag_bits & _ENCRYPTED:
+            raise ArtifactError(
+                f"{path}: entry {info.filename!r} is encrypted or compressed by another method than deflate, which"
+                f" 'zip -r' uses. {_AGAIN}"
+            )
         if not info.is_dir():
             files.append((name, info))
     folders = {name.parent for name, _ in files}
@@ -115,10 +123,11 @@ def _entries(archive: zipfile.ZipFile, path: Path) -> dict[str, zipfile.ZipInfo]
     return entries
 
 
-def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, size: int, path: Path) -> bytes:
-    """The content of an entry, which has to be of exactly this size."""
-    with archive.open(info) as file:
-        content = file.read(size + 1)
-    if info.file_size != size or len(content) != size:
+def _copy(archive: zipfile.ZipFile, info: zipfile.ZipInfo, size: int, path: Path, target: Path) -> None:
+    """Write the content of an entry, which has to be of exactly this size, to a new file."""
+    if info.file_size != size:
         raise ArtifactError(f"{path}: {info.filename}: expected {size} bytes; found {info.file_size}. {_AGAIN}")
-    return content
+    with archive.open(info) as source, target.open("xb") as file:
+        shutil.copyfileobj(source, file, CHUNK)  # never more than the directory says, which was compared above
+    if (found := target.stat().st_size) != size:
+        raise ArtifactError(f"{path}: {info.filename}: expected {size} bytes; found {found}. {_AGAIN}")

@@ -12,7 +12,7 @@ from typing import Any
 
 from ..config import INT8
 from ..errors import ArtifactError
-from ..ir.joint import JOINT
+from ..ir.joint import OF_ALL_BLOCKS
 from ..ir.program import Binding, Reuse
 from .manifest import (
     DENSE,
@@ -161,7 +161,7 @@ def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:
         fields["flops"].fail(f"FLOPs of {blocks} blocks")
     if len(manifest.reuse) not in (0, blocks):
         fields["reuse"].fail(f"none, or one for each of {blocks} blocks")
-    missing = {"condition", "stem", "advance", *map(block_name, range(blocks))} - set(manifest.pieces)
+    missing = {"condition", "stem", "advance", *OF_ALL_BLOCKS, *map(block_name, range(blocks))} - set(manifest.pieces)
     if missing:
         fields["pieces"].fail(f"the pieces {sorted(missing)} too")
     for name, piece in manifest.pieces.items():
@@ -190,11 +190,11 @@ def _check_precision(manifest: Manifest, value: Value) -> None:
     record = manifest.precision
     assert record is not None
     known = list(map(block_name, range(len(manifest.blocks))))
-    single = set(record.models) - {JOINT}
+    single = set(record.models) - set(OF_ALL_BLOCKS)
     if not single or not single <= set(known):
         value.fail(f"models of some of the blocks {', '.join(known)} and of nothing else")
-    if (JOINT in record.models) != (JOINT in manifest.pieces):
-        value.fail(f"a model called {JOINT!r} exactly when there is a piece of this name")
+    if not set(OF_ALL_BLOCKS) <= set(record.models):
+        value.fail(f"models called {' and '.join(OF_ALL_BLOCKS)} too")
     own = {record.weights, *record.models.values()}
     others = {piece.file for piece in manifest.pieces.values()} | set(vars(manifest.stores).values())
     if len(own) <= len(record.models) or own & others:
@@ -283,9 +283,10 @@ def _plan(value: Value) -> PlanRecord:
 
 
 def _stores(value: Value) -> Stores:
-    fields = value.keys("program", "weights", "pruner", "plans")
-    pruner, plans = (None if fields[n].absent else fields[n].text() for n in ("pruner", "plans"))
-    return Stores(program=fields["program"].text(), weights=fields["weights"].text(), pruner=pruner, plans=plans)
+    optional = ("pruner", "plans", "golden", "golden_plans")
+    fields = value.keys("program", "weights", *optional)
+    names = {name: None if fields[name].absent else fields[name].text() for name in optional}
+    return Stores(program=fields["program"].text(), weights=fields["weights"].text(), **names)
 
 
 def _requires(value: Value) -> Requires:

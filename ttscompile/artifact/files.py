@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import ctypes
+import fcntl
 import hashlib
 import os
+import re
 import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from ..errors import ArtifactError
@@ -87,3 +93,80 @@ def sync_directory(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def replace_folder(partial: Path, target: Path) -> None:
+    """Put a finished folder in the place of another, which is removed: at every moment one of the two stands there.
+
+    Linux exchanges two names at once. Where the file system cannot (NFS and some others), the old folder is renamed
+    first; a crash between the two renames then leaves it beside ``target`` under a name that ends with ``.replaced``,
+    from where ``new_folder`` puts it back.
+    """
+    if not target.exists():
+        partial.replace(target)
+    elif exchange(partial, target):
+        shutil.rmtree(partial, ignore_errors=True)
+    else:
+        old = _replaced(target)
+        target.replace(old)
+        try:
+            partial.replace(target)
+        except BaseException:
+            old.replace(target)
+            raise
+        shutil.rmtree(old, ignore_errors=True)
+    sync_directory(target.parent)
+
+
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2
+
+
+def exchange(one: Path, other: Path) -> bool:
+    """Exchange two names at once; False, and nothing changed, where the system or the file system cannot."""
+    renameat2 = getattr(ctypes.CDLL(None), "renameat2", None)
+    if renameat2 is None:
+        return False
+    names = os.fsencode(one), os.fsencode(other)
+    return bool(renameat2(_AT_FDCWD, names[0], _AT_FDCWD, names[1], _RENAME_EXCHANGE) == 0)
+
+
+@contextmanager
+def new_folder(target: Path) -> Iterator[Path]:
+    """An empty folder beside ``target`` for what will take its place; gone after the block, if it is still there.
+
+    Folders that killed processes left there are removed first. A live process holds a lock on its folder.
+    """
+    name = re.compile(rf"\.{re.escape(target.name)}\.[0-9a-f]{{8}}{re.escape(PARTIAL)}")
+    for path in [path for path in target.parent.iterdir() if name.fullmatch(path.name)]:
+        _remove_abandoned(path)
+    partial = beside(target)
+    partial.mkdir()
+    descriptor = os.open(partial, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield partial
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+        os.close(descriptor)
+
+
+def recover(target: Path) -> None:
+    """Put a folder back that a crash left renamed and not replaced; see ``replace_folder``."""
+    old = _replaced(target)
+    if old.is_dir() and not target.exists():
+        old.replace(target)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _replaced(target: Path) -> Path:
+    return target.with_name(f".{target.name}.replaced")
+
+
+def _remove_abandoned(path: Path) -> None:
+    with suppress(OSError):  # somebody works in it, or removed it
+        descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(path, ignore_errors=True)
+        finally:
+            os.close(descriptor)

@@ -27,6 +27,8 @@ from .codec import decode
 from .files import verify
 from .identity import identities
 from .manifest import DENSE, MANIFEST, Manifest, Requires, block_name
+from .onnx_files import check_model
+from .size import check_size
 from .strict_json import REMEDY, parse
 
 TABLE_PREFIX = "table/"
@@ -230,6 +232,10 @@ def _load_directory(directory: Path) -> Artifact:
             f"{directory}: expected the identity {manifest.short_identity}; its content has"
             f" {identities(manifest)[0][:12]}. {REMEDY}"
         )
+    check_size(manifest, directory)
+    models = {piece.file for piece in manifest.pieces.values()}
+    for name in sorted(models | (set(manifest.precision.models.values()) if manifest.precision else set())):
+        check_model(directory / name, manifest.files)
     stored = tensors.read(directory / manifest.stores.weights)
     tables = {n.removeprefix(TABLE_PREFIX): a for n, a in stored.items() if n.startswith(TABLE_PREFIX)}
     schedules, corrections = _plans(directory, manifest)

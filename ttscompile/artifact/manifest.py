@@ -15,7 +15,7 @@ from ..ir.program import Binding, Reuse
 from ..lattice import PlanArray, plan_flops
 
 FORMAT = "ttscompile artifact"
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 MANIFEST = "manifest.json"
 DENSE = "dense"
 """The plan that computes every cell; every artifact has it without listing it."""
@@ -50,7 +50,7 @@ class PieceRecord:
         stream: the input that carries the sample (``stem``) or the residual stream (blocks, ``advance``); None for the
             pieces outside the loop.
         contexts: the values that its other inputs want: names in ``Manifest.contexts``. The input of a context has the
-            name of the context, in ``advance`` after ``tail.`` or ``stem.``.
+            name of the context, in ``advance`` after ``tail.`` or ``stem.``, in ``dense_step`` after ``context.``.
         outputs: names of its outputs, in order.
     """
 
@@ -99,6 +99,15 @@ class FlopsRecord:
         fixed = self.prologue + (self.pruner if pruned else 0) + len(plan) * (self.stem + self.tail)
         return fixed + plan_flops(plan, self.blocks)
 
+    def ceiling(self, steps: int) -> float:
+        """How many times the FLOPs of a call are that computes step 0 alone, in a dense call: no plan saves more.
+
+        Args:
+            steps: K. The ceiling is below K: prologue, stems and tails are always computed.
+        """
+        fixed, blocks = self.prologue + steps * (self.stem + self.tail), sum(self.blocks)
+        return (fixed + steps * blocks) / (fixed + blocks)
+
 
 @dataclass(frozen=True)
 class PlanRecord:
@@ -125,12 +134,23 @@ class FileRecord:
 
 @dataclass(frozen=True)
 class Stores:
-    """Names of the files that are not ONNX; None where the artifact has none."""
+    """Names of the files that are not ONNX; None where the artifact has none.
+
+    Attributes:
+        program: graphs of all pieces.
+        weights: constants of all pieces but the pruner's, and tables.
+        pruner: its constants.
+        plans: schedules and corrections.
+        golden: what the original network answered (``artifact.golden``).
+        golden_plans: what the reference runtime made of the plans when they were calibrated.
+    """
 
     program: str
     weights: str
     pruner: str | None
     plans: str | None
+    golden: str | None = None
+    golden_plans: str | None = None
 
 
 @dataclass(frozen=True)

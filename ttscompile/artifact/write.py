@@ -5,8 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import re
-import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -20,22 +19,32 @@ from ..correction import Correction
 from ..errors import ArtifactError
 from ..ir.program import Binding, Program
 from ..ir.serialize import graph_to_json
-from ..lattice import plan_flops, sparsity
 from . import tensors
 from .bind import Place, bind, rebind
 from .codec import encode
-from .files import PARTIAL, beside, content_hash, describe, replace_file, sync_directory, write_synced
+from .files import (
+    PARTIAL,
+    content_hash,
+    describe,
+    new_folder,
+    recover,
+    replace_file,
+    replace_folder,
+    sync_directory,
+    write_synced,
+)
+from .golden import Golden, GoldenPlan, plan_arrays
 from .identity import identities
 from .load import (
     CORRECTION_FIELDS,
     CORRECTION_PREFIX,
     TABLE_PREFIX,
     Artifact,
-    check_schedule,
     load_artifact,
     read_manifest,
 )
-from .manifest import DENSE, FORMAT, MANIFEST, SCHEMA_VERSION, Manifest, PlanRecord, Stores
+from .manifest import DENSE, FORMAT, MANIFEST, SCHEMA_VERSION, Manifest, Stores
+from .plan_records import PRUNER, calibration_record, plan_records
 from .precision import LoweredBlocks, store_blocks
 from .records import (
     PRUNER_PREFIX,
@@ -47,19 +56,19 @@ from .records import (
     piece_records,
     requirements,
 )
-from .strict_json import Value, dump_compact, parse
+from .strict_json import dump_compact
 
 if TYPE_CHECKING:
     from onnx import ModelProto
 
 PROGRAM = "program.json"
 WEIGHTS = "weights.safetensors"
-PRUNER = "pruner"
-"""Name of the pruner's piece, and of its plan where ``default_plan`` gives none."""
+GOLDEN = "golden.safetensors"
 
-_STALE = re.compile(rf"(pruner-[0-9a-f]+\.(onnx|safetensors)|plans-[0-9a-f]+\.safetensors|\..+{re.escape(PARTIAL)})")
+_STALE = re.compile(
+    rf"(pruner-[0-9a-f]+\.(onnx|safetensors)|(golden_)?plans-[0-9a-f]+\.safetensors|\..+{re.escape(PARTIAL)})"
+)
 _OURS = re.compile(rf"manifest\.json|program\.json|[A-Za-z0-9_-]+\.(onnx|safetensors)|{_STALE.pattern}")
-_PLAN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.%-]{0,63}")
 
 
 def write_artifact(
@@ -67,6 +76,7 @@ def write_artifact(
     models: Mapping[str, ModelProto],
     directory: str | os.PathLike[str],
     blocks: LoweredBlocks | None = None,
+    golden: Golden | None = None,
 ) -> Manifest:
     """Write a compiled program; its default plan is ``dense`` until it is calibrated.
 
@@ -77,6 +87,7 @@ def write_artifact(
         models: from ``lower_program``.
         directory: where it goes; its parents are made. An artifact that is there is replaced.
         blocks: residual blocks of another precision, which then is the artifact's; None for fp32.
+        golden: what the original network answered; None leaves the artifact without, which then cannot be verified.
 
     Returns:
         The manifest.
@@ -87,20 +98,17 @@ def write_artifact(
     """
     target = Path(os.path.realpath(directory))
     _require_replaceable(target)
-    partial = beside(target)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        with _locked(target) if target.is_dir() else nullcontext():
-            partial.mkdir()
-            manifest = _fill(partial, program, models, blocks)
+        recover(target)
+        with _locked(target) if target.is_dir() else nullcontext(), new_folder(target) as partial:
+            manifest = _fill(partial, program, models, blocks, golden)
             sync_directory(partial)
-            _install(partial, target)
+            replace_folder(partial, target)
     except OSError as error:
         raise ArtifactError(
             f"{target}: the artifact cannot be written: {error}. What was there is unharmed."
         ) from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)  # gone already if all went well
     return manifest
 
 
@@ -113,6 +121,7 @@ def update_calibration(
     *,
     corrections: Mapping[str, Correction] | None = None,
     model_identity: str | None = None,
+    golden: Callable[[Artifact], Mapping[str, GoldenPlan]] | None = None,
 ) -> Manifest:
     """Replace the plans of an artifact, and its pruner's weights: at once, or not at all.
 
@@ -129,6 +138,8 @@ def update_calibration(
         record: what was done to get here; JSON.
         corrections: of the sampler's steps, by the name of their plan; None for none.
         model_identity: of the artifact that was calibrated; refuses another one.
+        golden: records what the reference runtime makes of the plans (``ttscompile.golden.record_plans``), given the
+            artifact as it will be; None leaves the artifact without, and its plans cannot be verified.
 
     Returns:
         The new manifest.
@@ -151,14 +162,22 @@ def update_calibration(
             )
         manifest = replace(
             artifact.manifest,
-            plans=_plan_records(artifact.manifest, pruner_weights is not None, schedules, default_plan, record),
+            plans=plan_records(artifact.manifest, pruner_weights is not None, schedules, default_plan, record),
             default_plan=default_plan,
-            calibration=_json(record),
+            calibration=calibration_record(record),
         )
         try:
             manifest = _store_plans(directory, manifest, schedules, corrections or {})
             if pruner_weights is not None:
                 manifest = _store_pruner(artifact, manifest, pruner_weights)
+            after = replace(
+                artifact,
+                manifest=manifest,
+                schedules=dict(schedules),
+                corrections=dict(corrections or {}),
+                pruner=artifact.pruner if pruner_weights is None else pruner_weights,
+            )
+            manifest = _store_golden_plans(directory, manifest, {} if golden is None else golden(after))
             manifest = _identified(manifest)
             replace_file(directory / MANIFEST, encode(manifest))
         except OSError as error:
@@ -170,7 +189,13 @@ def update_calibration(
     return manifest
 
 
-def _fill(folder: Path, program: Program, models: Mapping[str, ModelProto], blocks: LoweredBlocks | None) -> Manifest:
+def _fill(
+    folder: Path,
+    program: Program,
+    models: Mapping[str, ModelProto],
+    blocks: LoweredBlocks | None,
+    golden: Golden | None,
+) -> Manifest:
     """Write all files of a new artifact into an empty folder."""
     graphs = piece_graphs(program)
     values = constants(program, graphs)
@@ -191,10 +216,12 @@ def _fill(folder: Path, program: Program, models: Mapping[str, ModelProto], bloc
         write_synced(folder / pruner_file, content)
         places.update(_places(folder / pruner_file, pruner))
 
-    pieces = piece_records(graphs, models, files)
+    pieces = piece_records(graphs, models, files, program.spec.sampler)
     for name in pieces:
         write_synced(folder / files[name], bind(models[name], places, name).SerializeToString(deterministic=True))
     precision = None if blocks is None else store_blocks(folder, blocks, pieces, places)
+    if golden is not None:
+        write_synced(folder / GOLDEN, tensors.serialize(golden.arrays()))
     document = {"graphs": {name: graph_to_json(graph) for name, graph in graphs.items()}}
     write_synced(folder / PROGRAM, dump_compact(document))
 
@@ -214,7 +241,7 @@ def _fill(folder: Path, program: Program, models: Mapping[str, ModelProto], bloc
             plans={},
             default_plan=DENSE,
             calibration=None,
-            stores=Stores(program=PROGRAM, weights=WEIGHTS, pruner=pruner_file, plans=None),
+            stores=Stores(PROGRAM, WEIGHTS, pruner_file, None, golden=None if golden is None else GOLDEN),
             requires=requires,
             files={path.name: describe(path) for path in sorted(folder.iterdir())},
             precision=precision,
@@ -260,23 +287,6 @@ def _start(path: Path) -> bytes:
         return file.read(256)
 
 
-def _install(partial: Path, target: Path) -> None:
-    """Put the finished folder in its place; an artifact that was there comes back if that fails."""
-    if not target.exists():
-        partial.replace(target)
-        sync_directory(target.parent)
-        return
-    old = beside(target)
-    target.replace(old)
-    try:
-        partial.replace(target)
-    except BaseException:
-        old.replace(target)
-        raise
-    shutil.rmtree(old, ignore_errors=True)
-    sync_directory(target.parent)
-
-
 @contextmanager
 def _locked(directory: Path) -> Iterator[None]:
     """Keep other processes from changing the artifact; a crash releases it."""
@@ -291,47 +301,6 @@ def _locked(directory: Path) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
-
-
-def _plan_records(
-    manifest: Manifest,
-    pruned: bool,
-    schedules: Mapping[str, npt.NDArray[np.int8]],
-    default_plan: str,
-    record: Mapping[str, Any],
-) -> dict[str, PlanRecord]:
-    plans = {}
-    for name in sorted(schedules):
-        if _PLAN_NAME.fullmatch(name) is None or name == DENSE:
-            raise ArtifactError(f"schedule {name!r}: expected letters, digits and _ . % - and not 'dense'.")
-        plan = np.asarray(schedules[name])
-        check_schedule(name, plan, manifest)
-        total = manifest.steps * sum(manifest.flops.blocks)
-        weighed = 1 - plan_flops(plan, manifest.flops.blocks) / total if total else sparsity(plan)
-        plans[name] = PlanRecord(kind="schedule", sparsity=sparsity(plan), flops_sparsity=weighed)
-    if pruned:
-        if manifest.stores.pruner is None:
-            raise ArtifactError("the artifact has no pruner whose weights could be set. Convert the checkpoint again.")
-        name = PRUNER if default_plan in {DENSE, *plans} else default_plan
-        if name in plans or _PLAN_NAME.fullmatch(name) is None:
-            raise ArtifactError(f"the pruner's plan cannot be called {name!r}. Give the schedule another name.")
-        plans[name] = PlanRecord("pruner", _share(record, "sparsity"), _share(record, "flops_sparsity"))
-    if default_plan not in {DENSE, *plans}:
-        raise ArtifactError(f"default plan {default_plan!r}: expected one of {[DENSE, *plans]}.")
-    return plans
-
-
-def _share(record: Mapping[str, Any], key: str) -> float | None:
-    return None if record.get(key) is None else Value(record[key], f"calibration record: {key}").share()
-
-
-def _json(record: Mapping[str, Any]) -> dict[str, Any]:
-    """The record as it will be read back."""
-    try:
-        content = dump_compact(dict(record))
-    except (TypeError, ValueError) as error:
-        raise ArtifactError(f"calibration record: expected JSON; found {error}. Convert arrays to lists.") from error
-    return {key: value.data for key, value in parse(content, "calibration record").members().items()}
 
 
 def _store_plans(
@@ -356,6 +325,19 @@ def _store_plans(
         replace_file(directory / name, content)
         files[name] = describe(directory / name)
     return replace(manifest, files=files, stores=replace(manifest.stores, plans=name))
+
+
+def _store_golden_plans(directory: Path, manifest: Manifest, plans: Mapping[str, GoldenPlan]) -> Manifest:
+    """Write the record of the plans beside the old one."""
+    old = manifest.stores.golden_plans
+    files = {name: record for name, record in manifest.files.items() if name != old}
+    name = None
+    if plans:
+        content = tensors.serialize(plan_arrays(plans))
+        name = f"golden_plans-{content_hash(content)}.safetensors"
+        replace_file(directory / name, content)
+        files[name] = describe(directory / name)
+    return replace(manifest, files=files, stores=replace(manifest.stores, golden_plans=name))
 
 
 def _store_pruner(artifact: Artifact, manifest: Manifest, weights: Mapping[str, npt.NDArray[Any]]) -> Manifest:

@@ -15,9 +15,12 @@ from ttscompile.cli.bench import bench
 from ttscompile.cli.calibrate import calibrate
 from ttscompile.cli.compare import compare
 from ttscompile.cli.convert import convert
+from ttscompile.cli.doctor import doctor
 from ttscompile.cli.inspect import inspect
 from ttscompile.cli.plan import plan
+from ttscompile.cli.report import report
 from ttscompile.cli.serve import serve
+from ttscompile.cli.verify import verify
 from ttscompile.errors import CalibrationFailedError, TtscompileError
 
 
@@ -39,5 +42,5 @@ def main() -> None:
     """Compile diffusion-transformer robot policies into artifacts that run in real time without PyTorch."""
 
 
-for _command in (convert, calibrate, inspect, compare, bench, plan, serve):
+for _command in (convert, calibrate, inspect, compare, bench, plan, serve, doctor, report, verify):
     main.add_command(_command)

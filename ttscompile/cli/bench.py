@@ -6,7 +6,17 @@ from pathlib import Path
 
 import click
 
-from ttscompile.cli.output import artifact_argument, json_option, print_json, progress, results, share, table
+from ttscompile.cli.output import (
+    artifact_argument,
+    identity_of,
+    json_option,
+    print_identity,
+    print_json,
+    progress,
+    results,
+    share,
+    table,
+)
 from ttscompile.cli.timing import Measurement, contestants, measure
 from ttscompile.machine import fingerprint, one_line
 
@@ -59,7 +69,13 @@ def bench(
         measured = measure(entered, runs, seed, lambda done, total: status.update(f"timing: round {done} of {total}"))
     if as_json:
         print_json(
-            {"machine": fingerprint(), "threads": threads, "runs": runs, "contestants": [m.to_json() for m in measured]}
+            {
+                "identity": identity_of(directory),
+                "machine": fingerprint(),
+                "threads": threads,
+                "runs": runs,
+                "contestants": [m.to_json() for m in measured],
+            }
         )
         return
     made = table("", "ms a call", "quartiles", "calls/s", "speed-up", "GFLOP", "reused", "prologue", "pruner")
@@ -72,6 +88,7 @@ def bench(
         " Speed-up: how many times faster the first row is. Prologue and pruner: their ms of the call.",
         soft_wrap=True,
     )
+    print_identity(identity_of(directory), output)
     output.print(one_line(fingerprint()), markup=False, soft_wrap=True)
 
 

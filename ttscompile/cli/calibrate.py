@@ -7,9 +7,9 @@ from pathlib import Path
 import click
 
 import ttscompile
-from ttscompile.cli.output import artifact_argument, json_option, only_results_on_stdout, print_json, progress, results
+from ttscompile.cli.output import artifact_argument, json_option, only_results_on_stdout, print_json, results
 from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
-from ttscompile.cli.summary import document, few_steps, print_summary
+from ttscompile.cli.summary import document, print_summary
 
 STRATEGIES = (
     "tts",
@@ -87,8 +87,6 @@ def calibrate(
     artifact gets 'safe', which computes twice as much, and 'fast', which computes half. Exit status 1: the budget was
     not kept.
     """
-    if (warning := few_steps(document(directory))) is not None:  # before minutes of work
-        progress().print(f"warning: {warning}", markup=False, soft_wrap=True)
     with only_results_on_stdout():
         ttscompile.calibrate(
             directory,

@@ -11,6 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from ttscompile.cli.calibrate import STRATEGIES
 from ttscompile.cli.output import (
     artifact_argument,
+    identity_of,
     json_option,
     only_results_on_stdout,
     print_json,
@@ -129,9 +130,13 @@ def compare(
         plot_frontier(found.points, found.efficient(), found.yardsticks, picture, title)
         told.print(f"wrote {picture}", markup=False, soft_wrap=True)
     if as_json:
-        print_json({"machine": fingerprint(), **found.to_json()})
+        identities = {str(path): identity_of(path) for path in (directory, *others)}
+        of = {"identity": identity_of(directory), "identities": identities}
+        print_json({**of, "machine": fingerprint(), **found.to_json()})
     else:
         _print(found, results(), machine)
+        for path in (directory, *others):
+            results().print(f"{path}: identity {identity_of(path)[:12]}", markup=False, soft_wrap=True)
 
 
 def _print(found: Frontier, output: Console, machine: str) -> None:

@@ -7,6 +7,8 @@ from pathlib import Path
 import click
 
 import ttscompile
+from ttscompile.artifact.ceiling import few_steps
+from ttscompile.artifact.load import load_artifact
 from ttscompile.cli.output import json_option, only_results_on_stdout, print_json, progress, results
 from ttscompile.cli.summary import document, print_summary
 from ttscompile.config import FP32, PRECISIONS
@@ -17,17 +19,30 @@ from ttscompile.config import FP32, PRECISIONS
 @click.option("-o", "--output", "directory", required=True, type=click.Path(path_type=Path), help="The artifact.")
 @click.option(
     "--format",
-    type=click.Choice(["auto", "diffusion_policy"]),
+    type=click.Choice(["auto", "diffusion_policy", "lerobot"]),
     default="auto",
     show_default=True,
     help="Of CHECKPOINT.",
 )
-@click.option("--sampler", type=click.Choice(["ddpm", "ddim"]), help="In place of the checkpoint's own.")
+@click.option(
+    "--sampler",
+    type=click.Choice(["ddpm", "ddim", "dpmsolver++", "euler", "rk4"]),
+    help="In place of the checkpoint's own: ddpm, ddim or dpmsolver++ of a diffusion policy, euler or rk4 of one"
+    " trained with flow matching.",
+)
 @click.option("--steps", type=click.IntRange(min=1), help="Denoising steps, in place of the checkpoint's own.")
 @click.option(
     "--spacing",
     type=click.Choice(["leading", "trailing", "linspace"]),
-    help="Timesteps that fewer steps visit, in place of the checkpoint's own.",
+    help="Timesteps that fewer steps visit, in place of the checkpoint's own. leading starts below the last one, where"
+    " pure noise is not what the network expects; trailing and linspace start at it, which needs a bound on the sample."
+    " Left out, dpmsolver++ in place of another sampler takes trailing; ddim takes leading.",
+)
+@click.option("--task", help="LeRobot: compile this instruction in; without it, its tokens are an observation.")
+@click.option(
+    "--encoders",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="LeRobot: folder with the CLIP encoders' config.json, if not in or beside CHECKPOINT. Nothing is downloaded.",
 )
 @click.option(
     "--precision",
@@ -50,12 +65,16 @@ def convert(
     sampler: str | None,
     steps: int | None,
     spacing: str | None,
+    task: str | None,
+    encoders: Path | None,
     precision: str,
     single_file: Path | None,
     explain: bool,
     as_json: bool,
 ) -> None:
-    """Compile CHECKPOINT, a trained policy. Nothing in the file is executed.
+    """Compile CHECKPOINT, a trained policy: a .ckpt file of Diffusion Policy, or the directory of a LeRobot policy.
+
+    Nothing in it is executed.
 
     The artifact computes everything until 'ttscompile calibrate' gives it a plan.
     """
@@ -77,11 +96,16 @@ def convert(
             sampler=sampler,
             steps=steps,
             spacing=spacing,
+            task=task,
+            encoders=encoders,
             precision=precision,
             single_file=single_file,
             explain=on_stage,
         )
-    summary = document(directory)
+    artifact = load_artifact(directory)
+    summary = document(directory, artifact)
+    if (warning := few_steps(artifact.manifest)) is not None:
+        console.print(f"warning: {warning}", markup=False, soft_wrap=True)
     if as_json:
         print_json(summary | {"stages": stages})
     else:

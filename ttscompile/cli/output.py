@@ -14,19 +14,44 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from ttscompile.artifact.load import load_artifact, read_manifest
+from ttscompile.errors import TtscompileError
+from ttscompile.units import flops as flops
+from ttscompile.units import share as share
+
 artifact_argument = click.argument("directory", type=click.Path(path_type=Path))
 json_option = click.option(
     "--json", "as_json", is_flag=True, help="One JSON document on standard output, nothing else."
 )
 
+_SHOWN = 12
+"""Digits of an identity that people are shown; JSON has them all."""
+
 _WIDTH = 110
 """Columns of a table that goes to a file or a pipe; a terminal's own width is used where there is one."""
+
+_SCRIPTS_WIDTH = 150
 
 
 def results() -> Console:
     """Console for results, on standard output."""
     console = Console(highlight=False)
     return console if console.is_terminal else Console(highlight=False, width=_WIDTH)
+
+
+def results_console() -> Console:
+    """The same for scripts of ``examples``, whose tables are wider."""
+    console = Console(highlight=False)
+    return console if console.is_terminal else Console(highlight=False, width=_SCRIPTS_WIDTH)
+
+
+def run(command: click.Command) -> None:
+    """Run a script's command; an error of ttscompile is its message and exit status 2."""
+    try:
+        command()
+    except TtscompileError as error:
+        click.echo(f"error: {error}", err=True)
+        sys.exit(2)
 
 
 def progress() -> Console:
@@ -54,16 +79,15 @@ def table(*columns: str) -> Table:
     return made
 
 
-def flops(count: float) -> str:
-    """FLOPs with a unit: ``16.1 GFLOP``."""
-    for unit, size in (("GFLOP", 1e9), ("MFLOP", 1e6), ("kFLOP", 1e3)):
-        if count >= size:
-            return f"{count / size:.3g} {unit}" if count < 1000 * size else f"{count / size:.0f} {unit}"
-    return f"{count:.0f} FLOP"
+def identity_of(path: Path) -> str:
+    """Identity of an artifact, 64 digits; of a directory its manifest's, which is not checked again.
+
+    Raises:
+        ArtifactError: there is no artifact.
+    """
+    return (read_manifest(path) if path.is_dir() else load_artifact(path).manifest).identity
 
 
-def share(part: float | None) -> str:
-    """A share in per cent, small ones to two digits more; empty if it is not known."""
-    if part is None:
-        return ""
-    return f"{part:.1%}" if part == 0 or part >= 0.01 else f"{part:.3%}"
+def print_identity(identity: str, console: Console) -> None:
+    """The line that says what the figures above are of."""
+    console.print(f"identity {identity[:_SHOWN]}", soft_wrap=True)

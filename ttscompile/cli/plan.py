@@ -10,7 +10,7 @@ import click
 import numpy as np
 
 import ttscompile
-from ttscompile.cli.output import artifact_argument, json_option, print_json, progress, results, table
+from ttscompile.cli.output import artifact_argument, json_option, print_identity, print_json, progress, results, table
 from ttscompile.errors import DeadlineMissedError
 from ttscompile.machine import fingerprint, one_line
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings, Feasibility, GuardLimits, MonotonicClock
@@ -85,6 +85,7 @@ def plan(
     if as_json:
         print_json(
             {
+                "identity": policy.info.identity,
                 "machine": fingerprint(),
                 "threads": threads,
                 "runs": runs,
@@ -97,6 +98,7 @@ def plan(
         )
     else:
         _print(measured, judged, jitter, runs, threads)
+        print_identity(policy.info.identity, results())
     if not any(each.feasible for each in judged.values()):
         context.exit(1)
 

@@ -54,7 +54,8 @@ def serve(
 ) -> None:
     """Serve the artifact DIRECTORY on a local WebSocket until it is interrupted; docs/serve.md has the protocol.
 
-    The first line on standard output is a JSON object with the url; statistics follow at the end.
+    The first line on standard output is a JSON object with the url and the artifact's identity; statistics follow at
+    the end.
     """
     console = progress()
     settings = ExecutorSettings(
@@ -76,14 +77,18 @@ def serve(
             soft_wrap=True,
         )
     with executor:
-        asyncio.run(_run(ExecutorServer(executor, limits), host, port))
+        asyncio.run(_run(ExecutorServer(executor, limits), host, port, policy.info.identity))
     click.echo(json.dumps({"statistics": executor.statistics().to_json()}, allow_nan=False))
 
 
-async def _run(server: ExecutorServer, host: str, port: int) -> None:
+async def _run(server: ExecutorServer, host: str, port: int, identity: str) -> None:
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for each in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(each, stop.set)
     shown = f"[{host}]" if ":" in host else host
-    await server.run(host, port, stop, lambda bound: click.echo(json.dumps({"url": f"ws://{shown}:{bound}/"})))
+
+    def bound(number: int) -> None:
+        click.echo(json.dumps({"url": f"ws://{shown}:{number}/", "identity": identity}))
+
+    await server.run(host, port, stop, bound)

@@ -12,7 +12,7 @@ from rich.console import Console
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import DENSE, Manifest
 from ttscompile.cli.output import flops, share, table
-from ttscompile.ir.joint import JOINT
+from ttscompile.ir.joint import OF_ALL_BLOCKS
 from ttscompile.runtimes.liveness import rollout_needs
 
 
@@ -59,6 +59,10 @@ def document(directory: Path, artifact: Artifact | None = None) -> dict[str, Any
         ],
         "precision": _precision(manifest),
         "flops": _flops(manifest),
+        "ceiling": {
+            "sparsity": 1 - 1 / manifest.steps,
+            "flops": manifest.flops.ceiling(manifest.steps),
+        },
         "plans": _plans(artifact),
         "rollout_cache": asdict(rollout_needs(artifact)),
         "default_plan": manifest.default_plan,
@@ -73,7 +77,7 @@ def _precision(manifest: Manifest) -> dict[str, Any]:
         return {"name": manifest.precision_name, "blocks": 0, "bytes": 0, "error": None}
     size = sum(manifest.files[name].bytes for name in (record.weights, *record.models.values()))
     error = None if record.error is None else dict(vars(record.error))
-    return {"name": record.name, "blocks": len(set(record.models) - {JOINT}), "bytes": size, "error": error}
+    return {"name": record.name, "blocks": len(set(record.models) - set(OF_ALL_BLOCKS)), "bytes": size, "error": error}
 
 
 def _told_precision(precision: dict[str, Any], blocks: int) -> str:

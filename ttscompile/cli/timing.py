@@ -113,18 +113,11 @@ def contestants(
 
 
 def random_calls(spec: PolicySpec, count: int, seed: int) -> list[tuple[Observation, Noise]]:
-    """Observations of one stream within the range of the normaliser, and noise, for consecutive calls.
-
-    Without a normaliser, observations are drawn from -1..1.
-    """
+    """Observations of one stream as ``ObservationSpec.draw`` makes them, and noise, for consecutive calls."""
     rng = np.random.default_rng(seed)
     calls = []
     for _ in range(count):
-        obs: Observation = {}
-        for key, observation in spec.observations.items():
-            drawn = rng.uniform(-1, 1, (1, *observation.shape)).astype(np.float32)
-            normalizer = observation.normalizer
-            obs[key] = (drawn if normalizer is None else normalizer.unnormalize(drawn)).astype(observation.dtype)
+        obs: Observation = {key: observation.draw(rng) for key, observation in spec.observations.items()}
         initial = rng.standard_normal((1, *spec.sample), dtype=np.float32)
         draws = rng.standard_normal((spec.sampler.steps, *initial.shape), dtype=np.float32)
         calls.append((obs, Noise(initial, draws if spec.sampler.stochastic else None)))

@@ -1,0 +1,54 @@
+"""Break an artifact so that its bytes still fit each other: what changed is what it computes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ttscompile.artifact import tensors
+from ttscompile.artifact.codec import encode
+from ttscompile.artifact.files import describe
+from ttscompile.artifact.identity import identities
+from ttscompile.artifact.load import read_manifest
+from ttscompile.artifact.manifest import MANIFEST, Manifest
+
+Arrays = dict[str, npt.NDArray[Any]]
+
+
+def edit_manifest(directory: Path, edit: Callable[[Manifest], Manifest] = lambda manifest: manifest) -> None:
+    """Change the manifest; hashes of files, identities and checksum are made anew."""
+    manifest = edit(read_manifest(directory))
+    manifest = replace(manifest, files={name: describe(directory / name) for name in manifest.files})
+    identity, model_identity = identities(manifest)
+    manifest = replace(manifest, identity=identity, model_identity=model_identity)
+    (directory / MANIFEST).write_bytes(encode(manifest))
+
+
+def edit_tensors(directory: Path, store: str, edit: Callable[[Arrays], None]) -> None:
+    """Change arrays of one of the artifact's stores in place; every tensor stays where it lies."""
+    path = directory / getattr(read_manifest(directory).stores, store)
+    places = tensors.offsets(path)
+    arrays = {name: np.array(array) for name, array in tensors.read(path).items()}
+    edit(arrays)
+    path.write_bytes(tensors.serialize(arrays))
+    assert tensors.offsets(path) == places, "the ONNX graphs would read other weights"
+    edit_manifest(directory)
+
+
+def exchange_names(directory: Path, one: str, other: str) -> None:
+    """Exchange the names of two weights in the header of their file; the data stay where they are."""
+    path = directory / read_manifest(directory).stores.weights
+    content = path.read_bytes()
+    size = 8 + int.from_bytes(content[:8], "little")
+    header = json.loads(content[8:size])
+    header[one], header[other] = header[other], header[one]
+    made = json.dumps(header, separators=(",", ":")).encode()
+    assert len(made) <= size - 8
+    path.write_bytes(content[:8] + made.ljust(size - 8) + content[size:])
+    edit_manifest(directory)

@@ -1,0 +1,74 @@
+"""A calibrated artifact with a golden record, to be broken in copies."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ttscompile
+from tests.calibration import policies
+from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.write import update_calibration
+from ttscompile.correction import no_correction
+from ttscompile.golden import record_plans
+from ttscompile.ir.program import Program
+from ttscompile.lattice import Source
+
+from . import policy
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Program]:
+    """An artifact that is not calibrated, and the program that it holds."""
+    directory = tmp_path_factory.mktemp("made") / "compiled"
+    return directory, ttscompile.compile_denoiser(policy.Network().eval(), policy.spec(), directory)
+
+
+@pytest.fixture(scope="session")
+def compiled(made: tuple[Path, Program]) -> Path:
+    """The artifact."""
+    return made[0]
+
+
+@pytest.fixture(scope="session")
+def program(made: tuple[Path, Program]) -> Program:
+    """The program."""
+    return made[1]
+
+
+@pytest.fixture(scope="session")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six episodes."""
+    return policies.record(tmp_path_factory.mktemp("recording") / "calls.npz")
+
+
+@pytest.fixture(scope="session")
+def sound(compiled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same with a corrected schedule, its default, another one, and plans that the pruner makes."""
+    directory = Path(shutil.copytree(compiled, tmp_path_factory.mktemp("sound") / "compiled"))
+    corrected = no_correction(policy.STEPS, (policy.HORIZON, policy.CHANNELS))
+    corrected.weights[2:] += np.random.default_rng(0).normal(0, 0.002, corrected.weights[2:].shape)
+    corrected.anchors[[0, 4, 8]] = True
+    pruner = {name: np.array(value) for name, value in load_artifact(directory).pruner.items()}
+    pruner["pruner.base"][...] = np.eye(4)[policy.sparse()] - 0.5 * np.eye(4)[Source.ROLLOUT]
+    pruner["pruner.step"] *= 10
+    pruner["pruner.block"] *= 3  # so that plans depend on the observation
+    update_calibration(
+        directory,
+        pruner,
+        {"schedule": policy.sparse(), "other": policy.other()},
+        "schedule",
+        {"strategy": "by hand"},
+        corrections={"schedule": corrected},
+        golden=record_plans,
+    )
+    return directory
+
+
+@pytest.fixture
+def artifact(sound: Path, tmp_path: Path) -> Path:
+    """A copy of ``sound``."""
+    return Path(shutil.copytree(sound, tmp_path / "compiled"))

@@ -1,0 +1,365 @@
+"""A sound artifact holds; each way of breaking one fails at its rung, which names step and block."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+
+import ttscompile
+from ttscompile import Affine, Verification
+from ttscompile.artifact import tensors
+from ttscompile.artifact.golden import DIGITS, load_golden, load_golden_plans
+from ttscompile.artifact.load import load_artifact, read_manifest
+from ttscompile.artifact.manifest import Manifest
+from ttscompile.artifact.write import update_calibration
+from ttscompile.correction import Correction, no_correction
+from ttscompile.errors import ArtifactError
+from ttscompile.golden import record_original, record_plans
+from ttscompile.ir.program import Program
+from ttscompile.lattice import Source
+from ttscompile.verification.rung import FAILED, PASSED, SKIPPED, Rung
+
+from . import policy
+from .broken import Arrays, edit_manifest, edit_tensors, exchange_names
+
+LADDER = [
+    *("integrity", "preprocessing", "block", "evaluation", "dense call", "runtimes", "plans", "sparsity error"),
+    "engaged",
+]
+
+
+def failure(artifact: Path) -> Rung:
+    """The lowest rung that fails; the bytes are sound in all of these tests."""
+    found = ttscompile.verify(artifact)
+    assert found.rungs[0].status == PASSED, found.rungs[0].told
+    assert not found.passed
+    assert found.first_failure is not None
+    json.dumps(found.to_json(), allow_nan=False)
+    return found.first_failure
+
+
+def test_a_sound_artifact_holds(sound: Path) -> None:
+    found = ttscompile.verify(sound)
+    assert found.passed, found.first_failure
+    assert [rung.name for rung in found.rungs] == LADDER
+    assert {rung.name for rung in found.rungs if rung.status == SKIPPED} == {"sparsity error"}
+    assert all(rung.figure is not None and rung.figure < 1e-5 for rung in found.rungs[2:7]), "exports are exact"
+    assert found.identity == read_manifest(sound).identity
+    assert found.map is not None
+    assert found.map.errors.shape == (10, 6)
+    json.dumps(found.to_json(), allow_nan=False)
+
+
+def test_an_artifact_that_is_not_calibrated_holds_and_says_what_it_lacks(compiled: Path) -> None:
+    found = ttscompile.verify(compiled)
+    assert found.passed
+    assert all("every call is dense" in found.rung(name).told for name in ("plans", "sparsity error", "engaged"))
+
+
+def test_the_weights_of_one_block(artifact: Path) -> None:
+    def perturb(arrays: Arrays) -> None:
+        arrays["narrow.1.weight"][:4] *= 1.02
+
+    edit_tensors(artifact, "weights", perturb)
+    rung = failure(artifact)
+    assert (rung.name, rung.blocks, rung.step) == ("block", (3,), 0)
+    assert "block 3" in rung.told
+
+
+def test_the_weights_of_two_blocks_exchanged(artifact: Path) -> None:
+    def exchange(arrays: Arrays) -> None:
+        for name in ("narrow.{}.weight", "narrow.{}.bias", "wide.{}.weight", "wide.{}.bias"):
+            one, other = name.format(0), name.format(2)
+            arrays[one], arrays[other] = arrays[other], arrays[one]
+
+    edit_tensors(artifact, "weights", exchange)
+    rung = failure(artifact)
+    assert (rung.name, rung.blocks) == ("block", (1, 5))
+
+
+def test_the_names_of_two_blocks_weights_exchanged(artifact: Path) -> None:
+    """The ONNX graphs find their weights by place, the reference runtime by name: so they disagree."""
+    exchange_names(artifact, "narrow.0.weight", "narrow.2.weight")
+    rung = failure(artifact)
+    assert (rung.name, rung.blocks) == ("runtimes", (1, 5))
+
+
+def test_the_graphs_of_two_blocks_exchanged(artifact: Path) -> None:
+    def exchange(manifest: Manifest) -> Manifest:
+        one, other = manifest.pieces["block_01"], manifest.pieces["block_05"]
+        files = {"block_01": replace(one, file=other.file), "block_05": replace(other, file=one.file)}
+        return replace(manifest, pieces={**manifest.pieces, **files})
+
+    edit_manifest(artifact, exchange)
+    rung = failure(artifact)
+    assert (rung.name, rung.blocks) == ("block", (1, 5)) or "block" in rung.told  # or the graphs have other inputs
+
+
+def test_the_table_of_one_step(artifact: Path) -> None:
+    (name,) = (name for name in load_artifact(artifact).tables)
+
+    def perturb(arrays: Arrays) -> None:
+        arrays[f"table/{name}"][7] += 0.1
+
+    edit_tensors(artifact, "weights", perturb)
+    rung = failure(artifact)
+    assert (rung.name, rung.step) == ("block", 7)
+    assert rung.blocks == (0, 2, 4), "the blocks that see the time"
+    assert "All of them read" in rung.told
+
+
+@pytest.mark.parametrize("weight", ["embed.weight", "head.weight"])
+def test_what_is_no_block(weight: str, artifact: Path) -> None:
+    def perturb(arrays: Arrays) -> None:
+        arrays[weight] *= 1.05
+
+    small = np.array(load_artifact(artifact).weights[weight]).nbytes <= 256
+    assert not small, "small weights are kept in the graphs"
+    edit_tensors(artifact, "weights", perturb)
+    # The stem and the tail are in the graph of the same name and in that of ``advance``.
+    assert failure(artifact).name == "evaluation"
+
+
+def test_the_normaliser_of_an_observation(artifact: Path) -> None:
+    def change(manifest: Manifest) -> Manifest:
+        spec = manifest.spec
+        old = spec.observations["obs"]
+        assert old.normalizer is not None
+        turned = Affine(old.normalizer.scale[::-1].copy(), old.normalizer.offset)
+        return replace(manifest, spec=replace(spec, observations={"obs": replace(old, normalizer=turned)}))
+
+    edit_manifest(artifact, change)
+    rung = failure(artifact)
+    assert rung.name == "preprocessing"
+    assert rung.details["wrong"] == ["observation 'obs'"]
+
+
+def test_the_normaliser_of_the_action(artifact: Path) -> None:
+    def change(manifest: Manifest) -> Manifest:
+        chunk = manifest.spec.chunk
+        assert chunk.normalizer is not None
+        other = Affine(chunk.normalizer.scale, chunk.normalizer.offset + np.float32(0.01))
+        return replace(manifest, spec=replace(manifest.spec, chunk=replace(chunk, normalizer=other)))
+
+    edit_manifest(artifact, change)
+    rung = failure(artifact)
+    assert (rung.name, rung.details["wrong"]) == ("preprocessing", ["the action"])
+
+
+def test_another_part_of_the_chunk(artifact: Path) -> None:
+    def change(manifest: Manifest) -> Manifest:
+        chunk = manifest.spec.chunk
+        moved = replace(chunk, start=chunk.start + 1, stop=chunk.stop + 1)
+        return replace(manifest, spec=replace(manifest.spec, chunk=moved))
+
+    edit_manifest(artifact, change)
+    assert failure(artifact).details["wrong"] == ["the executed part of the chunk"]
+
+
+def test_the_sampler_at_one_step(artifact: Path) -> None:
+    def change(manifest: Manifest) -> Manifest:
+        sampler = manifest.spec.sampler
+        column = sampler.sample_to_next.copy()
+        column[3] *= 1.05
+        return replace(manifest, spec=replace(manifest.spec, sampler=replace(sampler, sample_to_next=column)))
+
+    edit_manifest(artifact, change)
+    rung = failure(artifact)
+    assert (rung.name, rung.step) == ("dense call", 3)
+    assert "the sampler" in rung.told
+
+
+def test_a_plan_shifted_by_a_step(artifact: Path) -> None:
+    def shift(arrays: Arrays) -> None:
+        arrays["schedule"] = policy.shifted(arrays["schedule"])
+
+    edit_tensors(artifact, "plans", shift)
+    rung = failure(artifact)
+    assert (rung.name, rung.step) == ("plans", 1)
+    assert "plan 'schedule'" in rung.told
+    assert "1 step later" in rung.told
+    errors = ttscompile.verify(artifact).map
+    assert errors is not None
+    assert errors.plan == "schedule"
+    np.testing.assert_array_equal(errors.cells, policy.shifted(policy.sparse()) != policy.sparse())
+
+
+def test_one_cell_of_a_plan(artifact: Path) -> None:
+    def change(arrays: Arrays) -> None:
+        arrays["other"][6, 2] = Source.FORWARD
+
+    edit_tensors(artifact, "plans", change)
+    rung = failure(artifact)
+    assert (rung.name, rung.step, rung.blocks) == ("plans", 6, (2,))
+    assert "'other'" in rung.told
+
+
+def test_two_plans_exchanged(artifact: Path) -> None:
+    def exchange(arrays: Arrays) -> None:
+        arrays["schedule"], arrays["other"] = arrays["other"], arrays["schedule"]
+
+    edit_tensors(artifact, "plans", exchange)
+    rung = failure(artifact)
+    assert rung.name == "plans"
+    assert len(rung.details["failures"]) == 2
+
+
+def test_a_correction_of_one_step(artifact: Path) -> None:
+    def change(arrays: Arrays) -> None:
+        arrays["correction/schedule/weights"][5] += 0.01
+
+    edit_tensors(artifact, "plans", change)
+    rung = failure(artifact)
+    assert (rung.name, rung.step) == ("plans", 5)
+    assert "correction" in rung.told
+
+
+def test_the_pruners_weights(artifact: Path) -> None:
+    def change(arrays: Arrays) -> None:
+        for name, array in arrays.items():
+            if array.dtype == np.float32 and name != "pruner.mask":
+                arrays[name] = np.random.default_rng(0).standard_normal(array.shape, dtype=np.float32)
+
+    edit_tensors(artifact, "pruner", change)
+    rung = failure(artifact)
+    assert rung.name == "plans"
+    assert "'pruner'" in rung.told
+
+
+def _with(artifact: Path, plan: np.ndarray, correction: Correction | None = None) -> Path:
+    corrections = {} if correction is None else {"mine": correction}
+    update_calibration(artifact, None, {"mine": plan}, "mine", {}, corrections=corrections, golden=record_plans)
+    return artifact
+
+
+def test_a_plan_that_computes_everything_is_inert(artifact: Path) -> None:
+    rung = failure(_with(artifact, np.full((10, 6), Source.COMPUTE, np.int8)))
+    assert rung.name == "engaged"
+    assert "dense in disguise" in rung.told
+
+
+def test_a_plan_that_reuses_less_than_it_says_is_inert(artifact: Path) -> None:
+    def boast(manifest: Manifest) -> Manifest:
+        return replace(manifest, plans={"mine": replace(manifest.plans["mine"], sparsity=0.95)})
+
+    edit_manifest(_with(artifact, policy.sparse()), boast)
+    rung = failure(artifact)
+    assert rung.name == "engaged"
+    assert "was to reuse 95.00%" in rung.told
+
+
+def test_plans_of_other_means_are_not_verified_and_that_is_said(artifact: Path) -> None:
+    update_calibration(artifact, None, {"mine": policy.sparse()}, "mine", {})
+    assert read_manifest(artifact).stores.golden_plans is None
+    rung = ttscompile.verify(artifact).rung("plans")
+    assert rung.status == SKIPPED
+    assert "by other means" in rung.told
+
+
+def test_an_artifact_without_a_record_of_the_original_is_refused(artifact: Path) -> None:
+    stores = read_manifest(artifact).stores
+
+    def strip(manifest: Manifest) -> Manifest:
+        kept = {name: one for name, one in manifest.files.items() if name not in (stores.golden, stores.golden_plans)}
+        return replace(manifest, files=kept, stores=replace(stores, golden=None, golden_plans=None))
+
+    edit_manifest(artifact, strip)
+    with pytest.raises(ArtifactError, match="expected a golden record"):
+        ttscompile.verify(artifact)
+
+
+def test_a_record_of_another_policy_is_refused(artifact: Path) -> None:
+    path = artifact / "golden.safetensors"
+    arrays = {name: np.array(array) for name, array in tensors.read(path).items()}
+    arrays["residuals"] = arrays["residuals"][:, :5]
+    path.write_bytes(tensors.serialize(arrays))
+    edit_manifest(artifact)
+    with pytest.raises(ArtifactError, match=r"golden record: expected .*'residuals'"):
+        ttscompile.verify(artifact)
+
+
+def test_episodes_are_judged_by_what_other_noise_would_change(artifact: Path, recording: Path) -> None:
+    found = ttscompile.verify(artifact, [recording], calls=8)
+    rung = found.rung("sparsity error")
+    assert rung.details["calls"] >= 8
+    assert set(rung.details["plans"]) == {"schedule", "other", "pruner"}
+    assert rung.tolerance == rung.details["other_noise"]
+    assert rung.status == PASSED, rung.told
+
+    wrong = no_correction(policy.STEPS, (policy.HORIZON, policy.CHANNELS))
+    wrong.bias[-1] += 1
+    rung = failure_of(ttscompile.verify(_with(artifact, policy.sparse(), wrong), [recording], calls=8))
+    assert rung.name == "sparsity error"
+    assert rung.figure is not None
+    assert rung.tolerance is not None
+    assert rung.figure > rung.tolerance
+
+
+def failure_of(found: Verification) -> Rung:
+    assert found.first_failure is not None, [rung.told for rung in found.rungs]
+    return found.first_failure
+
+
+def test_the_record_is_small_and_the_same_every_time(sound: Path, program: Program) -> None:
+    content = (sound / "golden.safetensors").read_bytes()
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(3)
+        again = record_original(policy.Network().eval(), program)
+    finally:
+        torch.set_num_threads(threads)
+    assert tensors.serialize(again.arrays()) == content
+    assert len(content) < 20_000
+    artifact = load_artifact(sound)
+    golden = load_golden(artifact)
+    assert golden.residuals.shape == (10, 6, 2, DIGITS)
+    first, second = load_golden_plans(artifact, 2)["pruner"].plan
+    assert (first[0] != first[1]).any(), "plans of the pruner should depend on the observation"
+    np.testing.assert_array_equal(first[0][:1], second[1][:1])
+
+
+WITHOUT_TORCH = """
+import sys
+sys.modules["torch"] = None
+import ttscompile
+found = ttscompile.verify(sys.argv[1])
+assert found.passed, [rung.told for rung in found.rungs]
+heavy = {"onnx", "safetensors", "matplotlib", "diffusers"} & set(sys.modules)
+assert not heavy, heavy
+rung = found.rung("runtimes")
+print(rung.status, rung.told)
+"""
+
+
+def test_it_needs_no_torch_and_says_what_it_could_not_do(sound: Path) -> None:
+    command = [sys.executable, "-W", "error", "-c", WITHOUT_TORCH, str(sound)]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.startswith("skipped the reference runtime was not run: ")
+
+
+def test_a_zipped_artifact(sound: Path, tmp_path: Path) -> None:
+    archive = shutil.make_archive(str(tmp_path / "zipped"), "zip", sound)
+    found = ttscompile.verify(archive)
+    assert found.passed
+    assert found.path == archive
+
+
+def test_a_rung_that_cannot_be_climbed_fails(artifact: Path) -> None:
+    path = artifact / "block_02.onnx"
+    model = onnx.load(path, load_external_data=False)
+    model.graph.node[0].op_type = "NoSuchOperation"
+    path.write_bytes(model.SerializeToString())
+    edit_manifest(artifact)
+    rung = failure(artifact)
+    assert (rung.name, rung.status) == ("block", FAILED)
+    assert "block_02.onnx" in rung.told

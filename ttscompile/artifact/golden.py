@@ -1,0 +1,278 @@
+"""The golden record: what the original network answered when the artifact was made, kept in the artifact.
+
+It is small whatever the policy is: inputs of a call and what came of it are kept as they are; residuals, predictions
+and the sample after each step as ``DIGITS`` random projections of each stream, which keep the relative size of an error
+within some tens of per cent (Johnson and Lindenstrauss, 1984) and are compared with tolerances far above rounding.
+Residuals are of blocks taken one by one, each given a pseudorandom stream that nobody has to store. Large observations
+are a pattern that repeats. Whoever checks needs numpy alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..config import FloatArray, Noise, PolicySpec
+from ..errors import ArtifactError
+from ..ir.graph import TensorType
+from . import tensors
+from .manifest import Manifest
+from .strict_json import REMEDY
+
+if TYPE_CHECKING:
+    from .load import Artifact
+
+Array = npt.NDArray[Any]
+
+DIGITS = 16
+"""Random projections that are kept of an array, for each stream."""
+
+PATTERN = 16384
+"""Numbers of one stream's observation that are stored; a larger observation repeats them."""
+
+_OBSERVATION, _NORMALIZED, _DRAWS = "observation/", "normalized/", "draws"
+_PLAN_FIELDS = ("plan", "path", "sample")
+
+
+@dataclass(frozen=True, eq=False)
+class Golden:
+    """Inputs of one call of B streams, and what the original module made of them in eager PyTorch.
+
+    Residuals are those of the captured graph before any pass of the compiler changed it.
+
+    Attributes:
+        observations: by key ``[B, ...]`` as ``predict_action`` takes them; patterns, see ``expand``.
+        normalized: by key ``[B, ...]``, what the module was given; patterns.
+        initial: float32 ``[B, T, D]``, the sample at step 0.
+        draws: float32 ``[K, B, T, D]``; None for a deterministic sampler.
+        steps: int64 ``[A]``, the steps whose residuals are kept.
+        scales: float32 ``[blocks]``, standard deviation of the residual stream before each block.
+        residuals: float32 ``[A, blocks, B, DIGITS]``, projections of each block's residual on ``probe_stream``.
+        evaluated: int64 ``[E]``, steps at which single evaluations of the network are kept.
+        inputs: float32 ``[E, B, T, D]``, the samples that it was given there.
+        outputs: float32 ``[E, B, T, D]``, what it gave.
+        predictions: float32 ``[K, B, DIGITS]``, projections of what it gave at every step.
+        path: float32 ``[K, B, DIGITS]``, projections of the sample after every step.
+        sample: float32 ``[B, T, D]``, the denoised sample.
+        actions: float32 ``[B, T, Da]``, the same as ``action_pred``.
+        executed: float32 ``[B, Ta, Da]``, the same as ``action``.
+    """
+
+    observations: Mapping[str, Array]
+    normalized: Mapping[str, Array]
+    initial: FloatArray
+    draws: FloatArray | None
+    steps: npt.NDArray[np.int64]
+    scales: FloatArray
+    residuals: FloatArray
+    evaluated: npt.NDArray[np.int64]
+    inputs: FloatArray
+    outputs: FloatArray
+    predictions: FloatArray
+    path: FloatArray
+    sample: FloatArray
+    actions: FloatArray
+    executed: FloatArray
+
+    @property
+    def streams(self) -> int:
+        """B."""
+        return len(self.initial)
+
+    @property
+    def noise(self) -> Noise:
+        """Of the call."""
+        return Noise(self.initial, self.draws)
+
+    def arrays(self) -> dict[str, Array]:
+        """All of it by name, for a file."""
+        found: dict[str, Array] = {}
+        for name, value in vars(self).items():
+            if isinstance(value, Mapping):
+                prefix = _OBSERVATION if name == "observations" else _NORMALIZED
+                found |= {prefix + key: array for key, array in value.items()}
+            elif value is not None:
+                found[name] = value
+        return found
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, Array], manifest: Manifest) -> Golden:
+        """Inverse of ``arrays``.
+
+        Raises:
+            ArtifactError: it is not the record of such a policy.
+        """
+        spec, blocks = manifest.spec, len(manifest.blocks)
+        streams = len(arrays["initial"]) if "initial" in arrays and arrays["initial"].ndim == 3 else 0
+        anchors, evaluated = (len(arrays[n]) if n in arrays and arrays[n].ndim else 0 for n in ("steps", "evaluated"))
+        sample = (streams, *spec.sample)
+        wanted: dict[str, tuple[tuple[int, ...], str]] = {
+            "initial": (sample, "float32"),
+            "steps": ((anchors,), "int64"),
+            "scales": ((blocks,), "float32"),
+            "residuals": ((anchors, blocks, streams, DIGITS), "float32"),
+            "evaluated": ((evaluated,), "int64"),
+            "inputs": ((evaluated, *sample), "float32"),
+            "outputs": ((evaluated, *sample), "float32"),
+            "predictions": ((manifest.steps, streams, DIGITS), "float32"),
+            "path": ((manifest.steps, streams, DIGITS), "float32"),
+            "sample": (sample, "float32"),
+            "actions": ((streams, spec.sample[0], spec.chunk.action_dim), "float32"),
+            "executed": ((streams, spec.chunk.stop - spec.chunk.start, spec.chunk.action_dim), "float32"),
+        }
+        if spec.sampler.stochastic:
+            wanted[_DRAWS] = ((manifest.steps, *sample), "float32")
+        for key, one in spec.observations.items():
+            dtype = one.dtype if one.normalizer is None else "float32"
+            wanted[_OBSERVATION + key] = ((streams, pattern_size(one.shape)), one.dtype)
+            wanted[_NORMALIZED + key] = ((streams, pattern_size(one.shape)), dtype)
+        found = {name: (array.shape, str(array.dtype)) for name, array in arrays.items()}
+        in_range = all(
+            name in arrays and ((arrays[name] >= 0) & (arrays[name] < manifest.steps)).all()
+            for name in ("steps", "evaluated")
+        )
+        if found != wanted or not streams or not anchors or not evaluated or not in_range:
+            wrong = sorted(name for name in {*wanted, *found} if wanted.get(name) != found.get(name))
+            name = wrong[0] if wrong else "steps"
+            raise ArtifactError(
+                f"golden record: expected {wanted.get(name, 'no array')} for {name!r} of steps 0..{manifest.steps - 1};"
+                f" found {found.get(name, 'none')}. {REMEDY}"
+            )
+        mappings = {
+            name: {key: arrays[prefix + key] for key in spec.observations}
+            for name, prefix in (("observations", _OBSERVATION), ("normalized", _NORMALIZED))
+        }
+        single = {each.name: arrays.get(each.name) for each in fields(cls) if each.name not in mappings}
+        return cls(**mappings, **single)  # type: ignore[arg-type]
+
+    def raw_observations(self, spec: PolicySpec) -> dict[str, Array]:
+        """What ``predict_action`` is given, ``[B, ...]``."""
+        return {key: expand(self.observations[key], one.shape) for key, one in spec.observations.items()}
+
+    def network_observations(self, spec: PolicySpec) -> dict[str, Array]:
+        """What the network is given, ``[B, ...]``."""
+        return {key: expand(self.normalized[key], one.shape) for key, one in spec.observations.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class GoldenPlan:
+    """What the reference runtime made of one plan when it was calibrated: an episode of two calls.
+
+    The first call has the inputs of ``Golden``; the second the same with the order of the streams reversed.
+
+    Attributes:
+        plan: int8 ``[2, B, K, blocks]``, as executed.
+        path: float32 ``[2, K, B, DIGITS]``, projections of the sample after every step.
+        sample: float32 ``[2, B, T, D]``, the denoised samples.
+    """
+
+    plan: npt.NDArray[np.int8]
+    path: FloatArray
+    sample: FloatArray
+
+
+def plan_arrays(plans: Mapping[str, GoldenPlan]) -> dict[str, Array]:
+    """Records of plans by name, for a file."""
+    return {f"{name}/{field}": getattr(one, field) for name, one in plans.items() for field in _PLAN_FIELDS}
+
+
+def plans_of(arrays: Mapping[str, Array], manifest: Manifest, streams: int) -> dict[str, GoldenPlan]:
+    """Inverse of ``plan_arrays``.
+
+    Raises:
+        ArtifactError: these are no records of the artifact's plans.
+    """
+    names = sorted({name.rpartition("/")[0] for name in arrays})
+    wanted = {
+        "plan": ((2, streams, manifest.steps, len(manifest.blocks)), "int8"),
+        "path": ((2, manifest.steps, streams, DIGITS), "float32"),
+        "sample": ((2, streams, *manifest.spec.sample), "float32"),
+    }
+    expected = {f"{name}/{field}": one for name in names for field, one in wanted.items()}
+    found = {name: (array.shape, str(array.dtype)) for name, array in arrays.items()}
+    if found != expected or set(names) != set(manifest.plans):
+        raise ArtifactError(
+            f"golden record of plans: expected {', '.join(_PLAN_FIELDS)} of {sorted(manifest.plans)}; found"
+            f" {sorted(arrays)}. {REMEDY}"
+        )
+    return {name: GoldenPlan(**{field: arrays[f"{name}/{field}"] for field in _PLAN_FIELDS}) for name in names}
+
+
+def load_golden(artifact: Artifact) -> Golden:
+    """The record of an artifact.
+
+    Raises:
+        ArtifactError: it has none, or one that does not fit.
+    """
+    name = artifact.manifest.stores.golden
+    if name is None:
+        raise ArtifactError(
+            f"{artifact.path}: expected a golden record of the original network; found none: it was written by"
+            " 'write_artifact' alone. Convert the checkpoint with 'ttscompile convert', or use compile_denoiser."
+        )
+    return Golden.of(tensors.read(artifact.path / name), artifact.manifest)
+
+
+def load_golden_plans(artifact: Artifact, streams: int) -> dict[str, GoldenPlan]:
+    """Records of the plans of an artifact by name; empty if it has none.
+
+    Args:
+        artifact: opened.
+        streams: B of the record of the original network.
+
+    Raises:
+        ArtifactError: records that do not fit.
+    """
+    name = artifact.manifest.stores.golden_plans
+    return {} if name is None else plans_of(tensors.read(artifact.path / name), artifact.manifest, streams)
+
+
+def pattern_size(shape: tuple[int, ...]) -> int:
+    """How many numbers of an observation of this shape are stored: whole rows of the last axis."""
+    size, last = int(np.prod(shape)), shape[-1]
+    return size if size <= PATTERN else max(PATTERN // last, 1) * last
+
+
+def pattern(array: Array, shape: tuple[int, ...]) -> Array:
+    """What is stored of ``[B, *shape]``."""
+    return np.ascontiguousarray(array.reshape(len(array), -1)[:, : pattern_size(shape)])
+
+
+def expand(stored: Array, shape: tuple[int, ...]) -> Array:
+    """``[B, *shape]`` of a stored pattern."""
+    return np.stack([np.resize(one, shape) for one in stored])
+
+
+def probe_stream(block: int, kind: TensorType, streams: int, scale: float) -> FloatArray:
+    """A pseudorandom residual stream, uniform with this standard deviation; the same on every machine.
+
+    Made of the raw bits of PCG64, whose sequence numpy guarantees; that of its distributions it does not.
+    """
+    shape = kind.at(streams)
+    bits = np.random.PCG64(1 + block).random_raw(int(np.prod(shape))) >> 40
+    unit = (bits.astype(np.float64) / 2**23 - 1).astype(np.float32)
+    return np.asarray(unit.reshape(shape) * np.float32(np.sqrt(3) * scale), np.float32)
+
+
+def project(array: Array, axis: int | None) -> FloatArray:
+    """Random projections of each stream, float32 ``[B, DIGITS]``, whose norm is about the stream's.
+
+    Args:
+        array: of any shape.
+        axis: of the streams; None for one stream.
+    """
+    rows = array[None] if axis is None else np.moveaxis(array, axis, 0)
+    rows = rows.reshape(len(rows), -1).astype(np.float64)
+    return np.asarray(rows @ _signs(rows.shape[1]) / np.sqrt(DIGITS), np.float32)
+
+
+@lru_cache(maxsize=2)  # residuals, and samples
+def _signs(size: int) -> npt.NDArray[np.float64]:
+    """Pseudorandom signs ``[size, DIGITS]``."""
+    bits = np.random.PCG64(0).random_raw((DIGITS * size + 63) // 64).astype("<u8").view(np.uint8)
+    return 2 * np.unpackbits(bits)[: DIGITS * size].reshape(size, DIGITS).astype(np.float64) - 1

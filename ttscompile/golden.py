@@ -1,0 +1,279 @@
+"""Make the golden record of an artifact: run the original network, and later the plans, on inputs that are kept.
+
+``ttscompile.artifact.golden`` says what is kept and how; ``ttscompile.verification`` compares with it.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import nn
+
+from .artifact.golden import DIGITS, Golden, GoldenPlan, load_golden, pattern, probe_stream, project
+from .artifact.load import Artifact
+from .config import FloatArray, Noise, PolicySpec
+from .errors import CaptureError
+from .frontends.eager import eager_policy
+from .frontends.encoded import EncodedDenoiser
+from .ir.dataflow import reachable_from
+from .ir.evaluate import Evaluator
+from .ir.graph import Graph, TensorType, backward_slice
+from .ir.program import Block, Program
+from .ir.rows import Rows
+from .runtimes.base import pruner_plan, settle_plan
+from .runtimes.reference import ReferenceModel
+
+STREAMS = 2
+"""Streams of the call, so that what mixes streams up shows; one where that would take long or much room."""
+
+EVALUATIONS = 6
+"""Steps at which inputs and outputs of the network are kept."""
+
+EFFORT = 4e10
+"""FLOPs of one call of one stream above which there is one stream, and residuals of fewer steps: Push-T has 16e9."""
+
+ROOM = 1 << 20
+"""Bytes of noise of one stream above which there is one stream."""
+
+
+def record_original(module: nn.Module, program: Program) -> Golden:
+    """Run the original module, a whole call and single evaluations, and the captured graph block by block.
+
+    On one thread: the record does not depend on how many there are, nor on what else the machine does.
+
+    Args:
+        module: as it was given to ``compile_denoiser``; it is copied.
+        program: what became of it. Its ``denoiser`` is the graph as captured; its pieces are not used.
+
+    Raises:
+        CaptureError: the module gives values that are not finite.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        return _record_original(module, program)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _record_original(module: nn.Module, program: Program) -> Golden:
+    spec = program.spec
+    steps, small = spec.sampler.steps, program.dense_flops <= EFFORT
+    streams = STREAMS if small and 4 * steps * np.prod(spec.sample) <= ROOM else 1
+    # The sequences of numpy's distributions may change with its version: what they give is stored.
+    draw = np.random.default_rng(7)
+    observations, normalized = {}, {}
+    for key, one in spec.observations.items():
+        raw = np.concatenate([one.draw(draw) for _ in range(streams)])
+        raw = np.stack([np.resize(each, one.shape) for each in pattern(raw, one.shape)])
+        observations[key] = raw
+        normalized[key] = raw if one.normalizer is None else one.normalizer.normalize(raw)
+    shape = (streams, *spec.sample)
+    initial = draw.standard_normal(shape, dtype=np.float32)
+    draws = draw.standard_normal((steps, *shape), dtype=np.float32) if spec.sampler.stochastic else None
+
+    copied = copy.deepcopy(module).float().eval()
+    watch = _Watch(copied, spec)
+    tensors = {key: torch.from_numpy(value) for key, value in normalized.items()}
+    sample = eager_policy(copied, spec)(tensors, Noise(initial, draws)).numpy()
+    given, predicted = np.stack(watch.given), np.stack(watch.predicted)
+    if not (np.isfinite(predicted).all() and np.isfinite(sample).all()):
+        raise CaptureError(
+            "the module's prediction on a random observation within the range of its normaliser is not a number."
+            " Look for NaN in its weights, and check normaliser and sampler."
+        )
+    actions = sample[..., : spec.chunk.action_dim]
+    if spec.chunk.normalizer is not None:
+        actions = spec.chunk.normalizer.unnormalize(actions)
+    evaluated = _spread(steps, EVALUATIONS)
+    anchors = _spread(steps, steps if small else max(3, int(steps * EFFORT / program.dense_flops)))
+    inside = _Inside(program, tensors, streams)
+    scales = inside.scales(given[steps // 2], steps // 2)
+    return Golden(
+        observations={key: pattern(value, spec.observations[key].shape) for key, value in observations.items()},
+        normalized={key: pattern(value, spec.observations[key].shape) for key, value in normalized.items()},
+        initial=initial,
+        draws=draws,
+        steps=anchors,
+        scales=scales,
+        residuals=inside.residuals(anchors, scales),
+        evaluated=evaluated,
+        inputs=given[evaluated],
+        outputs=predicted[evaluated],
+        predictions=np.stack([project(one, 0) for one in predicted]),
+        path=np.stack([project(one, 0) for one in (*given[1:], sample)]),
+        sample=sample,
+        actions=actions,
+        executed=actions[:, spec.chunk.start : spec.chunk.stop],
+    )
+
+
+def record_plans(artifact: Artifact) -> dict[str, GoldenPlan]:
+    """What the reference runtime makes of the plans of an artifact, with their corrections: two calls each.
+
+    Args:
+        artifact: with its plans; without a golden record of the original network there is none of plans.
+    """
+    if artifact.manifest.stores.golden is None:
+        return {}
+    golden, spec = load_golden(artifact), artifact.manifest.spec
+    model = ReferenceModel.from_artifact(artifact)
+    obs = golden.network_observations(spec)
+    with torch.no_grad():
+        return {name: _episode(artifact, model, name, golden, obs) for name in artifact.manifest.plans}
+
+
+def _episode(
+    artifact: Artifact, model: ReferenceModel, name: str, golden: Golden, obs: Mapping[str, npt.NDArray[Any]]
+) -> GoldenPlan:
+    """Two calls with one plan; see ``GoldenPlan``."""
+    pruned = artifact.manifest.plans[name].kind == "pruner"
+    cache, calls = model.empty_cache(golden.streams), []
+    for order in (1, -1):
+        contexts = model.prologue({key: torch.from_numpy(value[::order].copy()) for key, value in obs.items()})
+        wanted = pruner_plan(model.logits(contexts).numpy()) if pruned else artifact.schedule(name)
+        plan, _ = settle_plan(wanted, model.groups, cache.written, repair=True)
+        draws = None if golden.draws is None else torch.from_numpy(golden.draws[:, ::order].copy())
+        result = model.rollout(
+            contexts,
+            torch.from_numpy(golden.initial[::order].copy()),
+            draws,
+            plan,
+            cache,
+            keep_samples=True,
+            correction=artifact.corrections.get(name),
+        )
+        cache = result.cache
+        path = np.stack([project(sample.numpy(), 0) for sample in result.samples])
+        calls.append((plan, path, result.sample.numpy()))
+    return GoldenPlan(*(np.stack(each) for each in zip(*calls, strict=True)))
+
+
+_PROBE = "probe."
+
+
+def _spread(steps: int, count: int) -> npt.NDArray[np.int64]:
+    """Numbers of ``count`` steps, evenly spread, the first and the last among them; all if there are no more."""
+    return np.unique(np.linspace(0, steps - 1, min(count, steps)).round().astype(np.int64))
+
+
+class _Watch:
+    """What goes in and comes out of each evaluation of a module: ``[B, T, D]`` each.
+
+    Args:
+        module: hooked. Of one with an observation encoder before it, which runs once a call, the rest.
+        spec: names the sample's argument.
+    """
+
+    def __init__(self, module: nn.Module, spec: PolicySpec) -> None:
+        self._argument = spec.sample_argument
+        self.given: list[FloatArray] = []
+        self.predicted: list[FloatArray] = []
+        evaluated = module.denoiser if isinstance(module, EncodedDenoiser) else module
+        evaluated.register_forward_hook(self._saw, with_kwargs=True)
+
+    def _saw(self, _: nn.Module, args: tuple[Any, ...], kwargs: dict[str, Any], output: torch.Tensor) -> None:
+        sample = args[0] if args else kwargs[self._argument]
+        self.given.append(sample.numpy().copy())
+        self.predicted.append(output.numpy().copy())
+
+
+class _Inside:
+    """The captured graph of one evaluation, cut open at its residual stream.
+
+    Args:
+        program: with the block table.
+        observations: normalised, by key.
+        streams: B.
+    """
+
+    def __init__(self, program: Program, observations: Mapping[str, torch.Tensor], streams: int) -> None:
+        self._spec, self._blocks, self._streams = program.spec, program.blocks, streams
+        self._weights = {name: torch.from_numpy(np.asarray(value)) for name, value in program.weights.items()}
+        self._observations = dict(observations)
+        whole = program.denoiser
+        self._closed = replace(whole, outputs=tuple(block.stream for block in self._blocks))
+        self._open = _opened(whole, self._blocks)
+        self._condition, self._loop = _split(self._open, [program.spec.sample_argument, program.spec.timestep_argument])
+
+    def scales(self, sample: FloatArray, k: int) -> FloatArray:
+        """Standard deviation of the stream before each block, in the evaluation of this sample at step k."""
+        inputs = {self._spec.sample_argument: torch.from_numpy(sample), **self._at(k)}
+        with torch.inference_mode():
+            streams = Evaluator(self._closed, self._weights)(inputs)
+        return np.array([max(float(stream.std()), 1e-3) for stream in streams], np.float32)
+
+    def residuals(self, anchors: npt.NDArray[np.int64], scales: FloatArray) -> FloatArray:
+        """Projections of each block's residual on its ``probe_stream``, ``[A, blocks, B, DIGITS]``."""
+        probes = {
+            _probe(block.index): torch.from_numpy(probe_stream(block.index, block.type, self._streams, float(scale)))
+            for block, scale in zip(self._blocks, scales, strict=True)
+        }
+        run = Evaluator(self._loop, self._weights)
+        with torch.inference_mode():
+            values = Evaluator(self._condition, self._weights)(self._observations)
+        fixed = dict(zip(self._condition.outputs, values, strict=True))
+        given = dict(zip(list(self._open.inputs)[-len(probes) :], probes.values(), strict=True))
+        found = np.zeros((len(anchors), len(self._blocks), self._streams, DIGITS), np.float32)
+        for i, k in enumerate(anchors.tolist()):
+            with torch.inference_mode():
+                results = run({**fixed, **given, **self._at(k)})
+            for b, (block, result) in enumerate(zip(self._blocks, results, strict=True)):
+                residual = result if block.residual is not None else result - probes[_probe(b)]
+                found[i, b] = project(residual.numpy(), block.type.batch_axis)
+        return found
+
+    def _at(self, k: int) -> dict[str, torch.Tensor]:
+        """Timestep and observations at step k."""
+        timestep = torch.from_numpy(self._spec.sampler.timesteps)[k].expand(self._streams)
+        return {self._spec.timestep_argument: timestep, **self._observations}
+
+
+def _probe(block: int) -> str:
+    """Name of the input that takes the place of the stream before a block."""
+    return f"{_PROBE}{block}"
+
+
+def _opened(graph: Graph, blocks: tuple[Block, ...]) -> Graph:
+    """The graph with the stream before each block given as an input, and with the residuals as outputs.
+
+    Nothing but block b reads the stream before it (``find_residual_blocks`` sees to that), so that what it reads can be
+    replaced wherever it is read.
+    """
+    places = {block.stream: _probe(block.index) for block in blocks}
+    nodes = tuple(node.renamed(lambda name: places.get(name, name)) for node in graph.nodes)
+    probes: dict[str, TensorType] = {_probe(block.index): block.type for block in blocks}
+    outputs = tuple(block.result if block.residual is None else block.residual for block in blocks)
+    types = graph.types()
+    like, inner = blocks[0].type, types[blocks[0].stream]
+    if like == inner:
+        return Graph({**graph.inputs, **probes}, graph.constants, nodes, outputs)
+    # A doubled batch: between blocks the stream has an axis of streams, inside the graph it does not (``ir.rows``).
+    into = [Rows(name, inner, f"{name}.rows", like) for name in probes]
+    out = [Rows(name, inner, f"{name}.rows", like) for name in outputs]
+    return Graph(
+        {**graph.inputs, **{one.crossing: like for one in into}},
+        graph.constants,
+        (*(one.enter() for one in into), *nodes, *(one.leave() for one in out)),
+        tuple(one.crossing for one in out),
+    )
+
+
+def _split(graph: Graph, varying: list[str]) -> tuple[Graph, Graph]:
+    """What depends on observations alone, once, and what depends on these inputs or on a probe, for every step."""
+    types = graph.types()
+    loop = reachable_from(graph, [*varying, *(name for name in graph.inputs if name.startswith(_PROBE))])
+    before = {
+        name: types[name]
+        for node in graph.nodes
+        if node.name in loop
+        for name in node.refs()
+        if name not in loop and name not in graph.constants and name not in graph.inputs
+    }
+    return backward_slice(graph, tuple(before), {}), backward_slice(graph, graph.outputs, before)

@@ -1,0 +1,87 @@
+"""A picture of where an artifact differs from the original: steps across, blocks down, colour by relative error."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from .errors import OutputError, RuntimeUnavailableError
+
+_ABBREVIATIONS = {"self_attention": "SA", "cross_attention": "CA", "feed_forward": "FF"}
+
+_LEAST, _MOST = -8.0, 0.0
+"""Powers of ten at the ends of the colours: rounding, and another residual altogether."""
+
+
+def plot_errors(
+    errors: npt.NDArray[np.float64],
+    steps: Sequence[int],
+    kinds: Sequence[str],
+    tolerance: float,
+    path: str | Path,
+    title: str = "",
+    cells: npt.NDArray[np.bool_] | None = None,
+    plan: str | None = None,
+) -> None:
+    """Draw relative errors of residuals, and write the picture.
+
+    Args:
+        errors: ``[A, blocks]``.
+        steps: number of each of the A steps.
+        kinds: kind of each block, in order of execution.
+        tolerance: errors above it are framed.
+        path: of the picture; its suffix (``.png``, ``.svg``, ``.pdf``) is the format.
+        title: over the picture.
+        cells: bool ``[K, blocks]``, cells of a plan that are marked; None for none.
+        plan: its name.
+
+    Raises:
+        RuntimeUnavailableError: matplotlib is not installed.
+        OutputError: the picture cannot be written.
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ModuleNotFoundError as error:
+        raise RuntimeUnavailableError(
+            f"a picture of the errors needs matplotlib, and {error.name!r} is not installed."
+            " Install 'ttscompile[compile]', or read the errors with --json."
+        ) from error
+    count, blocks = errors.shape
+    figure = Figure(figsize=(min(7.0 + 0.06 * count, 14.0), min(2.2 + 0.17 * blocks, 14.0)), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    shown = np.log10(np.clip(np.nan_to_num(errors, nan=1.0, posinf=1.0), 10**_LEAST, 10**_MOST)).T
+    image = axes.imshow(shown, cmap="viridis", vmin=_LEAST, vmax=_MOST, aspect="auto", interpolation="none")
+    above = np.argwhere(~(errors <= tolerance))
+    if len(above):
+        axes.scatter(above[:, 0], above[:, 1], s=9, marker="s", facecolors="none", edgecolors="#d55e00", linewidths=0.9)
+    marked = 0
+    if cells is not None:
+        columns = {step: column for column, step in enumerate(steps)}
+        places = [(columns[k], b) for k, b in np.argwhere(cells).tolist() if k in columns]
+        marked = len(places)
+        if places:
+            across, down = zip(*places, strict=True)
+            axes.scatter(across, down, s=12, marker="x", color="#f0e442", linewidths=0.9)
+    ticks = np.unique(np.linspace(0, count - 1, min(count, 11)).round().astype(int))
+    axes.set_xticks(ticks, [str(steps[i]) for i in ticks])
+    axes.set_yticks(range(blocks), [f"{_ABBREVIATIONS.get(k, k[:12])} {b}" for b, k in enumerate(kinds)], fontsize=7)
+    axes.set_xlabel("denoising step k, in order of execution (0 is the noisiest)")
+    axes.set_ylabel("residual block")
+    told = f"{len(above)} of {errors.size} residuals differ by more than {tolerance:g} (framed)"
+    if plan is not None:
+        told += f"; {marked} cells of plan {plan!r} are not those stored (crossed)"
+    axes.set_title(f"{title}\n{told}" if title else told, fontsize=9, loc="left")
+    bar = figure.colorbar(image, ax=axes)
+    bar.set_label("relative error of the residual, power of ten")
+    metadata = {".png": {"Software": None}, ".svg": {"Date": None}}.get(Path(path).suffix)
+    try:
+        figure.savefig(path, dpi=150, metadata=metadata)
+    except (OSError, ValueError) as error:
+        raise OutputError(
+            f"{path}: the picture cannot be written: {error}. Give a .png, .svg or .pdf in a folder that exists."
+        ) from error

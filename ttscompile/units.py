@@ -1,0 +1,23 @@
+"""How figures are written for people."""
+
+from __future__ import annotations
+
+
+def flops(count: float) -> str:
+    """FLOPs with a unit: ``16.1 GFLOP``."""
+    for unit, size in (("GFLOP", 1e9), ("MFLOP", 1e6), ("kFLOP", 1e3)):
+        if count >= size:
+            return f"{count / size:.3g} {unit}" if count < 1000 * size else f"{count / size:.0f} {unit}"
+    return f"{count:.0f} FLOP"
+
+
+def share(part: float | None) -> str:
+    """A share in per cent, small ones to two digits more; empty if it is not known."""
+    if part is None:
+        return ""
+    return f"{part:.1%}" if part == 0 or part >= 0.01 else f"{part:.3%}"
+
+
+def ms(milliseconds: float) -> str:
+    """A time to three digits at least, without an exponent."""
+    return f"{milliseconds:.3g}" if milliseconds < 1000 else f"{milliseconds:.0f}"

@@ -1,0 +1,232 @@
+"""The rungs of whole calls on the recorded inputs: against the original, between runtimes, and of each plan."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..artifact.golden import Golden, GoldenPlan, project
+from ..artifact.load import Artifact
+from ..artifact.manifest import DENSE
+from ..config import Noise
+from ..correction import Correction
+from ..errors import RuntimeUnavailableError
+from ..lattice import PlanArray, Source
+from ..runtimes.base import Runtime, open_runtime
+from ..runtimes.policy import CompiledPolicy
+from .network import block_errors, describe_blocks, largest
+from .probe import Probe
+from .rung import FAILED, PASSED, SKIPPED, Rung, finite, verdict
+
+DENSE_CALL, PRECISION, RUNTIMES, PLANS = "dense call", "precision", "runtimes", "plans"
+
+SAMPLE = 2e-3
+"""Tolerance of a denoised sample, relative to its largest value. Push-T after 100 steps: 1e-5."""
+
+CELLS = 0.005
+"""Share of cells in which the plans that a pruner makes may differ: its logits are rounded otherwise on another
+processor, and near ties fall the other way."""
+
+REFERENCE_STEPS = 3
+"""Steps at which the reference runtime's blocks are looked at."""
+
+
+def check_dense(policy: CompiledPolicy, artifact: Artifact, golden: Golden, probe: Probe) -> Rung:
+    """A dense call against the original network in eager PyTorch with the same noise: the error of the export."""
+    spec = artifact.manifest.spec
+    policy.reset()
+    made = policy.predict_action(golden.raw_observations(spec), noise=golden.noise, plan=DENSE)
+    error = max(largest(made["action_pred"], golden.actions), largest(made["action"], golden.executed))
+    units = float(np.abs(made["action"].astype(np.float64) - golden.executed).max())
+    told = f"a dense call of {golden.streams} streams: its executed actions are within {units:.2g} of the original's"
+    details = {"error_in_units": finite(units)}
+    if error <= SAMPLE:
+        return Rung(DENSE_CALL, PASSED, told, error, SAMPLE, "of the largest action", details=details)
+    step, cause = _where(artifact, golden, probe, dense_of(artifact, golden.streams), None, golden.path)
+    told = f"the executed actions of a dense call are up to {units:.2g} off the original's: {cause}"
+    remedy = "Convert the checkpoint again; if that does not help, please report it."
+    return Rung(DENSE_CALL, FAILED, told, finite(error), SAMPLE, "of the largest action", remedy, step, details=details)
+
+
+def check_precision(artifact: Artifact, golden: Golden) -> Rung | None:
+    """Blocks of another precision than fp32 against those in fp32; None if there are none."""
+    record, spec = artifact.manifest.precision, artifact.manifest.spec
+    if record is None:
+        return None
+    tolerance = SAMPLE if record.error is None else record.error.tolerance
+    runtime, obs = open_runtime(artifact), golden.network_observations(spec)
+    runtime.reset()
+    sample, _ = runtime.predict(obs, golden.noise, artifact.schedule(DENSE), plan_name=DENSE)
+    error = largest(sample, golden.sample)
+    told = f"a dense call with {record.name} blocks against the original"
+    remedy = "Load with precision='fp32', or convert the checkpoint again." if error > tolerance else ""
+    return Rung(PRECISION, verdict(error <= tolerance), told, finite(error), tolerance, "of the largest value", remedy)
+
+
+def check_runtimes(artifact: Artifact, golden: Golden, runtime: Runtime) -> Rung:
+    """A dense call, and single blocks, in the reference runtime; skipped where there is no torch."""
+    try:
+        reference = open_runtime(artifact, "reference")
+    except RuntimeUnavailableError as missing:
+        return Rung(RUNTIMES, SKIPPED, f"the reference runtime was not run: {missing}")
+    manifest, obs = artifact.manifest, golden.network_observations(artifact.manifest.spec)
+    samples = []
+    for one in (runtime, reference):
+        one.reset()
+        samples.append(one.predict(obs, golden.noise, artifact.schedule(DENSE), plan_name=DENSE)[0])
+    error = largest(samples[0], samples[1])
+    if error <= SAMPLE:
+        told = "onnxruntime and the reference runtime give the same denoised sample"
+        return Rung(RUNTIMES, PASSED, told, error, SAMPLE, "of the largest value")
+    rows = np.unique(np.linspace(0, len(golden.steps) - 1, REFERENCE_STEPS).round().astype(np.int64))
+    errors = block_errors(manifest, golden, _reference_blocks(reference, obs), rows)
+    kinds = tuple(block.kind for block in manifest.blocks)
+    wrong, step, where = describe_blocks(errors, golden, kinds, rows)
+    found = f"in the reference runtime {where}" if wrong else "every block is the original's in both"
+    told = f"onnxruntime and the reference runtime give other samples: {found}"
+    remedy = "Their weights or graphs differ: convert the checkpoint again."
+    return Rung(RUNTIMES, FAILED, told, finite(error), SAMPLE, "of the largest value", remedy, step, wrong)
+
+
+def _reference_blocks(reference: Any, obs: Mapping[str, npt.NDArray[Any]]) -> Any:
+    """``network.BlockFunction`` of the reference runtime."""
+    import torch
+
+    with torch.no_grad():
+        contexts = reference.model.prologue({key: torch.from_numpy(value) for key, value in obs.items()})
+
+    def residual(b: int, k: int, stream: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        with torch.no_grad():
+            made: npt.NDArray[np.float32] = reference.model.block(b, k, torch.from_numpy(stream), contexts).numpy()
+        return made
+
+    return residual
+
+
+def check_plans(
+    artifact: Artifact, golden: Golden, recorded: Mapping[str, GoldenPlan], runtime: Runtime, probe: Probe
+) -> tuple[Rung, dict[str, npt.NDArray[np.bool_]]]:
+    """Episodes of two sparse calls with each plan against what calibration stored.
+
+    Returns:
+        The rung; and by plan the cells ``[K, blocks]`` that differ, where some do.
+    """
+    plans = artifact.manifest.plans
+    if not plans:
+        return Rung(PLANS, SKIPPED, "the artifact is not calibrated: every call is dense"), {}
+    if not recorded:
+        told = f"no record of {', '.join(plans)}: they were written by other means than 'ttscompile calibrate'"
+        return Rung(PLANS, SKIPPED, told, remedy="Calibrate the artifact to have its plans verified."), {}
+    failures: list[tuple[str, int | None, tuple[int, ...]]] = []
+    cells, worst = {}, 0.0
+    for name, record in recorded.items():
+        made, samples = _episode(artifact, golden, runtime, name)
+        differ = (made != record.plan).any((0, 1))
+        allowed = CELLS * differ.size if plans[name].kind == "pruner" else 0
+        if np.count_nonzero(differ) > allowed:
+            cells[name] = differ
+            step, block = np.argwhere(differ)[0].tolist()
+            told = f"plan {name!r} is not what calibration stored in {int(differ.sum())} of {differ.size} cells"
+            told += f", first at step {step}, block {block}{_shifted(made[0, 0], record.plan[0, 0])}"
+            failures.append((told, step, tuple(np.flatnonzero(differ[step]).tolist())))
+            continue
+        if differ.any():  # a near tie: hold what the stored plan gives against the record
+            samples = _given(artifact, golden, runtime, name, record.plan)
+        error = largest(samples, record.sample)
+        worst = max(worst, error)
+        if not error <= SAMPLE:
+            correction = artifact.corrections.get(name)
+            step, cause = _where(artifact, golden, probe, record.plan[0], correction, record.path[0])
+            more = "; it has a correction, which is the likely culprit where dense calls hold" if correction else ""
+            failures.append((f"plan {name!r} is what calibration stored, but {cause}{more}", step, ()))
+    if failures:
+        told = "; ".join(told for told, _, _ in failures)
+        remedy = "Plans or corrections were changed or exchanged after calibration: calibrate again."
+        steps = [step for _, step, _ in failures if step is not None]
+        details = {"plans": sorted({*cells}), "failures": [told for told, _, _ in failures]}
+        _, _, blocks = failures[0]
+        step = min(steps) if steps else None
+        return Rung(
+            PLANS, FAILED, told, finite(worst), SAMPLE, "of the largest value", remedy, step, blocks, details
+        ), cells
+    told = f"{', '.join(recorded)}: plans, corrections and samples of two calls are what calibration stored"
+    return Rung(PLANS, PASSED, told, worst, SAMPLE, "of the largest value"), {}
+
+
+def dense_of(artifact: Artifact, streams: int) -> PlanArray:
+    """The dense plan of some streams, int8 ``[B, K, blocks]``."""
+    return np.broadcast_to(artifact.schedule(DENSE), (streams, *artifact.schedule(DENSE).shape))
+
+
+def _episode(artifact: Artifact, golden: Golden, runtime: Runtime, name: str) -> tuple[PlanArray, npt.NDArray[Any]]:
+    """Executed plans and samples of the episode that ``GoldenPlan`` describes."""
+    schedule = None if artifact.manifest.plans[name].kind == "pruner" else artifact.schedule(name)
+    return _two_calls(artifact, golden, runtime, name, (schedule, schedule), True)
+
+
+def _given(
+    artifact: Artifact, golden: Golden, runtime: Runtime, name: str, plans: npt.NDArray[np.int8]
+) -> npt.NDArray[Any]:
+    """Samples of the same episode with these plans ``[2, B, K, blocks]`` and the correction of a named plan."""
+    return _two_calls(artifact, golden, runtime, name, (plans[0], plans[1]), False)[1]
+
+
+def _two_calls(
+    artifact: Artifact, golden: Golden, runtime: Runtime, name: str, plans: tuple[Any, Any], named: bool
+) -> tuple[PlanArray, npt.NDArray[Any]]:
+    obs, made, samples = golden.network_observations(artifact.manifest.spec), [], []
+    runtime.reset()
+    for order, plan in zip((1, -1), plans, strict=True):
+        draws = None if golden.draws is None else np.ascontiguousarray(golden.draws[:, ::order])
+        noise = Noise(np.ascontiguousarray(golden.initial[::order]), draws)
+        turned = {key: np.ascontiguousarray(value[::order]) for key, value in obs.items()}
+        correction = artifact.corrections.get(name)
+        sample, report = runtime.predict(
+            turned, noise, plan, plan_name=name if named else None, repair=named, correction=correction
+        )
+        made.append(report.plan)
+        samples.append(sample)
+    return np.stack(made), np.stack(samples)
+
+
+def _where(
+    artifact: Artifact,
+    golden: Golden,
+    probe: Probe,
+    plan: PlanArray,
+    correction: Correction | None,
+    path: npt.NDArray[np.float32],
+) -> tuple[int | None, str]:
+    """The first step after which the sample is another than recorded, and what that says."""
+    if (plan == Source.ROLLOUT).any():
+        return None, "its samples differ"
+    samples, predictions = probe.trace(golden.noise, plan, correction)
+    norms = np.linalg.norm(path.astype(np.float64), axis=(1, 2))
+    found = np.stack([project(one, 0) for one in samples])
+    errors = np.linalg.norm(found.astype(np.float64) - path, axis=(1, 2)) / np.maximum(norms, 1e-30)
+    above = np.flatnonzero(~(errors <= SAMPLE))
+    if not len(above):
+        return None, "the pieces, run one by one, give the recorded sample, so that the runtime is at fault"
+    k = int(above[0])
+    if (plan == Source.COMPUTE).all():
+        predicted = largest(project(predictions[k], 0), golden.predictions[k])
+        if predicted <= SAMPLE:
+            return k, f"the sampler goes another way from step {k} on, where the network's output is the original's"
+        return k, f"the network's output is another from step {k} on"
+    return k, f"the sample is another from step {k} on"
+
+
+def _shifted(found: PlanArray, recorded: PlanArray) -> str:
+    """In words: whether one plan ``[K, blocks]`` is the other, moved by a few steps."""
+    for by in (1, -1, 2, -2, 3, -3):
+        if len(found) <= abs(by):
+            continue
+        moved = np.roll(recorded, by, axis=0)
+        inner = slice(max(by, 0) + 1, len(found) + min(by, 0))
+        if np.array_equal(found[inner], moved[inner]) and (moved[inner] != recorded[inner]).any():
+            direction = "later" if by > 0 else "earlier"
+            return f": it is the stored plan {abs(by)} step{'s' * (abs(by) > 1)} {direction}"
+    return ""

@@ -1,0 +1,139 @@
+"""The last rung: plans do what they are for. A cache that never engages gives perfect actions, and saves nothing."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from time import perf_counter
+
+import numpy as np
+
+from ..artifact.golden import Golden
+from ..artifact.load import Artifact
+from ..artifact.manifest import DENSE
+from ..config import Noise
+from ..lattice import Source
+from ..runtimes.policy import CompiledPolicy
+from .rung import FAILED, PASSED, SKIPPED, Rung
+
+ENGAGED = "engaged"
+
+ROUNDS, MOST_ROUNDS = 5, 40
+"""Timed calls of each plan, in turn with dense ones; and how many there may be until a plan has saved time."""
+
+PATIENCE = 10.0
+"""Seconds after which there are no more of them."""
+
+LEGALISED = 0.25
+"""Share of the reused cells of a second call that may have had to take another source than planned."""
+
+SHORT = {"schedule": 0.01, "pruner": 0.1}
+"""How far the share of reused cells may stay behind what the manifest says, by kind of plan: that of a pruner depends
+on the observation."""
+
+
+@dataclass(frozen=True)
+class Engagement:
+    """What one plan saved, on one stream.
+
+    Attributes:
+        planned: share of cells to reuse as the manifest has it; None if it was not measured.
+        executed: share that was reused in the second call of an episode.
+        legalised: cells of that call that were computed, or reused otherwise, because their source was empty.
+        flops_saved: share of the FLOPs of a dense call of the artifact.
+        ms: median time of a call.
+        dense_ms: median time of a dense one, taken in turn.
+        time_saved: share, of the fastest of each.
+    """
+
+    planned: float | None
+    executed: float
+    legalised: int
+    flops_saved: float
+    ms: float
+    dense_ms: float
+    time_saved: float
+
+
+def check_engaged(artifact: Artifact, golden: Golden, policy: CompiledPolicy) -> Rung:
+    """Planned against executed cells, FLOPs and time of every plan; one that saves nothing fails.
+
+    Args:
+        artifact: opened.
+        golden: its record.
+        policy: loaded from it.
+    """
+    manifest = artifact.manifest
+    if not manifest.plans:
+        told = "the artifact is not calibrated: every call is dense, and nothing is saved"
+        return Rung(ENGAGED, SKIPPED, told, remedy="Run 'ttscompile calibrate' to give it a plan.")
+    found = _measure(artifact, golden, policy)
+    details = {name: asdict(one) for name, one in found.items()}
+    cells = manifest.steps * len(manifest.blocks)
+    judged = {name: _fault(manifest.plans[name].kind, one, cells) for name, one in found.items()}
+    faults = [f"plan {name!r} {fault}" for name, fault in judged.items() if fault]
+    name = manifest.default_plan if manifest.default_plan in found else next(iter(found))
+    if faults:
+        remedy = "The plan is inert on this machine: calibrate again, and look at 'ttscompile inspect --plot'."
+        return Rung(
+            ENGAGED, FAILED, "; ".join(faults), found[name].executed, None, "of the cells", remedy, details=details
+        )
+    shown = [
+        f"{n!r} reuses {one.executed:.1%} of the cells, saves {one.flops_saved:.1%} of the FLOPs and"
+        f" {one.time_saved:.0%} of the time ({one.ms:.4g} ms for {one.dense_ms:.4g})"
+        for n, one in found.items()
+    ]
+    return Rung(ENGAGED, PASSED, "; ".join(shown), found[name].executed, None, "of the cells", details=details)
+
+
+def _measure(artifact: Artifact, golden: Golden, policy: CompiledPolicy) -> dict[str, Engagement]:
+    manifest = artifact.manifest
+    obs = {key: value[:1] for key, value in golden.raw_observations(manifest.spec).items()}
+    noise = Noise(golden.initial[:1], None if golden.draws is None else golden.draws[:, :1].copy())
+    names = (DENSE, *manifest.plans)
+    times: dict[str, list[float]] = {name: [] for name in names}
+    begun = perf_counter()
+    executed, legalised, flops = dict[str, float](), dict[str, int](), dict[str, float]()
+    for number in range(MOST_ROUNDS + 1):
+        saved = number > ROUNDS and all(min(times[name]) < min(times[DENSE]) for name in names[1:])
+        if saved or (number > ROUNDS and perf_counter() - begun > PATIENCE):
+            break  # beside other work a few calls may say anything: an inert plan is one that never saves time
+        for name in names:
+            policy.reset()
+            if name != DENSE:
+                policy.predict_action(obs, noise=noise, plan=name)  # what an episode's first call cannot read
+            start = perf_counter()
+            policy.predict_action(obs, noise=noise, plan=name)
+            if number:  # the first round warms up
+                times[name].append(1e3 * (perf_counter() - start))
+            report = policy.last_report
+            assert report is not None
+            executed[name] = float(np.mean(report.plan != Source.COMPUTE))
+            legalised[name], flops[name] = report.legalised[0], report.flops[0]
+    return {
+        name: Engagement(
+            planned=plan.sparsity,
+            executed=executed[name],
+            legalised=legalised[name],
+            flops_saved=1 - flops[name] / flops[DENSE],
+            ms=float(np.median(times[name])),
+            dense_ms=float(np.median(times[DENSE])),
+            time_saved=1 - min(times[name]) / min(times[DENSE]),
+        )
+        for name, plan in manifest.plans.items()
+    }
+
+
+def _fault(kind: str, one: Engagement, cells: int) -> str:
+    """Why a plan is inert; empty if it is not."""
+    shown = f"{one.executed:.2%} of the cells"
+    if one.executed <= 0:
+        return "computes every cell: it is dense in disguise"
+    if one.planned is not None and one.executed < one.planned - SHORT[kind]:
+        return f"was to reuse {one.planned:.2%} of the cells and reuses {shown}, {one.legalised} being legalised"
+    if one.legalised > LEGALISED * one.executed * cells:
+        return f"has to be legalised in {one.legalised} cells of a second call: it reads what is never computed"
+    if one.flops_saved <= 0:
+        return f"reuses {shown} and saves no FLOPs"
+    if one.time_saved <= 0:
+        return f"reuses {shown} and saves no time: {one.ms:.4g} ms a call, dense {one.dense_ms:.4g} ms"
+    return ""

@@ -1,0 +1,140 @@
+"""The rung of episodes: what reuse changes in the actions, beside what other noise would change."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..artifact.golden import Golden
+from ..artifact.load import Artifact
+from ..artifact.manifest import DENSE
+from ..config import Noise, PolicySpec
+from ..runtimes.policy import CompiledPolicy
+from ..trajectories import Episode
+from .rung import FAILED, PASSED, SKIPPED, Rung, finite
+
+SPARSITY = "sparsity error"
+
+Progress = Callable[[str], None]
+"""Told what is being done."""
+
+
+@dataclass(frozen=True)
+class _Errors:
+    """Mean absolute differences of the executed actions from the dense call's, one a call, in their units."""
+
+    plans: Mapping[str, list[float]]
+    other_noise: list[float]
+
+
+def choose(episodes: Sequence[Episode], calls: int) -> list[Episode]:
+    """Whole episodes, spread over the recordings, until they hold this many calls; at least one."""
+    order = np.random.default_rng(0).permutation(len(episodes))
+    chosen, total = list[int](), 0
+    for number in order.tolist():
+        if total >= calls:
+            break
+        chosen.append(number)
+        total += episodes[number].calls
+    return [episodes[number] for number in sorted(chosen)]
+
+
+def check_episodes(
+    artifact: Artifact, golden: Golden, policy: CompiledPolicy, episodes: Sequence[Episode], told: Progress
+) -> Rung:
+    """Every plan against the dense policy with the same noise, call by call through whole episodes.
+
+    The default plan has to keep within what two dense calls with different noise are apart, or within what calibration
+    measured on held-out calls (90th percentile), whichever is more. Without episodes the recorded observations are
+    used, which are random: then nothing is judged.
+
+    Args:
+        artifact: opened.
+        golden: its record.
+        policy: loaded from it.
+        episodes: recorded; may be none.
+        told: of the episode under way.
+    """
+    manifest = artifact.manifest
+    if not manifest.plans:
+        return Rung(SPARSITY, SKIPPED, "the artifact is not calibrated: every call is dense")
+    spec, draw = manifest.spec, np.random.default_rng(0)
+    total = _Errors({name: [] for name in manifest.plans}, [])
+    if episodes:
+        for i, episode in enumerate(episodes):
+            told(f"episode {i + 1} of {len(episodes)}, {episode.calls} calls")
+            rows = [{k: a[r : r + 1] for k, a in episode.observations.items()} for r in range(episode.calls)]
+            _run(policy, rows, [_noise(spec, draw) for _ in rows], [_noise(spec, draw) for _ in rows], total)
+    else:
+        obs = golden.raw_observations(spec)
+        rows = [{key: value[s : s + 1] for key, value in obs.items()} for s in range(golden.streams)]
+        _run(policy, rows, [_noise(spec, draw) for _ in rows], [_noise(spec, draw) for _ in rows], total)
+    figures = {
+        name: {"error": finite(float(np.mean(e))), "error_p90": finite(float(np.quantile(e, 0.9)))}
+        for name, e in total.plans.items()
+    }
+    yardstick = float(np.mean(total.other_noise))
+    calls = len(total.other_noise)
+    name = manifest.default_plan if manifest.default_plan in manifest.plans else next(iter(manifest.plans))
+    error = float(np.mean(total.plans[name]))
+    details = {"plan": name, "calls": calls, "episodes": len(episodes), "plans": figures, "other_noise": yardstick}
+    others = ", ".join(f"{n!r} {np.mean(e):.3g}" for n, e in total.plans.items() if n != name)
+    found = (
+        f"executed actions of plan {name!r} are {error:.3g} from the dense policy's with the same noise, in their units"
+        + (f" ({others})" if others else "")
+        + f"; two dense calls with different noise are {yardstick:.3g} apart"
+    )
+    if not episodes:
+        where = f"{found}. No trajectories were given: these are {calls} calls on random observations, and not judged"
+        remedy = "Give recorded episodes with --trajectories to have this judged."
+        return Rung(SPARSITY, SKIPPED, where, finite(error), None, "action units", remedy, details=details)
+    promised = _promised(manifest.calibration, name)
+    tolerance = max(yardstick, promised or 0.0)
+    details["promised_p90"] = promised
+    where = f"{calls} calls of {len(episodes)} episodes: {found}"
+    if error <= tolerance:
+        return Rung(SPARSITY, PASSED, where, error, tolerance, "action units", details=details)
+    remedy = (
+        "These episodes are unlike those of the calibration, or the plan is too sparse: calibrate with such episodes,"
+        " or with a lower --target-sparsity."
+    )
+    return Rung(SPARSITY, FAILED, where, finite(error), tolerance, "action units", remedy, details=details)
+
+
+def _run(
+    policy: CompiledPolicy,
+    rows: Sequence[Mapping[str, npt.NDArray[Any]]],
+    noises: Sequence[Noise],
+    others: Sequence[Noise],
+    total: _Errors,
+) -> None:
+    """One episode with every plan, and twice dense; each begins with a reset."""
+
+    def actions(plan: str, with_noise: Sequence[Noise]) -> list[npt.NDArray[np.float64]]:
+        policy.reset()
+        made = (policy.predict_action(o, noise=n, plan=plan)["action"] for o, n in zip(rows, with_noise, strict=True))
+        return [np.asarray(one, np.float64) for one in made]
+
+    dense = actions(DENSE, noises)
+    pairs = [(total.plans[name], actions(name, noises)) for name in total.plans]
+    pairs.append((total.other_noise, actions(DENSE, others)))
+    for errors, made in pairs:
+        errors += [float(np.abs(one - other).mean()) for one, other in zip(made, dense, strict=True)]
+
+
+def _noise(spec: PolicySpec, draw: np.random.Generator) -> Noise:
+    initial = draw.standard_normal((1, *spec.sample), dtype=np.float32)
+    if not spec.sampler.stochastic:
+        return Noise(initial)
+    return Noise(initial, draw.standard_normal((spec.sampler.steps, *initial.shape), dtype=np.float32))
+
+
+def _promised(calibration: Mapping[str, Any] | None, name: str) -> float | None:
+    """What calibration measured for a plan on held-out calls; None if it did not."""
+    score = (calibration or {}).get("plans", {})
+    found = score.get(name, {}).get("error_p90") if isinstance(score, dict) else None
+    return float(found) if isinstance(found, int | float) else None

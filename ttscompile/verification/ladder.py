@@ -1,0 +1,136 @@
+"""The ladder: every rung stands on those below it."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..artifact.golden import load_golden, load_golden_plans
+from ..artifact.load import Artifact
+from ..config import FP32
+from ..errors import ArtifactError, TtscompileError
+from ..runtimes.base import open_runtime
+from ..runtimes.policy import CompiledPolicy
+from ..trajectories import load_trajectories
+from .calls import DENSE_CALL, PLANS, PRECISION, RUNTIMES, check_dense, check_plans, check_precision, check_runtimes
+from .engaged import ENGAGED, check_engaged
+from .episodes import SPARSITY, Progress, check_episodes, choose
+from .integrity import check_integrity
+from .network import BLOCK, EVALUATION, PREPROCESSING, check_blocks, check_evaluation, check_preprocessing
+from .probe import Probe
+from .rung import FAILED, ErrorMap, Rung, Verification
+
+
+def _silent(what: str) -> None:
+    """Tell nobody."""
+
+
+def verify(
+    path: str | os.PathLike[str],
+    trajectories: Sequence[str | os.PathLike[str]] = (),
+    *,
+    sources: Mapping[str, Sequence[str]] | None = None,
+    calls: int = 24,
+    threads: int = 1,
+    progress: Progress = _silent,
+) -> Verification:
+    """Check an artifact, without the checkpoint that it was made from, and without torch.
+
+    From the bottom: its bytes; what is around the network; each residual block; single evaluations; a dense call, which
+    are all held against what the original network answered when the artifact was made; the runtimes against each other
+    (where there is torch); plans against what calibration stored; reuse against dense calls with the same noise over
+    whole episodes; and whether the plans save anything. A rung that fails says where, and what to do; those above it
+    are tried all the same, except after the first.
+
+    Args:
+        path: the artifact's directory, or the same zipped.
+        trajectories: recorded episodes, see ``ttscompile.trajectories``. None: errors of reuse are not judged.
+        sources: by key of the observation, the arrays of a recording that it is made of.
+        calls: recorded calls to go through at least, in whole episodes.
+        threads: of onnxruntime.
+        progress: told what is being done.
+
+    Returns:
+        What every rung found. Nothing is raised for a rung that fails.
+
+    Raises:
+        ArtifactError: there is no artifact, or none that was made with a golden record.
+        TrajectoryError: the recordings do not fit the policy.
+        RuntimeUnavailableError: onnxruntime is missing.
+    """
+    begun = time.monotonic()
+    progress("integrity")
+    rung, artifact = check_integrity(Path(path))
+    if artifact is None:
+        return Verification(str(path), None, None, (rung,), time.monotonic() - begun)
+    chunk = artifact.manifest.spec.chunk
+    episodes = []
+    if trajectories:
+        recorded = load_trajectories(
+            trajectories, artifact.manifest.spec.observations, chunk.stop - chunk.start, sources
+        )
+        episodes = choose(recorded, calls)
+    rungs, errors = _climb(artifact, episodes, threads, progress)
+    manifest = artifact.manifest
+    seconds = time.monotonic() - begun
+    return Verification(str(path), manifest.identity, manifest.model_identity, (rung, *rungs), seconds, errors)
+
+
+def _climb(
+    artifact: Artifact, episodes: Sequence[Any], threads: int, progress: Progress
+) -> tuple[list[Rung], ErrorMap | None]:
+    """All rungs above integrity."""
+    golden = load_golden(artifact)
+    recorded = load_golden_plans(artifact, golden.streams)
+    plain = artifact.at_precision(FP32)
+    try:
+        probe = Probe(plain, golden.network_observations(artifact.manifest.spec))
+        runtime = open_runtime(plain, threads=threads)
+        own_runtime = runtime if plain is artifact else open_runtime(artifact, threads=threads)
+    except ArtifactError as error:
+        return [Rung(BLOCK, FAILED, str(error))], None
+    exact = CompiledPolicy(plain, runtime, seed=0)
+    own = exact if plain is artifact else CompiledPolicy(artifact, own_runtime, seed=0)
+    rungs: list[Rung] = []
+    errors: ErrorMap | None = None
+    differing: Mapping[str, npt.NDArray[np.bool_]] = {}
+
+    def climb(name: str, check: Callable[[], Rung | None]) -> None:
+        progress(name)
+        try:
+            rung = check()
+        except TtscompileError as error:
+            rung = Rung(name, FAILED, str(error))
+        if rung is not None:
+            rungs.append(rung)
+
+    def blocks() -> Rung:
+        nonlocal errors
+        rung, errors = check_blocks(plain, golden, probe)
+        return rung
+
+    def plans() -> Rung:
+        nonlocal differing
+        rung, differing = check_plans(plain, golden, recorded, runtime, probe)
+        return rung
+
+    climb(PREPROCESSING, lambda: check_preprocessing(plain, golden))
+    climb(BLOCK, blocks)
+    climb(EVALUATION, lambda: check_evaluation(plain, golden, probe, rungs[-1]))
+    climb(DENSE_CALL, lambda: check_dense(exact, plain, golden, probe))
+    climb(PRECISION, lambda: check_precision(artifact, golden))
+    climb(RUNTIMES, lambda: check_runtimes(plain, golden, runtime))
+    climb(PLANS, plans)
+    climb(SPARSITY, lambda: check_episodes(artifact, golden, own, episodes, progress))
+    climb(ENGAGED, lambda: check_engaged(artifact, golden, own))
+    for name, cells in differing.items():
+        if errors is not None and errors.plan is None:
+            errors = replace(errors, plan=name, cells=cells)
+    return rungs, errors

@@ -1,0 +1,149 @@
+"""The pieces of an artifact one by one, with onnxruntime and numpy: what a runtime does in one go, to look inside.
+
+Slow and plain on purpose, and no part of the runtimes: where a call goes wrong and this goes right, the pieces are
+sound and the loop over them is not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..artifact.load import Artifact
+from ..artifact.manifest import block_name
+from ..config import FloatArray, Noise
+from ..correction import HISTORY, Correction, no_correction
+from ..ir.program import Binding
+from ..lattice import PlanArray, Source
+from ..runtimes.onnxruntime_sessions import open_sessions, repeat_streams, run_named
+from ..update import clips, matrices
+
+Array = npt.NDArray[Any]
+
+
+class Probe:
+    """The pieces on one observation.
+
+    Args:
+        artifact: opened.
+        obs: normalised observations by key, ``[B, ...]``.
+    """
+
+    def __init__(self, artifact: Artifact, obs: Mapping[str, Array]) -> None:
+        self._manifest = artifact.manifest
+        self._sessions = open_sessions(artifact, 1)
+        self.streams = len(next(iter(obs.values())))
+        self._tables = {
+            name: repeat_streams(artifact.tables[name], None if axis is None else axis + 1, self.streams)
+            for name, context in artifact.manifest.contexts.items()
+            if context.binding is Binding.TABLE
+            for axis in (context.type.batch_axis,)
+        }
+        piece = self._manifest.pieces["condition"]
+        arguments = self._manifest.spec.arguments
+        named = {**obs, **{arguments[key]: value for key, value in obs.items()}}
+        feed = {name: np.ascontiguousarray(named[name]) for name in piece.inputs}
+        self._condition = run_named(self._sessions["condition"], piece.outputs, feed) if piece.outputs else {}
+        self._steps = [self._step(k) for k in range(self._manifest.steps)]
+        self._tail_blanks = {
+            one.name: np.zeros([n if isinstance(n, int) else self.streams for n in one.shape], np.float32)
+            for one in self._sessions["advance"].get_inputs()
+        }
+
+    def evaluate(self, sample: FloatArray, k: int) -> FloatArray:
+        """The network's prediction at step k, ``[B, T, D]`` of ``[B, T, D]``."""
+        stream = self.stem(sample, k)
+        for b in range(len(self._manifest.blocks)):
+            stream = stream + self.block(b, k, stream)
+        return self.tail(stream, k)
+
+    def stem(self, sample: FloatArray, k: int) -> FloatArray:
+        """The residual stream of step k."""
+        return self._run("stem", np.ascontiguousarray(sample), k)
+
+    def block(self, b: int, k: int, stream: FloatArray) -> FloatArray:
+        """The residual of block b at step k."""
+        return self._run(block_name(b), stream, k)
+
+    def tail(self, stream: FloatArray, k: int) -> FloatArray:
+        """The prediction at step k, ``[B, T, D]``; what else ``advance`` computes is left aside."""
+        feed = dict(self._tail_blanks)
+        feed["stream"] = stream
+        feed |= {name: self._value(name.removeprefix("tail."), k) for name in feed if name.startswith("tail.")}
+        return run_named(self._sessions["advance"], ["prediction"], feed)["prediction"].transpose(1, 2, 0)
+
+    def trace(self, noise: Noise, plan: PlanArray, correction: Correction | None) -> tuple[FloatArray, FloatArray]:
+        """One call, the first of its episode, by the definitions in ``docs/design.md`` section 2.
+
+        Args:
+            noise: of the call.
+            plan: int8 ``[B, K, blocks]``, without ROLLOUT.
+            correction: of the plan.
+
+        Returns:
+            The sample after every step, and the prediction at every step, ``[K, B, T, D]`` each.
+        """
+        spec, blocks, groups = self._manifest.spec, self._manifest.blocks, self._manifest.groups
+        sampler, horizon = spec.sampler, spec.sample[0]
+        correction = correction or no_correction(sampler.steps, spec.sample)
+        updates, own, shared = matrices(sampler, correction), dict[int, Array](), dict[int, Array]()
+        sample = noise.initial.transpose(2, 0, 1)
+        dimensions = sample.shape[0]
+        history = np.zeros((dimensions, self.streams, HISTORY * horizon), np.float32)
+        memory = np.zeros((dimensions, self.streams, sampler.memories * horizon), np.float32)
+        samples, predictions = [], []
+        for k in range(sampler.steps):
+            stream = self.stem(sample.transpose(1, 2, 0), k)
+            for b, block in enumerate(blocks):
+                sources, axis, group = plan[:, k, b], block.type.batch_axis, groups[b]
+                mask_shape = [1] * stream.ndim
+                if axis is not None:
+                    mask_shape[axis] = self.streams
+                computing, forwarding = (
+                    (sources == source).reshape(mask_shape) if axis is not None else sources[0] == source
+                    for source in (Source.COMPUTE, Source.FORWARD)
+                )
+                computed = self.block(b, k, stream) if np.any(computing) else np.zeros_like(stream)
+                own_last, shared_last = own.get(b, computed), shared.get(group, computed)
+                residual = np.where(computing, computed, np.where(forwarding, shared_last, own_last))
+                own[b], shared[group] = (np.where(computing, computed, old) for old in (own_last, shared_last))
+                stream = stream + residual
+            prediction = self.tail(stream, k).transpose(2, 0, 1)
+            parts = [sample, prediction, history]
+            if clips(sampler):
+                assert sampler.clip is not None
+                denoised = sampler.sample_to_x0[k] * sample + sampler.out_to_x0[k] * prediction
+                parts.append(np.clip(denoised, -sampler.clip, sampler.clip))
+            product = np.concatenate([*parts, memory], 2) @ updates[k]
+            following, memory = product[..., :horizon] + correction.bias[k], product[..., horizon:]
+            if noise.steps is not None:
+                following = following + sampler.noise_to_next[k] * noise.steps[k].transpose(2, 0, 1)
+            if correction.anchors[k]:
+                history = np.concatenate([sample, prediction, history[..., : history.shape[2] // 2]], 2)
+            sample = np.asarray(following, np.float32)
+            samples.append(sample.transpose(1, 2, 0))
+            predictions.append(prediction.transpose(1, 2, 0))
+        return np.stack(samples), np.stack(predictions)
+
+    def _run(self, piece: str, value: FloatArray, k: int) -> FloatArray:
+        record = self._manifest.pieces[piece]
+        feed = {name: value if name == record.stream else self._value(name, k) for name in record.inputs}
+        result: FloatArray = run_named(self._sessions[piece], record.outputs, feed)[record.outputs[0]]
+        return result
+
+    def _step(self, k: int) -> dict[str, Array]:
+        """Step values of step k."""
+        piece = self._manifest.pieces.get("step")
+        if piece is None:
+            return {}
+        feed = {n: self._tables[n][k] if n in self._tables else self._condition[n] for n in piece.inputs}
+        return run_named(self._sessions["step"], piece.outputs, feed)
+
+    def _value(self, name: str, k: int) -> Array:
+        if name in self._tables:
+            row: Array = self._tables[name][k]
+            return row
+        return self._steps[k][name] if name in self._steps[k] else self._condition[name]

@@ -1,0 +1,129 @@
+"""What a rung of the ladder found, and all of them together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+PASSED, FAILED, SKIPPED = "passed", "failed", "skipped"
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One check.
+
+    Attributes:
+        name: of the rung.
+        status: ``passed``, ``failed`` or ``skipped``.
+        told: what was compared, and what was found.
+        figure: the error; None where there is no number.
+        tolerance: what it may be.
+        unit: of both.
+        remedy: what to do; empty if nothing is to be done.
+        step: first denoising step that differs; None if none does, or none can be named.
+        blocks: residual blocks that differ.
+        details: further figures, JSON.
+    """
+
+    name: str
+    status: str
+    told: str
+    figure: float | None = None
+    tolerance: float | None = None
+    unit: str = ""
+    remedy: str = ""
+    step: int | None = None
+    blocks: tuple[int, ...] = ()
+    details: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorMap:
+    """Errors by denoising step and residual block.
+
+    Attributes:
+        steps: the steps that were looked at, ``[A]``.
+        errors: relative error of each block's residual there, ``[A, blocks]``.
+        tolerance: what it may be.
+        kinds: kind of each block.
+        plan: name of a plan of which cells differ from what was calibrated; None if none does.
+        cells: bool ``[K, blocks]``, these cells; None likewise.
+    """
+
+    steps: npt.NDArray[np.int64]
+    errors: npt.NDArray[np.float64]
+    tolerance: float
+    kinds: tuple[str, ...]
+    plan: str | None = None
+    cells: npt.NDArray[np.bool_] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Verification:
+    """The ladder from bottom to top.
+
+    Attributes:
+        path: of the artifact, as it was given.
+        identity: sha256 of what the artifact computes; None where that cannot be read.
+        model_identity: the same without plans.
+        rungs: in order; after one of integrity that failed there are none.
+        seconds: that it took.
+        map: errors of residuals; None if they were not looked at.
+    """
+
+    path: str
+    identity: str | None
+    model_identity: str | None
+    rungs: tuple[Rung, ...]
+    seconds: float
+    map: ErrorMap | None = None
+
+    @property
+    def passed(self) -> bool:
+        """Whether no rung failed."""
+        return all(rung.status != FAILED for rung in self.rungs)
+
+    @property
+    def first_failure(self) -> Rung | None:
+        """The lowest rung that failed: those above it stand on it."""
+        return next((rung for rung in self.rungs if rung.status == FAILED), None)
+
+    def rung(self, name: str) -> Rung:
+        """The rung of this name."""
+        return next(rung for rung in self.rungs if rung.name == name)
+
+    def to_json(self) -> dict[str, Any]:
+        """As plain JSON values."""
+        failure = self.first_failure
+        return {
+            "path": self.path,
+            "identity": self.identity,
+            "model_identity": self.model_identity,
+            "passed": self.passed,
+            "first_failure": None if failure is None else failure.name,
+            "seconds": round(self.seconds, 3),
+            "rungs": [
+                {**asdict(rung), "blocks": list(rung.blocks), "details": dict(rung.details)} for rung in self.rungs
+            ],
+            "map": None
+            if self.map is None
+            else {
+                "steps": self.map.steps.tolist(),
+                "errors": [[finite(error) for error in row] for row in self.map.errors.tolist()],
+                "tolerance": self.map.tolerance,
+            },
+        }
+
+
+def finite(number: float) -> float | None:
+    """For JSON, which has no NaN and no infinity."""
+    return number if np.isfinite(number) else None
+
+
+def verdict(within: bool) -> str:
+    """``passed`` or ``failed``."""
+    return PASSED if within else FAILED
