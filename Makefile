@@ -11,7 +11,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/installed.stamp
 
 .DELETE_ON_ERROR:
-.PHONY: demo test lint types pytest benchmark clean
+.PHONY: demo test lint types pytest benchmark docs clean
 
 demo: $(READY)
 	$(BIN)/python examples/pusht/demo.py
@@ -37,6 +37,10 @@ pytest: $(READY)
 
 benchmark: $(READY)
 	$(BIN)/pytest --benchmark-only
+
+# The site, into build/site.
+docs: $(READY)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 clean:
 	rm -rf $(VENV) build ttscompile.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -28,6 +28,9 @@ MAY_IMPORT = {
     "lattice": {"errors"},
     "update": {"config", "correction"},
     "machine": set(),
+    "report": BELOW_ARTIFACT | {"machine", "plots", "runtimes", "trajectories", "units", "verification"},
+    "units": set(),
+    "doctor": BELOW_ARTIFACT | {"machine", "runtimes"},
     "plots": {"errors", "lattice"},
     "samplers": BASE,
     "trajectories": BASE,
@@ -38,9 +41,24 @@ MAY_IMPORT = {
     "frontends": BASE | {"samplers"},
     "artifact": BASE | {"ir"},
     "runtimes": BELOW_ARTIFACT | {"machine"},
-    "calibration": BELOW_ARTIFACT | {"runtimes", "trajectories"},
-    "driver": BELOW_ARTIFACT | COMPILER | {"runtimes"},
-    "cli": BELOW_ARTIFACT | COMPILER | {"calibration", "driver", "machine", "plots", "runtimes", "trajectories"},
+    "golden": BELOW_ARTIFACT | {"frontends", "runtimes"},
+    "verification": BELOW_ARTIFACT | {"runtimes", "trajectories"},
+    "calibration": BELOW_ARTIFACT | {"golden", "runtimes", "trajectories"},
+    "driver": BELOW_ARTIFACT | COMPILER | {"golden", "runtimes"},
+    "cli": BELOW_ARTIFACT
+    | COMPILER
+    | {
+        "calibration",
+        "doctor",
+        "driver",
+        "machine",
+        "plots",
+        "report",
+        "runtimes",
+        "trajectories",
+        "units",
+        "verification",
+    },
 }
 """Part of the package -> the other parts that it may import, anywhere in its code. Design, section 4."""
 
@@ -50,6 +68,7 @@ COMPILES = (
     "ttscompile.capture",
     "ttscompile.driver",
     "ttscompile.frontends",
+    "ttscompile.golden",
     "ttscompile.ir.evaluate",
     "ttscompile.lower",
     "ttscompile.passes",

@@ -40,7 +40,7 @@ class ArtifactError(TtscompileError):
 
 
 class ObservationError(TtscompileError):
-    """An observation, or noise, that does not fit the specification of the policy."""
+    """An observation, noise, or a prefix of actions that does not fit the specification of the policy."""
 
 
 class IllegalPlanError(TtscompileError):
@@ -61,6 +61,10 @@ class CalibrationFailedError(CalibrationError):
 
 class OutputError(TtscompileError):
     """A result that cannot be written where it was asked for."""
+
+
+class ReportError(TtscompileError):
+    """What a report was asked to show cannot be read."""
 
 
 class RuntimeUnavailableError(TtscompileError):

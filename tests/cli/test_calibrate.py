@@ -43,6 +43,7 @@ def test_every_file_up_to_the_next_option_is_taken(arguments: list[str], asked: 
     assert args == (Path("out"),)
     assert kwargs == {
         "trajectories": [Path("a.npz"), Path("b.npz")],
+        "observation": {},
         "target_sparsity": None,
         "strategy": "tts",
         "seed": 3,

@@ -51,7 +51,7 @@ def test_what_is_no_artifact(command: str, made: bool, tmp_path: Path) -> None:
     ("arguments", "reason"),
     [
         (["convert", "policy.ckpt"], "Missing option '-o'"),
-        (["convert", "policy.ckpt", "-o", "out", "--sampler", "euler"], "'euler' is not one of"),
+        (["convert", "policy.ckpt", "-o", "out", "--sampler", "pndm"], "'pndm' is not one of"),
         (["convert", "policy.ckpt", "-o", "out", "--steps", "0"], "not in the range"),
         (["calibrate", "out"], "Missing option '--trajectories'"),
         (["calibrate", "out", "--trajectories"], "Missing option '--trajectories'"),
@@ -59,7 +59,7 @@ def test_what_is_no_artifact(command: str, made: bool, tmp_path: Path) -> None:
         (["inspect", "out", "--plan", "dense"], "give --plot FILE too"),
         (["bench", "out", "--against", "eager"], "give --checkpoint FILE too"),
         (["bench", "out", "--against", "tensorrt"], "'tensorrt' is not one of eager, onnxruntime-dense"),
-        (["doctor"], "No such command"),
+        (["deploy"], "No such command"),
     ],
 )
 def test_bad_usage(arguments: list[str], reason: str) -> None:

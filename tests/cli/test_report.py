@@ -1,0 +1,278 @@
+"""The report: one page that needs nothing else, says what was measured, and lets no name of the artifact's act."""
+
+from __future__ import annotations
+
+import base64
+import json
+import shutil
+from dataclasses import replace
+from html.parser import HTMLParser
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+from PIL import Image
+
+import ttscompile
+from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.write import update_calibration
+from ttscompile.cli import main
+from ttscompile.errors import ReportError
+from ttscompile.lattice import Source, uniform_plan
+from ttscompile.report import Given, build, facts, pictures, render, verified
+from ttscompile.report.frontier import efficient, from_comparison
+from ttscompile.report.measure import run_episode
+from ttscompile.runtimes import open_runtime
+from ttscompile.runtimes.policy import CompiledPolicy
+from ttscompile.trajectories import Episode
+from ttscompile.verification import Rung, Verification
+from ttscompile.verification.rung import ErrorMap
+
+HOSTILE = """<script>alert(1)</script>"><img src=x onerror=alert(2)>'{{ 7 * 7 }}$\\frac{"""
+VOID = {"meta", "img", "link", "br", "hr", "input"}
+SCORE = {"error": 1.5, "error_p90": 2.5, "sparsity": 0.6, "flops_saved": 0.5}
+
+
+class Reader(HTMLParser):
+    """Tags with their attributes, and the text; fails where tags are not closed in order."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__(convert_charrefs=True)
+        self.tags: list[tuple[str, dict[str, str]]] = []
+        self.parents: dict[int, list[str]] = {}
+        self.text = ""
+        self._open: list[str] = []
+        self.feed(page)
+        self.close()
+        assert self._open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.parents[len(self.tags)] = list(self._open)
+        self.tags.append((tag, {name: value or "" for name, value in attrs}))
+        if tag not in VOID:
+            self._open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self._open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+    def of(self, tag: str) -> list[dict[str, str]]:
+        return [attributes for name, attributes in self.tags if name == tag]
+
+
+@pytest.fixture(scope="module")
+def calibrated(toy_compiled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The toy with two schedules, one of which reads the call before, and a record."""
+    directory = tmp_path_factory.mktemp("report") / "calibrated"
+    shutil.copytree(toy_compiled, directory)
+    rollout = np.full((5, 5), Source.ROLLOUT, np.int8)
+    rollout[0] = Source.COMPUTE
+    record = {"strategy": "tts", "plans": {"schedule": SCORE, "fast": {**SCORE, "error": 9.0}}, "steps": [0, 2]}
+    update_calibration(directory, None, {"schedule": uniform_plan(5, 5, 2), "fast": rollout}, "schedule", record)
+    return directory
+
+
+@pytest.fixture(scope="module")
+def calls(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two episodes of four and three calls."""
+    path = tmp_path_factory.mktemp("calls") / "calls.npz"
+    obs = np.random.default_rng(0).standard_normal((7, 2)).astype(np.float32)
+    np.savez(path, obs=obs, episode_ends=np.array([4, 7]))
+    return path
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(main, ["report", *(str(a) for a in arguments)], catch_exceptions=False)
+
+
+def pictures_of(reader: Reader) -> list[np.ndarray]:
+    encoded = [image["src"].removeprefix("data:image/png;base64,") for image in reader.of("img")]
+    return [np.asarray(Image.open(BytesIO(base64.b64decode(one))).convert("RGB")) for one in encoded]
+
+
+@pytest.fixture(scope="module")
+def page(calibrated: Path, calls: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    output = tmp_path_factory.mktemp("page") / "report.html"
+    point = {"series": HOSTILE, "name": "0.9", "error": 2.0, "latency_ms": 12.5}
+    comparison = calls.with_name("comparison.json")
+    comparison.write_text(json.dumps({"points": [point], "yardsticks": {"all": 9.0}}))
+    options = ("--verify", "--episode", 1, "--runs", 2, "--comparison", comparison)
+    result = run(calibrated, "-o", output, "--trajectories", calls, *options)
+    assert result.exit_code == 0, result.stderr
+    assert load_artifact(calibrated).manifest.short_identity in result.stdout
+    assert [path.name for path in output.parent.iterdir()] == ["report.html"], "nothing is left beside it"
+    return output.read_text()
+
+
+def test_the_page_is_whole_and_needs_nothing_else(page: str) -> None:
+    reader = Reader(page)
+    assert page.startswith("<!doctype html>")
+    assert not {"script", "link", "iframe", "object", "base", "form"} & {tag for tag, _ in reader.tags}
+    assert all(image["src"].startswith("data:image/png;base64,") and image["alt"] for image in reader.of("img"))
+    anchors = {attributes["id"] for _, attributes in reader.tags if "id" in attributes}
+    assert {link["href"].removeprefix("#") for link in reader.of("a")} == anchors
+    assert "url(" not in page
+    assert "://" not in page
+    policy = next(m["content"] for m in reader.of("meta") if m.get("http-equiv") == "Content-Security-Policy")
+    assert policy.startswith("default-src 'none'")
+
+
+def test_the_page_can_be_read_on_a_phone_and_in_the_dark(page: str) -> None:
+    reader = Reader(page)
+    assert any("width=device-width" in m.get("content", "") for m in reader.of("meta"))
+    assert "prefers-color-scheme: dark" in page
+    assert "overflow-x: auto" in page
+    for i, (tag, _) in enumerate(reader.tags):
+        if tag == "table":
+            assert reader.parents[i][-1] == "div", "a wide table scrolls by itself, not the page"
+    assert "figure img { display: block; max-width: 100%; height: auto; background: #ffffff" in page
+
+
+def test_the_page_says_what_was_found(page: str, calibrated: Path) -> None:
+    text = Reader(page).text
+    manifest = load_artifact(calibrated).manifest
+    for expected in (
+        manifest.identity,
+        "Hoisting",
+        "once a call, 5 steps in one batch",
+        "schedule (default)",
+        "3 consecutive calls of calls.npz[1]",
+        "ms a call",
+        "on the frontier",
+        "12.5",
+        "Could not be run",
+        "5 denoising steps: the first is always dense, so at most 80% of the cells",
+        "the first call after reset() falls back",
+    ):
+        assert expected in text, expected
+    # 2 schedules, the episode's mean and course, latency, frontier, calibration
+    drawn = pictures_of(Reader(page))
+    assert len(drawn) == 7
+    assert all(len(set(map(tuple, picture[::3, ::3].reshape(-1, 3)))) > 3 for picture in drawn), "a picture is empty"
+
+
+def test_hostile_names_stay_text(calibrated: Path) -> None:
+    artifact = load_artifact(calibrated)
+    manifest = artifact.manifest
+    spec = replace(manifest.spec, source={HOSTILE: HOSTILE}, sampler=replace(manifest.spec.sampler, name=HOSTILE))
+    blocks = tuple(replace(block, kind=HOSTILE, reason=HOSTILE) for block in manifest.blocks)
+    record = {HOSTILE: HOSTILE, "plans": {HOSTILE: SCORE, "other": HOSTILE}, "skipped": {HOSTILE: HOSTILE}}
+    plans = {HOSTILE: manifest.plans["schedule"]}
+    manifest = replace(manifest, spec=spec, blocks=blocks, plans=plans, default_plan=HOSTILE, calibration=record)
+    artifact = replace(artifact, manifest=manifest, schedules={HOSTILE: artifact.schedules["schedule"]})
+    policy = CompiledPolicy(artifact, open_runtime(artifact), seed=0)
+    obs = {"obs": np.zeros((2, 2), np.float32)}
+    rung = Rung(HOSTILE, "failed", HOSTILE, unit=HOSTILE, remedy=HOSTILE, step=3, blocks=(1, 2))
+    errors = ErrorMap(np.arange(2), np.full((2, 5), 1e-3), 1e-5, (HOSTILE,) * 5)
+    found = Verification(HOSTILE, None, None, (rung,), 1.0, errors)
+    given = Given(Episode(HOSTILE, obs), None, verified(found), runs=1)
+    page = render(build(artifact, policy, given))
+    reader = Reader(page)
+    assert "script" not in {tag for tag, _ in reader.tags}
+    assert all(image["src"].startswith("data:") and "onerror" not in image for image in reader.of("img"))
+    assert not any(name.startswith("on") for _, attributes in reader.tags for name in attributes)
+    assert reader.text.count(HOSTILE) >= 10, "it is shown, as text"
+
+
+def test_a_check_that_failed_is_told_and_is_the_exit_status(
+    toy_compiled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rung = Rung("one block", "failed", "block 2 differs", 0.5, 1e-4, "relative", "Convert it again.", 1, (2,))
+    found = Verification("compiled", None, None, (rung,), 1.0)
+    monkeypatch.setattr(ttscompile, "verify", lambda *_, **__: found, raising=False)
+    result = run(toy_compiled, "-o", tmp_path / "r.html", "--runs", 1, "--verify")
+    assert result.exit_code == 1
+    text = Reader((tmp_path / "r.html").read_text()).text
+    assert "FAILED at one block. Convert it again." in text
+    assert "First at step 1, blocks 2." in text
+
+
+def test_text_in_pictures_is_no_formula() -> None:
+    assert pictures.plain("$\\frac{\x00\u202e") == "?\\frac{??"
+    assert len(pictures.plain("x" * 1000)) == 60
+
+
+def test_an_artifact_that_is_not_calibrated(toy_compiled: Path, tmp_path: Path) -> None:
+    assert run(toy_compiled, "-o", tmp_path / "r.html", "--runs", 1).exit_code == 0
+    text = Reader((tmp_path / "r.html").read_text()).text
+    assert "Not run for this report" in text
+    assert "Not calibrated: every call is dense" in text
+    assert "calibrate the artifact first" in text
+
+
+@pytest.mark.parametrize(
+    "content", ["nothing", "[1]", '{"points": [{"error": "x"}]}', '{"points": [{"error": NaN, "latency_ms": 1}]}', "{}"]
+)
+def test_what_is_no_comparison_is_refused_and_nothing_is_written(
+    content: str, calibrated: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "c.json").write_text(content)
+    result = run(calibrated, "-o", tmp_path / "r.html", "--runs", 1, "--comparison", tmp_path / "c.json")
+    assert result.exit_code == 2
+    assert "compare" in result.stderr
+    assert not (tmp_path / "r.html").exists()
+
+
+def test_a_report_replaces_another_only_when_it_is_whole(
+    calibrated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "r.html").write_text("old")
+
+    def fail(*_: Any) -> Any:
+        raise ReportError("in the middle")
+
+    monkeypatch.setattr(facts, "provenance", fail)
+    assert run(calibrated, "-o", tmp_path / "r.html", "--runs", 1).exit_code == 2
+    assert (tmp_path / "r.html").read_text() == "old"
+
+
+def test_bad_input_is_one_message(calibrated: Path, calls: Path, tmp_path: Path) -> None:
+    result = run(calibrated, "-o", tmp_path / "no" / "r.html", "--runs", 1)
+    assert (result.exit_code, "cannot be written" in result.stderr) == (2, True)
+    result = run(calibrated, "-o", tmp_path / "r.html", "--trajectories", calls, "--episode", 2)
+    assert (result.exit_code, "there are 2 episodes" in result.stderr) == (2, True)
+    result = run(tmp_path, "-o", tmp_path / "r.html")
+    assert (result.exit_code, "not an artifact" in result.stderr) == (2, True)
+
+
+def test_shares_of_an_episode_are_counted_by_hand(calibrated: Path) -> None:
+    policy = ttscompile.load(calibrated, seed=0, plan="fast")
+    course = run_episode(policy, Episode("one", {"obs": np.zeros((4, 2), np.float32)}))
+    assert course.legalised == (20, 20, 20, 20), "nothing was ever computed there, so all fall back to TIMESTEP"
+    read = course.plans.copy()
+    read[1:, 1:] = Source.ROLLOUT
+    shares = replace(course, plans=read).shares()
+    assert shares[Source.COMPUTE, 0].tolist() == [1.0] * 5
+    assert shares[Source.TIMESTEP, 1:].min() == shares[Source.TIMESTEP, 1:].max() == 0.25
+    assert shares[Source.ROLLOUT, 1:].min() == shares[Source.ROLLOUT, 1:].max() == 0.75
+    np.testing.assert_allclose(course.sparsity, 0.8)
+
+
+def test_the_frontier_leaves_out_what_is_beaten() -> None:
+    document = {
+        "points": [
+            {"series": "a", "name": str(i), "error": error, "latency_ms": ms}
+            for i, (error, ms) in enumerate([(3, 1), (2, 2), (2.5, 3), (1, 4)])
+        ]
+    }
+    assert [point.name for point in efficient(from_comparison(document)[0])] == ["0", "1", "3"]
+
+
+@pytest.mark.parametrize("package", ["jinja2", "matplotlib"])
+def test_what_is_missing_is_named(
+    package: str, calibrated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import sys
+
+    for name in [name for name in sys.modules if name.partition(".")[0] == package]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, package, None)
+    result = run(calibrated, "-o", tmp_path / "r.html", "--runs", 1)
+    assert result.exit_code == 2
+    assert package in result.stderr
+    assert "'ttscompile[compile]'" in result.stderr

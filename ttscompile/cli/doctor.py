@@ -1,0 +1,31 @@
+"""``ttscompile doctor``: what of this machine and installation stands in the way of running artifacts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from ttscompile import doctor as examination
+from ttscompile.cli.output import identity_of, json_option, print_json
+
+
+@click.command()
+@click.argument("directory", required=False, type=click.Path(exists=True, path_type=Path))
+@json_option
+@click.pass_context
+def doctor(context: click.Context, directory: Path | None, as_json: bool) -> None:
+    """Look at Python, packages, processor, cores, memory and clock; with DIRECTORY, also try that artifact here.
+
+    Every warning and problem comes with its remedy. Exit status 1: something stops artifacts from running. Where the
+    command line itself does not start, python -m ttscompile.doctor says why.
+    """
+    found = examination.examine(directory)
+    if as_json:
+        opened = any(finding.what == "identity" for finding in found)
+        of = {"identity": identity_of(directory)} if directory is not None and opened else {}
+        print_json(of | examination.document(found))
+    else:
+        click.echo(examination.text(found))
+    if examination.problems(found):
+        context.exit(1)

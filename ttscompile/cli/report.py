@@ -1,0 +1,120 @@
+"""``ttscompile report``: everything about an artifact on one page."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+import ttscompile
+from ttscompile.artifact.files import replace_file
+from ttscompile.artifact.load import load_artifact
+from ttscompile.cli.output import artifact_argument, only_results_on_stdout, progress, results
+from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
+from ttscompile.errors import ArtifactError, OutputError, ReportError
+from ttscompile.report import Given, Section, build, refused, render, verified
+from ttscompile.report.verified import NOT_RUN
+from ttscompile.trajectories import Episode, load_trajectories
+
+
+@click.command(cls=FilesCommand)
+@artifact_argument
+@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="The page to write, .html.")
+@trajectories_options(required=False)
+@click.option("--episode", "number", type=click.IntRange(min=0), default=0, show_default=True, help="Which, from 0.")
+@click.option(
+    "--comparison",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="What 'ttscompile compare --json' printed, for the frontier.",
+)
+@click.option("--verify", "verifies", is_flag=True, help="Also do what 'ttscompile verify' does; it takes minutes.")
+@click.option(
+    "--threads", type=click.IntRange(min=1), default=1, show_default=True, help="Of the calls that are timed."
+)
+@click.option("--runs", type=click.IntRange(min=1), default=10, show_default=True, help="Counted calls of each plan.")
+@click.pass_context
+def report(
+    context: click.Context,
+    directory: Path,
+    output: Path,
+    trajectories: tuple[Path, ...],
+    sources: Sources,
+    number: int,
+    comparison: Path | None,
+    verifies: bool,
+    threads: int,
+    runs: int,
+) -> None:
+    """Write a page about the artifact DIRECTORY: what it is, its plans, its times now, its errors, its limits.
+
+    One HTML file without scripts that needs nothing beside it. Times are measured while it is made. With recordings, an
+    episode of them is run, to show what the default plan does from call to call. Exit status 1: with --verify, a check
+    failed; the page is written all the same.
+    """
+    if not output.absolute().parent.is_dir():
+        raise OutputError(f"{output}: the report cannot be written: no such folder. Give one that exists.")
+    console = progress()
+    artifact = load_artifact(directory)
+    manifest = artifact.manifest
+    episode = None
+    if trajectories:
+        chunk = manifest.spec.chunk
+        episode = _chosen(load_trajectories(trajectories, manifest.spec.observations, chunk.stop - chunk.start), number)
+    compared = None if comparison is None else _document(comparison)
+    with only_results_on_stdout(), console.status("loading") as status:
+        recordings = () if sources else trajectories  # verify takes none whose arrays are called otherwise
+        passed, section = _verified(directory, recordings, threads, status.update) if verifies else (True, NOT_RUN)
+        given = Given(episode, compared, section, threads, runs)
+        policy = ttscompile.load(directory, threads=threads, seed=0)
+        page = render(build(artifact, policy, given, status.update))
+    try:
+        replace_file(output, page.encode())
+    except OSError as error:
+        raise OutputError(f"{output}: the report cannot be written: {error}. Give a folder that exists.") from error
+    results().print(
+        f"wrote {output}, {len(page) / 1e6:.2f} MB, on artifact {manifest.short_identity}",
+        markup=False,
+        soft_wrap=True,
+    )
+    if not passed:
+        console.print("failed: the artifact does not hold what it promises; the page says where.", soft_wrap=True)
+        context.exit(1)
+
+
+def _verified(
+    directory: Path, trajectories: tuple[Path, ...], threads: int, progress: Callable[[str], None]
+) -> tuple[bool, Section]:
+    """Whether no check failed, and what the page says; an artifact that has nothing to check against fails none."""
+    try:
+        found = ttscompile.verify(
+            directory, trajectories, threads=threads, progress=lambda what: progress(f"verifying: {what}")
+        )
+    except ArtifactError as error:
+        return True, refused(str(error))
+    return found.passed, verified(found)
+
+
+def _chosen(episodes: list[Episode], number: int) -> Episode:
+    if number >= len(episodes):
+        raise click.BadParameter(f"there are {len(episodes)} episodes, numbered from 0.", param_hint="--episode")
+    return episodes[number]
+
+
+def _document(path: Path) -> dict[str, Any]:
+    """A JSON document of moderate size.
+
+    Raises:
+        ReportError: it is none.
+    """
+    try:
+        document = json.loads(path.read_text())
+    except (OSError, ValueError, RecursionError) as error:
+        raise ReportError(
+            f"{path}: no JSON document ({error}). Give what 'ttscompile compare ... --json' printed."
+        ) from error
+    if not isinstance(document, dict):
+        raise ReportError(f"{path}: expected a JSON object; found another value. Give what compare --json printed.")
+    return document

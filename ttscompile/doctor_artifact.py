@@ -1,0 +1,119 @@
+"""What an artifact needs of this machine, tried: it is loaded and called. Imports at need, to say what is missing."""
+
+from __future__ import annotations
+
+import statistics
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from .doctor_finding import Finding, Level
+from .doctor_machine import available_bytes
+from .errors import TtscompileError
+
+if TYPE_CHECKING:
+    from .artifact.load import Artifact
+
+PART = "artifact"
+CALLS = 5
+_COPIES = 3
+"""Times the weights that loading takes at most, for a moment: the mapped file, and onnxruntime's packed copies."""
+
+
+def artifact_findings(directory: Path) -> list[Finding]:
+    """Does it load here, does it fit, and does a call give finite actions, in which time.
+
+    Args:
+        directory: of the artifact, or the same zipped.
+
+    Returns:
+        Findings up to the first problem.
+    """
+    try:
+        from .artifact.load import load_artifact
+    except ModuleNotFoundError as error:
+        remedy = f"Run: pip install {error.name}."
+        return [Finding(PART, "load", f"not tried: {error.name} is not installed", Level.PROBLEM, remedy)]
+    try:
+        artifact = load_artifact(directory)
+    except TtscompileError as error:
+        return [Finding(PART, "load", str(error), Level.PROBLEM, "As the message says; nothing else was tried.")]
+    return [*_needs(artifact), *_call(directory, artifact)]
+
+
+def _needs(artifact: Artifact) -> list[Finding]:
+    from .machine import has_integer_dot_product
+    from .runtimes.liveness import rollout_needs
+
+    manifest = artifact.manifest
+    needs = manifest.requires
+    found = [
+        Finding(PART, "identity", manifest.short_identity),
+        Finding(
+            PART,
+            "format",
+            f"schema {manifest.schema_version} of ttscompile {manifest.ttscompile_version}; opset {needs.opset},"
+            f" onnxruntime {needs.onnxruntime} or later",
+        ),
+    ]
+    precision = manifest.precision_name
+    if precision == "int8" and has_integer_dot_product() is False:
+        remedy = "Its fast kernels saturate on this processor. Load it with precision='fp32', which it holds too."
+        found.append(Finding(PART, "precision", f"{precision}, without VNNI or AMX", Level.WARNING, remedy))
+    else:
+        found.append(Finding(PART, "precision", precision))
+    weights = sum(record.bytes for record in manifest.files.values())
+    cache = rollout_needs(artifact)
+    told = (
+        f"{weights / 2**20:.1f} MiB of files, and {cache.bytes_read / 2**20:.1f} MiB of rollout cache a stream for its"
+        f" plans ({cache.bytes_most / 2**20:.1f} for plans that you give)"
+    )
+    available = available_bytes()
+    if available is not None and _COPIES * weights + cache.bytes_read > available:
+        remedy = f"{available / 2**20:.0f} MiB are available: free some, or raise the limit of the control group."
+        found.append(Finding(PART, "memory", told, Level.PROBLEM, remedy))
+    else:
+        found.append(Finding(PART, "memory", told))
+    if manifest.calibration is None or manifest.default_plan == "dense":
+        remedy = "It computes everything, in many times the time. Run: ttscompile calibrate DIR --trajectories FILE."
+        found.append(Finding(PART, "plan", "dense: not calibrated", Level.WARNING, remedy))
+    else:
+        others = ", ".join(manifest.plans)
+        found.append(Finding(PART, "plan", f"{manifest.default_plan}, of {others}"))
+    return found
+
+
+def _call(directory: Path, artifact: Artifact) -> list[Finding]:
+    """Calls on an observation that the normaliser maps to 0."""
+    import numpy as np
+
+    from .runtimes.executor.measure import neutral_observation
+    from .runtimes.policy import load
+
+    try:
+        policy = load(directory, threads=1, seed=0)
+        obs: dict[str, Any] = neutral_observation(dict(policy.info.observation))
+        times, finite = [], True
+        for _ in range(CALLS):
+            made = policy.predict_action(obs)
+            finite = finite and bool(np.isfinite(made["action_pred"]).all())
+            report = policy.last_report
+            assert report is not None  # a call was made
+            times.append(report.timings.total)
+    except TtscompileError as error:
+        return [Finding(PART, "call", str(error), Level.PROBLEM, "As the message says.")]
+    except Exception as error:  # of onnxruntime: an instruction that the processor lacks, no memory
+        remedy = "Tell what it is to the project, with the output of: ttscompile doctor DIR --json."
+        return [Finding(PART, "call", f"fails: {type(error).__name__}: {error}", Level.PROBLEM, remedy)]
+    if not finite:
+        remedy = "The weights are damaged, or the checkpoint's were: convert it again, and try plan='dense'."
+        return [Finding(PART, "call", "the actions are not finite numbers", Level.PROBLEM, remedy)]
+    chunk = artifact.manifest.spec.chunk
+    median = statistics.median(times[1:])
+    return [
+        Finding(
+            PART,
+            "call",
+            f"{median:.1f} ms with one thread (the first {times[0]:.1f}), for {chunk.stop - chunk.start} actions:"
+            f" {1000 / median:.1f} calls a second",
+        )
+    ]

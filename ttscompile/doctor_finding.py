@@ -1,0 +1,47 @@
+"""One thing that the doctor found."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+
+class Level(enum.Enum):
+    """How much it matters."""
+
+    OK = "ok"
+    NOTE = "note"  # worth knowing
+    WARNING = "warning"  # slower, or less certain, than it could be
+    PROBLEM = "problem"  # stops artifacts from running
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at.
+
+    Attributes:
+        part: heading under which it stands.
+        what: was looked at.
+        found: what it is.
+        level: how much it matters.
+        remedy: what to do; every warning and problem has one.
+    """
+
+    part: str
+    what: str
+    found: str
+    level: Level = Level.OK
+    remedy: str = ""
+
+    def __post_init__(self) -> None:
+        assert self.remedy or self.level in (Level.OK, Level.NOTE), f"{self.what}: no remedy"
+
+    def to_json(self) -> dict[str, str]:
+        """As plain JSON values."""
+        return {
+            "part": self.part,
+            "what": self.what,
+            "found": self.found,
+            "level": self.level.value,
+            "remedy": self.remedy,
+        }

@@ -1,0 +1,208 @@
+"""Processor, cores, memory, clock and load of this machine, from ``/proc`` and ``/sys``; standard library alone."""
+
+from __future__ import annotations
+
+import os
+import platform
+import statistics
+import time
+from itertools import pairwise
+from math import floor
+from pathlib import Path
+
+from .doctor_finding import Finding, Level
+
+_X86 = {
+    "avx2": "AVX2",
+    "avx512f": "AVX-512",
+    "avx512_vnni": "AVX-512 VNNI",
+    "avx_vnni": "AVX VNNI",
+    "avx512_bf16": "AVX-512 BF16",
+    "amx_int8": "AMX int8",
+    "amx_bf16": "AMX bf16",
+}
+_ARM = {"asimd": "NEON", "asimddp": "dotprod", "i8mm": "i8mm", "bf16": "BF16", "sve": "SVE", "sve2": "SVE2"}
+"""Name in ``/proc/cpuinfo`` -> name that people know."""
+
+_AS_GOOD = {"avx_vnni": {"avx512_vnni"}, "avx512_vnni": {"avx_vnni"}}
+"""What does the same, so that its absence is not worth a word."""
+
+_X86_NAMES = ("x86_64", "amd64", "i386", "i686")
+_FAST_CLOCKS = ("tsc", "arch_sys_counter", "kvm-clock", "hyperv_clocksource_tsc_page")
+_BUSY = 0.5
+"""Load for each core from which timings say little."""
+
+_LATE_MS = 1.0
+"""How late a sleep may wake in the median before a control loop should worry."""
+
+
+def machine_findings(root: Path = Path("/")) -> list[Finding]:
+    """What decides how fast calls are here, and how steady.
+
+    Args:
+        root: of ``/proc`` and ``/sys``.
+    """
+    return [*_processor(root), *_cores(root), *_memory(root), *_clock(root)]
+
+
+def usable_cores(root: Path = Path("/")) -> float:
+    """Cores that this process may keep busy: affinity, physical cores and the cgroup's limit, whichever is least."""
+    affinity = _affinity()
+    physical = _physical(root)
+    limits: list[float] = [len(affinity)]
+    if physical is not None:
+        limits.append(physical)
+    quota = cgroup_cores(root)
+    if quota is not None:
+        limits.append(quota)
+    return min(limits)
+
+
+def cgroup_cores(root: Path) -> float | None:
+    """Cores' worth of time that the control group allows; None for no limit."""
+    found = _text(root / "sys/fs/cgroup/cpu.max").split()
+    if len(found) == 2 and found[0].isdigit() and found[1].isdigit() and int(found[1]) > 0:
+        return int(found[0]) / int(found[1])
+    quota = _number(root / "sys/fs/cgroup/cpu/cpu.cfs_quota_us")
+    period = _number(root / "sys/fs/cgroup/cpu/cpu.cfs_period_us")
+    return quota / period if quota is not None and quota > 0 and period else None
+
+
+def available_bytes(root: Path = Path("/")) -> int | None:
+    """Memory that can be had without swapping, in the control group's limit; None where nothing says so."""
+    found = []
+    for line in _text(root / "proc/meminfo").splitlines():
+        name, _, value = line.partition(":")
+        if name == "MemAvailable":
+            found.append(1024 * int(value.split()[0]))
+    for limit, used in (
+        ("sys/fs/cgroup/memory.max", "sys/fs/cgroup/memory.current"),
+        ("sys/fs/cgroup/memory/memory.limit_in_bytes", "sys/fs/cgroup/memory/memory.usage_in_bytes"),
+    ):
+        most, now = _number(root / limit), _number(root / used)
+        if most is not None:
+            found.append(most - (now or 0))
+    return max(min(found), 0) if found else None
+
+
+def _processor(root: Path) -> list[Finding]:
+    part, x86 = "processor", platform.machine().lower() in _X86_NAMES
+    fields = {}
+    for line in _text(root / "proc/cpuinfo").split("\n\n", 1)[0].splitlines():
+        name, separator, value = line.partition(":")
+        if separator:
+            fields[name.strip()] = value.strip()
+    found = [Finding(part, "model", fields.get("model name") or platform.processor() or platform.machine())]
+    flags = set((fields.get("flags") or fields.get("Features") or "").split())
+    if not flags:
+        return [*found, Finding(part, "instructions", "not known: nothing here lists them", Level.NOTE)]
+    known = _X86 if x86 else _ARM
+    has = [told for name, told in known.items() if name in flags]
+    lacks = [told for name, told in known.items() if name not in flags and not flags & _AS_GOOD.get(name, set())]
+    told = f"{', '.join(has) or 'none that matter'}" + (f"; not {', '.join(lacks)}" if lacks else "")
+    if x86 and "avx2" not in flags:
+        remedy = "onnxruntime falls back to kernels that are several times slower; use a processor of 2015 or later."
+        return [*found, Finding(part, "instructions", told, Level.WARNING, remedy)]
+    return [*found, Finding(part, "instructions", told)]
+
+
+def _cores(root: Path) -> list[Finding]:
+    part, affinity, physical, quota = "cores", _affinity(), _physical(root), cgroup_cores(root)
+    told = f"{os.cpu_count()} logical" + (f", {physical} physical" if physical is not None else "")
+    found = [Finding(part, "cores", f"{told}, {len(affinity)} of them for this process")]
+    if quota is not None:
+        level = Level.WARNING if quota < 1 else Level.NOTE
+        remedy = "A call waits for its share of a core: give the container at least one." if quota < 1 else ""
+        found.append(Finding(part, "limit of the control group", f"{quota:g} cores", level, remedy))
+    usable = usable_cores(root)
+    most = max(floor(usable) - 1, 1)
+    advice = (
+        "threads=1: there is no core to spare"
+        if most == 1
+        else f"threads=1 first; up to {most}, if a call is too slow: it leaves a core to the control loop"
+    )
+    found.append(Finding(part, "threads", advice))
+    governor = _text(root / "sys/devices/system/cpu/cpu0/cpufreq/scaling_governor").strip()
+    if governor and governor != "performance":
+        remedy = "The first calls after a pause are slow. Run: sudo cpupower frequency-set -g performance."
+        found.append(Finding(part, "frequency governor", governor, Level.WARNING, remedy))
+    elif governor:
+        found.append(Finding(part, "frequency governor", governor))
+    load = os.getloadavg()[0]
+    if load > _BUSY * usable:
+        remedy = "Timings taken now say little: stop what else runs, or reserve cores (taskset)."
+        found.append(Finding(part, "load", f"{load:.1f} over the last minute", Level.WARNING, remedy))
+    else:
+        found.append(Finding(part, "load", f"{load:.1f} over the last minute"))
+    return found
+
+
+def _memory(root: Path) -> list[Finding]:
+    available = available_bytes(root)
+    if available is None:
+        return [Finding("memory", "memory", "not known: nothing here says how much there is", Level.NOTE)]
+    return [Finding("memory", "available", f"{available / 2**30:.1f} GiB")]
+
+
+def _clock(root: Path) -> list[Finding]:
+    part, info = "clock", time.get_clock_info("monotonic")
+    found = [Finding(part, "resolution", f"{1e9 * info.resolution:g} ns, {1e9 * _tick():.0f} ns between two readings")]
+    source = _text(root / "sys/devices/system/clocksource/clocksource0/current_clocksource").strip()
+    if source and source not in _FAST_CLOCKS:
+        remedy = "Reading the time costs a system call of microseconds; see the kernel's parameter clocksource=tsc."
+        found.append(Finding(part, "source", source, Level.WARNING, remedy))
+    elif source:
+        found.append(Finding(part, "source", source))
+    late = _lateness_ms()
+    told = f"{late:.2f} ms late in the median, of 20 sleeps of 1 ms"
+    if late > _LATE_MS:
+        remedy = "A control loop will jitter: look with ttscompile plan DIR --control-hz HZ --jitter 10."
+        found.append(Finding(part, "sleep", told, Level.WARNING, remedy))
+    else:
+        found.append(Finding(part, "sleep", told))
+    return found
+
+
+def _tick() -> float:
+    """Seconds between two readings of the clock, median."""
+    times = [time.monotonic() for _ in range(201)]
+    return statistics.median(b - a for a, b in pairwise(times))
+
+
+def _lateness_ms() -> float:
+    late = []
+    for _ in range(20):
+        started = time.monotonic()
+        time.sleep(0.001)
+        late.append(1e3 * (time.monotonic() - started) - 1)
+    return statistics.median(late)
+
+
+def _affinity() -> set[int]:
+    if hasattr(os, "sched_getaffinity"):
+        return set(os.sched_getaffinity(0))
+    return set(range(os.cpu_count() or 1))
+
+
+def _physical(root: Path) -> int | None:
+    """Physical cores of those that this process may use: hyperthreads of one core count once."""
+    found = set()
+    for cpu in _affinity():
+        siblings = _text(root / f"sys/devices/system/cpu/cpu{cpu}/topology/thread_siblings_list").strip()
+        if not siblings:
+            return None
+        found.add(siblings)
+    return len(found)
+
+
+def _text(path: Path) -> str:
+    """A file of the system; empty where there is none."""
+    try:
+        return path.read_text(errors="replace")
+    except OSError:
+        return ""
+
+
+def _number(path: Path) -> int | None:
+    text = _text(path).strip()
+    return int(text) if text.lstrip("-").isdigit() else None

@@ -1,0 +1,151 @@
+"""Python, the packages that matter, and what onnxruntime offers; standard library alone."""
+
+from __future__ import annotations
+
+import importlib
+import platform
+import re
+import struct
+import sys
+from importlib.metadata import PackageNotFoundError, requires, version
+from typing import NamedTuple
+
+from .doctor_finding import Finding, Level
+
+PYTHON = (3, 11)
+PROJECT = "ttscompile"
+ENABLES = {
+    "compile": "convert, calibrate, compare, report, pictures, runtime='reference'",
+    "lerobot": "convert of LeRobot policies",
+    "serve": "serve",
+    "pusht": "examples/pusht",
+    "ray": "examples/ray_serve",
+}
+"""What each extra of ttscompile is for. Those for its own development are not looked at."""
+
+_REQUIREMENT = re.compile(
+    r"(?P<name>[A-Za-z0-9._-]+)(\[.*?\])?\s*(>=\s*(?P<least>[0-9.]+))?[^;]*(;\s*extra\s*==\s*['\"](?P<extra>\w+)['\"])?$"
+)
+_COMMAND_LINE = ("click", "rich")
+_PROVIDER = "CPUExecutionProvider"
+
+
+class Requirement(NamedTuple):
+    """``name>=least; extra == "extra"``; parts that are not there are empty."""
+
+    name: str
+    least: str
+    extra: str
+
+
+def package_findings() -> list[Finding]:
+    """Python, required packages, extras, and onnxruntime's providers."""
+    return [*_python(), *_packages(requirements()), *_providers()]
+
+
+def requirements() -> list[Requirement]:
+    """What ttscompile asks for, from its own installation; empty if it is not installed."""
+    try:
+        told = requires(PROJECT) or []
+    except PackageNotFoundError:
+        return []
+    found = (_REQUIREMENT.match(line) for line in told)
+    return [Requirement(m["name"], m["least"] or "", m["extra"] or "") for m in found if m is not None]
+
+
+def release(text: str) -> tuple[int, ...]:
+    """``2.13.0+cpu`` as (2, 13); trailing zeros do not count."""
+    match = re.match(r"\d+(?:\.\d+)*", text)
+    numbers = [int(n) for n in match[0].split(".")] if match else [0]
+    while numbers and numbers[-1] == 0:
+        numbers.pop()
+    return tuple(numbers)
+
+
+def _python() -> list[Finding]:
+    part, bits = "python", 8 * struct.calcsize("P")
+    told = f"{platform.python_implementation()} {platform.python_version()}, {bits} bits"
+    if sys.version_info[:2] < PYTHON:
+        wanted = ".".join(map(str, PYTHON))
+        found = [Finding(part, "version", told, Level.PROBLEM, f"Install Python {wanted} or later.")]
+    elif bits < 64:
+        found = [Finding(part, "version", told, Level.PROBLEM, "Install a 64-bit Python: onnxruntime has no other.")]
+    else:
+        found = [Finding(part, "version", told)]
+    system = f"{platform.system()} {platform.release()} {platform.machine()}"
+    if platform.system() == "Linux":
+        return [*found, Finding(part, "system", system)]
+    return [*found, Finding(part, "system", system, Level.WARNING, "ttscompile is tested on Linux only; use that.")]
+
+
+def _packages(wanted: list[Requirement]) -> list[Finding]:
+    part = "packages"
+    try:
+        own = Finding(part, PROJECT, version(PROJECT))
+    except PackageNotFoundError:
+        remedy = "Install it: pip install ttscompile. Until then nothing is known of the packages it needs."
+        return [Finding(part, PROJECT, "not installed: imported from a folder", Level.WARNING, remedy)]
+    found = [own]
+    for each in (r for r in wanted if not r.extra):
+        installed, fits = _installed(each)
+        if fits:
+            found.append(Finding(part, each.name, installed))
+            continue
+        level = Level.WARNING if each.name in _COMMAND_LINE else Level.PROBLEM
+        needed = "the command line needs it" if each.name in _COMMAND_LINE else "no artifact runs without"
+        remedy = f"Run: pip install '{each.name}>={each.least}'" + f" ({needed})."
+        found.append(Finding(part, each.name, f"{installed}; {each.least} or later is needed", level, remedy))
+    for extra in dict.fromkeys(r.extra for r in wanted if r.extra in ENABLES):
+        found.append(_extra(extra, [r for r in wanted if r.extra == extra]))
+    return found
+
+
+def _installed(wanted: Requirement) -> tuple[str, bool]:
+    """The version for people, and whether it is enough."""
+    try:
+        found = version(wanted.name)
+    except PackageNotFoundError:
+        return "not installed", False
+    return found, release(found) >= release(wanted.least or "0")
+
+
+def _extra(name: str, wanted: list[Requirement]) -> Finding:
+    """One extra: complete, or what it lacks; its absence is no problem on a robot."""
+    found = {each.name: _installed(each) for each in wanted}
+    what = f"extra {name!r}"
+    lacking = [
+        f"{each.name} {'' if told == 'not installed' else told + ' '}(needs {each.least})"
+        for each in wanted
+        for told, fits in [found[each.name]]
+        if not fits
+    ]
+    if not lacking:
+        versions = ", ".join(f"{package} {told}" for package, (told, _) in found.items())
+        return Finding("packages", what, f"for {ENABLES[name]}: {versions}")
+    remedy = f"Where you want {ENABLES[name]}: pip install 'ttscompile[{name}]'."
+    return Finding("packages", what, f"lacks {', '.join(lacking)}", Level.NOTE, remedy)
+
+
+def _providers() -> list[Finding]:
+    """Whether onnxruntime can be imported, and where it can compute."""
+    part = "onnxruntime"
+    try:
+        module = importlib.import_module("onnxruntime")
+        offered = list(module.get_available_providers())
+    except ModuleNotFoundError as error:
+        lacking = error.name or "onnxruntime"
+        remedy = f"Run: pip install {lacking}."
+        return [Finding(part, "import", f"fails: {lacking} is not installed", Level.PROBLEM, remedy)]
+    except Exception as error:  # a broken installation: its shared library, or numpy's
+        remedy = "Install it again: pip install --force-reinstall onnxruntime numpy."
+        return [Finding(part, "import", f"fails: {type(error).__name__}: {error}", Level.PROBLEM, remedy)]
+    told = ", ".join(offered)
+    if _PROVIDER not in offered:
+        remedy = "Install the plain build: pip install onnxruntime."
+        return [Finding(part, "providers", told or "none", Level.PROBLEM, remedy)]
+    found = [Finding(part, "providers", f"{told}; artifacts run on {_PROVIDER}")]
+    builds = [name for name in ("onnxruntime", "onnxruntime-gpu") if _installed(Requirement(name, "", ""))[1]]
+    if len(builds) > 1:
+        remedy = "They overwrite each other's files. Run: pip uninstall onnxruntime-gpu, and onnxruntime again."
+        found.append(Finding(part, "builds", " and ".join(builds), Level.WARNING, remedy))
+    return found

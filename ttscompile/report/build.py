@@ -1,0 +1,243 @@
+"""The report of an artifact: its facts, what is measured now, and what was measured before."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from ..artifact.load import Artifact
+from ..artifact.manifest import DENSE
+from ..machine import fingerprint, one_line
+from ..runtimes.policy import CompiledPolicy
+from ..trajectories import Episode
+from ..units import flops, ms, share
+from . import facts, pictures
+from .frontier import Compared, efficient, from_comparison, from_record
+from .measure import Course, Latency, measure_latencies, run_episode
+from .page import Page, Picture, Section, Table, require_packages
+from .verified import NOT_RUN
+
+_CACHES = "the last block of its kind (FORWARD), an earlier step (TIMESTEP) or the last call (ROLLOUT)."
+
+MOST_PICTURES = 6
+"""Schedules that are drawn; an artifact may hold many."""
+
+
+@dataclass(frozen=True)
+class Given:
+    """What a report shows beside the artifact.
+
+    Attributes:
+        episode: recorded observations; None for none.
+        comparison: what ``ttscompile compare --json`` printed; None for none.
+        verification: what was found; see ``verified``.
+        threads: of the calls that are timed.
+        runs: counted calls of each plan.
+    """
+
+    episode: Episode | None = None
+    comparison: Mapping[str, Any] | None = None
+    verification: Section = NOT_RUN
+    threads: int = 1
+    runs: int = 10
+
+
+def build(
+    artifact: Artifact, policy: CompiledPolicy, given: Given, progress: Callable[[str], None] = lambda what: None
+) -> Page:
+    """Measure what has to be measured, draw, and put the page together.
+
+    Args:
+        artifact: loaded.
+        policy: the same, with its default runtime and a seed.
+        given: what else is shown.
+        progress: told what is under way.
+
+    Raises:
+        RuntimeUnavailableError: matplotlib or Jinja2 is not installed.
+        ReportError: the comparison is not what ``compare --json`` prints.
+    """
+    manifest = artifact.manifest
+    require_packages()
+    compared = None if given.comparison is None else from_comparison(given.comparison)
+    progress("timing calls")
+    latencies = measure_latencies(policy, (DENSE, *manifest.plans), given.runs)
+    course = None
+    if given.episode is not None:
+        progress("running an episode")
+        course = run_episode(policy, given.episode)
+    progress("drawing")
+    record = manifest.calibration
+    sections = (
+        facts.provenance(artifact),
+        facts.policy(manifest),
+        facts.hoisting(artifact),
+        facts.blocks(manifest),
+        _plans(artifact, course),
+        *(() if course is None else (_episode(course),)),
+        _latency(latencies, given, manifest.default_plan),
+        _frontier(artifact, latencies, compared),
+        _calibration(record),
+        given.verification,
+        facts.limits(artifact),
+    )
+    machine = fingerprint()
+    return Page(
+        title=f"Report on artifact {manifest.short_identity}",
+        lead=", ".join(f"{value}" for value in manifest.spec.source.values()) or "A policy of the user's own network",
+        figures=_figures(artifact, latencies),
+        sections=sections,
+        foot=f"Made by ttscompile {machine.get('ttscompile', '')} from identity {manifest.identity}. Times: medians of"
+        f" {given.runs} calls on {one_line(machine)}.",
+    )
+
+
+def _figures(artifact: Artifact, latencies: Sequence[Latency]) -> tuple[tuple[str, str], ...]:
+    manifest = artifact.manifest
+    by_name = {latency.plan: latency for latency in latencies}
+    own, dense = by_name[manifest.default_plan], by_name[DENSE]
+    made = [
+        ("a call now", f"{ms(own.total)} ms"),
+        ("faster than dense", f"{dense.total / own.total:.1f} x"),
+        ("FLOPs saved", share(1 - own.flops / manifest.flops.dense)),
+        ("denoising steps", str(manifest.steps)),
+        ("residual blocks", str(len(manifest.blocks))),
+    ]
+    score = facts.scores(manifest.calibration).get(manifest.default_plan)
+    if score is not None:
+        made.append(("held-out action error", f"{score['error']:.3g}"))
+    return tuple(made)
+
+
+def _plans(artifact: Artifact, course: Course | None) -> Section:
+    manifest = artifact.manifest
+    kinds = [block.kind for block in manifest.blocks]
+    drawn: list[Picture] = []
+    ordered = sorted(artifact.schedules, key=lambda name: name != manifest.default_plan)
+    for name in ordered[:MOST_PICTURES]:
+        plan = artifact.schedule(name)
+        drawn.append(
+            Picture(
+                pictures.plan_picture(plan, kinds, f"plan {name!r}"),
+                alt=f"Plan {name!r}, steps across and blocks down. {pictures.caption_of(plan)}",
+                caption=f"Plan {name!r} of one call: steps across, blocks down. {pictures.caption_of(plan)}",
+                wide=True,
+            )
+        )
+    if course is not None:
+        last, calls = course.plans[-1], len(course.plans)
+        if not any((last == schedule).all() for schedule in artifact.schedules.values()):
+            drawn.append(
+                Picture(
+                    pictures.plan_picture(last, kinds, f"executed in call {calls - 1}"),
+                    alt=f"The plan of the episode's last call. {pictures.caption_of(last)}",
+                    caption=f"What the last of {calls} calls of the episode executed. {pictures.caption_of(last)}",
+                    wide=True,
+                )
+            )
+        drawn.append(
+            Picture(
+                pictures.shares_picture(course),
+                alt="A heat map a source: the share of calls in which a cell had this source.",
+                caption=f"Mean over {calls} calls of the episode {course.name}, a map for each source.",
+                wide=True,
+            )
+        )
+    text = [
+        "A plan says for every denoising step and every block whether it is computed, or its residual taken from "
+        + _CACHES
+    ]
+    if len(ordered) > MOST_PICTURES:
+        text.append(f"{MOST_PICTURES} of {len(ordered)} schedules are drawn.")
+    if not ordered:
+        text.append("This artifact has no schedule to draw.")
+    return Section("Plans", tuple(text), (facts.plan_table(artifact),), tuple(drawn))
+
+
+def _episode(course: Course) -> Section:
+    low, high = float(course.sparsity.min()), float(course.sparsity.max())
+    replaced = sum(course.legalised)
+    text = (
+        f"{len(course.plans)} consecutive calls of {course.name} with the default plan: between {share(low)} and"
+        f" {share(high)} of the cells were reused, {share(float(course.sparsity.mean()))} on average."
+        + (
+            f" {replaced} cells were replaced because what they read was not computed yet."
+            if replaced
+            else " Every read found what it was to read."
+        )
+    )
+    drawn = Picture(
+        pictures.sparsity_picture(course),
+        alt="A line: the share of reused cells, call by call.",
+        caption="Share of the cells that were reused, as executed. Step 0 of every call is dense.",
+    )
+    return Section("Episode", (text,), pictures=(drawn,))
+
+
+def _latency(latencies: Sequence[Latency], given: Given, default: str) -> Section:
+    rows = tuple(
+        (
+            one.plan + (" (default)" if one.plan == default else ""),
+            ms(one.total),
+            f"{ms(one.quartiles[0])}..{ms(one.quartiles[1])}",
+            f"{one.parts['prologue']:.2f}",
+            f"{one.pruner:.2f}",
+            f"{one.parts['wait_pruner']:.2f}",
+            ms(one.parts["decode"]),
+            flops(one.flops),
+        )
+        for one in latencies
+    )
+    head = ("plan", "ms a call", "quartiles", "prologue", "pruner", "wait for it", "denoising loop", "FLOPs")
+    text = (
+        f"Medians of {given.runs} calls of each plan, which took turns; one stream,"
+        f" {given.threads} thread{'s' * (given.threads != 1)}, onnxruntime. The pruner runs beside step 0: only the"
+        " wait for it lengthens a call."
+    )
+    drawn = Picture(
+        pictures.latency_picture(latencies),
+        alt="Bars: what the calls of each plan spend their time on. The table has the figures.",
+        caption="What the calls of each plan spend their time on.",
+    )
+    return Section("Latency", (text, one_line(fingerprint())), (Table(head, rows),), (drawn,))
+
+
+def _frontier(artifact: Artifact, latencies: Sequence[Latency], compared: Compared | None) -> Section:
+    manifest = artifact.manifest
+    if compared is not None:
+        points, yardsticks = compared
+        text = "As ttscompile compare measured it, on the machine and the calls that its document names."
+    else:
+        points, yardsticks = from_record(manifest.calibration, latencies), {}
+        text = "Errors from the calibration record, latencies measured now. ttscompile compare measures more of it."
+    if not any(point.error > 0 for point in points):
+        return Section("Frontier", ("There is no error to hold against a latency: calibrate the artifact first.",))
+    drawn = Picture(
+        pictures.frontier_picture(points, efficient(points), yardsticks, f"artifact {manifest.short_identity}"),
+        alt="Points: action error against latency of each plan. The table has the figures.",
+        caption="Action error against latency: down and left is better.",
+        wide=True,
+    )
+    best = efficient(points)
+    rows = tuple((p.series, p.name, f"{p.error:.4g}", ms(p.latency_ms), "yes" if p in best else "") for p in points)
+    head = ("", "plan", "action error", "ms a call", "on the frontier")
+    return Section("Frontier", (text,), (Table(head, rows),), (drawn,))
+
+
+def _calibration(record: Mapping[str, Any] | None) -> Section:
+    if record is None:
+        return Section("Calibration", ("Not calibrated: every call is dense. ttscompile calibrate gives it a plan.",))
+    scores = facts.scores(record)
+    drawn: tuple[Picture, ...] = ()
+    if scores and all(score["error"] > 0 for score in scores.values()):
+        drawn = (
+            Picture(
+                pictures.plans_picture(scores),
+                alt="Points: held-out action error of each plan against the share of cells it computes.",
+                caption="Held-out action error against computed cells: mean (point) and 90th percentile (bar).",
+            ),
+        )
+    tables = (facts.score_table(record), facts.record_table(record)) if scores else (facts.record_table(record),)
+    text = "Errors on episodes that nothing was learned from, against the dense policy with the same noise."
+    return Section("Calibration", (text,) if scores else (), tables, drawn)

@@ -1,0 +1,247 @@
+"""What an artifact says of itself, as sections of a report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import groupby
+from typing import Any
+
+from ..artifact.load import Artifact
+from ..artifact.manifest import DENSE, BlockRecord, Manifest
+from ..ir.flops import graph_flops
+from ..ir.graph import TensorType
+from ..ir.program import Binding
+from ..runtimes.liveness import rollout_needs
+from ..units import flops, share
+from .page import Section, Table
+
+FEW_STEPS = 16
+"""Steps from which on there is little left to reuse: step 0 is always dense, and neighbours differ more."""
+
+_NOT_TOLD = ("plans", "precision", "sparsity", "flops_sparsity", "skipped")
+_LONG = 200
+
+
+def provenance(artifact: Artifact) -> Section:
+    """Identity, and where it comes from."""
+    manifest = artifact.manifest
+    size = sum(record.bytes for record in manifest.files.values())
+    source = ", ".join(f"{key}: {value}" for key, value in manifest.spec.source.items())
+    rows = (
+        ("identity", manifest.identity),
+        ("identity of the model, without plans", manifest.model_identity),
+        ("made from", source or "a module of the user's own (compile_denoiser)"),
+        ("made by", f"ttscompile {manifest.ttscompile_version}, artifact schema {manifest.schema_version}"),
+        ("needs", f"onnxruntime {manifest.requires.onnxruntime} or later (opset {manifest.requires.opset}), numpy"),
+        ("files", f"{len(manifest.files) + 1}, {size / 1e6:.1f} MB; sizes and hashes of all were checked for this"),
+    )
+    text = "The identity is a hash over weights, normaliser, sampler, plans and preprocessing: whatever prints the same"
+    return Section("Identity", (f"{text} one computes the same.",), (Table(("", ""), rows, prose=True),))
+
+
+def policy(manifest: Manifest) -> Section:
+    """What goes in, what comes out, and the loop between."""
+    spec = manifest.spec
+    sampler, chunk = spec.sampler, spec.chunk
+    horizon, channels = spec.sample
+    rows = [
+        (
+            f"observation {key!r}",
+            f"{one.dtype}{list(one.shape)} a stream, {'as it is' if one.normalizer is None else 'normalised inside'}",
+        )
+        for key, one in spec.observations.items()
+    ]
+    rows += [
+        ("action", f"{chunk.action_dim} numbers, {horizon} steps predicted, {chunk.start}..{chunk.stop - 1} executed"),
+        ("sample", f"[{horizon}, {channels}]"),
+        ("sampler", f"{sampler.name}, {'draws noise in its steps' if sampler.stochastic else 'draws no noise'}"),
+        ("denoising steps K", f"{sampler.steps}, timesteps {sampler.timesteps[0]:g}..{sampler.timesteps[-1]:g}"),
+        ("clip of the denoised sample", "none" if sampler.clip is None else f"{sampler.clip:g}"),
+        ("precision of the blocks", manifest.precision_name),
+        ("default plan", manifest.default_plan),
+    ]
+    return Section("Policy", (), (Table(("", ""), tuple(rows), prose=True),))
+
+
+def hoisting(artifact: Artifact) -> Section:
+    """What is computed when, and what that saves before anything is reused."""
+    manifest = artifact.manifest
+    record, steps = manifest.flops, manifest.steps
+    bound: dict[Binding, list[TensorType]] = {binding: [] for binding in Binding}
+    for context in manifest.contexts.values():
+        bound[context.binding].append(context.type)
+    table_bytes = sum(table.nbytes for table in artifact.tables.values())
+    condition = graph_flops(artifact.graphs["condition"]) if "condition" in artifact.graphs else 0
+    loop = steps * (record.stem + record.tail + sum(record.blocks))
+    dense = record.prologue + loop
+
+    def row(name: str, when: str, values: str, cost: float) -> tuple[str, ...]:
+        return name, when, values, flops(cost), share(cost / record.dense)
+
+    rows = (
+        row(
+            "table",
+            "when it was compiled",
+            f"{len(artifact.tables)} tables of {steps} rows, {table_bytes / 1e6:.1f} MB",
+            0,
+        ),
+        row("condition", "once a call", f"{len(bound[Binding.CONDITION])} values", condition),
+        row(
+            "step",
+            f"once a call, {steps} steps in one batch",
+            f"{len(bound[Binding.STEP])} values",
+            max(record.prologue - condition, 0),
+        ),
+        row("loop", f"{steps} times a call", f"stem, {len(record.blocks)} blocks, tail", loop),
+        row("all, every cell computed", "", "", dense),
+        row("the denoiser as it was captured", f"{steps} times a call", "", record.dense),
+    )
+    saved = record.dense - dense
+    text = (
+        f"Work that does not depend on the noisy sample has left the loop: {flops(abs(saved))} a call"
+        f" ({share(abs(saved) / record.dense)}) {'less' if saved >= 0 else 'more'} before anything is reused."
+        f" Multiply and add are counted as two; a pruner, where a plan uses one, adds {flops(record.pruner)}."
+    )
+    head = ("binding time", "computed", "values that the loop reads", "FLOPs a call", "of the captured denoiser")
+    return Section("Hoisting", (text,), (Table(head, rows),))
+
+
+def blocks(manifest: Manifest) -> Section:
+    """The block table, repeated layers told once."""
+
+    def alike(item: tuple[int, BlockRecord]) -> tuple[Any, ...]:
+        block = item[1]
+        return block.group, block.kind, str(block.type), block.flops, block.reason
+
+    rows = []
+    for key, members in groupby(sorted(enumerate(manifest.blocks), key=alike), alike):
+        group, kind, type_, cost, reason = key
+        indices = [str(index) for index, _ in members]
+        shown = ", ".join(indices if len(indices) <= 6 else [*indices[:3], "…", indices[-1]])
+        rows.append(
+            (shown, kind + (f": {reason}" if reason else ""), type_, str(group), flops(cost), str(len(indices)))
+        )
+    head = ("block", "kind", "residual", "group", "FLOPs, one evaluation", "how many")
+    text = (
+        f"{len(manifest.blocks)} residual blocks, numbered in order of execution. Reuse from the last block of a kind"
+    )
+    return Section("Blocks", (f"{text} (FORWARD) stays within a group.",), (Table(head, tuple(rows)),))
+
+
+def plan_table(artifact: Artifact) -> Table:
+    """Every plan: its kind, its sparsity, its cost."""
+    manifest = artifact.manifest
+    record = manifest.flops
+    rows = []
+    for name in (DENSE, *manifest.plans):
+        own = manifest.plans.get(name)
+        kind = "schedule" if own is None else own.kind
+        cells, weighed = (0.0, 0.0) if own is None else (own.sparsity, own.flops_sparsity)
+        cost = None
+        if weighed is not None:
+            every = manifest.steps * sum(record.blocks)
+            cost = record.call(artifact.schedule(DENSE), pruned=kind == "pruner") - weighed * every
+        rows.append(
+            (
+                name + (" (default)" if name == manifest.default_plan else ""),
+                "for each observation" if kind == "pruner" else "schedule",
+                share(cells),
+                share(weighed),
+                "" if cost is None else flops(cost),
+                "" if cost is None else share(1 - cost / record.dense),
+            )
+        )
+    return Table(("plan", "made", "cells reused", "FLOPs reused", "FLOPs a call", "FLOPs saved"), tuple(rows))
+
+
+def score_table(record: Mapping[str, Any]) -> Table:
+    """What calibration measured on episodes that it did not learn from."""
+    rows = [
+        (
+            name,
+            f"{score['error']:.4g}",
+            f"{score['error_p90']:.4g}",
+            share(score["sparsity"]),
+            share(score["flops_saved"]),
+        )
+        for name, score in _scores(record).items()
+    ]
+    for name, reason in _mapping(record.get("skipped")).items():
+        rows.append((f"{name}: none, {reason}", "", "", "", ""))
+    head = ("plan", "mean action error", "90th percentile", "cells reused", "FLOPs saved")
+    return Table(head, tuple(rows))
+
+
+def record_table(record: Mapping[str, Any]) -> Table:
+    """The rest of the calibration record, shortened where it is long."""
+    rows = []
+    for name, value in record.items():
+        if name in _NOT_TOLD:
+            continue
+        text = f"{value:.4g}" if isinstance(value, float) else str(value)
+        rows.append((name.replace("_", " "), text if len(text) <= _LONG else f"{text[:_LONG]}…"))
+    return Table(("", ""), tuple(rows), prose=True)
+
+
+def scores(record: Mapping[str, Any] | None) -> Mapping[str, Mapping[str, Any]]:
+    """Of each plan that calibration judged; empty without a record."""
+    return {} if record is None else _scores(record)
+
+
+def _scores(record: Mapping[str, Any]) -> Mapping[str, Mapping[str, Any]]:
+    """Those with figures: the record is free JSON, written by whoever made the artifact."""
+    wanted = ("error", "error_p90", "sparsity", "flops_saved")
+    found = _mapping(record.get("plans"))
+    return {
+        str(name): score
+        for name, score in found.items()
+        if isinstance(score, Mapping) and all(isinstance(score.get(key), int | float) for key in wanted)
+    }
+
+
+def _mapping(value: object) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}
+
+
+def limits(artifact: Artifact) -> Section:
+    """What a reader should not expect, from the artifact's own facts."""
+    manifest = artifact.manifest
+    spec, plans = manifest.spec, manifest.plans
+    points = []
+    if manifest.calibration is None or manifest.default_plan == DENSE:
+        points.append("Not calibrated: its default plan computes everything. It is as slow as a dense call.")
+    else:
+        points.append(
+            "Errors are of the actions, on recorded episodes, against the dense policy with the same noise. They are no"
+            " success rates: evaluate the plan on your own task before a robot moves."
+        )
+    if spec.sampler.steps <= FEW_STEPS:
+        points.append(
+            f"{spec.sampler.steps} denoising steps: the first is always dense, so at most"
+            f" {1 - 1 / spec.sampler.steps:.0%} of the cells can be reused, and steps that lie far apart resemble each"
+            " other less."
+        )
+    if spec.sampler.stochastic:
+        points.append(
+            f"The sampler ({spec.sampler.name}) draws noise in every step: two calls on one observation differ, dense"
+            " or not. Give reset a seed, or predict_action the noise, to repeat a call."
+        )
+    if manifest.precision_name == "fp32":
+        points.append("Weights are in fp32. On processors with integer dot products, --precision int8 may be faster.")
+    else:
+        points.append(f"Blocks compute with {manifest.precision_name} weights: dense calls differ from fp32 as well.")
+    if any(plan.kind == "pruner" for plan in plans.values()):
+        points.append("A plan that is made for each observation costs a different time each call.")
+    needs = rollout_needs(artifact)
+    if needs.read:
+        points.append(
+            f"Its plans read residuals of the call before: {needs.bytes_read / 1e6:.1f} MB a stream are kept, and the"
+            " first call after reset() falls back, which its report counts."
+        )
+    coarse = [str(i) for i, block in enumerate(manifest.blocks) if block.reason]
+    if coarse:
+        points.append(f"Blocks {', '.join(coarse)} are coarse: several operations are reused or computed together.")
+    points.append(
+        "Times are of warm calls of one stream on one machine, taken while this page was made. There is no GPU runtime."
+    )
+    return Section("Limits", points=tuple(points))

@@ -1,0 +1,134 @@
+"""What is measured for a report: calls of every plan in turn, and one episode."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..lattice import PlanArray, Source
+from ..runtimes.base import CallReport
+from ..runtimes.executor.measure import neutral_observation
+from ..runtimes.policy import CompiledPolicy
+from ..trajectories import Episode
+
+PARTS = ("prologue", "wait_pruner", "decode")
+"""Timings of a call that add up to nearly its total; the pruner runs beside step 0, only the wait for it counts."""
+
+WARM_UP = 2
+EPISODE_CALLS = 64
+"""Of an episode at most: a picture of more says no more."""
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Medians over the counted calls of one plan, in ms.
+
+    Attributes:
+        plan: its name.
+        total: from the normalised observation to the denoised sample.
+        quartiles: first and third of the total.
+        parts: of ``PARTS`` by name.
+        pruner: the pruner's own time, most of it beside step 0.
+        flops: of a call.
+    """
+
+    plan: str
+    total: float
+    quartiles: tuple[float, float]
+    parts: Mapping[str, float]
+    pruner: float
+    flops: float
+
+
+@dataclass(frozen=True)
+class Course:
+    """One episode with the default plan.
+
+    Attributes:
+        name: of the episode.
+        plans: int8 ``[R, K, blocks]``, as executed.
+        legalised: cells of each call that were replaced because they were never computed.
+        total_ms: of each call.
+    """
+
+    name: str
+    plans: PlanArray
+    legalised: tuple[int, ...]
+    total_ms: tuple[float, ...]
+
+    @property
+    def sparsity(self) -> npt.NDArray[np.float64]:
+        """Share of reused cells of each call, ``[R]``."""
+        return np.asarray(np.mean(self.plans != Source.COMPUTE, axis=(1, 2)), dtype=np.float64)
+
+    def shares(self) -> npt.NDArray[np.float64]:
+        """For each source and cell the share of calls in which the cell had it, ``[4, K, blocks]``."""
+        return np.stack([np.mean(self.plans == source, axis=0) for source in Source])
+
+
+def measure_latencies(policy: CompiledPolicy, plans: Sequence[str], runs: int) -> list[Latency]:
+    """Time plans in turn, so that whatever else the machine does hits all of them.
+
+    Args:
+        policy: loaded; it is reset before and after.
+        plans: their names.
+        runs: counted calls of each.
+    """
+    obs = neutral_observation(dict(policy.info.observation))
+    reports: dict[str, list[CallReport]] = {plan: [] for plan in plans}
+    policy.reset()
+    for turn in range(WARM_UP + runs):
+        for i in range(len(plans)):
+            plan = plans[(i + turn) % len(plans)]  # nobody always runs after the same one
+            report = _call(policy, obs, plan)
+            if turn >= WARM_UP:
+                reports[plan].append(report)
+    policy.reset()
+    found = []
+    for plan, made in reports.items():
+        totals = [report.timings.total for report in made]
+        low, high = np.percentile(totals, [25, 75])
+        found.append(
+            Latency(
+                plan=plan,
+                total=float(np.median(totals)),
+                quartiles=(float(low), float(high)),
+                parts={part: float(np.median([getattr(r.timings, part) for r in made])) for part in PARTS},
+                pruner=float(np.median([r.timings.pruner for r in made])),
+                flops=float(np.median([r.flops[0] for r in made])),
+            )
+        )
+    return found
+
+
+def run_episode(policy: CompiledPolicy, episode: Episode) -> Course:
+    """The default plan on consecutive calls, from a reset.
+
+    Args:
+        policy: loaded with a seed; it is reset before and after.
+        episode: its first ``EPISODE_CALLS`` calls are run.
+    """
+    policy.reset()
+    count = min(episode.calls, EPISODE_CALLS)
+    made = []
+    for row in range(count):
+        obs = {key: array[row : row + 1] for key, array in episode.observations.items()}
+        made.append(_call(policy, obs, None))
+    policy.reset()
+    return Course(
+        name=episode.name,
+        plans=np.stack([report.plan[0] for report in made]),
+        legalised=tuple(report.legalised[0] for report in made),
+        total_ms=tuple(report.timings.total for report in made),
+    )
+
+
+def _call(policy: CompiledPolicy, obs: Mapping[str, Any], plan: str | None) -> CallReport:
+    policy.predict_action(obs, plan=plan)
+    report = policy.last_report
+    assert report is not None  # a call was made
+    return report

@@ -1,0 +1,107 @@
+"""What a page is made of, and the page as HTML in which everything is escaped."""
+
+from __future__ import annotations
+
+import base64
+import importlib
+from dataclasses import dataclass
+from importlib.resources import files
+
+from ..errors import RuntimeUnavailableError
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of text; the first column is text, the others are figures unless ``prose``."""
+
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    prose: bool = False
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A PNG.
+
+    Attributes:
+        png: the file.
+        alt: what it shows, for who cannot see it.
+        caption: under it.
+        wide: it is scrolled on a narrow screen rather than made too small to read.
+    """
+
+    png: bytes
+    alt: str
+    caption: str
+    wide: bool = False
+
+    @property
+    def data(self) -> str:
+        """As a ``data:`` address."""
+        return "data:image/png;base64," + base64.b64encode(self.png).decode("ascii")
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading and what stands under it, in this order."""
+
+    title: str
+    text: tuple[str, ...] = ()
+    tables: tuple[Table, ...] = ()
+    pictures: tuple[Picture, ...] = ()
+    points: tuple[str, ...] = ()
+
+    @property
+    def anchor(self) -> str:
+        """Of links to it."""
+        return self.title.lower().replace(" ", "-")
+
+
+@dataclass(frozen=True)
+class Page:
+    """A report.
+
+    Attributes:
+        title: of the page.
+        lead: under the title.
+        figures: label and value of what matters most.
+        sections: of the page.
+        foot: at its end.
+    """
+
+    title: str
+    lead: str
+    figures: tuple[tuple[str, str], ...]
+    sections: tuple[Section, ...]
+    foot: str
+
+
+def require_packages() -> None:
+    """Raise before anything is measured for a page that could not be made.
+
+    Raises:
+        RuntimeUnavailableError: Jinja2 or matplotlib is not installed.
+    """
+    for name in ("jinja2", "matplotlib"):
+        try:
+            importlib.import_module(name)
+        except ModuleNotFoundError as error:
+            raise RuntimeUnavailableError(
+                f"a report needs {name}, and {error.name!r} is not installed. Run: pip install 'ttscompile[compile]',"
+                " or read the figures with: ttscompile inspect DIR --json."
+            ) from error
+
+
+def render(page: Page) -> str:
+    """The page as one HTML document without scripts, which refers to nothing outside of itself.
+
+    Raises:
+        RuntimeUnavailableError: Jinja2 is not installed.
+    """
+    require_packages()
+    from jinja2 import Environment, StrictUndefined
+
+    # Names in an artifact are a stranger's: nothing of the page is marked as safe.
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    template = environment.from_string((files(__package__) / "page.html").read_text(encoding="utf-8"))
+    return template.render(page=page)

@@ -1,0 +1,173 @@
+"""Pictures of a report as PNG: on white, whatever the page is on, so that their colours mean the same everywhere."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..lattice import PlanArray, Source, sparsity
+from ..plots import COLOURS, plot_plan
+from ..plots_frontier import Plotted, plot_frontier
+from ..units import ms
+from .measure import PARTS, Course, Latency
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_PART_COLOURS = {"prologue": "#0072b2", "wait_pruner": "#cc79a7", "decode": "#d55e00"}
+_DWARFS = 4.0
+"""A bar is cut off where it is so many times as long as the next."""
+
+_PART_NAMES = {"prologue": "prologue", "wait_pruner": "wait for the pruner", "decode": "denoising loop"}
+
+
+def plain(text: str, most: int = 60) -> str:
+    """Text that matplotlib draws as it stands: no formulas, no characters that its font lacks, not too long."""
+    kept = "".join(c if c.isascii() and c.isprintable() and c != "$" else "?" for c in text)
+    return kept if len(kept) <= most else kept[: most - 3] + "..."
+
+
+def drawn(draw: Callable[[Path], None]) -> bytes:
+    """What a function draws into a PNG file."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "picture.png"
+        draw(path)
+        return path.read_bytes()
+
+
+def plan_picture(plan: PlanArray, kinds: Sequence[str], title: str) -> bytes:
+    """One plan, ``[K, blocks]``; see ``ttscompile.plots.plot_plan``."""
+    return drawn(lambda path: plot_plan(plan, [plain(kind) for kind in kinds], path, plain(title)))
+
+
+def frontier_picture(
+    points: Sequence[Plotted], efficient: Sequence[Plotted], yardsticks: Mapping[str, float], title: str
+) -> bytes:
+    """Error against latency, names as matplotlib can draw them; see ``ttscompile.plots_frontier.plot_frontier``."""
+    return drawn(lambda path: plot_frontier(points, efficient, yardsticks, path, plain(title, 110)))
+
+
+def shares_picture(course: Course) -> bytes:
+    """For each source that occurs, in how many of the episode's calls each cell had it."""
+    figure = _figure()
+    shares = course.shares()
+    used = [source for source in Source if shares[source].any()]
+    steps, blocks = shares.shape[1:]
+    figure.set_size_inches(min(6.5 + 0.06 * steps, 14.0), len(used) * min(1.0 + 0.09 * blocks, 6.0) + 0.6)
+    panels = figure.subplots(len(used), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, source in zip(panels, used, strict=True):
+        drawn = axes.imshow(shares[source].T, cmap="cividis", vmin=0, vmax=1, aspect="auto", interpolation="none")
+        mean = float(shares[source].mean())
+        axes.set_title(f"{source.name}: {mean:.1%} of the cells", fontsize=10, loc="left")
+        axes.set_ylabel("block")
+    panels[-1].set_xlabel("denoising step k, in order of execution (0 is the noisiest)")
+    figure.colorbar(drawn, ax=list(panels), label="share of the calls", pad=0.01)
+    return _png(figure)
+
+
+def sparsity_picture(course: Course) -> bytes:
+    """Reused cells, call by call; and those that had to be replaced."""
+    from matplotlib.ticker import MaxNLocator
+
+    figure = _figure()
+    figure.set_size_inches(8.0, 3.6)
+    axes = figure.add_subplot()
+    calls = np.arange(len(course.sparsity))
+    axes.plot(calls, 100 * course.sparsity, color=COLOURS[Source.COMPUTE], marker="o", markersize=3, linewidth=1.2)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_xlabel("call of the episode")
+    axes.set_ylabel("cells reused, %")
+    low = 100 * float(course.sparsity.min())
+    axes.set_ylim(max(min(low - 2, 90.0), -2.0), 100.5)
+    axes.grid(color="#dddddd", linewidth=0.5)
+    replaced = np.flatnonzero(course.legalised)
+    if len(replaced):
+        axes.scatter(replaced, 100 * course.sparsity[replaced], marker="x", color="#0072b2", zorder=3)
+        axes.set_title("crosses: cells that read what was never computed were replaced", fontsize=9, loc="left")
+    return _png(figure)
+
+
+def latency_picture(latencies: Sequence[Latency]) -> bytes:
+    """A bar a plan, cut into what its calls spend their time on; a bar that would dwarf the others is cut off."""
+    figure = _figure()
+    figure.set_size_inches(8.0, 1.5 + 0.45 * len(latencies))
+    axes = figure.add_subplot()
+    rows = np.arange(len(latencies))[::-1]
+    left = np.zeros(len(latencies))
+    for part in PARTS:
+        widths = np.array([latency.parts[part] for latency in latencies])
+        axes.barh(rows, widths, left=left, height=0.6, color=_PART_COLOURS[part], label=_PART_NAMES[part])
+        left += widths
+    ends = sorted(left)
+    cut = len(ends) > 1 and ends[-1] > _DWARFS * ends[-2]
+    limit = 1.35 * (ends[-2] if cut else ends[-1])
+    axes.set_xlim(0, limit)
+    axes.set_yticks(rows, [plain(latency.plan, 24) for latency in latencies])
+    for row, end, latency in zip(rows, left, latencies, strict=True):
+        inside = bool(end > limit)
+        axes.annotate(
+            f"{ms(latency.total)} ms" + ", cut off" * inside,
+            (limit if inside else end, row),
+            xytext=(-6 if inside else 4, 0),
+            textcoords="offset points",
+            va="center",
+            ha="right" if inside else "left",
+            color="white" if inside else "black",
+        )
+    axes.set_xlabel("ms of a call, median")
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+    return _png(figure)
+
+
+def plans_picture(scores: Mapping[str, Mapping[str, Any]]) -> bytes:
+    """Held-out action error of each plan of a calibration against the share of cells that it computes."""
+    from matplotlib.ticker import LogFormatter
+
+    figure = _figure()
+    figure.set_size_inches(8.0, 4.2)
+    axes = figure.add_subplot()
+    for name, score in scores.items():
+        x, middle, high = 100 * (1 - score["sparsity"]), score["error"], score["error_p90"]
+        axes.plot([x, x], [middle, high], color="#999999", linewidth=1, zorder=1)
+        axes.plot(x, middle, "o", color=COLOURS[Source.COMPUTE], zorder=2)
+        axes.plot(x, high, "_", color="#999999", markersize=10, zorder=1)
+        axes.annotate(plain(name, 24), (x, middle), xytext=(7, -3), textcoords="offset points", fontsize=9)
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter(LogFormatter())  # 40 rather than 4 x 10^1
+    axes.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
+    axes.set_xlabel("cells computed, %")
+    axes.set_ylabel("error of the actions, in their units")
+    axes.margins(x=0.2, y=0.1)
+    axes.grid(which="both", color="#dddddd", linewidth=0.5)
+    axes.set_axisbelow(True)
+    return _png(figure)
+
+
+def caption_of(plan: PlanArray) -> str:
+    """Counts of a plan, for who cannot see it."""
+    counts = ", ".join(f"{source.name.lower()} {int(np.count_nonzero(plan == source))}" for source in Source)
+    return f"{sparsity(plan):.1%} of {plan.size} cells are reused: {counts}."
+
+
+def _figure() -> Figure:
+    """A figure without pyplot, which keeps every figure in a global list, and would choose a window system."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _png(figure: Figure) -> bytes:
+    # The same figures are the same file: matplotlib would put its version into it.
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=130, metadata={"Software": None})
+    return buffer.getvalue()
