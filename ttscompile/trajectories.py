@@ -150,8 +150,9 @@ def read_npz(path: Path) -> dict[str, Array]:
                     f"{path}: expected an .npz with several arrays; found a single one. Use np.savez."
                 )
             with file:
-                # Nothing has been decompressed yet.
-                require_proportion(path, sum(info.file_size for info in file.zip.infolist()), path.stat().st_size)
+                archive: Any = file.zip  # nothing has been decompressed yet
+                total = sum(entry.file_size for entry in archive.infolist())
+                require_proportion(path, total, path.stat().st_size)
                 return {name: np.asarray(file[name]) for name in file.files}
     except TrajectoryError:
         raise

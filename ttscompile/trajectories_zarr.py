@@ -27,7 +27,8 @@ def zarr_frames(path: Path) -> Frames:
     try:
         store: Any = zarr.storage.ZipStore(path, mode="r") if path.is_file() else str(path)
         group = zarr.open_group(store, mode="r")
-        data, ends = group["data"], group["meta/episode_ends"]
+        data: Any = group["data"]
+        ends = group["meta/episode_ends"]
         names = tuple(sorted(name for name, _ in data.arrays()))
     except Exception as error:  # zarr raises whatever its stores and parsers raise
         raise TrajectoryError(

@@ -5,10 +5,12 @@ from __future__ import annotations
 import random
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from ttscompile.config import Affine
 from ttscompile.errors import (
     DeadlineMissedError,
     ExecutorClosedError,
@@ -225,6 +227,22 @@ def test_a_jump_at_the_seam_is_refused() -> None:
         made, error = run_until_starved(world)
         assert "its step of 5 in channel 0 exceeds the limit of 1" in str(error)
         assert not np.any(made)
+
+
+@pytest.mark.parametrize("ranged", [True, False])
+def test_only_a_normaliser_that_knows_the_range_of_the_actions_bounds_them(ranged: bool) -> None:
+    """By mean and deviation, an action five deviations out is rare; by range it was never seen in training."""
+    policy = ScriptedPolicy(FakeClock())
+    chunk = replace(policy.info.action, normalizer=Affine(np.ones(3), np.zeros(3)), ranged=ranged)
+    policy.info = replace(policy.info, action=chunk)
+    policy.actions = lambda obs: np.full((16, 3), 5.0)
+    with World(policy=policy) as world:
+        if ranged:
+            with pytest.raises(DeadlineMissedError, match="the bounds are -1.1 to 1.1"):
+                world.begin()
+        else:
+            world.begin()
+            assert (world.tick() == 5).all()
 
 
 def test_reset_during_inference_a_hundred_times_at_random_moments() -> None:

@@ -1,0 +1,161 @@
+"""What is fuzzed: for each, a folder of good files, one bad file a case, and what a user would do with it."""
+
+from __future__ import annotations
+
+import random
+import shutil
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+from tests.hostile import forged, messages, pickles
+from tests.hostile.archives import write, write_hostile
+from tests.hostile.mutate import damaged
+from ttscompile.errors import CalibrationError, ExecutorError, TtscompileError
+
+Case = Callable[[random.Random, Path, Path], Callable[[], None]]
+"""From random numbers, the corpus and an empty folder to what has to refuse or to work; makes the bad file."""
+
+
+class Accepted(AssertionError):
+    """A file that was damaged, and was loaded."""
+
+
+def artifact(rng: random.Random, corpus: Path, folder: Path) -> Callable[[], None]:
+    """A directory: one file damaged; or forged, with hashes that are right again."""
+    source = rng.choice(sorted((corpus / "artifacts").iterdir()))
+    path = Path(shutil.copytree(source, folder / "compiled"))
+    if rng.random() < 0.25:
+        return _damaged_artifact(rng, path)
+    return forged.artifact(rng, path)
+
+
+def _damaged_artifact(rng: random.Random, path: Path) -> Callable[[], None]:
+    from ttscompile.artifact.load import load_artifact
+
+    victim = rng.choice(sorted(path.iterdir()))
+    before = victim.read_bytes()
+    kind = rng.randrange(12)
+    victim.unlink()
+    if kind == 0:
+        victim.symlink_to("/etc/passwd")
+    elif kind == 1:
+        victim.mkdir()
+    elif kind > 2:
+        victim.write_bytes(damaged(rng, before))
+
+    def load() -> None:
+        load_artifact(path)
+        if victim.read_bytes() != before and victim.name != "manifest.json":
+            raise Accepted(f"{victim.name} was changed")
+
+    return load
+
+
+def zipped(rng: random.Random, corpus: Path, folder: Path) -> Callable[[], None]:
+    """A zipped artifact."""
+    source = rng.choice(sorted((corpus / "artifacts").iterdir()))
+    files = {path.name: path.read_bytes() for path in sorted(source.iterdir())}
+    target, kind = folder / "compiled.zip", rng.random()
+    if kind < 0.3:
+        write(target, files, rng)
+        target.write_bytes(damaged(rng, target.read_bytes()))
+    elif kind < 0.4:
+        path = Path(shutil.copytree(source, folder / "compiled"))
+        forged.artifact(rng, path)
+        files = {each.name: each.read_bytes() for each in sorted(path.iterdir())}
+        shutil.rmtree(path)
+        write(target, files, rng)
+    else:
+        write_hostile(target, files, rng)
+    return lambda: forged.use(target)
+
+
+def checkpoint(rng: random.Random, corpus: Path, folder: Path) -> Callable[[], None]:
+    """A checkpoint of Diffusion Policy."""
+    from ttscompile.frontends import load_checkpoint_policy
+
+    target = folder / "policy.ckpt"
+    pickles.write(rng, corpus / "checkpoints", target)
+
+    def load() -> None:
+        load_checkpoint_policy(target)
+
+    return load
+
+
+def trajectories(rng: random.Random, corpus: Path, folder: Path) -> Callable[[], None]:
+    """A recording of episodes."""
+    from ttscompile.config import ObservationSpec
+    from ttscompile.trajectories import load_trajectories
+
+    target = folder / "calls.npz"
+    pickles.write_npz(rng, corpus / "trajectories", target)
+    observations = {"obs": ObservationSpec((2,))}
+
+    def load() -> None:
+        episodes = load_trajectories([target], observations, 2)
+        if not all(episode.calls >= 1 for episode in episodes):
+            raise Accepted("an episode without calls")
+
+    return load
+
+
+def protocol(rng: random.Random, corpus: Path, folder: Path) -> Callable[[], None]:
+    """A message to the executor's server; a refusal is an answer that names an error of ttscompile."""
+    text = messages.draw(rng)
+
+    def send() -> None:
+        kind, message = messages.reply(text)
+        if kind is not None:
+            raise ExecutorError(f"{kind}: {message}")
+
+    return send
+
+
+def state(rng: random.Random, corpus: Path, folder: Path) -> Callable[[], None]:
+    """What an interrupted calibration left."""
+    from ttscompile.calibration.state import FILE, StateFile
+
+    source = corpus / "states" / FILE
+    content = source.read_bytes()
+    changed = damaged(rng, content) if rng.random() < 0.3 else forged.state(rng, content)
+    (folder / FILE).write_bytes(changed)
+    settings = {"model": "0" * 16, "seed": 0, "budget": {"kind": "sparsity", "value": 0.9}}
+
+    def load() -> None:
+        loaded = StateFile(folder, settings)
+        if not loaded.load():
+            raise CalibrationError("nothing to resume")
+        loaded.get("strategy")
+
+    return load
+
+
+TARGETS: dict[str, Case] = {
+    "artifact": artifact,
+    "zip": zipped,
+    "checkpoint": checkpoint,
+    "trajectories": trajectories,
+    "protocol": protocol,
+    "state": state,
+}
+
+
+def mixed(rng: random.Random, corpus: Path, folder: Path) -> Callable[[], None]:
+    """One of them."""
+    return rng.choice([*TARGETS.values()])(rng, corpus, folder)
+
+
+def outcome(case: Callable[[], None]) -> str:
+    """``refused`` or ``accepted``; whatever else comes out of the case is a defect, and goes on to the caller."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            case()
+        except TtscompileError as error:
+            text = str(error)
+            if not text.strip() or "Traceback" in text:
+                raise Accepted(f"a message that says nothing: {text[:200]!r}") from error
+            return "refused"
+    return "accepted"

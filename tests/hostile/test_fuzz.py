@@ -1,0 +1,80 @@
+"""A few hundred cases of the fuzzer; the record of the long run is in docs/security.md."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.hostile.corpus import make
+from tests.hostile.guard import Violation
+from tests.hostile.targets import Accepted, outcome
+
+ROOT = Path(__file__).resolve().parents[2]
+CASES = 500
+
+
+def test_nothing_but_errors_of_its_own(tmp_path: Path) -> None:
+    make(tmp_path / "corpus")
+    command = [sys.executable, "-m", "tests.hostile.fuzz", "--corpus", str(tmp_path / "corpus"), "--processes", "1"]
+    command += ["--target", "mixed", "--cases", str(CASES), "--seed", "1"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    lines = [json.loads(line) for line in result.stdout.splitlines()]
+    assert (result.returncode, result.stderr, lines[:-1]) == (0, "", [])
+    assert lines[-1]["refused"] + lines[-1]["accepted"] == CASES
+    assert min(lines[-1]["refused"], lines[-1]["accepted"]) > 20
+
+
+def test_a_case_that_is_no_error_of_its_own_is_a_defect() -> None:
+    def other() -> None:
+        raise KeyError("x")
+
+    with pytest.raises(KeyError):
+        outcome(other)
+
+
+def test_the_guard_sees_what_must_not_happen(tmp_path: Path) -> None:
+    """In a process of its own, because an audit hook stays."""
+    code = f"""
+import os, pathlib, pickle, sys
+from tests.hostile.corpus import make
+from tests.hostile.guard import Guard, Violation
+inside = pathlib.Path({str(tmp_path)!r}) / "inside"
+inside.mkdir()
+guard = Guard(inside)
+with guard.watching():
+    (inside / "a").write_text("x")
+    (inside / "a").rename(inside / "b")
+    (inside / "b").unlink()
+outside = inside.parent / "outside"
+def swallowed():
+    try:
+        os.mkdir(outside)
+    except BaseException:
+        pass
+for act in (
+    lambda: outside.write_text("x"),
+    lambda: os.system("true"),
+    lambda: os.symlink("/etc/passwd", outside),
+    lambda: eval("1 + 1"),
+    lambda: pickle.loads(pickle.dumps(os.mkdir)),
+    lambda: bytearray(3 << 30),
+    swallowed,
+):
+    try:
+        with guard.watching():
+            act()
+    except (Violation, MemoryError) as error:
+        print(type(error).__name__)
+print(outside.exists())
+"""
+    result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert result.stdout.split() == ["Violation"] * 5 + ["MemoryError", "Violation", "False"]
+
+
+def test_a_violation_is_no_exception_that_a_loader_could_take_for_damage() -> None:
+    assert not issubclass(Violation, Exception)
+    assert issubclass(Accepted, AssertionError)
