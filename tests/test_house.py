@@ -79,7 +79,7 @@ COMPILES = (
 
 
 def part(module: str) -> str:
-    """``ttscompile.ir.graph`` -> ``ir``, ``ttscompile.lower_onnx`` -> ``lower``, ``ttscompile`` -> the empty string."""
+    """``ttscompile.ir.graph`` -> ``ir``, ``ttscompile.capture_batch`` -> ``capture``, ``ttscompile`` -> nothing."""
     return module.removeprefix("ttscompile").lstrip(".").partition(".")[0].partition("_")[0]
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from .runtimes.base import CallReport
     from .runtimes.executor import AsyncExecutor, ExecutorSettings, GuardLimits
     from .runtimes.policy import CompiledPolicy, PolicyInfo, load
-    from .samplers_flow import flow_matching_table
+    from .samplers.flow import flow_matching_table
     from .verification import Verification, verify
 
 __version__ = "0.1.0"
@@ -69,7 +69,7 @@ _HOMES = {
     "calibrate": "calibration",
     "compile_denoiser": "driver",
     "convert": "driver",
-    "flow_matching_table": "samplers_flow",
+    "flow_matching_table": "samplers.flow",
     "legalize": "lattice",
     "load": "runtimes.policy",
     "verify": "verification",

@@ -28,7 +28,7 @@ def convert(folder: Path, layers: int, width: int) -> None:
 
     import ttscompile
     from ttscompile import ChunkSpec, ObservationSpec, PolicySpec
-    from ttscompile.samplers_flow import flow_matching_table
+    from ttscompile.samplers.flow import flow_matching_table
 
     class Layer(nn.Module):
         def __init__(self) -> None:

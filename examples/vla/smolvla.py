@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 import ttscompile
 from ttscompile import ChunkSpec, ObservationSpec, PolicySpec
-from ttscompile.samplers_flow import flow_matching_table
+from ttscompile.samplers.flow import flow_matching_table
 
 
 class PrefixCache:

@@ -22,8 +22,8 @@ from ttscompile.artifact.write import update_calibration, write_artifact
 from ttscompile.errors import ArtifactError
 from ttscompile.ir.joint import DENSE_STEP, JOINT
 from ttscompile.lattice import uniform_plan
-from ttscompile.lower_joint import chain_blocks, join_blocks
-from ttscompile.lower_precision import lower_precision
+from ttscompile.lower.joint import chain_blocks, join_blocks
+from ttscompile.lower.precision import lower_precision
 
 ERROR = PrecisionError(calls=8, mean=0.25, p90=0.5, largest=1.5, tolerance=0.03)
 

@@ -12,7 +12,7 @@ from ttscompile.config import Affine, ChunkSpec, ObservationSpec, PolicySpec, Sa
 from ttscompile.ir.graph import Batch, Graph, Node, Ref, TensorType
 from ttscompile.ir.joint import DENSE_STEP, JOINT
 from ttscompile.ir.program import Binding, Block, Pieces, Program, Reuse
-from ttscompile.lower_joint import chain_blocks, join_blocks
+from ttscompile.lower.joint import chain_blocks, join_blocks
 
 STEPS, HORIZON, CHANNELS, WIDTH, MEMORY = 3, 4, 2, 16, 8
 

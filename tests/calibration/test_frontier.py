@@ -22,7 +22,7 @@ from ttscompile.calibration.points import Frontier, Point
 from ttscompile.cli import main
 from ttscompile.errors import CalibrationError, OutputError
 from ttscompile.lattice import uniform_plan
-from ttscompile.plots_frontier import plot_frontier
+from ttscompile.plots.frontier import plot_frontier
 
 from . import policies
 

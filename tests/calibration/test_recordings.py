@@ -17,10 +17,10 @@ import pytest
 import zarr
 from PIL import Image
 
-from ttscompile import trajectories_frames
 from ttscompile.config import ObservationSpec
 from ttscompile.errors import TrajectoryError
 from ttscompile.trajectories import Episode, load_trajectories
+from ttscompile.trajectories import frames as trajectories_frames
 
 LOW = {"obs": ObservationSpec((2, 8))}
 IMAGES = {"image": ObservationSpec((2, 3, 5, 4)), "state": ObservationSpec((2, 5))}

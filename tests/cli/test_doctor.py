@@ -12,10 +12,12 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from ttscompile import doctor, doctor_machine, doctor_packages
 from ttscompile.artifact.write import update_calibration
 from ttscompile.cli import main
-from ttscompile.doctor_finding import Finding, Level
+from ttscompile.doctor import diagnosis as doctor
+from ttscompile.doctor import machine as doctor_machine
+from ttscompile.doctor import packages as doctor_packages
+from ttscompile.doctor.finding import Finding, Level
 from ttscompile.lattice import uniform_plan
 
 
@@ -192,7 +194,7 @@ def test_int8_without_integer_dot_products_is_a_warning(calibrated: Path, monkey
 
 
 def test_too_little_memory_is_a_problem(calibrated: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from ttscompile import doctor_artifact
+    from ttscompile.doctor import artifact as doctor_artifact
 
     monkeypatch.setattr(doctor_artifact, "available_bytes", lambda: 1000)
     assert found("memory", doctor.artifact_findings(calibrated)).level is Level.PROBLEM

@@ -24,8 +24,8 @@ from tests.families.weights import draw_weights
 from ttscompile import ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
 from ttscompile.driver import transform
 from ttscompile.ir.program import Program
-from ttscompile.samplers import sampler_table
-from ttscompile.samplers_flow import flow_matching_table
+from ttscompile.samplers.flow import flow_matching_table
+from ttscompile.samplers.table import sampler_table
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from ttscompile import Noise
 from ttscompile.errors import SpecError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
-from ttscompile.samplers_multistep import set_timesteps
+from ttscompile.samplers.multistep import set_timesteps
 
 Build = Callable[..., dict[str, Any]]
 Save = Callable[[dict[str, Any]], Path]

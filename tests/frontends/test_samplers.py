@@ -17,8 +17,8 @@ from diffusers.schedulers.scheduling_unipc_multistep import UniPCMultistepSchedu
 
 from ttscompile.config import SamplerTable
 from ttscompile.errors import SpecError
-from ttscompile.samplers import sampler_table
-from ttscompile.samplers_multistep import set_timesteps
+from ttscompile.samplers.multistep import set_timesteps
+from ttscompile.samplers.table import sampler_table
 
 BETAS: dict[str, Any] = {"num_train_timesteps": 50, "beta_schedule": "squaredcos_cap_v2"}
 

@@ -23,7 +23,7 @@ def main() -> None:
     from ttscompile.artifact.load import load_artifact
     from ttscompile.artifact.write import update_calibration, write_artifact
     from ttscompile.calibration.state import StateFile
-    from ttscompile.lower import lower_program
+    from ttscompile.lower.program import lower_program
 
     torch.set_num_threads(1)
     programs = [toy_program(2, 2, seed=seed) for seed in (0, 1)]

@@ -20,7 +20,6 @@ import ttscompile
 from tests.artifact.tiny import tiny_models, tiny_program
 from tests.frontends.conftest import _config, _weights
 from tests.hostile.forged import rehash
-from ttscompile import trajectories_frames
 from ttscompile.artifact import load_artifact
 from ttscompile.artifact.write import write_artifact
 from ttscompile.calibration.state import StateFile
@@ -29,6 +28,7 @@ from ttscompile.errors import ArtifactError, CalibrationError, CheckpointError, 
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.checkpoint import plain_config
 from ttscompile.frontends.interpolation import Config
+from ttscompile.trajectories import frames as trajectories_frames
 from ttscompile.trajectories import load_trajectories
 
 Change = Callable[[dict[str, Any]], object]

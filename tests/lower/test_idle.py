@@ -13,8 +13,8 @@ from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Graph, Node, Ref
 from ttscompile.ir.idle import OUTPUTS, TOTAL
 from ttscompile.ir.program import Pieces, Program
-from ttscompile.lower import OPSET
-from ttscompile.lower_idle import lower_idle
+from ttscompile.lower.idle import lower_idle
+from ttscompile.lower.program import OPSET
 
 from .sessions import session
 

@@ -11,7 +11,7 @@ import torch
 from tests.runtimes.toys import toy_program
 from ttscompile.ir.graph import Batch, TensorType
 from ttscompile.ir.joint import RESIDUAL, STREAM, join
-from ttscompile.lower import lower_program
+from ttscompile.lower.program import lower_program
 
 from .sessions import session
 

@@ -11,7 +11,7 @@ from tests.lower.modules import ALL, captured, random_values
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Argument, Batch, Graph, Node, Ref, Size, TensorType
 from ttscompile.ir.layout import product, ratio, sink_layout
-from ttscompile.lower import structural_key
+from ttscompile.lower.program import structural_key
 
 B = Batch()
 

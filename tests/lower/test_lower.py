@@ -23,7 +23,7 @@ from ttscompile.ir.advance import fuse_advance
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Batch, Graph, Node, Ref, TensorType
 from ttscompile.ir.program import Pieces, Program
-from ttscompile.lower import OPSET, lower_graph, lower_program, structural_key
+from ttscompile.lower.program import OPSET, lower_graph, lower_program, structural_key
 
 ROOT = Path(__file__).resolve().parents[2]
 B = Batch()
@@ -122,7 +122,7 @@ def test_expansion_over_streams() -> None:
 HASH = """
 import hashlib
 from tests.lower.modules import captured
-from ttscompile.lower import lower_graph
+from ttscompile.lower.program import lower_graph
 for name in ("SelfAttention", "AdaptiveNorm"):
     print(hashlib.sha256(lower_graph(captured(name)[1], "p").SerializeToString()).hexdigest())
 """

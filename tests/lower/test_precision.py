@@ -18,8 +18,8 @@ from onnx.helper import make_graph, make_model, make_node, make_opsetid, make_te
 from tests.lower.modules import captured, random_values
 from ttscompile.errors import LoweringError
 from ttscompile.ir.evaluate import evaluate
-from ttscompile.lower import lower_graph
-from ttscompile.lower_precision import lower_precision, quantize_matrix, quantize_model
+from ttscompile.lower.precision import lower_precision, quantize_matrix, quantize_model
+from ttscompile.lower.program import lower_graph
 from ttscompile.machine import has_integer_dot_product
 from ttscompile.runtimes.precision import EXACT_INTEGERS
 

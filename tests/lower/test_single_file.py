@@ -30,10 +30,10 @@ from ttscompile.ir.graph import Batch
 from ttscompile.ir.joint import DENSE_STEP, JOINT
 from ttscompile.ir.program import Program
 from ttscompile.lattice import Source
-from ttscompile.lower import lower_program
-from ttscompile.lower_joint import chain_blocks, join_blocks
-from ttscompile.lower_precision import lower_precision
-from ttscompile.lower_single_file import lower_single_file
+from ttscompile.lower.joint import chain_blocks, join_blocks
+from ttscompile.lower.precision import lower_precision
+from ttscompile.lower.program import lower_program
+from ttscompile.lower.single_file import lower_single_file
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..artifact import tensors
 from ..config import FP32
 from ..correction import Correction
 from ..errors import ArtifactError, IllegalPlanError
@@ -21,7 +22,6 @@ from ..ir.graph import Graph
 from ..ir.program import Binding, Block, Pieces, Program
 from ..ir.serialize import graph_from_json
 from ..lattice import PlanArray, Source, check_plan, dense_plan
-from . import tensors
 from .archive import Unpacked, unpack
 from .codec import decode
 from .files import verify

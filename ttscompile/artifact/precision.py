@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy.typing as npt
 
+from ..artifact import tensors
 from ..errors import ArtifactError
-from . import tensors
 from .bind import Place, bind
 from .files import write_synced
 from .manifest import PieceRecord, PrecisionError, PrecisionRecord

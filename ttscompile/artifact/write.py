@@ -15,11 +15,11 @@ import numpy as np
 import numpy.typing as npt
 
 from .. import __version__
+from ..artifact import tensors
 from ..correction import Correction
 from ..errors import ArtifactError
 from ..ir.program import Binding, Program
 from ..ir.serialize import graph_to_json
-from . import tensors
 from .bind import Place, bind, rebind
 from .codec import encode
 from .files import (

@@ -23,7 +23,7 @@ from ttscompile.cli.output import (
 from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
 from ttscompile.errors import RuntimeUnavailableError
 from ttscompile.machine import fingerprint, one_line
-from ttscompile.plots_frontier import plot_frontier
+from ttscompile.plots.frontier import plot_frontier
 
 if TYPE_CHECKING:
     from rich.console import Console

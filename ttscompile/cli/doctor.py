@@ -6,8 +6,8 @@ from pathlib import Path
 
 import click
 
-from ttscompile import doctor as examination
 from ttscompile.cli.output import identity_of, json_option, print_json
+from ttscompile.doctor import diagnosis as examination
 
 
 @click.command()

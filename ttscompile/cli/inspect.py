@@ -15,7 +15,7 @@ from ttscompile.cli.output import artifact_argument, json_option, print_json, pr
 from ttscompile.cli.summary import document, print_summary
 from ttscompile.errors import ArtifactError, ObservationError
 from ttscompile.lattice import PlanArray
-from ttscompile.plots import plot_plan
+from ttscompile.plots.plan import plot_plan
 from ttscompile.trajectories import read_npz
 
 SCHEDULE = "schedule"

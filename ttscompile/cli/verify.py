@@ -13,7 +13,7 @@ from ttscompile.cli.output import table as make_table
 from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
 from ttscompile.errors import OutputError
 from ttscompile.machine import fingerprint, one_line
-from ttscompile.plots_errors import plot_errors
+from ttscompile.plots.errors import plot_errors
 from ttscompile.verification import Verification
 from ttscompile.verification.rung import FAILED, SKIPPED, Rung
 

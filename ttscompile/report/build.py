@@ -9,10 +9,10 @@ from typing import Any
 from ..artifact.load import Artifact
 from ..artifact.manifest import DENSE
 from ..machine import fingerprint, one_line
+from ..report import facts, pictures
 from ..runtimes.policy import CompiledPolicy
-from ..trajectories import Episode
+from ..trajectories.episodes import Episode
 from ..units import flops, ms, share
-from . import facts, pictures
 from .frontier import Compared, efficient, from_comparison, from_record
 from .measure import Course, Latency, measure_latencies, run_episode
 from .page import Page, Picture, Section, Table, require_packages

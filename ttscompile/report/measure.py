@@ -13,7 +13,7 @@ from ..lattice import PlanArray, Source
 from ..runtimes.base import CallReport
 from ..runtimes.executor.measure import neutral_observation
 from ..runtimes.policy import CompiledPolicy
-from ..trajectories import Episode
+from ..trajectories.episodes import Episode
 
 PARTS = ("prologue", "wait_pruner", "decode")
 """Timings of a call that add up to nearly its total; the pruner runs beside step 0, only the wait for it counts."""

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..lattice import PlanArray, Source, sparsity
-from ..plots import COLOURS, plot_plan
-from ..plots_frontier import Plotted, plot_frontier
+from ..plots.frontier import Plotted, plot_frontier
+from ..plots.plan import COLOURS, plot_plan
 from ..units import ms
 from .measure import PARTS, Course, Latency
 

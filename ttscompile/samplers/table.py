@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from .config import SamplerTable
-from .errors import SpecError
-from .samplers_multistep import multistep_table, set_timesteps
+from ..config import SamplerTable
+from ..errors import SpecError
+from .multistep import multistep_table, set_timesteps
 
 _SHAPE = (2, 3, 4)  # of a probe; small, with no two sizes equal, so that a broadcast along the wrong axis shows
 _FAR = 2.0**30  # an input this large saturates any clip that is there; its inverse stays inside any

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from .errors import OutputError, RuntimeUnavailableError
+from ..errors import OutputError, RuntimeUnavailableError
 
 _ABBREVIATIONS = {"self_attention": "SA", "cross_attention": "CA", "feed_forward": "FF"}
 

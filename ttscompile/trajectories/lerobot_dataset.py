@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from .errors import TrajectoryError
-from .trajectories_frames import Array, Frames, require_package, require_proportion
+from ..errors import TrajectoryError
+from .frames import Array, Frames, require_package, require_proportion
 
 EPISODE, FRAME = "episode_index", "frame_index"
 

@@ -10,13 +10,14 @@ import sys
 from importlib.metadata import PackageNotFoundError, requires, version
 from typing import NamedTuple
 
-from .doctor_finding import Finding, Level
+from .finding import Finding, Level
 
 PYTHON = (3, 11)
 PROJECT = "ttscompile"
 ENABLES = {
     "compile": "convert, calibrate, compare, report, pictures, runtime='reference'",
-    "lerobot": "convert of LeRobot policies",
+    "lerobot": "convert --task of LeRobot policies",
+    "recordings": "recordings in zarr, HDF5 and LeRobot's format",
     "serve": "serve",
     "pusht": "examples/pusht",
     "ray": "examples/ray_serve",

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 from onnx import ModelProto
 
-from .errors import LoweringError
-from .ir.graph import Batch, TensorType
-from .ir.program import Binding, Pieces
-from .lower_graph_writer import GraphWriter, Weights
+from ..errors import LoweringError
+from ..ir.graph import Batch, TensorType
+from ..ir.program import Binding, Pieces
+from .graph_writer import GraphWriter, Weights
 
 
 class Contexts:

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from .errors import TrajectoryError
-from .trajectories_frames import Array, Frames, require_package, require_proportion
+from ..errors import TrajectoryError
+from .frames import Array, Frames, require_package, require_proportion
 
 CODECS = frozenset({"blosc", "bz2", "delta", "gzip", "lz4", "lzma", "shuffle", "zlib", "zstd", "bytes", "crc32c"})
 """Compression that only computes. zarr also knows codecs that unpickle what they read."""

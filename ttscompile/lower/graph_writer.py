@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from onnx import GraphProto, ModelProto, NodeProto, TensorProto, ValueInfoProto, helper, numpy_helper
 
-from .errors import LoweringError
+from ..errors import LoweringError
 
 Array = npt.NDArray[Any]
 Weights = Mapping[str, npt.NDArray[Any]]

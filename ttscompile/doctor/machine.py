@@ -10,7 +10,7 @@ from itertools import pairwise
 from math import floor
 from pathlib import Path
 
-from .doctor_finding import Finding, Level
+from .finding import Finding, Level
 
 _X86 = {
     "avx2": "AVX2",

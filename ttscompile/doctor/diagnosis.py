@@ -12,10 +12,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from .doctor_artifact import artifact_findings
-from .doctor_finding import Finding, Level
-from .doctor_machine import machine_findings
-from .doctor_packages import package_findings
+from .artifact import artifact_findings
+from .finding import Finding, Level
+from .machine import machine_findings
+from .packages import package_findings
 
 MARKS = {Level.OK: "ok", Level.NOTE: "-", Level.WARNING: "!", Level.PROBLEM: "PROBLEM"}
 
@@ -82,7 +82,3 @@ def main(arguments: Sequence[str]) -> int:
     found = examine(Path(paths[0]) if paths else None)
     sys.stdout.write((json.dumps(document(found), indent=2) if "--json" in options else text(found)) + "\n")
     return 1 if problems(found) else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

@@ -20,8 +20,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from .config import SamplerTable
-from .errors import SpecError
+from ..config import SamplerTable
+from ..errors import SpecError
 
 _SHAPE = (2, 3, 4)
 _SMALL, _FAR = 2.0**-30, 2.0**30  # inside any clip and outside of it

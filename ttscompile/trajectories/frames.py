@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .config import ObservationSpec
-from .errors import TrajectoryError
+from ..config import ObservationSpec
+from ..errors import TrajectoryError
 
 Array = npt.NDArray[Any]
 

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from onnx import GraphProto, ModelProto, NodeProto, TensorProto, ValueInfoProto, helper
 
-from .ir.graph import Batch, Graph, TensorType
-from .ir.joint import CONTEXT, DENSE_STEP, JOINT, RESIDUAL, STREAM, dense_step_outputs, halves, join
+from ..ir.graph import Batch, Graph, TensorType
+from ..ir.joint import CONTEXT, DENSE_STEP, JOINT, RESIDUAL, STREAM, dense_step_outputs, halves, join
 
 
 def join_blocks(blocks: Sequence[Graph], models: Mapping[str, ModelProto]) -> ModelProto:

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from .errors import TrajectoryError
-from .trajectories_frames import Array, Frames, require_package, require_proportion
+from ..errors import TrajectoryError
+from .frames import Array, Frames, require_package, require_proportion
 
 
 def hdf5_frames(path: Path) -> Frames:

@@ -6,12 +6,12 @@ import statistics
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .doctor_finding import Finding, Level
-from .doctor_machine import available_bytes
-from .errors import TtscompileError
+from ..errors import TtscompileError
+from .finding import Finding, Level
+from .machine import available_bytes
 
 if TYPE_CHECKING:
-    from .artifact.load import Artifact
+    from ..artifact.load import Artifact
 
 PART = "artifact"
 CALLS = 5
@@ -29,7 +29,7 @@ def artifact_findings(directory: Path) -> list[Finding]:
         Findings up to the first problem.
     """
     try:
-        from .artifact.load import load_artifact
+        from ..artifact.load import load_artifact
     except ModuleNotFoundError as error:
         remedy = f"Run: pip install {error.name}."
         return [Finding(PART, "load", f"not tried: {error.name} is not installed", Level.PROBLEM, remedy)]
@@ -41,8 +41,8 @@ def artifact_findings(directory: Path) -> list[Finding]:
 
 
 def _needs(artifact: Artifact) -> list[Finding]:
-    from .machine import has_integer_dot_product
-    from .runtimes.liveness import rollout_needs
+    from ..machine import has_integer_dot_product
+    from ..runtimes.liveness import rollout_needs
 
     manifest = artifact.manifest
     needs = manifest.requires
@@ -86,8 +86,8 @@ def _call(directory: Path, artifact: Artifact) -> list[Finding]:
     """Calls on an observation that the normaliser maps to 0."""
     import numpy as np
 
-    from .runtimes.executor.measure import neutral_observation
-    from .runtimes.policy import load
+    from ..runtimes.executor.measure import neutral_observation
+    from ..runtimes.policy import load
 
     try:
         policy = load(directory, threads=1, seed=0)

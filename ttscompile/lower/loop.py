@@ -20,11 +20,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from onnx import GraphProto, ModelProto
 
-from .ir.advance import MEMORY, X0_COLUMNS
-from .ir.program import Program
-from .lower_contexts import Contexts
-from .lower_graph_writer import GraphWriter, Weights, sequence, tensor
-from .lower_plan import LoweredPlan
+from ..ir.advance import MEMORY, X0_COLUMNS
+from ..ir.program import Program
+from .contexts import Contexts
+from .graph_writer import GraphWriter, Weights, sequence, tensor
+from .plan import LoweredPlan
 
 GROUP = 6
 """Blocks that are skipped with one question where none of them is computed."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .lower_graph_writer import GraphWriter
+from .graph_writer import GraphWriter
 
 INT64, INT8 = 7, 3
 """ONNX's numbers of these dtypes."""

@@ -39,16 +39,16 @@ from collections.abc import Mapping
 import numpy as np
 from onnx import ModelProto, ValueInfoProto, helper
 
-from .config import PolicySpec
-from .correction import FEATURES, HISTORY, no_correction
-from .errors import LoweringError
-from .ir.graph import TensorType
-from .ir.program import Program
-from .lower_contexts import Contexts
-from .lower_graph_writer import GraphWriter, Weights, tensor
-from .lower_loop import GROUP, DenoisingLoop, LoopInputs
-from .lower_plan import LoweredPlan, lower_plan
-from .update import columns, diagonals, rows
+from ..config import PolicySpec
+from ..correction import FEATURES, HISTORY, no_correction
+from ..errors import LoweringError
+from ..ir.graph import TensorType
+from ..ir.program import Program
+from ..update import columns, diagonals, rows
+from .contexts import Contexts
+from .graph_writer import GraphWriter, Weights, tensor
+from .loop import GROUP, DenoisingLoop, LoopInputs
+from .plan import LoweredPlan, lower_plan
 
 CORRECTION, CORRECTION_BIAS, ANCHORS = "correction", "correction_bias", "correction_anchors"
 """Inputs of the whole call that carry a schedule's correction."""

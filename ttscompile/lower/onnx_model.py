@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 import onnx
 from onnx import AttributeProto, GraphProto, ModelProto, NodeProto, TensorProto, ValueInfoProto, helper
 
-from .errors import LoweringError
-from .ir.graph import Batch, TensorType
+from ..errors import LoweringError
+from ..ir.graph import Batch, TensorType
 
 Values = Sequence[tuple[str, TensorType]]
 

@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .config import ObservationSpec
-from .errors import TrajectoryError
-from .trajectories_frames import Frames, observation_frames, require_proportion
-from .trajectories_hdf5 import hdf5_frames
-from .trajectories_lerobot import lerobot_frames
-from .trajectories_zarr import zarr_frames
+from ..config import ObservationSpec
+from ..errors import TrajectoryError
+from .frames import Frames, observation_frames, require_proportion
+from .hdf5_file import hdf5_frames
+from .lerobot_dataset import lerobot_frames
+from .zarr_buffer import zarr_frames
 
 Array = npt.NDArray[Any]
 

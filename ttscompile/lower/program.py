@@ -18,18 +18,18 @@ from typing import Any
 import onnx
 import torch
 
-from .errors import LoweringError
-from .ir.advance import fuse_advance
-from .ir.evaluate import resolve_op
-from .ir.graph import Argument, Batch, Enum, Graph, Node, Ref, TensorType
-from .ir.idle import IDLE
-from .ir.joint import DENSE_STEP, JOINT
-from .ir.layout import sink_layout
-from .ir.program import Pieces, Program
-from .lower_attention import flatten_attention
-from .lower_idle import lower_idle
-from .lower_joint import chain_blocks, join_blocks
-from .lower_onnx import name_model, only
+from ..errors import LoweringError
+from ..ir.advance import fuse_advance
+from ..ir.evaluate import resolve_op
+from ..ir.graph import Argument, Batch, Enum, Graph, Node, Ref, TensorType
+from ..ir.idle import IDLE
+from ..ir.joint import DENSE_STEP, JOINT
+from ..ir.layout import sink_layout
+from ..ir.program import Pieces, Program
+from .attention import flatten_attention
+from .idle import lower_idle
+from .joint import chain_blocks, join_blocks
+from .onnx_model import name_model, only
 
 OPSET = 23
 """Has Gelu (20) and Attention (23). Measured with onnxruntime 1.31, 1 thread, blocks of width 256, 16 tokens, 4 heads:

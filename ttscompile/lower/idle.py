@@ -10,12 +10,12 @@ import numpy.typing as npt
 import torch
 from onnx import ModelProto, helper
 
-from .ir.evaluate import evaluate
-from .ir.graph import Argument, Batch, Graph, Node, Ref, TensorType
-from .ir.idle import BASE, IDLE, PRODUCT, SHIFT, TOTAL
-from .ir.program import Pieces
-from .lower_graph_writer import GraphWriter, tensor
-from .lower_onnx import IR_VERSION
+from ..ir.evaluate import evaluate
+from ..ir.graph import Argument, Batch, Graph, Node, Ref, TensorType
+from ..ir.idle import BASE, IDLE, PRODUCT, SHIFT, TOTAL
+from ..ir.program import Pieces
+from .graph_writer import GraphWriter, tensor
+from .onnx_model import IR_VERSION
 
 Wide = npt.NDArray[np.float64]
 Weights = Mapping[str, npt.NDArray[np.generic]]

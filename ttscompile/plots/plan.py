@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from .errors import IllegalPlanError, OutputError, RuntimeUnavailableError
-from .lattice import PlanArray, Source, sparsity
+from ..errors import IllegalPlanError, OutputError, RuntimeUnavailableError
+from ..lattice import PlanArray, Source, sparsity
 
 COLOURS = {
     Source.COMPUTE: "#d55e00",

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
 
-from .errors import OutputError, RuntimeUnavailableError
+from ..errors import OutputError, RuntimeUnavailableError
 
 COLOURS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 """Okabe and Ito's palette, without the yellow that white paper swallows."""

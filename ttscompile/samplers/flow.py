@@ -11,8 +11,8 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from .config import SamplerTable
-from .errors import SpecError
+from ..config import SamplerTable
+from ..errors import SpecError
 
 METHODS = ("euler", "rk4")
 

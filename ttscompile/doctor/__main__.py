@@ -1,0 +1,9 @@
+"""``python -m ttscompile.doctor [DIR]``."""
+
+from __future__ import annotations
+
+import sys
+
+from .diagnosis import main
+
+sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,1 @@
+"""From graphs to ONNX models: each piece of a program, the whole call as one file, eight-bit blocks."""

@@ -1,0 +1,1 @@
+"""Pictures: plans, errors of verification, the frontier of a comparison."""

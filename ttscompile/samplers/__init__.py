@@ -1,0 +1,1 @@
+"""Denoising loops as tables of numbers: from diffusers' schedulers, and flow matching by its definition."""
