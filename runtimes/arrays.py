@@ -14,6 +14,8 @@ from ttscompile.errors import ObservationError
 
 Array: TypeAlias = npt.NDArray[Any]
 
+_OVERSHOOT = 0.1
+
 
 def is_tensor(value: object) -> bool:
     """Whether this is a torch tensor; if torch was never imported, nothing is."""
@@ -84,21 +86,64 @@ def _one(key: str, array: Array, spec: ObservationSpec) -> Array:
     found = f"{array.dtype} {list(array.shape)}"
     if array.shape[1:] != spec.shape or array.ndim != len(spec.shape) + 1 or len(array) < 1:
         remedy = " A single stream needs a first axis of 1: use obs[None]." if array.shape == spec.shape else ""
+        remedy = remedy or image_remedy(array, spec)
         raise ObservationError(f"observation {key!r} has the wrong shape: expected {expected}; found {found}.{remedy}")
     if str(array.dtype) != spec.dtype:
-        raise ObservationError(
-            f"observation {key!r} has the wrong dtype: expected {expected}; found {found}. Convert it with"
-            f" .astype(np.{spec.dtype}), after making sure that its units are those of the training data."
+        remedy = image_remedy(array, spec) or (
+            f" Convert it with .astype(np.{spec.dtype}), after making sure that its units are those of the training"
+            " data."
         )
+        raise ObservationError(f"observation {key!r} has the wrong dtype: expected {expected}; found {found}.{remedy}")
+    check_values(array, key, spec)
+    return array
+
+
+def check_values(array: Array, key: str, spec: ObservationSpec) -> None:
+    """Raise unless the numbers are finite, and of tokens and images within their bounds.
+
+    Images may overshoot by a tenth of the range, as resizing with a cubic filter does at edges. One of 0..255 in place
+    of 0..1 would give actions that look like actions.
+
+    Args:
+        array: of the specified dtype; with or without the axis of time.
+        key: of the observation, for messages.
+        spec: of the observation.
+
+    Raises:
+        ObservationError: says what was expected, what was found, and the remedy.
+    """
     check_finite(array, f"observation {key!r}", "Look for the sensor, or the division, that made it.")
-    if spec.bounds is not None and array.dtype.kind in "iu":
-        low, high = (np.asarray(each) for each in spec.bounds)
+    if spec.bounds is None or not (spec.image or array.dtype.kind in "iu"):
+        return
+    low, high = (np.asarray(each) for each in spec.bounds)
+    if not spec.image:
         if (array < low).any() or (array > high).any():
             raise ObservationError(
                 f"observation {key!r} must hold integers of {low.min():.0f} to {high.max():.0f}; found {array.min()} to"
                 f" {array.max()}. Tokens must come from the tokenizer that the policy was trained with."
             )
-    return array
+        return
+    least, most, room = float(array.min()), float(array.max()), _OVERSHOOT * float(high[0] - low[0])
+    if least < low[0] - room or most > high[0] + room:
+        remedy = "Give what the camera measures, not normalised: the policy does that itself."
+        if most > high[0] + room and least >= 0 and high[0] == 1:
+            remedy = "Divide by 255, channels first."
+        raise ObservationError(
+            f"observation {key!r} is an image and must hold numbers of {low[0]:g} to {high[0]:g}; found {least:.6g} to"
+            f" {most:.6g}. {remedy}"
+        )
+
+
+def image_remedy(array: Array, spec: ObservationSpec) -> str:
+    """What to do with an image of bytes, or with its channels last; nothing for other arrays."""
+    if not spec.image:
+        return ""
+    remedy = ""
+    if array.dtype.kind in "iu":
+        remedy += f" Divide by 255, channels first: image.astype(np.{spec.dtype}) / 255."
+    if array.shape[-3:] == (*spec.shape[-2:], spec.shape[-3]) != spec.shape[-3:]:
+        remedy += " Its channels are last: use np.moveaxis(image, -1, -3)."
+    return remedy
 
 
 def check_finite(array: Array, what: str, remedy: str) -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -12,14 +13,20 @@ import numpy.typing as npt
 
 from ttscompile.config import FloatArray, Noise, SamplerTable
 from ttscompile.correction import Correction
-from ttscompile.errors import IllegalPlanError, ObservationError, RuntimeUnavailableError
+from ttscompile.errors import (
+    ArtifactError,
+    IllegalPlanError,
+    ObservationError,
+    RuntimeUnavailableError,
+    TtscompileError,
+)
 from ttscompile.lattice import BoolArray, PlanArray, Source, check_plan, legalize, require_legal
 
 if TYPE_CHECKING:
     from ttscompile.artifact.load import Artifact
 
-PRUNER, GIVEN = "pruner", "given"
-"""``CallReport.plan_name`` where the caller gave no name: a plan that the pruner made, and a matrix."""
+GIVEN = "given"
+"""``CallReport.plan_name`` of a matrix that the caller gave no name."""
 
 RUNTIMES = ("onnxruntime", "reference")
 
@@ -87,6 +94,7 @@ class Runtime(Protocol):
         plan_name: str | None = None,
         repair: bool = False,
         correction: Correction | None = None,
+        prefix: FloatArray | None = None,
     ) -> tuple[FloatArray, CallReport]:
         """Denoise one chunk. A call that fails after its arguments were checked ends the episode, as ``reset`` does.
 
@@ -97,6 +105,8 @@ class Runtime(Protocol):
             plan_name: for the report; None for ``pruner`` or ``given``.
             repair: legalise ``plan`` and count it, rather than refuse it when it is illegal.
             correction: of the sampler's steps, which belongs to this plan; None for none.
+            prefix: normalised actions ``[B, N, Da]`` that the sample holds from ``chunk.start`` on, see ``inpainting``;
+                None for none.
 
         Returns:
             The denoised sample, float32 ``[B, T, D]``, and the report.
@@ -104,7 +114,7 @@ class Runtime(Protocol):
         Raises:
             IllegalPlanError: ``plan`` has the wrong shape, or is illegal and not to be repaired; or no plan was given
                 and the artifact has no pruner.
-            ObservationError: the number of streams differs from the episode's, or ``noise`` does not fit.
+            ObservationError: the number of streams differs from the episode's, or ``noise`` or ``prefix`` does not fit.
         """
 
 
@@ -118,13 +128,15 @@ def open_runtime(artifact: Artifact, runtime: str = "onnxruntime", threads: int 
 
     Raises:
         RuntimeUnavailableError: no runtime of this name, its packages are missing, or the threads cannot be had.
+        ArtifactError: the parts of the artifact do not fit each other.
     """
     if not isinstance(threads, int) or isinstance(threads, bool) or threads < 1:
         raise RuntimeUnavailableError(f"threads must be an integer of at least 1; found {threads!r}.")
     if runtime == "onnxruntime":
         from .onnxruntime_cpu import OnnxRuntime
 
-        return OnnxRuntime(artifact, threads)
+        with fitting(artifact):
+            return OnnxRuntime(artifact, threads)
     if runtime == "reference":
         try:
             from .reference_runtime import ReferenceRuntime
@@ -133,8 +145,29 @@ def open_runtime(artifact: Artifact, runtime: str = "onnxruntime", threads: int 
                 f"runtime 'reference' needs torch, and {error.name!r} is not installed. Install 'ttscompile[compile]',"
                 " or use runtime='onnxruntime'."
             ) from error
-        return ReferenceRuntime(artifact)
+        with fitting(artifact):
+            return ReferenceRuntime(artifact)
     raise RuntimeUnavailableError(f"no runtime is called {runtime!r}; expected one of {', '.join(RUNTIMES)}.")
+
+
+@contextmanager
+def fitting(artifact: Artifact) -> Iterator[None]:
+    """Within the block whatever fails is an error of the artifact: its hashes are right, and its parts do not fit.
+
+    Opening a runtime runs every piece once, so that an artifact that somebody put together is refused here.
+
+    Raises:
+        ArtifactError: in place of any other exception.
+    """
+    try:
+        yield
+    except TtscompileError:
+        raise
+    except Exception as error:
+        raise ArtifactError(
+            f"{artifact.path}: its manifest, tables and graphs do not fit each other"
+            f" ({type(error).__name__}: {str(error)[:300]}). Convert the checkpoint again."
+        ) from error
 
 
 def settle_plan(

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from ttscompile.artifact.manifest import DENSE, PRUNER
 from ttscompile.config import FloatArray, Noise
 from ttscompile.correction import Correction
 from ttscompile.errors import IllegalPlanError
@@ -25,7 +26,6 @@ from ttscompile.lattice import BoolArray, PlanArray, Source, check_plan, require
 
 from .base import (
     GIVEN,
-    PRUNER,
     CallReport,
     Timings,
     check_call,
@@ -45,8 +45,6 @@ from .workspace import Workspace
 
 if TYPE_CHECKING:
     from ttscompile.artifact.load import Artifact
-
-DENSE = "dense"
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,9 @@ from ttscompile.ir.graph import TensorType
 
 from .arrays import check_noise, check_observation, is_tensor, like
 from .base import GIVEN, CallReport, Runtime, open_runtime
+from .inpainting import check_prefix, prefix_refusal
 from .liveness import RolloutNeeds, rollout_needs
+from .queues import Queues, is_window
 
 if TYPE_CHECKING:
     from ttscompile.artifact.load import Artifact
@@ -53,6 +55,7 @@ class PolicyInfo:
         default_plan: the one that is taken when none is given.
         precision: of the weights of residual blocks, ``fp32`` or ``int8``.
         rollout: what keeping the rollout cache of one stream takes.
+        prefix_refusal: why ``predict_action`` takes no ``prefix``; None if it does.
     """
 
     K: int
@@ -68,6 +71,7 @@ class PolicyInfo:
     default_plan: str
     precision: str
     rollout: RolloutNeeds
+    prefix_refusal: str | None
 
 
 def load(
@@ -130,6 +134,7 @@ class CompiledPolicy:
         _require_plan(artifact, self._default)
         self._rng = np.random.default_rng(seed)
         self._report: CallReport | None = None
+        self._queues = Queues(artifact.manifest.spec.observations)
         self._lock = threading.Lock()
 
     @property
@@ -155,6 +160,7 @@ class CompiledPolicy:
             default_plan=self._default,
             precision=manifest.precision_name,
             rollout=rollout_needs(self._artifact),
+            prefix_refusal=prefix_refusal(manifest.spec),
         )
 
     def reset(self, seed: int | None = None) -> None:
@@ -165,11 +171,16 @@ class CompiledPolicy:
         """
         with self._alone():
             self._runtime.reset()
+            self._queues.reset()
             if seed is not None:
                 self._rng = np.random.default_rng(seed)
 
     def predict_action(
-        self, obs_dict: Mapping[str, Any], noise: Noise | None = None, plan: str | npt.ArrayLike | None = None
+        self,
+        obs_dict: Mapping[str, Any],
+        noise: Noise | None = None,
+        plan: str | npt.ArrayLike | None = None,
+        prefix: Any = None,
     ) -> dict[str, Any]:
         """One call of the policy.
 
@@ -180,40 +191,108 @@ class CompiledPolicy:
             plan: None for the default of ``load``; ``dense`` or the name of a plan of the artifact, whose reads of what
                 was never computed are repaired and counted in the report; or int8 ``[K, blocks]`` or
                 ``[B, K, blocks]`` of ``ttscompile.Source``, which is executed as it is or refused.
+            prefix: experimental: the actions that are committed already, float32 ``[B, N, Da]``, not normalised, from
+                the first executed one on. They are kept, and the rest of the chunk is inpainted to them
+                (``runtimes.inpainting``). None or N = 0: none are.
 
         Returns:
             ``action [B, Ta, Da]``, what to execute, and ``action_pred [B, T, Da]``, of the kind that came in.
 
         Raises:
-            ObservationError: an observation or noise that does not fit; nothing was executed.
+            ObservationError: an observation, noise or prefix that does not fit, or a prefix where
+                ``info.prefix_refusal`` says that there can be none; nothing was executed.
             IllegalPlanError: a plan that is unknown, malformed or illegal; nothing was executed.
         """
         with self._alone():
-            self._report = None
-            spec = self._manifest.spec
-            obs = check_observation(obs_dict, spec.observations)
-            streams = len(next(iter(obs.values())))
-            if self._runtime.streams not in (None, streams):
-                raise ObservationError(
-                    f"the observation holds {streams} streams, and the episode under way {self._runtime.streams}:"
-                    " residuals are kept for each stream. Call reset() before changing the number of streams."
-                )
-            if noise is None:
-                noise = self._draw(streams)
-            else:
-                noise = check_noise(noise, streams, self._manifest.steps, spec.sample, spec.sampler.stochastic)
-            matrix, name, repair = self._plan(plan)
-            correction = self._artifact.corrections.get(name)
-            normalized = {key: _normalized(array, spec.observations[key]) for key, array in obs.items()}
-            sample, self._report = self._runtime.predict(
-                normalized, noise, matrix, plan_name=name, repair=repair, correction=correction
-            )
-            predicted = sample[..., : spec.chunk.action_dim]
-            if spec.chunk.normalizer is not None:
-                predicted = spec.chunk.normalizer.unnormalize(predicted)
-            example = next((value for value in obs_dict.values() if is_tensor(value)), None)
-            executed = predicted[:, spec.chunk.start : spec.chunk.stop]
+            predicted = self._predict(obs_dict, noise, plan, prefix)
+            example, chunk = _example(obs_dict), self._manifest.spec.chunk
+            executed = predicted[:, chunk.start : chunk.stop]
             return {"action": like(executed.copy(), example), "action_pred": like(predicted.copy(), example)}
+
+    def select_action(
+        self, batch: Mapping[str, Any], noise: Noise | None = None, plan: str | npt.ArrayLike | None = None
+    ) -> Any:
+        """The next action, as LeRobot's policies give it: a chunk is computed when the one before it is used up.
+
+        Args:
+            batch: one frame of every stream by key, ``[B, ...]``, not normalised; ``reset`` forgets earlier ones. Keys
+                that are not the policy's are left alone.
+            noise: of the chunk, if this call computes one.
+            plan: the same.
+
+        Returns:
+            ``[B, Da]`` of the kind that came in.
+
+        Raises:
+            ObservationError: a frame or noise that does not fit; nothing was executed, and the frame was not kept.
+            IllegalPlanError: as ``predict_action``.
+        """
+        with self._alone():
+            frames = self._queues.after(batch)
+            if self._queues.empty:
+                self._queues.extend(self._chunk(self._queues.observation(frames), noise, plan))
+            self._queues.keep(frames)
+            return like(self._queues.pop().copy(), _example(batch))
+
+    def predict_action_chunk(
+        self, batch: Mapping[str, Any], noise: Noise | None = None, plan: str | npt.ArrayLike | None = None
+    ) -> Any:
+        """A chunk of actions ``[B, Ta, Da]``, as LeRobot's policies give it; the queue of ``select_action`` stays.
+
+        Args:
+            batch: whole windows ``[B, To, ...]``; or one frame of every stream ``[B, ...]``, which is added to the
+                frames that this method and ``select_action`` were given since ``reset``. Keys that are not the policy's
+                are left alone.
+            noise: of the call.
+            plan: of the call.
+
+        Raises:
+            ObservationError: a window, a frame or noise that does not fit; nothing was executed or kept.
+            IllegalPlanError: as ``predict_action``.
+        """
+        with self._alone():
+            specs = self._manifest.spec.observations
+            if isinstance(batch, Mapping) and is_window(batch, specs):
+                observation = {key: value for key, value in batch.items() if key in specs}
+                return like(self._chunk(observation, noise, plan).copy(), _example(batch))
+            frames = self._queues.after(batch)
+            chunk = self._chunk(self._queues.observation(frames), noise, plan)
+            self._queues.keep(frames)
+            return like(chunk.copy(), _example(batch))
+
+    def _chunk(self, obs: Mapping[str, Any], noise: Noise | None, plan: str | npt.ArrayLike | None) -> FloatArray:
+        """What is executed of a call, ``[B, Ta, Da]``."""
+        chunk = self._manifest.spec.chunk
+        return self._predict(obs, noise, plan)[:, chunk.start : chunk.stop]
+
+    def _predict(
+        self, obs_dict: Mapping[str, Any], noise: Noise | None, plan: str | npt.ArrayLike | None, prefix: Any = None
+    ) -> FloatArray:
+        """One call; the actions ``[B, T, Da]``."""
+        self._report = None
+        spec = self._manifest.spec
+        obs = check_observation(obs_dict, spec.observations)
+        streams = len(next(iter(obs.values())))
+        if self._runtime.streams not in (None, streams):
+            raise ObservationError(
+                f"the observation holds {streams} streams, and the episode under way {self._runtime.streams}:"
+                " residuals are kept for each stream. Call reset() before changing the number of streams."
+            )
+        if prefix is not None:
+            prefix = check_prefix(prefix, streams, spec)
+            prefix = prefix if spec.chunk.normalizer is None else spec.chunk.normalizer.normalize(prefix)
+        if noise is None:
+            noise = self._draw(streams)
+        else:
+            noise = check_noise(noise, streams, self._manifest.steps, spec.sample, spec.sampler.stochastic)
+        matrix, name, repair = self._plan(plan)
+        correction = self._artifact.corrections.get(name)
+        normalized = {key: _normalized(array, spec.observations[key]) for key, array in obs.items()}
+        sample, self._report = self._runtime.predict(
+            normalized, noise, matrix, plan_name=name, repair=repair, correction=correction, prefix=prefix
+        )
+        predicted = sample[..., : spec.chunk.action_dim]
+        return predicted if spec.chunk.normalizer is None else spec.chunk.normalizer.unnormalize(predicted)
 
     def _draw(self, streams: int) -> Noise:
         shape = (streams, *self._manifest.spec.sample)
@@ -262,6 +341,11 @@ def _require_plan(artifact: Artifact, name: str) -> None:
             f"the artifact has no plan {name!r}; it has {known}. Use one of these, or give predict_action a matrix"
             " [K, blocks] of ttscompile.Source."
         )
+
+
+def _example(batch: Mapping[str, Any]) -> Any:
+    """A tensor of the batch, if it holds any."""
+    return next((value for value in batch.values() if is_tensor(value)), None)
 
 
 def _of_one_stream(type_: TensorType) -> tuple[int, ...]:

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from ttscompile.artifact.manifest import DENSE, PrecisionError
-from ttscompile.config import FP32, ChunkSpec, FloatArray, Noise, PolicySpec
+from ttscompile.config import FP32, ChunkSpec, FloatArray, Noise
 from ttscompile.correction import Correction
 from ttscompile.errors import ObservationError
 from ttscompile.machine import has_integer_dot_product
 
 from .base import open_runtime
+from .random_calls import normalized, random_calls
 
 if TYPE_CHECKING:
     from ttscompile.artifact.load import Artifact
@@ -27,6 +28,9 @@ is needed."""
 
 CALLS = 8
 """Random observations that a precision is measured on. On Push-T at K = 100 that takes some seconds."""
+
+SEED = 8
+"""Of these observations and the noise."""
 
 MARGIN = 4.0
 """Tolerance over the largest difference that was measured."""
@@ -59,11 +63,12 @@ def needs_care(precision: str) -> bool:
 def measure_precision(artifact: Artifact) -> PrecisionError:
     """Dense calls in the artifact's precision against dense calls in fp32, on random observations, with equal noise.
 
-    Observations are uniform within the range of the normaliser, or in -1..1 where there is none. Figures are rounded
+    Observations are as ``ObservationSpec.draw`` makes them. Figures are rounded
     to four digits, so that they rarely depend on the processor.
     """
     spec = artifact.manifest.spec
-    differences = compare(artifact, artifact.schedule(DENSE), random_calls(spec, CALLS))
+    calls = [(normalized(spec, obs), noise) for obs, noise in random_calls(spec, CALLS, SEED)]
+    differences = compare(artifact, artifact.schedule(DENSE), calls)
     errors = np.array([action_errors(spec.chunk, one, other) for one, other in differences])
     shares = [float(np.abs(one - other).max() / np.abs(other).max()) for one, other in differences]
     return PrecisionError(
@@ -115,19 +120,6 @@ def action_errors(chunk: ChunkSpec, one: FloatArray, other: FloatArray) -> npt.N
     if chunk.normalizer is not None:
         difference /= np.abs(chunk.normalizer.scale)
     return difference.ravel()
-
-
-def random_calls(spec: PolicySpec, count: int) -> Iterator[Call]:
-    """Normalised observations and noise, the same at every time."""
-    for number in range(count):
-        rng = np.random.default_rng((number, 8))
-        obs: dict[str, npt.NDArray[Any]] = {
-            key: one.draw(rng) if one.normalizer is None else rng.uniform(-1, 1, (1, *one.shape)).astype(np.float32)
-            for key, one in spec.observations.items()
-        }
-        initial = rng.standard_normal((1, *spec.sample), dtype=np.float32)
-        draws = rng.standard_normal((spec.sampler.steps, *initial.shape), dtype=np.float32)
-        yield obs, Noise(initial, draws if spec.sampler.stochastic else None)
 
 
 def _count_bad(sample: FloatArray) -> int:

@@ -15,9 +15,10 @@ import numpy as np
 from ttscompile.config import FloatArray, ObservationSpec
 from ttscompile.errors import ObservationError
 
-from .arrays import Array, as_array, check_finite
+from .arrays import Array, as_array, check_values, image_remedy
 
 Frame = dict[str, Array]
+Frames = dict[str, deque[Array]]
 
 
 class Queues:
@@ -29,34 +30,41 @@ class Queues:
 
     def __init__(self, specs: Mapping[str, ObservationSpec]) -> None:
         self._specs = specs
-        self._frames: dict[str, deque[Array]] = {}
+        self._frames: Frames = {}
         self._actions: deque[FloatArray] = deque()
 
     def reset(self) -> None:
         """A new episode."""
         self._frames, self._actions = {}, deque()
 
-    def push(self, batch: Mapping[str, Any]) -> None:
-        """Take one frame of every stream; the first of an episode fills the window.
+    def after(self, batch: Mapping[str, Any]) -> Frames:
+        """The frames with one more of every stream; the first of an episode fills the window. Nothing is kept yet.
+
+        A call that fails after this, and is made again, must not push its frame twice: ``keep`` what it used when it
+        succeeded.
 
         Args:
             batch: by key ``[B, ...]``, arrays or tensors: of a window's key one frame. Other keys are left alone.
 
         Raises:
-            ObservationError: a key is missing or does not fit; nothing was taken.
+            ObservationError: a key is missing or does not fit.
         """
-        frame = self._checked(batch)
-        for key, value in frame.items():
+        frames: Frames = {}
+        for key, value in self._checked(batch).items():
             length = self._specs[key].frames or 1
-            if key not in self._frames:
-                self._frames[key] = deque([value] * length, maxlen=length)
-            self._frames[key].append(value)
+            frames[key] = deque(self._frames.get(key, [value] * length), maxlen=length)
+            frames[key].append(value)
+        return frames
 
-    def observation(self) -> Frame:
+    def keep(self, frames: Frames) -> None:
+        """Keep what ``after`` gave."""
+        self._frames = frames
+
+    def observation(self, frames: Frames) -> Frame:
         """The window as ``predict_action`` takes it: by key ``[B, To, ...]``; of a key without frames the newest."""
         return {
-            key: frames[-1] if self._specs[key].frames is None else np.stack(frames, axis=1)
-            for key, frames in self._frames.items()
+            key: values[-1] if self._specs[key].frames is None else np.stack(values, axis=1)
+            for key, values in frames.items()
         }
 
     @property
@@ -105,8 +113,9 @@ class Queues:
             raise ObservationError(
                 f"one frame of observation {key!r} must be {expected}; found {array.dtype} {list(array.shape)}."
                 + (" A single stream needs a first axis of 1." if array.shape == shape else "")
+                + image_remedy(array, spec)
             )
-        check_finite(array, f"observation {key!r}", "Look for the sensor, or the division, that made it.")
+        check_values(array, key, spec)
         return array.copy()
 
 

@@ -10,22 +10,24 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from ttscompile.artifact.manifest import PRUNER
 from ttscompile.config import FloatArray, Noise
 from ttscompile.correction import Correction
 
 from .base import (
     GIVEN,
-    PRUNER,
     CallReport,
     Timings,
     check_call,
     computed_cells,
+    fitting,
     frozen,
     milliseconds,
     no_pruner,
     pruner_plan,
     settle_plan,
 )
+from .inpainting import known_samples
 from .reference import ReferenceModel, noise_tensors
 from .reference_reuse import RolloutCache
 
@@ -41,6 +43,7 @@ class ReferenceRuntime:
     """
 
     def __init__(self, artifact: Artifact) -> None:
+        self._artifact = artifact
         self.model = ReferenceModel.from_artifact(artifact)
         self._manifest = artifact.manifest
         self._cache: RolloutCache | None = None
@@ -63,10 +66,12 @@ class ReferenceRuntime:
         plan_name: str | None = None,
         repair: bool = False,
         correction: Correction | None = None,
+        prefix: FloatArray | None = None,
     ) -> tuple[FloatArray, CallReport]:
         """Denoise one chunk; see ``base.Runtime.predict``."""
         spec = self._manifest.spec
         streams = check_call(self.streams, noise, spec.sample, spec.sampler)
+        known = known_samples(spec, prefix, noise.initial)
         cache = self._cache if self._cache is not None else self.model.empty_cache(streams)
         pruned = plan is None
         if plan is None:
@@ -76,7 +81,7 @@ class ReferenceRuntime:
             plans, legalised = settle_plan(plan, self.model.groups, cache.written, repair)
         start = time.perf_counter()
         self.reset()  # a call that fails from here on ends the episode
-        with torch.no_grad():
+        with fitting(self._artifact), torch.no_grad():
             contexts = self.model.prologue({key: torch.from_numpy(np.array(value)) for key, value in obs.items()})
             prologue = time.perf_counter()
             if pruned:
@@ -84,7 +89,7 @@ class ReferenceRuntime:
                 plans, legalised = settle_plan(wanted, self.model.groups, cache.written, True)
             pruner = time.perf_counter()
             initial, steps = noise_tensors(noise, spec.sampler.stochastic)
-            result = self.model.rollout(contexts, initial, steps, plans, cache, correction=correction)
+            result = self.model.rollout(contexts, initial, steps, plans, cache, correction=correction, known=known)
         self._cache = result.cache
         stop = time.perf_counter()
         wait = milliseconds(prologue, pruner) if pruned else 0.0

@@ -19,9 +19,14 @@ from ttscompile.config import FloatArray, Noise
 from ttscompile.correction import HISTORY, Correction, no_correction
 from ttscompile.errors import ArtifactError, ObservationError
 from ttscompile.ir.graph import TensorType
+from ttscompile.ir.idle import IDLE
+from ttscompile.ir.joint import CONTEXT, DENSE_STEP, STREAM
 from ttscompile.ir.program import Binding
 from ttscompile.update import matrices
 
+from .bound_block import BoundBlock
+from .idle import IdleSteps
+from .inpainting import Known, MaskedUpdates
 from .onnxruntime_sessions import Array, Bound, repeat_streams, run_named
 from .rollout_store import RolloutStore
 
@@ -49,6 +54,7 @@ class Workspace:
         current: float32 ``[blocks, *stream]``, what each block computed last.
         table: float32 ``[blocks, *stream]``, what each reused block adds at the moment.
         rollout: entries of the rollout cache.
+        idle: for steps without a computed block; None if the network is of another form.
     """
 
     def __init__(
@@ -82,19 +88,36 @@ class Workspace:
         at_first = {name: self._value(name, 0) for name in stem.inputs if name != stem.stream}
         self._stem = Bound(sessions[STEM], {stem.stream: self._initial, **at_first}, {stem.outputs[0]: self.fresh})
         self._history = np.zeros((dimensions, streams, HISTORY * horizon), np.float32)
+        size = self._sampler.memories * horizon
+        self._memory = [np.zeros((dimensions, streams, size), np.float32) for _ in range(2 * bool(size))]
         self._prediction = np.zeros_like(self.sample[0])
+        self.idle = (
+            IdleSteps(sessions[IDLE], self._sampler, manifest.spec.sample, streams, shape)
+            if IDLE in manifest.pieces
+            else None
+        )
         self._no_correction = no_correction(self._steps, manifest.spec.sample)
-        self._advances: dict[int, _Advances] = {}  # by the correction's identity, which the entry keeps from reuse
+        # By the correction's identity, which the entry keeps from reuse, and whether there is a prefix.
+        self._advances: dict[tuple[int, bool], _Advances] = {}
         self._advance = self._advances_with(self._no_correction)
-        self._blocks = [_BoundBlock(self, b, streams, self.stream, self.current[b]) for b in range(count)]
-        self._some: dict[tuple[int, int], _BoundBlock] = {}
+        self._dense: dict[int, Bound] = {}
+        self._blocks: list[BoundBlock] = []
+        self._some: dict[tuple[int, int], BoundBlock] = {}
+        if block_name(0) in sessions:
+            self.bind_blocks()
 
-    def start(self, obs: Mapping[str, FloatArray], noise: Noise, correction: Correction | None) -> None:
-        """Take in an observation and the noise of a call, and run what they decide before the loop."""
+    def start(
+        self, obs: Mapping[str, FloatArray], noise: Noise, correction: Correction | None, known: Known | None = None
+    ) -> None:
+        """Take in what a call is given, and run what decides before the loop."""
         np.copyto(self._initial, noise.initial)
-        np.copyto(self.sample[0], noise.initial.transpose(2, 0, 1))
-        self._advance = self._advances_with(correction or self._no_correction)
+        if known is not None:
+            self._initial[:, known.positions, known.channels] = known.values[0]
+        np.copyto(self.sample[0], self._initial.transpose(2, 0, 1))
+        self._advance = self._advances_with(correction or self._no_correction, known)
         self._history.fill(0)
+        if self._memory:
+            self._memory[0].fill(0)
         if self._sampler.stochastic and noise.steps is not None:
             column = self._sampler.noise_to_next[:, None, None, None]
             np.multiply(noise.steps.transpose(0, 3, 1, 2), column, out=self._offset)
@@ -102,6 +125,8 @@ class Workspace:
             self._offset.fill(0)
         if correction is not None:
             self._offset += correction.bias
+        if known is not None:
+            self._offset[:, known.channels, :, known.positions] = known.values[1:].transpose(0, 3, 1, 2)
         piece = self._manifest.pieces["condition"]
         if piece.outputs:
             feed = {name: np.ascontiguousarray(obs[name]) for name in piece.inputs}
@@ -133,6 +158,24 @@ class Workspace:
             self._history[:, :, :horizon] = self.sample[k % 2]
             self._history[:, :, horizon:half] = self._prediction
 
+    def enter_idle(self, k: int) -> None:
+        """Hand the state of step k over to ``idle``."""
+        assert self.idle is not None
+        self.idle.enter(self.sample[k % 2], self._history, self._memory[k % 2] if self._memory else None)
+
+    def run_idle(self, first: int, stop: int) -> None:
+        """Steps that all add the total that ``idle`` has been prepared for."""
+        assert self.idle is not None
+        self.idle.run(first, stop, self._advance.updates, self._offset, self._advance.anchors)
+
+    def leave_idle(self, k: int) -> None:
+        """Take the state of step k back from ``idle``, and make the stream as that step begins."""
+        assert self.idle is not None
+        self.idle.leave(self.sample[k % 2], self._history, self._memory[k % 2] if self._memory else None)
+        if k < self._steps:
+            np.copyto(self._initial, self.sample[k % 2].transpose(1, 2, 0))
+            self._stem.run()
+
     def result(self) -> FloatArray:
         """The sample after the last step, a copy ``[B, T, D]``."""
         return np.ascontiguousarray(self.sample[self._steps % 2].transpose(1, 2, 0))
@@ -140,6 +183,38 @@ class Workspace:
     def prepare(self, correction: Correction) -> None:
         """Make what the first call with a correction would have to make."""
         self._advances_with(correction)
+
+    def bind_blocks(self) -> None:
+        """Make what running a single block would have to make; ``sessions`` has those of single blocks."""
+        self._blocks = [BoundBlock(self, b, self.streams, self.stream, row) for b, row in enumerate(self.current)]
+
+    def bind_dense(self, k: int) -> Bound:
+        """What runs all blocks at step k; made once."""
+        bound = self._dense.get(k)
+        if bound is None:
+            piece = self._manifest.pieces[DENSE_STEP]
+            inputs = {CONTEXT + name: self._value(name, k) for name in piece.contexts} | {STREAM: self.fresh}
+            outputs = dict(zip(piece.outputs, (self.stream, *self.current), strict=True))
+            bound = self._dense[k] = Bound(self._sessions[DENSE_STEP], inputs, outputs)
+        return bound
+
+    def run_dense(self, k: int) -> None:
+        """All blocks at step k for all streams: reads ``fresh``, writes ``stream`` and ``current``."""
+        self.bind_dense(k).run()
+
+    def run_dense_some(self, k: int, streams: Sequence[int]) -> list[Array]:
+        """All blocks at step k for these streams only; reads ``fresh``.
+
+        Returns:
+            The stream after the blocks, and the residual of each, with the streams on axis 0.
+        """
+        piece = self._manifest.pieces[DENSE_STEP]
+        feed = {STREAM: np.take(self.fresh, streams, axis=self.axis)}
+        for name in piece.contexts:
+            axis, value = self._manifest.contexts[name].type.batch_axis, self._value(name, k)
+            feed[CONTEXT + name] = value if axis is None else np.take(value, streams, axis=axis)
+        made = run_named(self._sessions[DENSE_STEP], piece.outputs, feed)
+        return [np.moveaxis(value, self.axis, 0) for value in made.values()]
 
     def run(self, k: int, b: int) -> None:
         """Block b at step k for all streams: reads ``stream``, writes ``current[b]``."""
@@ -157,7 +232,7 @@ class Workspace:
             assert self._manifest.blocks[b].type.batch_axis is not None
             shape = self._manifest.blocks[b].type.at(len(streams))
             stream, residual = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-            some = self._some[key] = _BoundBlock(self, b, len(streams), stream, residual)
+            some = self._some[key] = BoundBlock(self, b, len(streams), stream, residual)
         some.gather(k, streams, self.stream)
         return some.rows
 
@@ -171,19 +246,26 @@ class Workspace:
     def nbytes(self) -> int:
         """Memory of all buffers, the rollout cache included."""
         own = (*self.sample, self.fresh, self.stream, self.current, self.table, self._sums, self._offset, self._history)
-        kept = (*self._values.values(), *self._step_inputs.values())
+        idle = 0 if self.idle is None else self.idle.nbytes
+        kept = (self._initial, self._prediction, *self._memory, *self._values.values(), *self._step_inputs.values())
         bound = sum(block.nbytes for block in (*self._blocks, *self._some.values()))
         updates = sum(advances.updates.nbytes for advances in self._advances.values())
-        return sum(array.nbytes for array in (*own, *kept)) + updates + bound + self.rollout.nbytes
+        return sum(array.nbytes for array in (*own, *kept)) + updates + bound + idle + self.rollout.nbytes
 
-    def _advances_with(self, correction: Correction) -> _Advances:
-        """Bindings of all steps to the rows of a correction; made once for each."""
-        known = self._advances.get(id(correction))
-        if known is None:
-            updates = matrices(self._sampler, correction)
+    def _advances_with(self, correction: Correction, known: Known | None = None) -> _Advances:
+        """Bindings of all steps to the rows of a correction; made once for each, and once for its prefixes."""
+        made = self._advances.get((id(correction), known is not None))
+        if made is None:
+            masked = None
+            if known is not None:
+                masked = MaskedUpdates(self._advances_with(correction).updates, self._manifest.spec.chunk)
+            updates = matrices(self._sampler, correction) if masked is None else masked.updates
             steps = [self._bind_advance(k, updates[k]) for k in range(self._steps)]
-            known = self._advances[id(correction)] = _Advances(correction, correction.anchors.tolist(), updates, steps)
-        return known
+            made = _Advances(correction, correction.anchors.tolist(), updates, steps, masked)
+            self._advances[id(correction), known is not None] = made
+        if made.masked is not None and known is not None:
+            made.masked.mask(known.values.shape[2])
+        return made
 
     def _bind_advance(self, k: int, update: Array) -> Bound:
         piece = self._manifest.pieces[ADVANCE]
@@ -197,6 +279,8 @@ class Workspace:
             "sample_to_x0": self._sampler.sample_to_x0[k : k + 1],
             "out_to_x0": self._sampler.out_to_x0[k : k + 1],
         }
+        if self._memory:
+            inputs["memory"] = self._memory[k % 2]
         for name in piece.inputs:
             if name not in inputs:
                 where, _, context = name.partition(".")
@@ -206,6 +290,8 @@ class Workspace:
             "stream_next": self.fresh,
             "prediction": self._prediction,
         }
+        if self._memory:
+            outputs["memory_next"] = self._memory[(k + 1) % 2]
         return Bound(self._sessions[ADVANCE], {name: inputs[name] for name in piece.inputs}, outputs)
 
     def _value(self, name: str, k: int) -> Array:
@@ -268,64 +354,14 @@ class _Advances:
         anchors: of each step, whether it enters the history.
         updates: float32 ``[K, G, R, T]``.
         steps: the bindings.
+        masked: what ``updates`` are of, with a prefix.
     """
 
     correction: Correction
     anchors: list[bool]
     updates: Array
     steps: list[Bound]
-
-
-class _BoundBlock:
-    """A block bound to arrays for n of the streams, and how the contexts of a step get there.
-
-    Args:
-        work: has the values of the contexts.
-        b: the block.
-        count: n.
-        stream: what it reads.
-        residual: what it writes.
-    """
-
-    def __init__(self, work: Workspace, b: int, count: int, stream: Array, residual: Array) -> None:
-        self._stream, self._axis = stream, work.axis  # not the workspace: that has us
-        self.rows = np.moveaxis(residual, work.axis, 0) if work.streams > 1 else residual
-        self._by_step: list[tuple[Array, Array]] = []  # where it is read from, and one value a step
-        self._gathered: list[tuple[Array, Array, int, bool]] = []  # where, value, axis of the streams, one a step
-        whole = count == work.streams
-        arrays: dict[str, Array] = {}
-        for name, (context, value) in work.contexts_of(b).items():
-            axis, stepwise = context.type.batch_axis, context.binding is not Binding.CONDITION
-            if not stepwise and (whole or axis is None):
-                arrays[name] = value
-                continue
-            arrays[name] = np.zeros(context.type.at(count), context.type.dtype)
-            if whole or axis is None:
-                self._by_step.append((arrays[name], value))
-            elif context.binding is Binding.TABLE:  # the same for every stream
-                self._by_step.append((arrays[name], value.take(np.arange(count), axis=axis + 1)))
-            else:
-                self._gathered.append((arrays[name], value, axis, stepwise))
-        self._own = (*arrays.values(), stream, residual) if not whole else tuple(to for to, _ in self._by_step)
-        self._bound = work.bound_block(b, stream, residual, arrays)
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the arrays that are its own."""
-        return sum(array.nbytes for array in self._own)
-
-    def run(self, k: int) -> None:
-        """Run at step k on the stream as it is."""
-        for to, values in self._by_step:
-            np.copyto(to, values[k])
-        self._bound.run()
-
-    def gather(self, k: int, streams: Sequence[int], stream: Array) -> None:
-        """Run at step k on these streams of the batch's ``stream``."""
-        np.take(stream, streams, axis=self._axis, out=self._stream, mode="clip")
-        for to, value, axis, stepwise in self._gathered:
-            np.take(value[k] if stepwise else value, streams, axis=axis, out=to, mode="clip")
-        self.run(k)
+    masked: MaskedUpdates | None
 
 
 def stream_type(manifest: Manifest, streams: int) -> TensorType:

@@ -64,7 +64,7 @@ class SamplerTable:
         memory[s] = to_memory[k, s] . [x0, x, out, memory[0], ..., memory[S - 1]]       all s at once, after ``next``
 
     The tables are computed at compile time: from diffusers' scheduler (``ttscompile.samplers``), or for flow matching
-    from the method's definition (``ttscompile.samplers_flow``). Columns are float32 ``[K]``. A multistep solver keeps
+    from the method's definition (``ttscompile.samplers.flow``). Columns are float32 ``[K]``. A multistep solver keeps
     earlier predictions in memories; a Runge-Kutta method, of which each evaluation is a step of its own here, what its
     stages have in common.
 
@@ -143,8 +143,8 @@ class ObservationSpec:
         window: whether the first axis, where there are several, is time: the last To frames. A key without frames, such
             as an instruction, is what it is at the time of the call.
         bounds: the smallest and largest value that there can be, each a number or one for each entry of the last axis;
-            None if that is not known. Integers outside them are refused: they are rows of an embedding. Random
-            observations are drawn within them. Kept as tuples.
+            None if that is not known. Integers outside them are refused: they are rows of an embedding. So are images
+            (``image``). Random observations are drawn within them. Kept as tuples.
     """
 
     shape: tuple[int, ...]
@@ -175,6 +175,16 @@ class ObservationSpec:
     def frames(self) -> int | None:
         """To, the number of frames that the first axis holds; None without such an axis."""
         return self.shape[0] if self.window and len(self.shape) > 1 else None
+
+    @property
+    def image(self) -> bool:
+        """Whether a frame is an image of floats, ``[C, H, W]``, whose bounds are the range of its numbers.
+
+        Bounds of a vector may be statistics, from which the robot may stray; those of an image are how it is encoded.
+        """
+        axes = len(self.shape) - (self.frames is not None)
+        one_pair = self.bounds is not None and len(np.atleast_1d(self.bounds[0])) == 1
+        return one_pair and axes >= 3 and np.dtype(self.dtype).kind == "f"
 
     def draw(self, rng: np.random.Generator) -> npt.NDArray[np.generic]:
         """One stream's random observation ``[1, *shape]`` of the specified dtype, not normalised.

@@ -28,7 +28,7 @@ from ttscompile.errors import ExecutorClosedError, ExecutorError, InfeasibleErro
 
 from .clock import Clock, MonotonicClock
 from .feasibility import Feasibility, LatencyWindow
-from .measure import accepts_prefix, measure_latencies
+from .measure import measure_latencies, prefix_refusal
 from .pinning import pin
 from .settings import ExecutorSettings, Policy, resolve
 from .state import ExecutorState, Job, feasibility
@@ -76,16 +76,18 @@ class AsyncExecutor:
         self._settings = settings = settings or ExecutorSettings()
         info = policy.info
         self._resolved = resolve(settings, info, control_hz)
-        if settings.seam == "prefix" and not accepts_prefix(policy):
+        refusal = prefix_refusal(policy) if settings.seam == "prefix" else None
+        if refusal is not None:
             raise ExecutorError(
                 "seam='prefix' needs a policy whose predict_action takes prefix= and inpaints it;"
-                f" {type(policy).__name__} does not. Use seam='blend' or seam='replace'."
+                f" {refusal} Use seam='blend' or seam='replace'."
             )
         self._policy = policy
-        self._normalizer = info.action.normalizer
+        self._normalizer = info.action.normalizer if info.action.ranged else None
         self._given_latencies = latencies
         self._clock = clock or MonotonicClock()
-        self.trace = Trace(settings.trace_events)
+        self._identity = str(getattr(info, "identity", ""))  # anything that predicts may be driven
+        self.trace = Trace(settings.trace_events, self._identity)
         self._lock = threading.Lock()
         self._work, self._news = threading.Condition(self._lock), threading.Condition(self._lock)
         self._state: ExecutorState | None = None
@@ -234,7 +236,7 @@ class AsyncExecutor:
         with self._lock:
             state = self._opened()
             plan, copied = state.plan, state.recorder.copy()
-        return statistics(plan, copied)
+        return statistics(plan, copied, self._identity)
 
     def feasibility(self) -> dict[str, Feasibility]:
         """The arithmetic of each tier, as measured when the executor was made."""

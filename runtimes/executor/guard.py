@@ -20,7 +20,7 @@ class GuardLimits:
         low: least action; None for what the normaliser maps to -1, ``margin`` further out.
         high: largest action; likewise.
         margin: share of the normaliser's range by which an action may be outside of it. A normaliser by mean and
-            deviation has no range: give ``low`` and ``high`` with one.
+            deviation, or by quantiles, has no range, and sets no bounds: give ``low`` and ``high``.
         max_step: largest change of an action from one control tick to the next, seams included; None for no limit.
         max_jerk: largest third difference over control ticks, ``a[3] - 3 a[2] + 3 a[1] - a[0]``; None for no limit.
     """
@@ -45,7 +45,8 @@ class Guard:
 
     Args:
         limits: see there.
-        normalizer: of the actions; None if the policy has none, and so no bounds but the ones in ``limits``.
+        normalizer: of the actions; None if the policy has none that knows their range (``ChunkSpec.ranged``), and so
+            no bounds but the ones in ``limits``.
         channels: Da.
 
     Raises:

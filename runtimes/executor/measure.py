@@ -9,15 +9,21 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.config import ObservationSpec
+from ttscompile.config import ChunkSpec, FloatArray, ObservationSpec
 
 from .clock import Clock
 from .settings import ExecutorSettings, Policy
 
 
-def accepts_prefix(policy: Policy) -> bool:
-    """Whether ``predict_action`` has a parameter ``prefix``, by that name."""
-    return "prefix" in inspect.signature(policy.predict_action).parameters
+def prefix_refusal(policy: Policy) -> str | None:
+    """Why a policy cannot be given the actions that are committed; None if it can.
+
+    It can if ``predict_action`` has a parameter ``prefix``, by that name, and the policy itself has nothing against it.
+    """
+    if "prefix" not in inspect.signature(policy.predict_action).parameters:
+        return f"{type(policy).__name__} does not."
+    refusal: str | None = getattr(policy.info, "prefix_refusal", None)
+    return None if refusal is None else f"this one does not: {refusal}"
 
 
 def neutral_observation(specs: dict[str, ObservationSpec]) -> dict[str, npt.NDArray[Any]]:
@@ -29,21 +35,28 @@ def neutral_observation(specs: dict[str, ObservationSpec]) -> dict[str, npt.NDAr
     return made
 
 
+def neutral_action(chunk: ChunkSpec) -> FloatArray:
+    """One action of one stream, ``[1, 1, Da]``, that the normaliser maps to 0."""
+    zeros = np.zeros((1, 1, chunk.action_dim), np.float32)
+    return zeros if chunk.normalizer is None else chunk.normalizer.unnormalize(zeros)
+
+
 def measure_latencies(
     policy: Policy, clock: Clock, settings: ExecutorSettings, plans: Sequence[str]
 ) -> dict[str, list[float]]:
-    """Seconds of each measured call of each plan, after the warm-up.
+    """Seconds of each measured call of each plan, after the warm-up; with a prefix, if calls will have one.
 
     The caller resets the policy before and after.
     """
     obs = neutral_observation(dict(policy.info.observation))
+    known = {"prefix": neutral_action(policy.info.action)} if settings.seam == "prefix" else {}
     latencies: dict[str, list[float]] = {}
     for plan in plans:
         for _ in range(settings.warm_up):
-            policy.predict_action(obs, plan=plan)
+            policy.predict_action(obs, plan=plan, **known)
         latencies[plan] = []
         for _ in range(settings.measured_calls):
             start = clock.now()
-            policy.predict_action(obs, plan=plan)
+            policy.predict_action(obs, plan=plan, **known)
             latencies[plan].append(clock.now() - start)
     return latencies

@@ -22,7 +22,7 @@ from ttscompile.ir.program import Program
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.runtimes.reference import ReferenceModel, noise_tensors
-from ttscompile.samplers import sampler_table
+from ttscompile.samplers.table import sampler_table
 from ttscompile.update import update_flops
 
 from .agreement import largest_difference, random_inputs

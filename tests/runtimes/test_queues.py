@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,8 @@ import torch
 from ttscompile import Noise
 from ttscompile.artifact import Artifact
 from ttscompile.config import ObservationSpec
-from ttscompile.errors import ObservationError
+from ttscompile.errors import IllegalPlanError, ObservationError
+from ttscompile.runtimes.arrays import check_observation
 from ttscompile.runtimes.policy import CompiledPolicy, load
 from ttscompile.runtimes.queues import Queues, is_window
 
@@ -24,9 +26,15 @@ def frame(value: float, streams: int = 1) -> dict[str, Any]:
     return {"observation.state": state, "tokens": tokens, "task": ["push"]}
 
 
+def push(queues: Queues, batch: dict[str, Any]) -> dict[str, Any]:
+    """Take a frame; the window after it."""
+    queues.keep(queues.after(batch))
+    return queues.observation(queues._frames)
+
+
 def window(queues: Queues) -> list[float]:
     """The frames of the first stream, one number each."""
-    state = queues.observation()["observation.state"]
+    state = queues.observation(queues._frames)["observation.state"]
     assert state.shape[1:] == (3, 2)
     return state[0, :, 0].tolist()  # type: ignore[no-any-return]
 
@@ -35,20 +43,20 @@ def test_the_first_frame_stands_for_those_before_it() -> None:
     queues = Queues(SPECS)
     seen = []
     for value in (1, 2, 3, 4):
-        queues.push(frame(value))
+        push(queues, frame(value))
         seen.append(window(queues))
     assert seen == [[1, 1, 1], [1, 1, 2], [1, 2, 3], [2, 3, 4]]
-    assert queues.observation()["tokens"].tolist() == [[4, 4, 4, 4]]
-    assert set(queues.observation()) == set(SPECS)
+    after = push(queues, frame(5))
+    assert after["tokens"].tolist() == [[5, 5, 5, 5]] and set(after) == set(SPECS)
     queues.reset()
-    queues.push(frame(9, streams=2))
+    push(queues, frame(9, streams=2))
     assert window(queues) == [9, 9, 9]
 
 
 def test_frames_are_the_queues_own() -> None:
     """Robots reuse their buffers."""
     queues, given = Queues(SPECS), frame(1)
-    queues.push(given)
+    push(queues, given)
     given["observation.state"][:] = 7
     assert window(queues) == [1, 1, 1]
 
@@ -78,13 +86,64 @@ def test_actions_come_one_by_one() -> None:
 )
 def test_a_bad_frame_changes_nothing(change: dict[str, Any], message: str) -> None:
     queues = Queues(SPECS)
-    queues.push(frame(1))
+    push(queues, frame(1))
+    queues.after(frame(5))  # not kept
     bad = {key: value for key, value in (frame(2) | change).items() if value is not None}
     with pytest.raises(ObservationError, match=message):
-        queues.push(bad)
+        queues.after(bad)
     assert window(queues) == [1, 1, 1]
     with pytest.raises(ObservationError, match="before"):
-        queues.push(frame(2, streams=3))
+        queues.after(frame(2, streams=3))
+
+
+IMAGE = ObservationSpec((2, 3, 8, 9), bounds=(0.0, 1.0))
+RNG = np.random.default_rng(0)
+PIXELS = RNG.integers(0, 256, (1, 3, 8, 9)).astype(np.uint8)
+
+
+@pytest.mark.parametrize("bytes_per_pixel", ["as float", "as they are", "normalised", "channels last"])
+def test_images_are_what_the_policy_was_trained_on(bytes_per_pixel: str) -> None:
+    """The same picture as 0..255, as bytes, as -1..1 and with its channels last, in a window and as one frame."""
+    good = PIXELS.astype(np.float32) / 255
+    bad, message = {
+        "as float": (
+            PIXELS.astype(np.float32),
+            r"'camera' is an image .* of 0 to 1; found 0 to 25\d\. Divide by 255,",
+        ),
+        "as they are": (PIXELS, r"uint8.*Divide by 255, channels first: image\.astype\(np\.float32\) / 255\."),
+        "normalised": (good * 2 - 1, r"'camera' .* of 0 to 1; found -\S+ to \S+\. Give what the camera measures"),
+        "channels last": (np.moveaxis(good, 1, -1), r"np\.moveaxis\(image, -1, -3\)"),
+    }[bytes_per_pixel]
+    with pytest.raises(ObservationError, match=message):
+        check_observation({"camera": np.stack((bad, bad), 1)}, {"camera": IMAGE})
+    with pytest.raises(ObservationError, match=message):
+        Queues({"camera": IMAGE}).after({"camera": bad})
+    cubic = good * 1.1 - 0.05  # what a cubic filter may overshoot by
+    check_observation({"camera": np.stack((good, cubic), 1)}, {"camera": IMAGE})
+    Queues({"camera": IMAGE}).after({"camera": cubic})
+
+
+def test_bounds_of_vectors_are_statistics_and_bounds_of_tokens_are_not() -> None:
+    """A robot may be where it never was in training; a token that does not exist is refused in a frame, too."""
+    state = ObservationSpec((2, 1), bounds=((0.0,), (1.0,)))
+    assert not state.image and IMAGE.image and not ObservationSpec((2, 3, 8, 9)).image
+    assert not ObservationSpec((3, 8, 9), bounds=(0.0, 1.0)).image  # three frames of a matrix
+    assert ObservationSpec((3, 8, 9), bounds=(0.0, 1.0), window=False).image
+    check_observation({"state": np.full((1, 2, 1), 7.0, np.float32)}, {"state": state})
+    tokens = ObservationSpec((4,), dtype="int64", window=False, bounds=(0.0, 9.0))
+    with pytest.raises(ObservationError, match="integers of 0 to 9; found 10 to 10"):
+        Queues({"tokens": tokens}).after({"tokens": np.full((1, 4), 10)})
+
+
+def test_the_check_of_two_cameras_takes_less_than_a_millisecond() -> None:
+    spec = ObservationSpec((2, 3, 96, 96), bounds=(0.0, 1.0))
+    obs = {name: RNG.random((1, 2, 3, 96, 96), np.float32) for name in ("left", "right")}
+    times = []
+    for _ in range(30):
+        begun = time.perf_counter()
+        check_observation(obs, dict.fromkeys(obs, spec))
+        times.append(time.perf_counter() - begun)
+    assert min(times) < 1e-3
 
 
 def test_windows_are_told_from_frames() -> None:
@@ -120,6 +179,24 @@ def test_select_action_computes_when_the_chunk_is_used_up(policy: CompiledPolicy
     report = policy.last_report
     assert torch.equal(policy.select_action(obs), chunk[:, 1])  # the queue of actions was left alone
     assert policy.last_report is report
+
+
+@pytest.mark.parametrize("method", ["select_action", "predict_action_chunk"])
+def test_a_call_that_fails_keeps_no_frame(policy: CompiledPolicy, method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Made again with a right plan and noise, it sees the same frames as one that did not fail."""
+    monkeypatch.setattr("ttscompile.runtimes.policy.is_window", lambda *_: False)  # the toy's windows are frames
+    call = getattr(policy, method)
+    for value in (1, 2):
+        obs = {"obs": np.full((1, 2), value, np.float32)}
+        for wrong, error in (({"plan": "nowhere"}, IllegalPlanError), ({"noise": some_noise(3)}, ObservationError)):
+            before = dict(policy._queues._frames)
+            with pytest.raises(error):
+                call(obs, **wrong)
+            assert policy._queues._frames == before and policy._queues.empty
+        call(obs, noise=some_noise(), plan="dense")
+        assert policy._queues._frames["obs"][-1].tolist() == [[value, value]]
+        while not policy._queues.empty:
+            policy._queues.pop()
 
 
 def test_reset_drops_actions_and_streams(policy: CompiledPolicy) -> None:

@@ -14,7 +14,7 @@ from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.write import write_artifact
 from ttscompile.ir.graph import Argument, Batch, Graph, Node, Ref, TensorType
 from ttscompile.ir.program import Binding, Block, Pieces, Program, Reuse
-from ttscompile.lower import lower_program
+from ttscompile.lower.program import lower_program
 
 from .literal import Toy
 

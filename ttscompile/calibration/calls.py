@@ -13,7 +13,7 @@ from torch import Tensor
 from ..config import PolicySpec
 from ..ir.graph import Graph
 from ..runtimes.reference import Contexts, ReferenceModel
-from ..trajectories import Episode
+from ..trajectories.episodes import Episode
 
 IntArray = npt.NDArray[np.int64]
 FloatArray = npt.NDArray[np.float32]

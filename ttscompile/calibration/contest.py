@@ -14,10 +14,10 @@ from ..artifact.load import Artifact
 from ..artifact.manifest import DENSE
 from ..config import FP32, Noise
 from ..lattice import Source
+from ..points import MeasuredPoint
 from ..runtimes.base import open_runtime
 from ..runtimes.policy import CompiledPolicy
-from ..trajectories import Episode
-from .points import Point
+from ..trajectories.episodes import Episode
 
 WARM_UP = 2
 """Rounds that are not timed; their actions count."""
@@ -32,8 +32,8 @@ class Entrant:
     """A plan that takes part.
 
     Attributes:
-        series: see ``Point``.
-        name: see ``Point``.
+        series: see ``MeasuredPoint``.
+        name: see ``MeasuredPoint``.
         policy: that runs it.
         plan: its name there.
         paired: whether it takes all the noise of the dense calls.
@@ -54,7 +54,7 @@ def measure(
     seed: int,
     threads: int,
     progress: Progress,
-) -> tuple[tuple[Point, ...], dict[str, float]]:
+) -> tuple[tuple[MeasuredPoint, ...], dict[str, float]]:
     """All entrants on all calls, in turn; and the yardsticks.
 
     Args:
@@ -99,11 +99,13 @@ def measure(
     return points, {name: float(np.mean(found)) for name, found in apart.items()}
 
 
-def _point(entrant: Entrant, errors: list[float], times: list[float], reports: list[tuple[float, float]]) -> Point:
+def _point(
+    entrant: Entrant, errors: list[float], times: list[float], reports: list[tuple[float, float]]
+) -> MeasuredPoint:
     timed = times[WARM_UP:] or times
     low, high = np.percentile(timed, [25, 75])
     sparsity, flops = np.mean(reports, axis=0)
-    return Point(
+    return MeasuredPoint(
         series=entrant.series,
         name=entrant.name,
         sparsity=float(sparsity),

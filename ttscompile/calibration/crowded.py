@@ -6,8 +6,9 @@ import numpy as np
 
 from ..lattice import PlanArray, whole_steps_plan
 
-CROWDING = (0.4, 0.6, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0)
-"""1 is even, above it the steps crowd towards the end, below it towards the start."""
+CROWDING = (2.0, 3.0, 1.5, 4.0, 1.0, 2.5, 3.5, 5.0, 0.6, 0.4)
+"""1 is even, above it the steps crowd towards the end, below it towards the start. In the order in which they are
+tried: late steps mattered most wherever it was measured, and time may end the search."""
 
 
 def crowded_plan(steps: int, blocks: int, full_steps: int, crowding: float) -> PlanArray:

@@ -23,15 +23,15 @@ from ..artifact.manifest import DENSE
 from ..correction import FEATURES, Correction
 from ..errors import CalibrationError
 from ..lattice import PlanArray
+from ..points import Frontier
 from ..runtimes.base import open_runtime
 from ..runtimes.policy import CompiledPolicy
-from ..trajectories import Episode, load_trajectories
+from ..trajectories.episodes import Episode, load_trajectories
 from .budget import cells_of, goal_of
 from .calls import Actions, Split, sample_calls, split_episodes
 from .contest import Entrant, Progress, measure
 from .execute import Executor
 from .latency import with_plans
-from .points import Frontier
 from .strategies import Task, plan_of, require_reach
 from .targets import dense_rounds, draw_calls
 

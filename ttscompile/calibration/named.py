@@ -7,12 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 from ..correction import Correction
 from ..lattice import PlanArray
 from .families import Families
 from .strategies import Found, Task
 from .whole_steps import WholeSteps
+
+Kept = TypeVar("Kept")
 
 SAFE, FAST = "safe", "fast"
 
@@ -35,6 +38,14 @@ class Named:
     corrections: Mapping[str, Correction] = field(default_factory=dict)
     steps: Mapping[str, list[int]] = field(default_factory=dict)
     skipped: Mapping[str, str] = field(default_factory=dict)
+
+    def without(self, name: str, reason: str) -> Named:
+        """The same without one of the plans, and why."""
+
+        def rest(of: Mapping[str, Kept]) -> dict[str, Kept]:
+            return {key: value for key, value in of.items() if key != name}
+
+        return Named(rest(self.plans), rest(self.corrections), rest(self.steps), {**self.skipped, name: reason})
 
 
 def named_plans(families: Families, whole: WholeSteps, task: Task, strategy: str, cells: int) -> Named:

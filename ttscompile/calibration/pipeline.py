@@ -13,12 +13,12 @@ import numpy as np
 
 from ..artifact.ceiling import few_steps
 from ..artifact.load import Artifact, load_artifact
-from ..artifact.plan_records import PRUNER
+from ..artifact.manifest import PRUNER
 from ..artifact.write import update_calibration
 from ..correction import FEATURES
 from ..errors import CalibrationError
-from ..golden import record_plans
-from ..trajectories import Episode, load_trajectories
+from ..record_golden import record_plans
+from ..trajectories.episodes import Episode, load_trajectories
 from .budget import ERROR, LATENCY, Budget, Goal, cells_of, goal_of
 from .calls import Actions, Calls, split_episodes
 from .clock import Clock
@@ -27,7 +27,7 @@ from .families import Families, budget_of_error
 from .head import has_head
 from .judge import PRUNED, SCHEDULE, UNIFORM, default_of, judge, require_success, uniform_of
 from .latency import measure_budget
-from .named import SHARE, Named, named_plans, relaxed
+from .named import SAFE, SHARE, Named, named_plans, relaxed
 from .precision import precision_record
 from .progress import Bar
 from .result import CalibrationResult
@@ -162,6 +162,9 @@ def calibrate(
             found, budget = _relax(artifact, families, whole, task, found, budget, sets["validation"])
         named = named_plans(families, whole, task, strategy, budget.cells)
     scores = judge(artifact, executor, found, named, sets["validation"], budget.cells)
+    if SAFE in scores and not scores[SAFE].error < scores[SCHEDULE].error:
+        error = scores.pop(SAFE).error
+        named = named.without(SAFE, f"{error:.4g} off, no safer than {SCHEDULE}: its search was cut short")
     result = CalibrationResult(
         strategy=strategy,
         seed=seed,

@@ -13,7 +13,7 @@ from ..config import Noise
 from ..correction import Correction
 from ..lattice import PlanArray, Source
 from ..runtimes.precision import Call, action_errors, compare
-from ..trajectories import Episode
+from ..trajectories.episodes import Episode
 from .calls import sample_calls
 
 HELD_OUT = 8

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from ..config import PolicySpec
-from ..trajectories import Episode
+from ..trajectories.episodes import Episode
 from .calls import Calls, Split, prepare_calls, sample_calls
 from .clock import Clock
 from .execute import Executor

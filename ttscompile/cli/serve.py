@@ -30,7 +30,7 @@ from ttscompile.runtimes.executor.server import ExecutorServer, ServerLimits
 @click.option(
     "--tier", "tiers", multiple=True, help="A plan, slowest first; may be repeated. The default plan, if none."
 )
-@click.option("--seam", type=click.Choice(["replace", "blend"]), default="replace", show_default=True)
+@click.option("--seam", type=click.Choice(["replace", "blend", "prefix"]), default="replace", show_default=True)
 @click.option("--interpolation", type=click.Choice(["hold", "linear"]), default="hold", show_default=True)
 @click.option("--max-hold", type=click.IntRange(min=0), default=3, show_default=True, help="Ticks to repeat an action.")
 @click.option("--max-clients", type=click.IntRange(min=1), default=8, show_default=True)

@@ -1,0 +1,168 @@
+"""Prefixes: actions that are committed before a call. The call keeps them, and inpaints the rest of its chunk.
+
+Before every step, the sample at the positions of the prefix is the committed actions at the noise level of that step,
+made with the call's own initial noise; after the last step it is the actions themselves::
+
+    sample_k[:, start : start + N, :Da] = signal[k] * actions + deviation[k] * initial[:, start : start + N, :Da]
+    sample_K[:, start : start + N, :Da] = actions
+
+The other positions see them through the network. It is the replacement of RePaint (arXiv 2201.09865) without its
+resampling, and with one draw of noise for all steps, so that a call stays a function of its arguments.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ttscompile.config import ChunkSpec, FloatArray, PolicySpec, SamplerTable
+from ttscompile.correction import groups_of
+from ttscompile.errors import ObservationError
+
+from .arrays import as_array, check_finite
+
+TOLERANCE = 1e-3
+"""Of the levels of a path that is one: tables are float32, and schedules round."""
+
+Levels = tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What is known of the samples of a call.
+
+    Attributes:
+        positions: of the T time steps.
+        channels: of the D dimensions.
+        values: float32 ``[K + 1, B, N, Da]``, there, before each step and after the last.
+    """
+
+    positions: slice
+    channels: slice
+    values: FloatArray
+
+
+class MaskedUpdates:
+    """The matrices of a correction with zeros for what is known, so that the offset alone decides there.
+
+    One copy serves prefixes of every length: from call to call columns are put back, or made zeros.
+
+    Args:
+        updates: float32 ``[K, G, R, (1 + S) T]``, as they are without a prefix; G is 1 or D.
+        chunk: of the policy.
+
+    Attributes:
+        updates: the same for the prefix of the moment.
+    """
+
+    def __init__(self, updates: FloatArray, chunk: ChunkSpec) -> None:
+        self.updates = updates.copy()
+        self._plain, self._start = updates, chunk.start
+        self._groups = slice(chunk.action_dim)  # with G = 1, the one
+        self._length = 0
+
+    def mask(self, length: int) -> None:
+        """Set the length of the prefix."""
+        first, last = sorted((self._start + self._length, self._start + length))
+        changed = (slice(None), self._groups, slice(None), slice(first, last))
+        self.updates[changed] = 0 if length > self._length else self._plain[changed]
+        self._length = length
+
+
+def noise_levels(sampler: SamplerTable) -> Levels | None:
+    """``signal`` and ``deviation``, float64 ``[K]``: a sample before step k is ``signal * clean + deviation * noise``.
+
+    They follow from how the table predicts the clean sample: ``x0 = (x - sigma eps) / alpha`` or ``alpha x - sigma v``
+    with ``alpha^2 + sigma^2 = 1``; or ``x0 = x + left v`` on a straight line from noise. A table that holds no clean
+    sample (Runge-Kutta), or in whose network's output it cannot be told apart, has none.
+
+    Returns:
+        None if they do not follow.
+    """
+    sample, out = sampler.sample_to_x0.astype(np.float64), sampler.out_to_x0.astype(np.float64)
+    if (sample > 0).all() and _keeps_variance(1 / sample, -out / sample):
+        return 1 / sample, -out / sample
+    if _keeps_variance(sample, -out):
+        return sample, -out
+    left = np.abs(out)
+    straight = (sample == 1).all() and (out * out[0] > 0).all() and abs(left[0] - 1) <= TOLERANCE
+    return (1 - left, left) if straight and _rises(1 - left) else None
+
+
+def prefix_refusal(spec: PolicySpec) -> str | None:
+    """Why a policy takes no prefix; None if it does."""
+    if noise_levels(spec.sampler) is None:
+        return (
+            f"the table of its sampler {spec.sampler.name!r} does not give the noise level of each step. Prefixes need"
+            " a network that predicts noise or v (DDPM, DDIM, DPM-Solver++), or flow matching by Euler's method."
+        )
+    horizon, channels = spec.sample
+    if spec.chunk.action_dim < channels and groups_of(spec.sampler.steps, (horizon, channels)) == 1:
+        return (
+            f"only {spec.chunk.action_dim} of the sample's {channels} channels are actions, and with {horizon} time"
+            " steps all channels share the matrices of the sampler's steps, of which a prefix would take columns."
+        )
+    return None
+
+
+def check_prefix(prefix: Any, streams: int, spec: PolicySpec) -> FloatArray:
+    """A prefix as a float32 array ``[B, N, Da]`` that fits the policy.
+
+    Raises:
+        ObservationError: of another kind, dtype or shape, too long or not finite; or the policy takes none.
+    """
+    array = as_array(prefix, "prefix")
+    chunk, (horizon, _) = spec.chunk, spec.sample
+    room = horizon - chunk.start
+    shape = (streams, array.shape[1] if array.ndim == 3 else 0, chunk.action_dim)
+    if array.shape != shape or array.dtype != np.float32:
+        raise ObservationError(
+            f"prefix must be float32 [B, N, Da] = [{streams}, N, {chunk.action_dim}]; found {array.dtype}"
+            f" {list(array.shape)}. Give the committed actions of every stream, from the chunk's first on."
+        )
+    if shape[1] > room:
+        raise ObservationError(
+            f"prefix holds {shape[1]} actions; the chunk has {room}, from its first executed one to the end of the"
+            f" prediction. Give at most {room}."
+        )
+    refusal = prefix_refusal(spec)
+    if shape[1] and refusal is not None:
+        raise ObservationError(f"the policy takes no prefix: {refusal} Call it without one.")
+    check_finite(array, "prefix", "Only actions that can be executed can be committed.")
+    return array
+
+
+def known_samples(spec: PolicySpec, prefix: FloatArray | None, initial: FloatArray) -> Known | None:
+    """What a prefix makes known of the samples of a call; None if it is None or empty.
+
+    Args:
+        spec: of the policy.
+        prefix: normalised actions ``[B, N, Da]``.
+        initial: the noise that the call starts from, ``[B, T, D]``.
+
+    Raises:
+        ObservationError: see ``check_prefix``.
+    """
+    if prefix is None or not check_prefix(prefix, len(initial), spec).size:
+        return None
+    levels = noise_levels(spec.sampler)
+    assert levels is not None  # check_prefix looked
+    start, channels = spec.chunk.start, slice(spec.chunk.action_dim)
+    positions = slice(start, start + prefix.shape[1])
+    signal, deviation = (each.astype(np.float32)[:, None, None, None] for each in levels)
+    noisy = signal * prefix + deviation * initial[:, positions, channels]
+    return Known(positions, channels, np.concatenate([noisy, prefix[None]]))
+
+
+def _keeps_variance(signal: npt.NDArray[np.float64], deviation: npt.NDArray[np.float64]) -> bool:
+    """Whether these are the levels of a process that adds noise and keeps the variance, seen backwards."""
+    one = np.abs(signal**2 + deviation**2 - 1) <= TOLERANCE
+    return bool(one.all() and (deviation >= 0).all()) and _rises(signal)
+
+
+def _rises(signal: npt.NDArray[np.float64]) -> bool:
+    """Whether the signal grows from nothing or more; what falls is a table of something else."""
+    return bool((signal >= -TOLERANCE).all() and (np.diff(signal) >= -TOLERANCE).all())

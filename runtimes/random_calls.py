@@ -1,0 +1,38 @@
+"""Inputs for calls that stand for any other: to time them, or to hold two precisions against each other."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ttscompile.config import Noise, PolicySpec
+
+Observation = dict[str, npt.NDArray[Any]]
+
+
+def random_calls(spec: PolicySpec, count: int, seed: int) -> list[tuple[Observation, Noise]]:
+    """Observations of one stream as ``ObservationSpec.draw`` makes them, and noise, for consecutive calls.
+
+    Args:
+        spec: of the policy.
+        count: how many calls.
+        seed: the same calls come of the same seed; more of them begin with the same ones.
+    """
+    calls = []
+    for number in range(count):
+        rng = np.random.default_rng((number, seed))
+        obs: Observation = {key: observation.draw(rng) for key, observation in spec.observations.items()}
+        initial = rng.standard_normal((1, *spec.sample), dtype=np.float32)
+        draws = rng.standard_normal((spec.sampler.steps, *initial.shape), dtype=np.float32)
+        calls.append((obs, Noise(initial, draws if spec.sampler.stochastic else None)))
+    return calls
+
+
+def normalized(spec: PolicySpec, obs: Observation) -> Observation:
+    """What the network is given of an observation as ``predict_action`` takes it."""
+    return {
+        key: obs[key] if one.normalizer is None else one.normalizer.normalize(obs[key])
+        for key, one in spec.observations.items()
+    }

@@ -1,0 +1,96 @@
+"""The seam ``prefix`` with compiled policies: what is committed is what the next chunk begins with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from diffusers.schedulers.scheduling_ddim import DDIMScheduler
+
+import ttscompile
+from tests.runtimes.toys import toy_program, written_artifact
+from ttscompile import AsyncExecutor, ExecutorSettings
+from ttscompile.errors import ExecutorError
+from ttscompile.runtimes.policy import CompiledPolicy
+from ttscompile.samplers.table import sampler_table
+
+from .simulation import FakeClock
+
+HZ, HORIZON, LATENCY = 10.0, 12, 0.2
+
+
+@pytest.fixture(scope="module")
+def inpainting(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The toy with DDIM and eleven actions a chunk."""
+    program = toy_program(horizon=HORIZON)
+    table = sampler_table(DDIMScheduler(num_train_timesteps=50, beta_schedule="squaredcos_cap_v2"), steps=5)
+    program = replace(program, spec=replace(program.spec, sampler=table))
+    return written_artifact(program, tmp_path_factory.mktemp("inpainting") / "artifact").path
+
+
+class Recorded:
+    """A policy that keeps what it was given and what it gave.
+
+    Attributes:
+        calls: prefix and predicted actions of each call.
+    """
+
+    def __init__(self, policy: CompiledPolicy) -> None:
+        self.info, self.reset, self._policy = policy.info, policy.reset, policy
+        self.calls: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def predict_action(self, obs_dict: Mapping[str, Any], *, plan: str, prefix: np.ndarray) -> dict[str, Any]:
+        predicted = self._policy.predict_action(obs_dict, plan=plan, prefix=prefix)
+        self.calls.append((prefix[0], predicted["action_pred"][0]))
+        return predicted
+
+
+def drive(path: Path, ticks: int) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
+    """Actions of a loop at the policy's rate whose calls are said to take two ticks, and the calls."""
+    clock, policy = FakeClock(), Recorded(ttscompile.load(path, seed=0))
+    settings = ExecutorSettings(seam="prefix", n_obs_steps=1)
+    executor = AsyncExecutor(policy, HZ, settings, clock=clock, latencies={"dense": LATENCY})
+    clock.settle()
+    actions: list[np.ndarray] = []
+    rng = np.random.default_rng(0)
+    try:
+        while len(actions) < ticks:
+            executor.observe({"obs": rng.standard_normal(2).astype(np.float32)})
+            clock.settle()
+            if executor.ready:
+                actions.append(executor.action())
+            clock.advance(1 / HZ)
+    finally:
+        clock.free()
+        executor.close()
+    return np.array(actions), policy.calls
+
+
+def test_a_compiled_policy_keeps_what_is_committed(inpainting: Path) -> None:
+    actions, calls = drive(inpainting, ticks=60)
+    assert calls[0][0].shape == (0, 2)  # nothing was scheduled yet
+    assert len(calls) > 5
+    for prefix, predicted in calls[1:]:
+        assert prefix.shape == (3, 2)  # now, and the two ticks that the call may take
+        np.testing.assert_allclose(predicted[1:4], prefix, atol=1e-5)
+        assert np.abs(actions[:, None] - prefix).sum(-1).min(axis=0).max() < 1e-5  # all of it was played
+
+
+def test_a_policy_that_cannot_inpaint_is_refused_when_the_executor_is_made(toy_compiled: Path) -> None:
+    policy = ttscompile.load(toy_compiled)
+    with pytest.raises(
+        ExecutorError,
+        match=r"inpaints it; this one does not: the table of its sampler 'toy' does not give.*Use seam='blend'",
+    ):
+        AsyncExecutor(policy, HZ, ExecutorSettings(seam="prefix"))
+
+
+def test_latencies_are_measured_with_a_prefix(inpainting: Path) -> None:
+    policy = Recorded(ttscompile.load(inpainting, seed=0))
+    settings = ExecutorSettings(seam="prefix", warm_up=1, measured_calls=2, n_obs_steps=1)
+    with AsyncExecutor(policy, HZ, settings):
+        assert [prefix.shape for prefix, _ in policy.calls] == [(1, 2)] * 3
