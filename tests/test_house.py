@@ -28,10 +28,11 @@ MAY_IMPORT = {
     "lattice": {"errors"},
     "update": {"config", "correction"},
     "machine": set(),
-    "report": BELOW_ARTIFACT | {"machine", "plots", "runtimes", "trajectories", "units", "verification"},
+    "report": BELOW_ARTIFACT | {"machine", "plots", "points", "runtimes", "trajectories", "units", "verification"},
     "units": set(),
     "doctor": BELOW_ARTIFACT | {"machine", "runtimes"},
-    "plots": {"errors", "lattice"},
+    "plots": {"errors", "lattice", "points"},
+    "points": set(),
     "samplers": BASE,
     "trajectories": BASE,
     "ir": BASE,
@@ -41,10 +42,10 @@ MAY_IMPORT = {
     "frontends": BASE | {"samplers"},
     "artifact": BASE | {"ir"},
     "runtimes": BELOW_ARTIFACT | {"machine"},
-    "golden": BELOW_ARTIFACT | {"frontends", "runtimes"},
+    "record_golden": BELOW_ARTIFACT | {"frontends", "runtimes"},
     "verification": BELOW_ARTIFACT | {"runtimes", "trajectories"},
-    "calibration": BELOW_ARTIFACT | {"golden", "runtimes", "trajectories"},
-    "driver": BELOW_ARTIFACT | COMPILER | {"golden", "runtimes"},
+    "calibration": BELOW_ARTIFACT | {"points", "record_golden", "runtimes", "trajectories"},
+    "driver": BELOW_ARTIFACT | COMPILER | {"record_golden", "runtimes"},
     "cli": BELOW_ARTIFACT
     | COMPILER
     | {
@@ -53,6 +54,7 @@ MAY_IMPORT = {
         "driver",
         "machine",
         "plots",
+        "points",
         "report",
         "runtimes",
         "trajectories",
@@ -68,10 +70,10 @@ COMPILES = (
     "ttscompile.capture",
     "ttscompile.driver",
     "ttscompile.frontends",
-    "ttscompile.golden",
     "ttscompile.ir.evaluate",
     "ttscompile.lower",
     "ttscompile.passes",
+    "ttscompile.record_golden",
     "ttscompile.runtimes.reference",
     "ttscompile.samplers",
 )
@@ -80,7 +82,8 @@ COMPILES = (
 
 def part(module: str) -> str:
     """``ttscompile.ir.graph`` -> ``ir``, ``ttscompile.capture_batch`` -> ``capture``, ``ttscompile`` -> nothing."""
-    return module.removeprefix("ttscompile").lstrip(".").partition(".")[0].partition("_")[0]
+    name = module.removeprefix("ttscompile").lstrip(".").partition(".")[0]
+    return name if name in MAY_IMPORT else name.partition("_")[0]
 
 
 def direction_errors(found: list[Import], known: set[str]) -> list[str]:

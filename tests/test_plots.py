@@ -11,7 +11,7 @@ from PIL import Image
 
 from ttscompile.errors import IllegalPlanError
 from ttscompile.lattice import Source
-from ttscompile.plots import COLOURS, plot_plan
+from ttscompile.plots.plan import COLOURS, plot_plan
 
 
 def pixels_of(source: Source, picture: Path) -> int:

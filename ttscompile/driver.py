@@ -20,17 +20,16 @@ from .config import FP32, PolicySpec
 from .errors import ArtifactError
 from .frontends import load_checkpoint_policy
 from .frontends.encoded import EncodedDenoiser
-from .golden import record_original
 from .ir.dataflow import reachable_from
 from .ir.flops import graph_flops, node_flops
 from .ir.graph import Graph
 from .ir.joint import DENSE_STEP, JOINT
 from .ir.program import Program
 from .ir.verify import verify
-from .lower import lower_program
-from .lower_joint import chain_blocks, join_blocks
-from .lower_precision import lower_precision, require_precision
-from .lower_single_file import lower_single_file
+from .lower.joint import chain_blocks, join_blocks
+from .lower.precision import lower_precision, require_precision
+from .lower.program import lower_program
+from .lower.single_file import lower_single_file
 from .passes.base import Pass
 from .passes.clean_up import CleanUp
 from .passes.cut_copies import CutCopies
@@ -44,6 +43,7 @@ from .passes.split_features import SplitFeatures
 from .passes.split_tokens import SplitTokens
 from .passes.unfold_batch import UnfoldBatch
 from .passes.widen_attention import WidenAttention
+from .record_golden import record_original
 from .runtimes.precision import measure_precision
 
 if TYPE_CHECKING:
@@ -77,8 +77,10 @@ def convert(
         checkpoint: a file or directory that the training code saved.
         directory: where the artifact goes; an artifact that is there is replaced, anything else is left alone.
         format: ``auto``, ``diffusion_policy`` or ``lerobot``.
-        sampler: ``ddpm``, ``ddim`` or ``dpmsolver++`` in place of the checkpoint's own; None keeps it.
-        steps: number of denoising steps; None keeps the checkpoint's.
+        sampler: ``ddpm``, ``ddim`` or ``dpmsolver++`` in place of a diffusion policy's own, ``euler`` or ``rk4`` in
+            place of a flow-matching policy's; None keeps it.
+        steps: number of denoising or integration steps; None keeps the checkpoint's. ``rk4`` evaluates the network four
+            times a step: K = 4 ``steps``.
         spacing: ``leading``, ``trailing`` or ``linspace``: the timesteps that fewer steps visit. None: the checkpoint's
             own, or diffusers' default (``leading`` of DDIM); of ``dpmsolver++`` in place of another sampler
             ``trailing``, or ``leading`` for a policy that predicts noise without a bound on the sample.
@@ -88,7 +90,7 @@ def convert(
             beside the checkpoint. Nothing is ever downloaded.
         precision: of the weights of residual blocks: ``fp32`` or ``int8``; see ``compile_denoiser``.
         single_file: where one ONNX file of the whole call goes too, for programs without ttscompile; None for none.
-            ``ttscompile.lower_single_file`` describes its inputs and outputs.
+            ``ttscompile.lower.single_file`` describes its inputs and outputs.
         explain: told what each stage did.
 
     Raises:
@@ -143,7 +145,7 @@ def compile_denoiser(
         golden = record_original(module, program)
         explain("record_original", (f"{len(golden.steps)} of {spec.sampler.steps} steps, {golden.streams} streams",))
         manifest = write_artifact(program, models, directory, blocks, golden)
-        explain("write", (f"identity {manifest.identity[:12]}",))
+        explain("write", (f"identity {manifest.short_identity}",))
     if whole is not None and single_file is not None:
         _write(Path(single_file), whole)
         explain("write_single_file", (f"{len(whole) / 1e6:.1f} MB",))

@@ -33,9 +33,10 @@ from rounds import DENSE, EAGER, Effort, eager_contestant, measure_in_passes, ro
 import ttscompile
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.cli.output import identity_of, only_results_on_stdout, print_json, progress, results_console, run, table
-from ttscompile.cli.timing import Contestant, Measurement, original_network, plan_contestant, random_calls
+from ttscompile.cli.timing import Contestant, Measurement, original_network, plan_contestant
 from ttscompile.lattice import PlanArray
 from ttscompile.machine import fingerprint, one_line
+from ttscompile.runtimes.random_calls import random_calls
 
 OURS, LONGER = "compiled", "compiled, longer loop"
 GROWTH = 4

@@ -28,6 +28,7 @@ from rollout import EpisodeCache, Rollout, run_episodes
 from score_plot import Timed, plot_scores, time_calls
 from variants import Variant, first_seed_option, open_variant, results_console, run, runtime_option, threads_option
 
+from ttscompile.artifact.manifest import abbreviated
 from ttscompile.cli.output import identity_of
 from ttscompile.machine import fingerprint, one_line
 
@@ -217,7 +218,7 @@ def main(
     else:
         results_console().print(evaluation_table(evaluations, seeds, timed))
         for text, identity in zip(variants, identities, strict=True):
-            click.echo(f"{text}: identity {identity[:12]}")
+            click.echo(f"{text}: identity {abbreviated(identity)}")
     for e in evaluations:
         if e.legalised:
             click.echo(f"warning: {e.label}: {e.legalised} cells of its plans were illegal and were replaced", err=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import fill
 from time import perf_counter
 
 import numpy as np
@@ -70,10 +71,19 @@ def plot_scores(
     axes = figure.add_subplot()
     axes.axhspan(scores[0].low, scores[0].high, color="#dddddd", zorder=0, label=f"{names[0]}, 95 % interval")
     axes.axhline(scores[0].mean, color="#888888", linewidth=1, zorder=0)
+    middle = (min(one.median for one in timed) * max(one.median for one in timed)) ** 0.5
     for name, score, time in zip(names, scores, timed, strict=True):
         errors = [[score.mean - score.low], [score.high - score.mean]]
         axes.errorbar([time.median], [score.mean], yerr=errors, fmt="o", capsize=3, markersize=5)
-        axes.annotate(name, (time.median, score.mean), xytext=(6, 5), textcoords="offset points", fontsize=8)
+        left = time.median > middle  # so that no name leaves the picture
+        axes.annotate(
+            name,
+            (time.median, score.mean),
+            xytext=(-6 if left else 6, 5),
+            textcoords="offset points",
+            ha="right" if left else "left",
+            fontsize=8,
+        )
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter(LogFormatter())
     axes.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
@@ -82,6 +92,6 @@ def plot_scores(
     axes.margins(x=0.15)
     axes.grid(which="both", color="#eeeeee", linewidth=0.5)
     axes.set_axisbelow(True)
-    axes.set_title(title, fontsize=8, loc="left")
+    axes.set_title("\n".join(fill(line, 110) for line in title.splitlines()), fontsize=8, loc="left")
     axes.legend(loc="lower right", fontsize=8, frameon=False)
     figure.savefig(path, dpi=150, metadata={"Software": None} if path.suffix == ".png" else None)

@@ -18,11 +18,11 @@ from ttscompile import SamplerTable
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import update_calibration
 from ttscompile.calibration.frontier import compare
-from ttscompile.calibration.points import Frontier, Point
 from ttscompile.cli import main
 from ttscompile.errors import CalibrationError, OutputError
 from ttscompile.lattice import uniform_plan
 from ttscompile.plots.frontier import plot_frontier
+from ttscompile.points import Frontier, MeasuredPoint
 
 from . import policies
 
@@ -53,7 +53,7 @@ def frontier(planned: Path, other_sampler: Path, recording: Path) -> Frontier:
     return compare(planned, [recording], ["interval", "tts"], [0.5, 0.8], [other_sampler], calls=8, intervals=8)
 
 
-def points(frontier: Frontier) -> dict[tuple[str, str], Point]:
+def points(frontier: Frontier) -> dict[tuple[str, str], MeasuredPoint]:
     return {(point.series, point.name): point for point in frontier.points}
 
 
@@ -120,8 +120,8 @@ def test_what_cannot_be_compared_is_refused(
         compare(planned, [policies.record(tmp_path / "one.npz", episodes=1)], [], [])
 
 
-def _point(name: str, latency: float, error: float) -> Point:
-    return Point("s", name, 0.5, 1.0, error, error, latency, (latency, latency), "all")
+def _point(name: str, latency: float, error: float) -> MeasuredPoint:
+    return MeasuredPoint("s", name, error, latency, 0.5, 1.0, error, (latency, latency), "all")
 
 
 def test_the_frontier_is_what_nothing_beats() -> None:
@@ -160,6 +160,9 @@ def test_the_command_prints_the_same_as_a_table_and_as_json(
     assert told.exit_code == 0, told.stderr
     record = json.loads(told.stdout)
     assert [point["series"] for point in record["points"]] == ["this artifact"] * 2 + ["interval"] * 2 + ["five"]
+    identity, other = (load_artifact(path).manifest.identity for path in (planned, other_sampler))
+    assert record["identity"] == identity
+    assert record["with"] == [{"path": str(other_sampler), "identity": other}]
     assert "held-out calls" in (tmp_path / "f.svg").read_text()
     assert "warning: this artifact" in told.stderr
     shown = runner.invoke(main, ["compare", *arguments])

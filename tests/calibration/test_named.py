@@ -9,7 +9,7 @@ import pytest
 
 import ttscompile
 from ttscompile.artifact.load import load_artifact
-from ttscompile.calibration import CalibrationResult, calibrate
+from ttscompile.calibration import CalibrationResult, calibrate, families
 from ttscompile.calibration.strategies import tts
 from ttscompile.errors import IllegalPlanError
 from ttscompile.lattice import Source
@@ -84,3 +84,16 @@ def test_what_cannot_be_made_is_said(artifact: Path, recording: Path, short_sear
     assert record is not None
     assert record["skipped"] == dict(result.skipped)
     assert set(load_artifact(artifact).schedules) == {"schedule", "uniform"}
+
+
+def test_a_plan_that_is_no_safer_is_left_out_with_the_reason(
+    artifact: Path, recording: Path, short_search: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The time limit ends the search for ``safe`` at its first candidate, which is bad."""
+    monkeypatch.setattr(families.Families, "best", lambda *_: families.Best(tuple(range(8)), 1.0))
+    result = calibrate(artifact, [recording], 0.6, progress=False, max_minutes=1)
+    assert "safe" not in result.plans
+    assert result.skipped["safe"].endswith("off, no safer than schedule: its search was cut short")
+    loaded = load_artifact(artifact)
+    assert "safe" not in loaded.manifest.plans
+    assert "safe" not in loaded.corrections

@@ -13,7 +13,8 @@ from click.testing import CliRunner
 import ttscompile
 from ttscompile import Noise
 from ttscompile.cli import main
-from ttscompile.cli.timing import contestants, random_calls
+from ttscompile.cli.timing import contestants
+from ttscompile.runtimes.random_calls import random_calls
 
 STEPS = 4
 

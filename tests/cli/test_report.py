@@ -22,8 +22,9 @@ from ttscompile.artifact.write import update_calibration
 from ttscompile.cli import main
 from ttscompile.errors import ReportError
 from ttscompile.lattice import Source, uniform_plan
+from ttscompile.points import efficient
 from ttscompile.report import Given, build, facts, pictures, render, verified
-from ttscompile.report.frontier import efficient, from_comparison
+from ttscompile.report.frontier import from_comparison
 from ttscompile.report.measure import run_episode
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy
@@ -146,7 +147,8 @@ def test_the_page_says_what_was_found(page: str, calibrated: Path) -> None:
         "on the frontier",
         "12.5",
         "Could not be run",
-        "5 denoising steps: the first is always dense, so at most 80% of the cells",
+        "K = 5 denoising steps leave reuse little room",
+        "at most 80.0% of the cells",
         "the first call after reset() falls back",
     ):
         assert expected in text, expected
@@ -190,6 +192,28 @@ def test_a_check_that_failed_is_told_and_is_the_exit_status(
     text = Reader((tmp_path / "r.html").read_text()).text
     assert "FAILED at one block. Convert it again." in text
     assert "First at step 1, blocks 2." in text
+
+
+def test_arrays_of_other_names_reach_the_episode_and_the_checks(
+    calibrated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames = tmp_path / "frames.npz"
+    state = np.random.default_rng(0).standard_normal((6, 3)).astype(np.float32)
+    np.savez(frames, state=state, episode_ends=np.array([6]), meta=json.dumps({"frames": True}))
+    given: list[Any] = []
+
+    def verify(directory: Path, trajectories: Any, *, sources: Any, **_: Any) -> Verification:
+        given.extend((directory, trajectories, sources))
+        return Verification("compiled", None, None, (Rung("one block", "passed", "it holds"),), 1.0)
+
+    monkeypatch.setattr(ttscompile, "verify", verify, raising=False)
+    options = ("--trajectories", frames, "--observation", "obs=state:2", "--verify", "--runs", 1)
+    result = run(calibrated, "-o", tmp_path / "r.html", *options)
+    assert result.exit_code == 0, result.stderr
+    assert given == [calibrated, (frames,), {"obs": ("state:2",)}]
+    text = Reader((tmp_path / "r.html").read_text()).text
+    assert "consecutive calls of frames.npz[0]" in text
+    assert "All rungs hold" in text
 
 
 def test_text_in_pictures_is_no_formula() -> None:

@@ -41,6 +41,7 @@ def make(folder: Path) -> None:
             corrections={"schedule": no_correction(artifact.manifest.steps, artifact.manifest.spec.sample)},
         )
     _checkpoints(folder / "checkpoints")
+    _lerobot(folder / "lerobot")
     _trajectories(folder / "trajectories")
     (folder / "states").mkdir()
     state = StateFile(folder / "states", {"model": "0" * 16, "seed": 0, "budget": {"kind": "sparsity", "value": 0.9}})
@@ -63,6 +64,22 @@ def _checkpoints(folder: Path) -> None:
     shared = find_shared(ROOT)
     if shared is not None:
         shutil.copy(shared / "golden" / "diffusion_policy" / "bert.ckpt", folder / "golden.ckpt")
+
+
+def _lerobot(folder: Path) -> None:
+    from tests.frontends.lerobot_tiny import save_policy
+
+    policies = {
+        "images": {
+            "cameras": ("top", "wrist"),
+            "renamed": {"arm": "observation.state"},
+            "noise_scheduler_type": "DDPM",
+        },
+        "flow": {"objective": "flow_matching", "integration_method": "rk4", "use_positional_encoding": True},
+    }
+    for name, settings in policies.items():
+        (folder / name).mkdir(parents=True)
+        save_policy(folder / name, **settings)
 
 
 def _trajectories(folder: Path) -> None:

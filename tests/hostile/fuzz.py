@@ -188,7 +188,7 @@ def _warm_up(target: str, make: Callable[..., Callable[[], None]], corpus: Path,
     from tests.hostile import messages
     from tests.hostile.targets import outcome
 
-    if target in ("checkpoint", "artifact", "mixed"):
+    if target in ("checkpoint", "lerobot", "artifact", "mixed"):
         import torch
 
         torch.set_num_threads(1)

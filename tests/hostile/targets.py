@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import random
 import shutil
 import warnings
@@ -10,7 +11,7 @@ from pathlib import Path
 
 from tests.hostile import forged, messages, pickles
 from tests.hostile.archives import write, write_hostile
-from tests.hostile.mutate import damaged
+from tests.hostile.mutate import changed, damaged
 from ttscompile.errors import CalibrationError, ExecutorError, TtscompileError
 
 Case = Callable[[random.Random, Path, Path], Callable[[], None]]
@@ -84,6 +85,27 @@ def checkpoint(rng: random.Random, corpus: Path, folder: Path) -> Callable[[], N
     return load
 
 
+def lerobot(rng: random.Random, corpus: Path, folder: Path) -> Callable[[], None]:
+    """A directory of LeRobot's, with the configuration of its encoders beside it."""
+    from ttscompile.frontends import load_checkpoint_policy
+
+    path = Path(shutil.copytree(rng.choice(sorted((corpus / "lerobot").iterdir())), folder / "lerobot"))
+    files = sorted(file for file in path.rglob("*") if file.is_file())
+    victim = rng.choice([*files, *[file for file in files if file.suffix == ".json"]])
+    before = victim.read_bytes()
+    if rng.random() < 0.2:
+        victim.write_bytes(damaged(rng, before))
+    elif victim.suffix == ".json":
+        victim.write_text(json.dumps(changed(rng, json.loads(before))))
+    else:
+        victim.write_bytes(forged.changed_tensors(rng, before))
+
+    def load() -> None:
+        load_checkpoint_policy(path / "policy", format="lerobot")
+
+    return load
+
+
 def trajectories(rng: random.Random, corpus: Path, folder: Path) -> Callable[[], None]:
     """A recording of episodes."""
     from ttscompile.config import ObservationSpec
@@ -136,6 +158,7 @@ TARGETS: dict[str, Case] = {
     "artifact": artifact,
     "zip": zipped,
     "checkpoint": checkpoint,
+    "lerobot": lerobot,
     "trajectories": trajectories,
     "protocol": protocol,
     "state": state,

@@ -7,10 +7,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from .codec import to_json
-from .manifest import Manifest
+from .manifest import PRUNER, Manifest
 from .strict_json import dump_compact
-
-PRUNER = "pruner"
 
 
 def identities(manifest: Manifest) -> tuple[str, str]:

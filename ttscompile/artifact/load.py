@@ -26,7 +26,7 @@ from .archive import Unpacked, unpack
 from .codec import decode
 from .files import verify
 from .identity import identities
-from .manifest import DENSE, MANIFEST, Manifest, Requires, block_name
+from .manifest import DENSE, MANIFEST, Manifest, Requires, abbreviated, block_name
 from .onnx_files import check_model
 from .size import check_size
 from .strict_json import REMEDY, parse
@@ -230,7 +230,7 @@ def _load_directory(directory: Path) -> Artifact:
     if identities(manifest) != (manifest.identity, manifest.model_identity):
         raise ArtifactError(
             f"{directory}: expected the identity {manifest.short_identity}; its content has"
-            f" {identities(manifest)[0][:12]}. {REMEDY}"
+            f" {abbreviated(identities(manifest)[0])}. {REMEDY}"
         )
     check_size(manifest, directory)
     models = {piece.file for piece in manifest.pieces.values()}

@@ -19,6 +19,10 @@ SCHEMA_VERSION = 3
 MANIFEST = "manifest.json"
 DENSE = "dense"
 """The plan that computes every cell; every artifact has it without listing it."""
+PRUNER = "pruner"
+"""The pruner's piece, and the plan that it makes where that is not called otherwise."""
+
+_SHOWN = 12
 
 
 @dataclass(frozen=True)
@@ -264,8 +268,13 @@ class Manifest:
 
     @property
     def short_identity(self) -> str:
-        """The first 12 digits of the identity, for people."""
-        return self.identity[:12]
+        """Of the identity what people are shown."""
+        return abbreviated(self.identity)
+
+
+def abbreviated(identity: str) -> str:
+    """The first 12 digits of an identity, for people; JSON has all 64."""
+    return identity[:_SHOWN]
 
 
 def block_name(index: int) -> str:

@@ -12,11 +12,8 @@ import numpy.typing as npt
 from ..errors import ArtifactError
 from ..lattice import plan_flops, sparsity
 from .load import check_schedule
-from .manifest import DENSE, Manifest, PlanRecord
+from .manifest import DENSE, PRUNER, Manifest, PlanRecord
 from .strict_json import Value, dump_compact, parse
-
-PRUNER = "pruner"
-"""Name of the pruner's piece, and of its plan where ``default_plan`` gives none."""
 
 _PLAN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.%-]{0,63}")
 

@@ -43,8 +43,8 @@ from .load import (
     load_artifact,
     read_manifest,
 )
-from .manifest import DENSE, FORMAT, MANIFEST, SCHEMA_VERSION, Manifest, Stores
-from .plan_records import PRUNER, calibration_record, plan_records
+from .manifest import DENSE, FORMAT, MANIFEST, PRUNER, SCHEMA_VERSION, Manifest, Stores, abbreviated
+from .plan_records import calibration_record, plan_records
 from .precision import LoweredBlocks, store_blocks
 from .records import (
     PRUNER_PREFIX,
@@ -138,7 +138,7 @@ def update_calibration(
         record: what was done to get here; JSON.
         corrections: of the sampler's steps, by the name of their plan; None for none.
         model_identity: of the artifact that was calibrated; refuses another one.
-        golden: records what the reference runtime makes of the plans (``ttscompile.golden.record_plans``), given the
+        golden: records what the reference runtime makes of the plans (``record_golden.record_plans``), given the
             artifact as it will be; None leaves the artifact without, and its plans cannot be verified.
 
     Returns:
@@ -157,8 +157,9 @@ def update_calibration(
         artifact = load_artifact(directory)
         if model_identity not in (None, artifact.manifest.model_identity):
             raise ArtifactError(
-                f"{directory}: expected the model {str(model_identity)[:12]}, which was calibrated; found"
-                f" {artifact.manifest.model_identity[:12]}: the artifact was converted again. Calibrate it again."
+                f"{directory}: expected the model {abbreviated(str(model_identity))}, which was calibrated; found"
+                f" {abbreviated(artifact.manifest.model_identity)}: the artifact was converted again. Calibrate it"
+                " again."
             )
         manifest = replace(
             artifact.manifest,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from ttscompile.artifact.manifest import abbreviated
 from ttscompile.cli.calibrate import STRATEGIES
 from ttscompile.cli.output import (
     artifact_argument,
@@ -28,7 +29,7 @@ from ttscompile.plots.frontier import plot_frontier
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from ttscompile.calibration.points import Frontier
+    from ttscompile.points import Frontier
 
 
 def _strategies(_: click.Context, __: click.Parameter, value: str) -> tuple[str, ...]:
@@ -130,13 +131,12 @@ def compare(
         plot_frontier(found.points, found.efficient(), found.yardsticks, picture, title)
         told.print(f"wrote {picture}", markup=False, soft_wrap=True)
     if as_json:
-        identities = {str(path): identity_of(path) for path in (directory, *others)}
-        of = {"identity": identity_of(directory), "identities": identities}
-        print_json({**of, "machine": fingerprint(), **found.to_json()})
+        compared = [{"path": str(path), "identity": identity_of(path)} for path in others]
+        print_json({"identity": identity_of(directory), "with": compared, "machine": fingerprint(), **found.to_json()})
     else:
         _print(found, results(), machine)
         for path in (directory, *others):
-            results().print(f"{path}: identity {identity_of(path)[:12]}", markup=False, soft_wrap=True)
+            results().print(f"{path}: identity {abbreviated(identity_of(path))}", markup=False, soft_wrap=True)
 
 
 def _print(found: Frontier, output: Console, machine: str) -> None:

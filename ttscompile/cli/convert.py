@@ -30,7 +30,12 @@ from ttscompile.config import FP32, PRECISIONS
     help="In place of the checkpoint's own: ddpm, ddim or dpmsolver++ of a diffusion policy, euler or rk4 of one"
     " trained with flow matching.",
 )
-@click.option("--steps", type=click.IntRange(min=1), help="Denoising steps, in place of the checkpoint's own.")
+@click.option(
+    "--steps",
+    type=click.IntRange(min=1),
+    help="Denoising or integration steps, in place of the checkpoint's own. rk4 evaluates the network four times a"
+    " step: K is four times this.",
+)
 @click.option(
     "--spacing",
     type=click.Choice(["leading", "trailing", "linspace"]),
@@ -49,7 +54,8 @@ from ttscompile.config import FP32, PRECISIONS
     type=click.Choice(PRECISIONS),
     default=FP32,
     show_default=True,
-    help="Of the weights of residual blocks. int8 is faster on processors with VNNI; its error is measured and shown.",
+    help="Of the weights of residual blocks. int8 is faster on processors with VNNI; its error is measured and shown."
+    " bf16 is refused: onnxruntime's CPU provider multiplies no bfloat16 matrices.",
 )
 @click.option(
     "--single-file",

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ttscompile.artifact.load import load_artifact, read_manifest
+from ttscompile.artifact.manifest import abbreviated
 from ttscompile.errors import TtscompileError
 from ttscompile.units import flops as flops
 from ttscompile.units import share as share
@@ -23,9 +24,6 @@ artifact_argument = click.argument("directory", type=click.Path(path_type=Path))
 json_option = click.option(
     "--json", "as_json", is_flag=True, help="One JSON document on standard output, nothing else."
 )
-
-_SHOWN = 12
-"""Digits of an identity that people are shown; JSON has them all."""
 
 _WIDTH = 110
 """Columns of a table that goes to a file or a pipe; a terminal's own width is used where there is one."""
@@ -90,4 +88,4 @@ def identity_of(path: Path) -> str:
 
 def print_identity(identity: str, console: Console) -> None:
     """The line that says what the figures above are of."""
-    console.print(f"identity {identity[:_SHOWN]}", soft_wrap=True)
+    console.print(f"identity {abbreviated(identity)}", soft_wrap=True)

@@ -62,11 +62,13 @@ def report(
     episode = None
     if trajectories:
         chunk = manifest.spec.chunk
-        episode = _chosen(load_trajectories(trajectories, manifest.spec.observations, chunk.stop - chunk.start), number)
+        recorded = load_trajectories(trajectories, manifest.spec.observations, chunk.stop - chunk.start, sources)
+        episode = _chosen(recorded, number)
     compared = None if comparison is None else _document(comparison)
     with only_results_on_stdout(), console.status("loading") as status:
-        recordings = () if sources else trajectories  # verify takes none whose arrays are called otherwise
-        passed, section = _verified(directory, recordings, threads, status.update) if verifies else (True, NOT_RUN)
+        passed, section = True, NOT_RUN
+        if verifies:
+            passed, section = _verified(directory, trajectories, sources, threads, status.update)
         given = Given(episode, compared, section, threads, runs)
         policy = ttscompile.load(directory, threads=threads, seed=0)
         page = render(build(artifact, policy, given, status.update))
@@ -85,12 +87,20 @@ def report(
 
 
 def _verified(
-    directory: Path, trajectories: tuple[Path, ...], threads: int, progress: Callable[[str], None]
+    directory: Path,
+    trajectories: tuple[Path, ...],
+    sources: Sources,
+    threads: int,
+    progress: Callable[[str], None],
 ) -> tuple[bool, Section]:
     """Whether no check failed, and what the page says; an artifact that has nothing to check against fails none."""
     try:
         found = ttscompile.verify(
-            directory, trajectories, threads=threads, progress=lambda what: progress(f"verifying: {what}")
+            directory,
+            trajectories,
+            sources=sources,
+            threads=threads,
+            progress=lambda what: progress(f"verifying: {what}"),
         )
     except ArtifactError as error:
         return True, refused(str(error))

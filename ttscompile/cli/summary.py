@@ -10,7 +10,7 @@ from typing import Any
 from rich.console import Console
 
 from ttscompile.artifact.load import Artifact, load_artifact
-from ttscompile.artifact.manifest import DENSE, Manifest
+from ttscompile.artifact.manifest import DENSE, Manifest, abbreviated
 from ttscompile.cli.output import flops, share, table
 from ttscompile.ir.joint import OF_ALL_BLOCKS
 from ttscompile.runtimes.liveness import rollout_needs
@@ -138,7 +138,7 @@ def print_summary(summary: dict[str, Any], console: Console) -> None:
     horizon, channels = summary["sample"]
     about = table("artifact", summary["path"])
     about.columns[1].justify = "left"
-    about.add_row("identity", summary["identity"][:12])
+    about.add_row("identity", abbreviated(summary["identity"]))
     about.add_row("from", ", ".join(f"{k} {v}" for k, v in summary["source"].items()) or "a module")
     about.add_row(
         "sampler", f"{sampler['name']}, K = {sampler['steps']} steps" + ", draws noise" * sampler["stochastic"]

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
 import ttscompile
 from ttscompile.artifact.load import load_artifact
 from ttscompile.config import FP32, Affine, Noise, PolicySpec
 from ttscompile.errors import RuntimeUnavailableError, SpecError
 from ttscompile.lattice import Source
+from ttscompile.runtimes.random_calls import Observation, normalized, random_calls
 
 if TYPE_CHECKING:
     from torch import nn
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
 WARM_UP = 3
 """Calls of each that are not counted: allocations, and the first call of an episode, which cannot use ROLLOUT."""
-
-Observation = dict[str, npt.NDArray[Any]]
 
 
 @dataclass(frozen=True)
@@ -110,18 +108,6 @@ def contestants(
         elif checkpoint is not None:
             made.append(_eager(checkpoint, threads, manifest.spec, manifest.flops.dense))
     return made
-
-
-def random_calls(spec: PolicySpec, count: int, seed: int) -> list[tuple[Observation, Noise]]:
-    """Observations of one stream as ``ObservationSpec.draw`` makes them, and noise, for consecutive calls."""
-    rng = np.random.default_rng(seed)
-    calls = []
-    for _ in range(count):
-        obs: Observation = {key: observation.draw(rng) for key, observation in spec.observations.items()}
-        initial = rng.standard_normal((1, *spec.sample), dtype=np.float32)
-        draws = rng.standard_normal((spec.sampler.steps, *initial.shape), dtype=np.float32)
-        calls.append((obs, Noise(initial, draws if spec.sampler.stochastic else None)))
-    return calls
 
 
 def measure(
@@ -238,12 +224,8 @@ def network_contestant(label: str, run: EagerPolicy, spec: PolicySpec, dense_flo
     """
     import torch
 
-    def call(obs: Mapping[str, npt.NDArray[Any]], noise: Noise) -> object:
-        normalised = {}
-        for key, observation in spec.observations.items():
-            normalizer = observation.normalizer
-            normalised[key] = torch.from_numpy(obs[key] if normalizer is None else normalizer.normalize(obs[key]))
-        return run(normalised, noise)
+    def call(obs: Observation, noise: Noise) -> object:
+        return run({key: torch.from_numpy(array) for key, array in normalized(spec, obs).items()}, noise)
 
     return Contestant(label, "dense", call, lambda: None, spec, dense_flops)
 

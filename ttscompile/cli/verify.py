@@ -8,6 +8,7 @@ import click
 from rich.console import Console
 
 import ttscompile
+from ttscompile.artifact.manifest import abbreviated
 from ttscompile.cli.output import artifact_argument, json_option, only_results_on_stdout, print_json, progress, results
 from ttscompile.cli.output import table as make_table
 from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
@@ -78,7 +79,7 @@ def _draw(found: Verification, picture: Path) -> None:
             f"{picture}: there is nothing to draw: the artifact failed before its residuals were looked at"
             f" ({found.rungs[0].told})."
         )
-    title = f"{Path(found.path).name}, identity {(found.identity or '')[:12]}"
+    title = f"{Path(found.path).name}, identity {abbreviated(found.identity or '')}"
     plot_errors(
         errors.errors, errors.steps.tolist(), errors.kinds, errors.tolerance, picture, title, errors.cells, errors.plan
     )
@@ -90,7 +91,7 @@ def _print(found: Verification, output: Console) -> None:
     made.columns[1].justify = made.columns[4].justify = "left"
     for rung in found.rungs:
         made.add_row(rung.name, rung.status, _number(rung.figure), _number(rung.tolerance), rung.unit)
-    identity = "unknown" if found.identity is None else found.identity[:12]
+    identity = "unknown" if found.identity is None else abbreviated(found.identity)
     output.print(f"{found.path}: identity {identity}", markup=False, soft_wrap=True)
     output.print(made)
     for rung in found.rungs:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Protocol
 
 from ..errors import OutputError, RuntimeUnavailableError
+from ..points import Point
 
 COLOURS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 """Okabe and Ito's palette, without the yellow that white paper swallows."""
@@ -19,28 +19,8 @@ _TOLD = {
 }
 
 
-class Plotted(Protocol):
-    """What a point has to have; see ``ttscompile.calibration.points.Point``."""
-
-    @property
-    def series(self) -> str:
-        """Strategy, or artifact."""
-
-    @property
-    def name(self) -> str:
-        """Of the plan in its series."""
-
-    @property
-    def error(self) -> float:
-        """Of the executed actions."""
-
-    @property
-    def latency_ms(self) -> float:
-        """Of a call."""
-
-
 def plot_frontier(
-    points: Sequence[Plotted], efficient: Sequence[Plotted], yardsticks: Mapping[str, float], path: Path, title: str
+    points: Sequence[Point], efficient: Sequence[Point], yardsticks: Mapping[str, float], path: Path, title: str
 ) -> None:
     """Draw the points and write the picture.
 

@@ -9,12 +9,13 @@ from typing import Any
 from ..artifact.load import Artifact
 from ..artifact.manifest import DENSE
 from ..machine import fingerprint, one_line
+from ..points import efficient
 from ..report import facts, pictures
 from ..runtimes.policy import CompiledPolicy
 from ..trajectories.episodes import Episode
 from ..units import flops, ms, share
-from .frontier import Compared, efficient, from_comparison, from_record
-from .measure import Course, Latency, measure_latencies, run_episode
+from .frontier import Compared, from_comparison, from_record
+from .measure import Course, Latency, measure_parts, run_episode
 from .page import Page, Picture, Section, Table, require_packages
 from .verified import NOT_RUN
 
@@ -62,7 +63,7 @@ def build(
     require_packages()
     compared = None if given.comparison is None else from_comparison(given.comparison)
     progress("timing calls")
-    latencies = measure_latencies(policy, (DENSE, *manifest.plans), given.runs)
+    latencies = measure_parts(policy, (DENSE, *manifest.plans), given.runs)
     course = None
     if given.episode is not None:
         progress("running an episode")

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from itertools import groupby
 from typing import Any
 
+from ..artifact.ceiling import few_steps
 from ..artifact.load import Artifact
 from ..artifact.manifest import DENSE, BlockRecord, Manifest
 from ..ir.flops import graph_flops
@@ -14,9 +15,6 @@ from ..ir.program import Binding
 from ..runtimes.liveness import rollout_needs
 from ..units import flops, share
 from .page import Section, Table
-
-FEW_STEPS = 16
-"""Steps from which on there is little left to reuse: step 0 is always dense, and neighbours differ more."""
 
 _NOT_TOLD = ("plans", "precision", "sparsity", "flops_sparsity", "skipped")
 _LONG = 200
@@ -215,12 +213,9 @@ def limits(artifact: Artifact) -> Section:
             "Errors are of the actions, on recorded episodes, against the dense policy with the same noise. They are no"
             " success rates: evaluate the plan on your own task before a robot moves."
         )
-    if spec.sampler.steps <= FEW_STEPS:
-        points.append(
-            f"{spec.sampler.steps} denoising steps: the first is always dense, so at most"
-            f" {1 - 1 / spec.sampler.steps:.0%} of the cells can be reused, and steps that lie far apart resemble each"
-            " other less."
-        )
+    few = few_steps(manifest)
+    if few is not None:
+        points.append(few)
     if spec.sampler.stochastic:
         points.append(
             f"The sampler ({spec.sampler.name}) draws noise in every step: two calls on one observation differ, dense"

@@ -4,37 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from ..errors import ReportError
+from ..points import Point
 from .facts import scores
 from .measure import Latency
 
 _NUMBERS = ("error", "latency_ms")
 
 
-@dataclass(frozen=True)
-class Point:
-    """One plan; see ``ttscompile.calibration.points.Point``, which a robot does not have."""
-
-    series: str
-    name: str
-    error: float
-    latency_ms: float
-
-
 Compared = tuple[tuple[Point, ...], dict[str, float]]
 """Points and yardsticks of a comparison."""
-
-
-def efficient(points: Sequence[Point]) -> tuple[Point, ...]:
-    """Points that no other beats in error and latency both, fastest first."""
-    best: list[Point] = []
-    for point in sorted(points, key=lambda p: (p.latency_ms, p.error)):
-        if not best or point.error < best[-1].error:
-            best.append(point)
-    return tuple(best)
 
 
 def from_record(record: Mapping[str, Any] | None, latencies: Sequence[Latency]) -> tuple[Point, ...]:

@@ -70,8 +70,10 @@ class Course:
         return np.stack([np.mean(self.plans == source, axis=0) for source in Source])
 
 
-def measure_latencies(policy: CompiledPolicy, plans: Sequence[str], runs: int) -> list[Latency]:
-    """Time plans in turn, so that whatever else the machine does hits all of them.
+def measure_parts(policy: CompiledPolicy, plans: Sequence[str], runs: int) -> list[Latency]:
+    """What calls spend their time on, by their reports; plans in turn, so that whatever else the machine does hits all.
+
+    Not what ``runtimes.executor.measure`` does: that takes wall time by the executor's clock, of any policy.
 
     Args:
         policy: loaded; it is reset before and after.

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..lattice import PlanArray, Source, sparsity
-from ..plots.frontier import Plotted, plot_frontier
+from ..plots.frontier import plot_frontier
 from ..plots.plan import COLOURS, plot_plan
+from ..points import Point
 from ..units import ms
 from .measure import PARTS, Course, Latency
 
@@ -46,7 +47,7 @@ def plan_picture(plan: PlanArray, kinds: Sequence[str], title: str) -> bytes:
 
 
 def frontier_picture(
-    points: Sequence[Plotted], efficient: Sequence[Plotted], yardsticks: Mapping[str, float], title: str
+    points: Sequence[Point], efficient: Sequence[Point], yardsticks: Mapping[str, float], title: str
 ) -> bytes:
     """Error against latency, names as matplotlib can draw them; see ``ttscompile.plots_frontier.plot_frontier``."""
     return drawn(lambda path: plot_frontier(points, efficient, yardsticks, path, plain(title, 110)))

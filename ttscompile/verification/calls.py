@@ -22,6 +22,7 @@ from .probe import Probe
 from .rung import FAILED, PASSED, SKIPPED, Rung, finite, verdict
 
 DENSE_CALL, PRECISION, RUNTIMES, PLANS = "dense call", "precision", "runtimes", "plans"
+PLANS_PRECISION = "precision of plans"
 
 SAMPLE = 2e-3
 """Tolerance of a denoised sample, relative to its largest value. Push-T after 100 steps: 1e-5."""
@@ -29,6 +30,10 @@ SAMPLE = 2e-3
 CELLS = 0.005
 """Share of cells in which the plans that a pruner makes may differ: its logits are rounded otherwise on another
 processor, and near ties fall the other way."""
+
+CARRIED = 2.0
+"""How much more than a dense call a plan may differ for the precision of its blocks: an error that is made in one step
+is reused in those after it. Push-T in int8: 1.8 to 4.6 times a dense call's, which has a ninth of its tolerance."""
 
 REFERENCE_STEPS = 3
 """Steps at which the reference runtime's blocks are looked at."""
@@ -125,8 +130,7 @@ def check_plans(
     for name, record in recorded.items():
         made, samples = _episode(artifact, golden, runtime, name)
         differ = (made != record.plan).any((0, 1))
-        allowed = CELLS * differ.size if plans[name].kind == "pruner" else 0
-        if np.count_nonzero(differ) > allowed:
+        if np.count_nonzero(differ) > _differing_cells(artifact, name, differ):
             cells[name] = differ
             step, block = np.argwhere(differ)[0].tolist()
             told = f"plan {name!r} is not what calibration stored in {int(differ.sum())} of {differ.size} cells"
@@ -156,9 +160,49 @@ def check_plans(
     return Rung(PLANS, PASSED, told, worst, SAMPLE, "of the largest value"), {}
 
 
+def check_plans_precision(
+    artifact: Artifact, golden: Golden, recorded: Mapping[str, GoldenPlan], runtime: Runtime
+) -> Rung | None:
+    """The same episodes with blocks of another precision than fp32, as ``load`` runs them; None if there are none.
+
+    The record is made in fp32, so that the samples differ by what the precision does to them.
+    """
+    precision = artifact.manifest.precision
+    if precision is None or not recorded:
+        return None
+    tolerance = CARRIED * (SAMPLE if precision.error is None else precision.error.tolerance)
+    errors, wrong = dict[str, float](), dict[str, str]()
+    for name, record in recorded.items():
+        made, samples = _episode(artifact, golden, runtime, name)
+        differ = (made != record.plan).any((0, 1))
+        if differ.any():
+            samples = _given(artifact, golden, runtime, name, record.plan)
+        errors[name] = largest(samples, record.sample)
+        if np.count_nonzero(differ) > _differing_cells(artifact, name, differ):
+            wrong[name] = f"{name!r} in {np.count_nonzero(differ)} of {differ.size} cells"
+        elif not errors[name] <= tolerance:
+            wrong[name] = f"the samples of {name!r} by {errors[name]:.2g}"
+    told = f"{', '.join(errors)}: two calls with {precision.name} blocks against what calibration stored of fp32"
+    remedy = ""
+    if wrong:
+        told = f"with {precision.name} blocks plans are not what calibration stored of fp32: "
+        told += ", ".join(wrong.values())
+        remedy = "Load with precision='fp32', or convert the checkpoint again and calibrate."
+    details = {"errors": {name: finite(error) for name, error in errors.items()}}
+    worst = finite(float(np.max(list(errors.values()))))
+    return Rung(
+        PLANS_PRECISION, verdict(not wrong), told, worst, tolerance, "of the largest value", remedy, details=details
+    )
+
+
 def dense_of(artifact: Artifact, streams: int) -> PlanArray:
     """The dense plan of some streams, int8 ``[B, K, blocks]``."""
     return np.broadcast_to(artifact.schedule(DENSE), (streams, *artifact.schedule(DENSE).shape))
+
+
+def _differing_cells(artifact: Artifact, name: str, cells: npt.NDArray[np.bool_]) -> float:
+    """How many of these cells may differ from the record."""
+    return CELLS * cells.size if artifact.manifest.plans[name].kind == "pruner" else 0
 
 
 def _episode(artifact: Artifact, golden: Golden, runtime: Runtime, name: str) -> tuple[PlanArray, npt.NDArray[Any]]:

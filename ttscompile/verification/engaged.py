@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from time import perf_counter
 
@@ -17,11 +18,19 @@ from .rung import FAILED, PASSED, SKIPPED, Rung
 
 ENGAGED = "engaged"
 
-ROUNDS, MOST_ROUNDS = 5, 40
-"""Timed calls of each plan, in turn with dense ones; and how many there may be until a plan has saved time."""
+FEWEST_ROUNDS, MOST_ROUNDS = 3, 15
+"""Rounds in which each plan, and a dense call, is timed once. How many there are is settled before the first of them:
+rounds that went on until a plan was once the faster would let one pass that is as slow as a dense call."""
 
 PATIENCE = 10.0
-"""Seconds after which there are no more of them."""
+"""Seconds that they may take together, unless so few calls take longer."""
+
+LEAST_SAVED = 0.05
+"""Share of the time of a dense call that a plan has to save: less is what two medians of the same calls may differ
+by."""
+
+POOR = 0.5
+"""Share of what its FLOPs promise below which the time that a plan saves is remarked upon."""
 
 LEGALISED = 0.25
 """Share of the reused cells of a second call that may have had to take another source than planned."""
@@ -42,7 +51,8 @@ class Engagement:
         flops_saved: share of the FLOPs of a dense call of the artifact.
         ms: median time of a call.
         dense_ms: median time of a dense one, taken in turn.
-        time_saved: share, of the fastest of each.
+        time_saved: share, of these medians: slower calls beside other work hit few rounds, or plans and dense calls
+            alike.
     """
 
     planned: float | None
@@ -54,19 +64,22 @@ class Engagement:
     time_saved: float
 
 
-def check_engaged(artifact: Artifact, golden: Golden, policy: CompiledPolicy) -> Rung:
+def check_engaged(
+    artifact: Artifact, golden: Golden, policy: CompiledPolicy, clock: Callable[[], float] = perf_counter
+) -> Rung:
     """Planned against executed cells, FLOPs and time of every plan; one that saves nothing fails.
 
     Args:
         artifact: opened.
         golden: its record.
         policy: loaded from it.
+        clock: in seconds.
     """
     manifest = artifact.manifest
     if not manifest.plans:
         told = "the artifact is not calibrated: every call is dense, and nothing is saved"
         return Rung(ENGAGED, SKIPPED, told, remedy="Run 'ttscompile calibrate' to give it a plan.")
-    found = _measure(artifact, golden, policy)
+    found = _measure(artifact, golden, policy, clock)
     details = {name: asdict(one) for name, one in found.items()}
     cells = manifest.steps * len(manifest.blocks)
     judged = {name: _fault(manifest.plans[name].kind, one, cells) for name, one in found.items()}
@@ -79,45 +92,53 @@ def check_engaged(artifact: Artifact, golden: Golden, policy: CompiledPolicy) ->
         )
     shown = [
         f"{n!r} reuses {one.executed:.1%} of the cells, saves {one.flops_saved:.1%} of the FLOPs and"
-        f" {one.time_saved:.0%} of the time ({one.ms:.4g} ms for {one.dense_ms:.4g})"
+        f" {one.time_saved:.0%} of the time ({one.ms:.4g} ms for {one.dense_ms:.4g}{_remark(one)})"
         for n, one in found.items()
     ]
     return Rung(ENGAGED, PASSED, "; ".join(shown), found[name].executed, None, "of the cells", details=details)
 
 
-def _measure(artifact: Artifact, golden: Golden, policy: CompiledPolicy) -> dict[str, Engagement]:
+def _measure(
+    artifact: Artifact, golden: Golden, policy: CompiledPolicy, clock: Callable[[], float]
+) -> dict[str, Engagement]:
     manifest = artifact.manifest
     obs = {key: value[:1] for key, value in golden.raw_observations(manifest.spec).items()}
     noise = Noise(golden.initial[:1], None if golden.draws is None else golden.draws[:, :1].copy())
     names = (DENSE, *manifest.plans)
     times: dict[str, list[float]] = {name: [] for name in names}
-    begun = perf_counter()
     executed, legalised, flops = dict[str, float](), dict[str, int](), dict[str, float]()
-    for number in range(MOST_ROUNDS + 1):
-        saved = number > ROUNDS and all(min(times[name]) < min(times[DENSE]) for name in names[1:])
-        if saved or (number > ROUNDS and perf_counter() - begun > PATIENCE):
-            break  # beside other work a few calls may say anything: an inert plan is one that never saves time
-        for name in names:
-            policy.reset()
-            if name != DENSE:
-                policy.predict_action(obs, noise=noise, plan=name)  # what an episode's first call cannot read
-            start = perf_counter()
-            policy.predict_action(obs, noise=noise, plan=name)
-            if number:  # the first round warms up
-                times[name].append(1e3 * (perf_counter() - start))
-            report = policy.last_report
-            assert report is not None
-            executed[name] = float(np.mean(report.plan != Source.COMPUTE))
-            legalised[name], flops[name] = report.legalised[0], report.flops[0]
+
+    def call(name: str) -> float:
+        """Seconds of a call in the middle of an episode."""
+        policy.reset()
+        if name != DENSE:
+            policy.predict_action(obs, noise=noise, plan=name)  # what an episode's first call cannot read
+        start = clock()
+        policy.predict_action(obs, noise=noise, plan=name)
+        seconds = clock() - start
+        report = policy.last_report
+        assert report is not None
+        executed[name] = float(np.mean(report.plan != Source.COMPUTE))
+        legalised[name], flops[name] = report.legalised[0], report.flops[0]
+        return seconds
+
+    begun = clock()
+    for name in names:  # warms up, and tells how long a round takes
+        call(name)
+    rounds = int(PATIENCE / max(clock() - begun, 1e-9))
+    for number in range(min(max(rounds, FEWEST_ROUNDS), MOST_ROUNDS)):
+        for name in names[:: 1 if number % 2 else -1]:  # nobody always runs after the same one
+            times[name].append(1e3 * call(name))
+    medians = {name: float(np.median(taken)) for name, taken in times.items()}
     return {
         name: Engagement(
             planned=plan.sparsity,
             executed=executed[name],
             legalised=legalised[name],
             flops_saved=1 - flops[name] / flops[DENSE],
-            ms=float(np.median(times[name])),
-            dense_ms=float(np.median(times[DENSE])),
-            time_saved=1 - min(times[name]) / min(times[DENSE]),
+            ms=medians[name],
+            dense_ms=medians[DENSE],
+            time_saved=1 - medians[name] / medians[DENSE],
         )
         for name, plan in manifest.plans.items()
     }
@@ -134,6 +155,14 @@ def _fault(kind: str, one: Engagement, cells: int) -> str:
         return f"has to be legalised in {one.legalised} cells of a second call: it reads what is never computed"
     if one.flops_saved <= 0:
         return f"reuses {shown} and saves no FLOPs"
-    if one.time_saved <= 0:
-        return f"reuses {shown} and saves no time: {one.ms:.4g} ms a call, dense {one.dense_ms:.4g} ms"
+    if not one.time_saved >= LEAST_SAVED:
+        return (
+            f"reuses {shown} and saves no time: {one.ms:.4g} ms a call, dense {one.dense_ms:.4g} ms, which is"
+            f" {one.time_saved:.1%} saved and has to be {LEAST_SAVED:.0%}"
+        )
     return ""
+
+
+def _remark(one: Engagement) -> str:
+    """On a plan that saves much less time than FLOPs; empty for others."""
+    return ", less than half of what its FLOPs promise" if one.time_saved < POOR * one.flops_saved else ""

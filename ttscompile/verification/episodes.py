@@ -14,10 +14,19 @@ from ..artifact.load import Artifact
 from ..artifact.manifest import DENSE
 from ..config import Noise, PolicySpec
 from ..runtimes.policy import CompiledPolicy
-from ..trajectories import Episode
+from ..trajectories.episodes import Episode
 from .rung import FAILED, PASSED, SKIPPED, Rung, finite
 
 SPARSITY = "sparsity error"
+
+AS_CALIBRATED, FEW_AS_CALIBRATED = 2.0, 3.0
+"""How often the mean error that calibration measured on held-out calls a plan's may be; and with ``FEW`` calls or less,
+which are of a few episodes, whose calls are alike."""
+
+FEW = 32
+
+NEGLIGIBLE = 0.05
+"""Share of the yardstick below which an error is no worse than calibrated, however small that one was."""
 
 Progress = Callable[[str], None]
 """Told what is being done."""
@@ -48,9 +57,11 @@ def check_episodes(
 ) -> Rung:
     """Every plan against the dense policy with the same noise, call by call through whole episodes.
 
-    The default plan has to keep within what two dense calls with different noise are apart, or within what calibration
-    measured on held-out calls (90th percentile), whichever is more. Without episodes the recorded observations are
-    used, which are random: then nothing is judged.
+    The mean error of the default plan has to keep within what two dense calls with different noise are apart, or within
+    what calibration measured on held-out calls (90th percentile), whichever is more. It also has to keep within
+    ``AS_CALIBRATED`` times the mean that calibration measured, where it did: a plan that is much worse than it was may
+    still be within the noise of its policy. Without episodes the recorded observations are used, which are random: then
+    nothing is judged.
 
     Args:
         artifact: opened.
@@ -92,12 +103,22 @@ def check_episodes(
         where = f"{found}. No trajectories were given: these are {calls} calls on random observations, and not judged"
         remedy = "Give recorded episodes with --trajectories to have this judged."
         return Rung(SPARSITY, SKIPPED, where, finite(error), None, "action units", remedy, details=details)
-    promised = _promised(manifest.calibration, name)
-    tolerance = max(yardstick, promised or 0.0)
-    details["promised_p90"] = promised
+    promised, promised_p90 = (_promised(manifest.calibration, name, key) for key in ("error", "error_p90"))
+    beyond = max(yardstick, promised_p90 or 0.0)
+    factor = FEW_AS_CALIBRATED if calls <= FEW else AS_CALIBRATED
+    worse = float("inf") if promised is None else max(factor * promised, NEGLIGIBLE * yardstick)
+    reasons = list[str]()
+    if not error <= beyond:
+        reasons.append("more than other noise would change")
+    if not error <= worse:
+        told_before = f"more than {factor:g} times the {promised:.3g} that calibration measured on held-out calls"
+        reasons.append(f"worse than calibrated, {told_before}")
+    tolerance = min(beyond, worse)
+    details |= {"promised": promised, "promised_p90": promised_p90, "reasons": reasons}
     where = f"{calls} calls of {len(episodes)} episodes: {found}"
-    if error <= tolerance:
+    if not reasons:
         return Rung(SPARSITY, PASSED, where, error, tolerance, "action units", details=details)
+    where += f". This is {'; and '.join(reasons)}"
     remedy = (
         "These episodes are unlike those of the calibration, or the plan is too sparse: calibrate with such episodes,"
         " or with a lower --target-sparsity."
@@ -133,8 +154,9 @@ def _noise(spec: PolicySpec, draw: np.random.Generator) -> Noise:
     return Noise(initial, draw.standard_normal((spec.sampler.steps, *initial.shape), dtype=np.float32))
 
 
-def _promised(calibration: Mapping[str, Any] | None, name: str) -> float | None:
-    """What calibration measured for a plan on held-out calls; None if it did not."""
-    score = (calibration or {}).get("plans", {})
-    found = score.get(name, {}).get("error_p90") if isinstance(score, dict) else None
+def _promised(calibration: Mapping[str, Any] | None, name: str, key: str) -> float | None:
+    """``error`` or ``error_p90`` that calibration measured for a plan on held-out calls; None if it did not."""
+    scores = (calibration or {}).get("plans")
+    score = scores.get(name) if isinstance(scores, Mapping) else None
+    found = score.get(key) if isinstance(score, Mapping) else None  # free JSON, by whoever made the artifact
     return float(found) if isinstance(found, int | float) else None

@@ -18,8 +18,19 @@ from ..config import FP32
 from ..errors import ArtifactError, TtscompileError
 from ..runtimes.base import open_runtime
 from ..runtimes.policy import CompiledPolicy
-from ..trajectories import load_trajectories
-from .calls import DENSE_CALL, PLANS, PRECISION, RUNTIMES, check_dense, check_plans, check_precision, check_runtimes
+from ..trajectories.episodes import load_trajectories
+from .calls import (
+    DENSE_CALL,
+    PLANS,
+    PLANS_PRECISION,
+    PRECISION,
+    RUNTIMES,
+    check_dense,
+    check_plans,
+    check_plans_precision,
+    check_precision,
+    check_runtimes,
+)
 from .engaged import ENGAGED, check_engaged
 from .episodes import SPARSITY, Progress, check_episodes, choose
 from .integrity import check_integrity
@@ -128,6 +139,7 @@ def _climb(
     climb(PRECISION, lambda: check_precision(artifact, golden))
     climb(RUNTIMES, lambda: check_runtimes(plain, golden, runtime))
     climb(PLANS, plans)
+    climb(PLANS_PRECISION, lambda: check_plans_precision(artifact, golden, recorded, own_runtime))
     climb(SPARSITY, lambda: check_episodes(artifact, golden, own, episodes, progress))
     climb(ENGAGED, lambda: check_engaged(artifact, golden, own))
     for name, cells in differing.items():

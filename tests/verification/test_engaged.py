@@ -1,0 +1,95 @@
+"""What a plan saves in time is judged by medians of calls in turn, with a clock that the test moves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ttscompile
+from ttscompile.artifact.golden import load_golden
+from ttscompile.artifact.load import load_artifact
+from ttscompile.runtimes.policy import CompiledPolicy
+from ttscompile.verification import engaged
+from ttscompile.verification.rung import FAILED, PASSED, Rung
+
+
+class Timed:
+    """A policy whose calls take as long as they are told to; beside other work some of them take ten times that.
+
+    Args:
+        policy: makes the calls.
+        seconds: of a call, by plan; that of ``dense`` for plans that are not named.
+        busy: share of the calls that other work slows down.
+    """
+
+    def __init__(self, policy: CompiledPolicy, seconds: Mapping[str, float], busy: float) -> None:
+        self._policy, self._seconds, self._busy = policy, seconds, busy
+        self._draw = np.random.default_rng(0)
+        self.now, self.calls = 0.0, 0
+        self.reset = policy.reset
+
+    def predict_action(self, obs: Any, *, noise: Any, plan: str) -> Any:
+        self.calls += 1
+        slowed = 10 if self._draw.random() < self._busy else 1
+        self.now += self._seconds.get(plan, self._seconds["dense"]) * slowed
+        return self._policy.predict_action(obs, noise=noise, plan=plan)
+
+    @property
+    def last_report(self) -> Any:
+        return self._policy.last_report
+
+
+def judged(directory: Path, schedule: float, dense: float = 1.0, busy: float = 0.0) -> tuple[Rung, int]:
+    """The rung with a single plan of so many seconds a call, and how many calls were made."""
+    artifact = load_artifact(directory)
+    plans = {"schedule": artifact.manifest.plans["schedule"]}
+    artifact = replace(artifact, manifest=replace(artifact.manifest, plans=plans))
+    policy = Timed(ttscompile.load(directory, seed=0), {"dense": dense, "schedule": schedule}, busy)
+    rung = engaged.check_engaged(artifact, load_golden(artifact), policy, lambda: policy.now)  # type: ignore[arg-type]
+    return rung, policy.calls
+
+
+@pytest.mark.parametrize("schedule", [1.0, 1.1, 0.96])
+def test_a_plan_as_slow_as_a_dense_call_is_inert(sound: Path, schedule: float) -> None:
+    rung, _ = judged(sound, schedule)
+    assert rung.status == FAILED
+    assert "saves no time" in rung.told
+    assert f"{1 - schedule:.1%} saved" in rung.told
+
+
+def test_so_is_one_on_a_machine_that_is_busy_now_and_then(sound: Path) -> None:
+    """Rounds do not go on until the plan was once the faster."""
+    assert judged(sound, 0.001, dense=0.001, busy=0.3)[0].status == FAILED
+
+
+def test_a_faster_plan_passes_and_every_figure_is_of_the_same_medians(sound: Path) -> None:
+    rung, _ = judged(sound, 0.25)
+    assert rung.status == PASSED
+    found = rung.details["schedule"]
+    assert (found["ms"], found["dense_ms"], found["time_saved"]) == pytest.approx((250, 1000, 0.75))
+    assert "75% of the time (250 ms for 1000)" in rung.told
+
+
+@pytest.mark.parametrize("busy", [0.1, 0.3, 0.5])
+def test_other_work_does_not_make_a_fast_plan_inert(sound: Path, busy: float) -> None:
+    assert judged(sound, 0.05, busy=busy)[0].status == PASSED
+
+
+def test_a_plan_that_saves_much_less_than_its_flops_is_remarked_upon(sound: Path) -> None:
+    rung, _ = judged(sound, 0.8)
+    assert rung.status == PASSED
+    assert rung.details["schedule"]["flops_saved"] > 0.4
+    assert "less than half of what its FLOPs promise" in rung.told
+
+
+@pytest.mark.parametrize(("dense", "rounds"), [(0.001, 15), (0.7, 4), (60.0, 3)])
+def test_there_are_as_many_rounds_as_there_is_time_for_whatever_they_show(
+    sound: Path, dense: float, rounds: int
+) -> None:
+    """A round makes three calls, two of them of the plan; one more warms up."""
+    assert judged(sound, dense, dense)[1] == 3 * (rounds + 1)
