@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 from ttscompile.lattice import Source
-from ttscompile.plots import COLOURS
+from ttscompile.plots.plan import COLOURS
 
 STEPS, KINDS = 6, ("SA", "FF", "SA", "FF", "SA", "FF")
 TOLD = {
