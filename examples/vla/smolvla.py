@@ -94,8 +94,8 @@ def compile_head(model: nn.Module, cache: Any, directory: str | Path, **argument
         sample=(config.chunk_size, config.max_action_dim),
         observations={
             "prefix_mask": ObservationSpec((keys.shape[3],), dtype="bool"),
-            "keys": ObservationSpec(keys.shape[1:]),
-            "values": ObservationSpec(values.shape[1:]),
+            "keys": ObservationSpec(keys.shape[1:], window=False),
+            "values": ObservationSpec(values.shape[1:], window=False),
         },
         sampler=flow_matching_table(config.num_steps, start=1.0, end=0.0),
         chunk=ChunkSpec(config.max_action_dim, 0, config.chunk_size),
