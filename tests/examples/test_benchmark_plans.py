@@ -11,8 +11,9 @@ from networks import plan_at, plan_name, random_network, sampler_of
 import ttscompile
 from ttscompile import Source
 from ttscompile.artifact import load_artifact
-from ttscompile.cli.timing import Contestant, Measurement, random_calls
+from ttscompile.cli.timing import Contestant, Measurement
 from ttscompile.errors import RuntimeUnavailableError
+from ttscompile.runtimes.random_calls import random_calls
 
 
 @pytest.mark.parametrize("steps", [8, 16, 100])

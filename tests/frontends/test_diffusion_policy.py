@@ -14,7 +14,7 @@ from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 
 from ttscompile.errors import CheckpointError, SpecError
 from ttscompile.frontends import load_checkpoint_policy
-from ttscompile.samplers import sampler_table
+from ttscompile.samplers.table import sampler_table
 
 Build = Callable[..., dict[str, Any]]
 Save = Callable[[dict[str, Any]], Path]

@@ -25,9 +25,9 @@ from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.robomimic_encoder import ResidualBlock
 from ttscompile.ir.flops import graph_flops
 from ttscompile.ir.program import Program
-from ttscompile.lower import lower_graph
+from ttscompile.lower.program import lower_graph
 from ttscompile.runtimes import open_runtime
-from ttscompile.samplers import sampler_table
+from ttscompile.samplers.table import sampler_table
 
 from ..families.support import record
 from ..lower.sessions import run

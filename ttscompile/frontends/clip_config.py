@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
 from ..errors import CheckpointError
+from .json_files import read_json
 
 _ACTIVATIONS = ("quick_gelu", "gelu")
-_MAX_BYTES = 16 * 2**20
+_MOST = {"num_hidden_layers": 512, "image_size": 4096, "patch_size": 4096}
+_MOST_OTHERWISE = 2**20
+_MOST_LETTERS = 200
 
 
 @dataclass(frozen=True)
@@ -37,18 +39,19 @@ class TowerConfig:
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if field.type == "int" and (type(value) is not int or value < 1):
-                raise CheckpointError(f"CLIP's {field.name} is {value!r}; expected a positive whole number.")
+            most = _MOST.get(field.name, _MOST_OTHERWISE)
+            if field.type == "int" and (type(value) is not int or not 1 <= value <= most):
+                raise CheckpointError(f"CLIP's {field.name} is {value!r:.80}; expected a whole number of 1 to {most}.")
         if self.hidden_size % self.num_attention_heads:
             raise CheckpointError(
                 f"CLIP's hidden_size = {self.hidden_size} is no multiple of num_attention_heads ="
                 f" {self.num_attention_heads}."
             )
         if self.hidden_act not in _ACTIVATIONS:
-            raise CheckpointError(f"CLIP's hidden_act is {self.hidden_act!r}; expected one of {_ACTIVATIONS}.")
+            raise CheckpointError(f"CLIP's hidden_act is {self.hidden_act!r:.80}; expected one of {_ACTIVATIONS}.")
         if not isinstance(self.layer_norm_eps, float) or not 0 < self.layer_norm_eps < 1:
             raise CheckpointError(
-                f"CLIP's layer_norm_eps is {self.layer_norm_eps!r}; expected a small positive number."
+                f"CLIP's layer_norm_eps is {self.layer_norm_eps!r:.80}; expected a small positive number."
             )
 
 
@@ -66,6 +69,14 @@ class VisionConfig(TowerConfig):
     image_size: int = 224
     patch_size: int = 32
     num_channels: int = 3
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.num_channels != 3 or self.patch_size > self.image_size:
+            raise CheckpointError(
+                f"CLIP's num_channels is {self.num_channels}, its patch_size {self.patch_size} and its image_size"
+                f" {self.image_size}; expected 3 channels, and patches that are no larger than the image."
+            )
 
     @property
     def patches(self) -> int:
@@ -130,6 +141,8 @@ def find_encoder(name: str, folders: Sequence[Path]) -> Path | None:
         folders: in the order in which they are searched.
     """
     relative = Path(name)
+    if max(map(len, relative.parts), default=0) > _MOST_LETTERS:
+        return None  # no file system has such a name, and some say so with an error
     names = [relative.name]
     if not relative.is_absolute() and ".." not in relative.parts:
         names.insert(0, name)
@@ -176,25 +189,6 @@ def encoder_config(name: str, part: str, cls: type[Tower], folders: Sequence[Pat
         return cls(**{key: value for key, value in inner.items() if key in names})
     except CheckpointError as error:
         raise CheckpointError(f"{where}: {error}") from error
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object.
-
-    Raises:
-        CheckpointError: missing, unreadable, or something else.
-    """
-    if not path.is_file():
-        raise CheckpointError(f"{path}: no such file.")
-    if path.stat().st_size > _MAX_BYTES:
-        raise CheckpointError(f"{path}: {path.stat().st_size:,} bytes; a configuration has {_MAX_BYTES:,} at most.")
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise CheckpointError(f"{path}: cannot be read as JSON: {error}. Copy the file again.") from error
-    if not isinstance(content, dict):
-        raise CheckpointError(f"{path}: holds a {type(content).__name__}; expected an object.")
-    return content
 
 
 def _is_clip(path: Path) -> bool:

@@ -17,7 +17,7 @@ from torch import nn
 
 from ..config import ChunkSpec, ObservationSpec, PolicySpec
 from ..errors import CheckpointError
-from . import diffusion_policy_hybrid as hybrid
+from ..frontends import diffusion_policy_hybrid as hybrid
 from .checkpoint import plain_config, read_checkpoint
 from .diffusion_policy_weights import affine, build_network, choose_weights, load_network
 from .encoded import EncodedDenoiser

@@ -15,14 +15,18 @@ from torch import nn
 
 from ..config import ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
 from ..errors import CheckpointError, SpecError
-from ..samplers_flow import flow_matching_table
+from ..samplers.flow import flow_matching_table
 from .clip_config import TextConfig, VisionConfig, encoder_config, find_encoder
 from .encoded import EncodedDenoiser
 from .image_geometry import ResizeCrop
-from .lerobot_config import POLICY, STATE, WEIGHTS, LeRobotConfig, read_lerobot_config
-from .lerobot_processors import Normalizer, Processors, read_processors, read_tensors
-from .multi_task_dit import ConditionEncoder, DiffusionTransformer, Inputs, ObservationEncoder
-from .scheduler import configured_sampler
+from .lerobot_config import CONFIG, POLICY, STATE, WEIGHTS, LeRobotConfig, read_lerobot_config
+from .lerobot_processors import PREPROCESSOR, Normalizer, Processors, read_processors
+from .lerobot_weights import fill, network_parts, parts_without_memory, read_weights, require_weights
+from .multi_task_dit import ConditionEncoder, Inputs, ObservationEncoder
+from .scheduler import MOST_STEPS, configured_sampler
+
+_MOST_TOKENIZER_BYTES = 16 * 2**20
+"""Of one file; CLIP's own tokenizer.json has 2 MB."""
 
 TOKENS, MASK = "observation.language.tokens", "observation.language.attention_mask"
 _SCHEDULERS = {"DDPM": "DDPMScheduler", "DDIM": "DDIMScheduler"}
@@ -52,7 +56,6 @@ def load_lerobot(
     directory = Path(path)
     config = read_lerobot_config(directory)
     processors = read_processors(directory, config.features)
-    table = _sampler(config, sampler, steps, spacing)
     folders = [*([Path(encoders)] if encoders is not None else []), directory, directory.resolve().parent]
     text = encoder_config(config.text_encoder_name, "text_config", TextConfig, folders)
     vision = None
@@ -63,12 +66,23 @@ def load_lerobot(
             f"{directory}: instructions have {config.tokens} tokens (tokenizer_max_length); the text encoder takes"
             f" {text.max_position_embeddings} at most."
         )
+    length = (processors.tokenizer or {}).get("max_length", config.tokens)
+    if length != config.tokens:
+        raise CheckpointError(
+            f"{directory}: the tokenizer's max_length is {length!r:.80}, and tokenizer_max_length of {CONFIG} is"
+            f" {config.tokens}; expected the same number."
+        )
     compiled_in = None if task is None else _tokens(task, config, processors, folders, text)
+    weights = read_weights(directory / WEIGHTS)
     try:
+        # Compared before anything of the configured sizes is made, so that no more memory is taken than the file has.
+        require_weights(parts_without_memory(config, vision, text), weights)
         module = build_module(config, processors, vision, text, compiled_in)
-        _load_weights(module, read_tensors(directory / WEIGHTS))
     except CheckpointError as error:
         raise CheckpointError(f"{directory}: {error}") from error
+    observer = module.encoder.get_submodule("observation_encoder")
+    fill({"noise_predictor.": module.denoiser, "observation_encoder.": observer}, weights)
+    table = _sampler(config, str(directory / CONFIG), sampler, steps, spacing)
     chunk = ChunkSpec(
         action_dim=config.network.action_dim,
         start=config.n_obs_steps - 1,
@@ -117,7 +131,7 @@ def build_module(
     task: tuple[torch.Tensor, torch.Tensor] | None,
 ) -> EncodedDenoiser:
     """The network without its weights."""
-    cameras, network = config.cameras, config.network
+    cameras = config.cameras
     geometry = None
     if vision is not None:
         _, height, width = next(iter(cameras.values()))
@@ -127,77 +141,47 @@ def build_module(
                 f"images reach the vision encoder as {geometry.size}, and it takes {vision.image_size} pixels square."
                 " Check image_resize_shape and image_crop_shape, and that the encoder found is the policy's own."
             )
-    encoder = ObservationEncoder(
-        len(cameras), vision, text, network.hidden_dim, config.separate_encoders, config.n_obs_steps
-    )
+    parts = network_parts(config, vision, text)
+    encoder = parts["observation_encoder."]
+    assert isinstance(encoder, ObservationEncoder)
     names = [key.replace(".", "_") for key in (processors.renamed.get(k, k) for k in (STATE, *cameras))]
     tokens = (TOKENS.replace(".", "_"), MASK.replace(".", "_")) if task is None else None
     normalizers = [Normalizer(processors.normalizers.get(key)) for key in (STATE, *cameras)]
     condition = ConditionEncoder(encoder, Inputs(names[0], tuple(names[1:]), tokens), geometry, normalizers, task)
-    frame = config.state_dim + (vision.hidden_size * len(cameras) if vision is not None else 0) + network.hidden_dim
-    return EncodedDenoiser(condition, DiffusionTransformer(network, config.n_obs_steps * frame))
+    return EncodedDenoiser(condition, parts["noise_predictor."])
 
 
-def _sampler(config: LeRobotConfig, sampler: str | None, steps: int | None, spacing: str | None) -> SamplerTable:
-    """The denoising loop of the policy's objective."""
+def _sampler(
+    config: LeRobotConfig, where: str, sampler: str | None, steps: int | None, spacing: str | None
+) -> SamplerTable:
+    """The denoising loop of the policy's objective; ``where`` is the configuration, for messages."""
     settings = config.settings
     if not config.flow:
         name = settings.get("noise_scheduler_type", "DDPM")
-        if name not in _SCHEDULERS:
-            raise CheckpointError(f"noise_scheduler_type is {name!r}; expected one of {', '.join(_SCHEDULERS)}.")
+        if not isinstance(name, str) or name not in _SCHEDULERS:
+            known = ", ".join(_SCHEDULERS)
+            raise CheckpointError(f"{where}: noise_scheduler_type is {name!r:.80}; expected one of {known}.")
         own = {key: settings.get(key, default) for key, default in _SCHEDULER_SETTINGS.items()}
         if own["prediction_type"] not in ("epsilon", "sample"):
-            raise CheckpointError(f"prediction_type is {own['prediction_type']!r}; expected epsilon or sample.")
+            found = f"{own['prediction_type']!r:.80}"
+            raise CheckpointError(f"{where}: prediction_type is {found}; expected epsilon or sample.")
         if steps is None:
             steps = settings.get("num_inference_steps")
         scheduler = {"_target_": _SCHEDULERS[name], **own}
-        return configured_sampler(scheduler, steps, step_arguments={}, sampler=sampler, spacing=spacing)
+        return configured_sampler(scheduler, steps, step_arguments={}, sampler=sampler, spacing=spacing, where=where)
     if spacing is not None:
         raise SpecError("spacing is of the timesteps of diffusion; this policy's objective is flow matching.")
-    method: Any = sampler or settings.get("integration_method", "euler")
+    own_method = settings.get("integration_method", "euler")
+    if not isinstance(own_method, str):
+        raise CheckpointError(f"{where}: integration_method is {own_method!r:.80}; expected euler or rk4.")
+    method: Any = sampler or own_method
     count = steps if steps is not None else settings.get("num_integration_steps", 100)
-    if type(count) is not int or count < 1:
-        raise SpecError(f"{count!r} integration steps are not possible; expected a positive whole number.")
+    if type(count) is not int or not 1 <= count <= MOST_STEPS:
+        raise SpecError(
+            f"{where}: {count!r:.80} integration steps are not possible (num_integration_steps, or steps= and --steps);"
+            f" expected 1 to {MOST_STEPS}."
+        )
     return flow_matching_table(torch.linspace(0, 1, count + 1).tolist(), method)
-
-
-def _load_weights(module: EncodedDenoiser, weights: dict[str, torch.Tensor]) -> None:
-    """Fill the module; every weight must be there, of the right shape, finite, and nothing else may be there."""
-    observer = module.encoder.get_submodule("observation_encoder")
-    parts = {"noise_predictor.": module.denoiser, "observation_encoder.": observer}
-    expected = {prefix + name: value for prefix, part in parts.items() for name, value in part.state_dict().items()}
-    found: dict[str, torch.Tensor] = {}
-    for key, value in weights.items():
-        # transformers 4 saves an encoder below a level of its own, which transformers 5 leaves out.
-        short = key.replace(".model.vision_model.", ".model.").replace(".text_encoder.text_model.", ".text_encoder.")
-        if not short.endswith(".position_ids"):
-            found[short] = value.float()
-    missing, extra = sorted(set(expected) - set(found)), sorted(set(found) - set(expected))
-    if missing or extra:
-        parts_said = [f"missing {_names(missing)}"] * bool(missing) + [f"unexpected {_names(extra)}"] * bool(extra)
-        raise CheckpointError(
-            f"the weights do not fit the configuration: {'; '.join(parts_said)}. config.json, or the encoder's, is of"
-            " another network than the one that was saved, or the file is incomplete."
-        )
-    for key, value in found.items():
-        if value.shape != expected[key].shape:
-            raise CheckpointError(
-                f"weight {key} has shape {tuple(value.shape)}; expected {tuple(expected[key].shape)} from config.json"
-                " and the encoder's configuration."
-            )
-        if not torch.isfinite(value).all():
-            count = int((~torch.isfinite(value)).sum())
-            raise CheckpointError(f"weight {key} holds {count} values that are not finite; training diverged.")
-    for prefix, part in parts.items():
-        part.load_state_dict(
-            {key.removeprefix(prefix): value for key, value in found.items() if key.startswith(prefix)}
-        )
-
-
-def _names(keys: list[str]) -> str:
-    """A few names and how many more there are."""
-    more = f" and {len(keys) - 4} more" if len(keys) > 4 else ""
-    return ", ".join(keys[:4]) + more
 
 
 def _tokens(
@@ -209,10 +193,17 @@ def _tokens(
     found = find_encoder(str(name), folders)
     if found is None or not any((found / file).is_file() for file in ("tokenizer.json", "vocab.json")):
         raise CheckpointError(
-            f"the tokenizer {name!r} is not on this machine, and nothing is ever downloaded; it is needed to compile"
-            " the policy for one task. Put config.json and the tokenizer's files (tokenizer.json, or vocab.json and"
-            " merges.txt) of the text encoder into one folder, and name it: encoders= in Python, --encoders on the"
+            f"the tokenizer {str(name)!r:.200} is not on this machine, and nothing is ever downloaded; it is needed to"
+            " compile the policy for one task. Put config.json and the tokenizer's files (tokenizer.json, or vocab.json"
+            " and merges.txt) of the text encoder into one folder, and name it: encoders= in Python, --encoders on the"
             " command line. Or leave the task out: the policy then takes tokens as an observation."
+        )
+    files = [file for file in sorted(found.iterdir()) if file.suffix in (".json", ".txt")]
+    large = [file.name for file in files if file.stat().st_size > _MOST_TOKENIZER_BYTES]
+    if large:
+        raise CheckpointError(
+            f"{found}: {', '.join(large[:4])} of the tokenizer has more than {_MOST_TOKENIZER_BYTES:,} bytes; CLIP's"
+            " own has less than 3 MB. It is of another model, or damaged."
         )
     try:
         from transformers import CLIPTokenizer
@@ -232,8 +223,16 @@ def _tokens(
             return_tensors="pt",
         )
         tokens, mask = made["input_ids"].to(torch.int64), made["attention_mask"].to(torch.bool)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise CheckpointError(f"{found}: the tokenizer cannot be read, or refuses {task!r}: {error}") from error
+    except Exception as error:  # of damaged files the tokenizers package raises plain Exception
+        raise CheckpointError(
+            f"{found}: the tokenizer cannot be read, or refuses {task!r:.200}: {type(error).__name__}:"
+            f" {error!s:.300}. Copy its files again."
+        ) from error
+    if tokens.shape != mask.shape or tokens.shape[0] != 1 or not 1 <= tokens.shape[-1] <= config.tokens:
+        raise CheckpointError(
+            f"{found}: its tokenizer gives tokens {list(tokens.shape)} and a mask {list(mask.shape)}; expected [1, L]"
+            f" of both, and L = {config.tokens} at most. Shorten the task, or check truncation of {PREPROCESSOR}."
+        )
     if int(tokens.max()) >= text.vocab_size:
         raise CheckpointError(
             f"{found}: its tokenizer gives token {int(tokens.max())}; the encoder has"

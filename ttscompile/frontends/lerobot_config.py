@@ -8,12 +8,17 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import CheckpointError
-from .clip_config import read_json
+from .json_files import read_json
 from .multi_task_dit import DiTConfig
 
 POLICY = "multi_task_dit"
 CONFIG, WEIGHTS, ADAPTER = "config.json", "model.safetensors", "adapter_config.json"
 STATE = "observation.state"
+
+_MOST_CAMERAS, _MOST_PIXELS, _MOST_LETTERS = 64, 4096, 200
+_MOST = {"horizon": 4096, "n_obs_steps": 4096, "num_layers": 512}
+_MOST_OTHERWISE = 2**16
+"""Sizes above these are no policy's. Whether the weights are there for them is asked later, of ``lerobot_weights``."""
 
 _BY_HAND = (
     "Its action head can be compiled from its own code: ttscompile.compile_denoiser(module, spec), with the features"
@@ -101,10 +106,11 @@ def read_lerobot_config(directory: Path) -> LeRobotConfig:
     settings = read_json(directory / CONFIG)
     kind = settings.get("type")
     if kind != POLICY:
-        why = _REFUSED.get(str(kind), "not known. If its denoiser is a transformer, build it and use")
-        if kind not in _REFUSED:
-            why += " ttscompile.compile_denoiser(module, spec)."
-        raise CheckpointError(f"{directory}: the policy is {kind!r}, {why} Expected a directory of {POLICY!r}.")
+        unknown = (
+            "not known. If its denoiser is a transformer, build it and use ttscompile.compile_denoiser(module, spec)."
+        )
+        why = _REFUSED.get(kind, unknown) if isinstance(kind, str) else unknown
+        raise CheckpointError(f"{directory}: the policy is {kind!r:.80}, {why} Expected a directory of {POLICY!r}.")
     return _Reader(directory / CONFIG, settings).read()
 
 
@@ -118,15 +124,20 @@ class _Reader:
         features = {**self.features("input_features"), **self.features("output_features")}
         actions = [(key, shape) for key, (kind, shape) in features.items() if kind == "ACTION"]
         if [key for key, _ in actions] != ["action"] or len(actions[0][1]) != 1:
-            raise self.error(f"output_features are {features}; expected one vector, 'action'")
+            raise self.error(f"output_features are {features!s:.300}; expected one vector, 'action'")
         if STATE not in features or len(features[STATE][1]) != 1:
             raise self.error(f"input_features have no vector {STATE!r}, which this policy needs")
         cameras = {key: shape for key, (kind, shape) in features.items() if kind == "VISUAL"}
         if len(set(cameras.values())) > 1 or any(len(shape) != 3 or shape[0] != 3 for shape in cameras.values()):
-            raise self.error(f"cameras have the shapes {cameras}; expected the same [3, height, width] of all")
+            raise self.error(f"cameras have the shapes {cameras!s:.300}; expected the same [3, height, width] of all")
+        if len(cameras) > _MOST_CAMERAS or any(max(shape) > _MOST_PIXELS for shape in cameras.values()):
+            raise self.error(
+                f"there are {len(cameras)} cameras of {next(iter(cameras.values()))}; expected {_MOST_CAMERAS} at most,"
+                f" of {_MOST_PIXELS} pixels a side at most"
+            )
         objective = self.settings.get("objective", "diffusion")
         if objective not in ("diffusion", "flow_matching"):
-            raise self.error(f"objective is {objective!r}; expected diffusion or flow_matching")
+            raise self.error(f"objective is {objective!r:.80}; expected diffusion or flow_matching")
         old = self.flag("use_separate_encoder_per_camera", False)  # the name of lerobot 0.5
         return LeRobotConfig(
             features={key: features[key] for key in (STATE, *cameras, "action")},
@@ -146,7 +157,7 @@ class _Reader:
     def network(self, action_dim: int) -> DiTConfig:
         base = self.settings.get("rope_base", 10000.0)
         if not isinstance(base, float) or not base > 1:
-            raise self.error(f"rope_base is {base!r}; expected a number above 1")
+            raise self.error(f"rope_base is {base!r:.80}; expected a number above 1")
         config = DiTConfig(
             action_dim=action_dim,
             horizon=self.number("horizon", 32),
@@ -170,40 +181,49 @@ class _Reader:
     def features(self, name: str) -> dict[str, tuple[str, tuple[int, ...]]]:
         entries = self.settings.get(name)
         if not isinstance(entries, dict):
-            raise self.error(f"{name} is {entries!r}; expected type and shape by name")
+            raise self.error(f"{name} is {entries!r:.80}; expected type and shape by name")
         found = {}
         for key, entry in entries.items():
             shape = entry.get("shape") if isinstance(entry, dict) else None
-            if not isinstance(shape, list) or not shape or not all(type(n) is int and n > 0 for n in shape):
-                raise self.error(f"{name}.{key} is {entry!r}; expected a type and a shape")
+            if not isinstance(shape, list) or not shape or not all(map(_is_size, shape)):
+                raise self.error(
+                    f"{name}.{key:.80} is {entry!r:.80}; expected a type and a shape of sizes up to {_MOST_OTHERWISE}"
+                )
             found[key] = (str(entry.get("type")), tuple(shape))
         return found
 
     def number(self, name: str, default: int) -> int:
         value = self.settings.get(name, default)
-        if type(value) is not int or value < 1:
-            raise self.error(f"{name} is {value!r}; expected a positive whole number")
+        most = _MOST.get(name, _MOST_OTHERWISE)
+        if type(value) is not int or not 1 <= value <= most:
+            raise self.error(f"{name} is {value!r:.80}; expected a positive whole number, {most} at most")
         return value
 
     def flag(self, name: str, default: bool) -> bool:
         value = self.settings.get(name, default)
         if type(value) is not bool:
-            raise self.error(f"{name} is {value!r}; expected true or false")
+            raise self.error(f"{name} is {value!r:.80}; expected true or false")
         return value
 
     def text(self, name: str, default: str) -> str:
         value = self.settings.get(name, default)
-        if not isinstance(value, str) or not value:
-            raise self.error(f"{name} is {value!r}; expected a name")
+        if not isinstance(value, str) or not 0 < len(value) <= _MOST_LETTERS:
+            raise self.error(f"{name} is {value!r:.80}; expected a name")
         return value
 
     def size(self, name: str, default: list[int] | None) -> tuple[int, int] | None:
         value = self.settings.get(name, default)
         if value is None:
             return None
-        if not isinstance(value, list) or len(value) != 2 or not all(type(n) is int and n > 0 for n in value):
-            raise self.error(f"{name} is {value!r}; expected [height, width] or null")
+        if not isinstance(value, list) or len(value) != 2 or not all(_is_size(n, _MOST_PIXELS) for n in value):
+            raise self.error(
+                f"{name} is {value!r:.80}; expected [height, width] of {_MOST_PIXELS} pixels at most, or null"
+            )
         return value[0], value[1]
 
     def error(self, what: str) -> CheckpointError:
         return CheckpointError(f"{self.path}: {what}. The file was changed, or is of another version of lerobot.")
+
+
+def _is_size(value: Any, most: int = _MOST_OTHERWISE) -> bool:
+    return type(value) is int and 1 <= value <= most

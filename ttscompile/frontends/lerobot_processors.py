@@ -13,13 +13,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import nn
 
 from ..config import Affine
 from ..errors import CheckpointError
-from .clip_config import read_json
+from .json_files import read_json
 
 ACTION = "action"
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
@@ -30,16 +29,13 @@ _STATISTICS = {
     "QUANTILES": ("q01", "q99"),
     "QUANTILE10": ("q10", "q90"),
 }
-_KNOWN_STEPS = frozenset(
-    {
-        "rename_observations_processor",
-        "to_batch_processor",
-        "tokenizer_processor",
-        "device_processor",
-        "normalizer_processor",
-        "unnormalizer_processor",
-    }
-)
+_RENAME, _TOKENIZE, _NORMALIZE = "rename_observations_processor", "tokenizer_processor", "normalizer_processor"
+_UNNORMALIZE, _BATCH, _DEVICE = "unnormalizer_processor", "to_batch_processor", "device_processor"
+_KNOWN_STEPS: Mapping[str, frozenset[str]] = {
+    PREPROCESSOR: frozenset({_RENAME, _BATCH, _TOKENIZE, _DEVICE, _NORMALIZE}),
+    POSTPROCESSOR: frozenset({_BATCH, _DEVICE, _UNNORMALIZE}),
+}
+_ONCE = frozenset({_RENAME, _TOKENIZE, _NORMALIZE, _UNNORMALIZE})
 _LEAST_STD = 1e-30
 """Stands for a standard deviation of zero, which gives the mean whatever the network says."""
 
@@ -141,16 +137,13 @@ def read_processors(directory: Path, features: Mapping[str, tuple[str, tuple[int
         features: of the policy: type (``STATE``, ``VISUAL``, ``ACTION``) and shape by name.
 
     Raises:
-        CheckpointError: a file is missing or damaged, or there is a step that is not known.
+        CheckpointError: a file is missing or damaged; a step is not known, there twice, or out of order.
     """
     before, after = (_steps(directory, name) for name in (PREPROCESSOR, POSTPROCESSOR))
-    renamed: dict[str, str] = {}
-    for step in before:
-        if step["registry_name"] == "rename_observations_processor":
-            renamed = {new: old for old, new in _mapping(step, directory, "rename_map").items()}
-    statistics = _statistics(directory, before, "normalizer_processor", features)
-    inverse = _statistics(directory, after, "unnormalizer_processor", features)
-    tokenizers = [dict(step["config"]) for step in before if step["registry_name"] == "tokenizer_processor"]
+    renamed = _renamed(directory, before, features)
+    statistics = _statistics(directory, before, _NORMALIZE, features)
+    inverse = _statistics(directory, after, _UNNORMALIZE, features)
+    tokenizers = [dict(step["config"]) for step in before if step["registry_name"] == _TOKENIZE]
     return Processors(
         normalizers={key: value for key, value in statistics.items() if features[key][0] != "ACTION"},
         action=inverse.get(ACTION),
@@ -169,13 +162,15 @@ def read_tensors(path: Path) -> dict[str, torch.Tensor]:
         raise CheckpointError(f"{path}: no such file. Copy the policy's directory whole.")
     try:
         tensors: dict[str, torch.Tensor] = load_file(path, device="cpu")
-    except (SafetensorError, OSError, ValueError, RuntimeError) as error:
-        raise CheckpointError(f"{path}: not a safetensors file, or a truncated one: {error}. Copy it again.") from error
+    except Exception as error:  # what the reader raises depends on where the file is damaged
+        raise CheckpointError(
+            f"{path}: not a safetensors file, or a truncated one: {error!s:.300}. Copy it again."
+        ) from error
     return tensors
 
 
 def _steps(directory: Path, name: str) -> list[dict[str, Any]]:
-    """The steps of a pipeline, each with a registered name that is known and a configuration."""
+    """The steps of a pipeline, each with a registered name that is known and a configuration, in lerobot's order."""
     path = directory / name
     if not path.is_file():
         raise CheckpointError(
@@ -187,21 +182,55 @@ def _steps(directory: Path, name: str) -> list[dict[str, Any]]:
     if not isinstance(steps, list) or not all(isinstance(step, dict) for step in steps):
         raise CheckpointError(f"{path}: has no list of steps; expected a pipeline that lerobot saved.")
     for step in steps:
-        registered = step.get("registry_name", step.get("class"))
-        if registered not in _KNOWN_STEPS:
+        registered = step.get("registry_name")  # a step of somebody's own has a class instead
+        if not isinstance(registered, str) or registered not in _KNOWN_STEPS[name]:
             raise CheckpointError(
-                f"{path}: the step {registered!r} is not known, and without it actions would be wrong. Expected"
-                f" {', '.join(sorted(_KNOWN_STEPS))}. Do its work outside of the policy, and leave it out of the file."
+                f"{path}: the step {step.get('registry_name', step.get('class'))!r:.80} is not known here, and without"
+                f" it actions would be wrong. Expected {', '.join(sorted(_KNOWN_STEPS[name]))}. Do its work outside of"
+                " the policy, and leave it out of the file."
             )
         if not isinstance(step.setdefault("config", {}), dict):
             raise CheckpointError(f"{path}: the configuration of {registered} is no object.")
+        if registered == _DEVICE and step["config"].get("float_dtype") not in (None, "float32"):
+            raise CheckpointError(
+                f"{path}: {registered}.float_dtype is {step['config']['float_dtype']!r:.80}; expected null or float32:"
+                " the compiled policy computes in float32. Set it to null if the policy was trained so."
+            )
+    order = [step["registry_name"] for step in steps]
+    twice = sorted(kind for kind in _ONCE if order.count(kind) > 1)
+    if twice:
+        raise CheckpointError(
+            f"{path}: expected at most one step of a kind; found {order.count(twice[0])} of {twice[0]}. Combine them"
+            " into one, and save the pipeline again."
+        )
+    if _RENAME in order and any(kind in order[: order.index(_RENAME)] for kind in (_NORMALIZE, _TOKENIZE)):
+        raise CheckpointError(
+            f"{path}: expected {_RENAME} before the other steps, as lerobot saves them; found {', '.join(order)}. Steps"
+            " before it would see other names. Save the pipeline again in that order."
+        )
     return steps
+
+
+def _renamed(
+    directory: Path, steps: list[dict[str, Any]], features: Mapping[str, tuple[str, tuple[int, ...]]]
+) -> dict[str, str]:
+    """The policy's name of each renamed observation -> the robot's."""
+    step = next((step for step in steps if step["registry_name"] == _RENAME), None)
+    names = {} if step is None else _mapping(step, directory, "rename_map")
+    renamed = {new: old for old, new in names.items()}
+    given = [renamed.get(key, key) for key, (kind, _) in features.items() if kind != "ACTION"]
+    if len(renamed) < len(names) or len(set(given)) < len(given):
+        raise CheckpointError(
+            f"{directory}: {_RENAME}.rename_map is {names!s:.300}; expected one name of the robot for each"
+            " observation of the policy, and the other way round."
+        )
+    return renamed
 
 
 def _mapping(step: Mapping[str, Any], directory: Path, key: str) -> dict[str, str]:
     value = step["config"].get(key, {})
     if not isinstance(value, dict) or not all(isinstance(item, str) for item in value.values()):
-        raise CheckpointError(f"{directory}: {step['registry_name']}.{key} is {value!r}; expected names by name.")
+        raise CheckpointError(f"{directory}: {step['registry_name']}.{key} is {value!r:.80}; expected names by name.")
     return value
 
 
@@ -219,18 +248,27 @@ def _statistics(
     config, modes = step["config"], _mapping(step, directory, "norm_map")
     eps = config.get("eps", 1e-8)
     if not isinstance(eps, float) or not eps > 0:
-        raise CheckpointError(f"{directory}: {registered}.eps is {eps!r}; expected a positive number.")
+        raise CheckpointError(f"{directory}: {registered}.eps is {eps!r:.80}; expected a positive number.")
     tensors = _state(directory, step)
     only, own = config.get("normalize_observation_keys"), config.get("features", {})
+    if not isinstance(own, dict):
+        raise CheckpointError(f"{directory}: {registered}.features is {own!r:.80}; expected type and shape by name.")
+    if only is not None and not (isinstance(only, list) and all(isinstance(key, str) for key in only)):
+        raise CheckpointError(
+            f"{directory}: {registered}.normalize_observation_keys is {only!r:.80}; expected a list of names, or null."
+        )
     result = {}
     for key, (kind, shape) in features.items():
         mode = modes.get(kind, "IDENTITY")
-        skipped = only is not None and kind != "ACTION" and key not in only
-        if mode == "IDENTITY" or skipped or key not in own:
+        # lerobot looks for observations in ``features``, and never for the action.
+        skipped = kind != "ACTION" and (key not in own or (only is not None and key not in only))
+        if mode == "IDENTITY" or skipped:
             continue
         if mode not in _STATISTICS:
             known = ", ".join(("IDENTITY", *_STATISTICS))
-            raise CheckpointError(f"{directory}: {registered} normalises {kind} by {mode!r}; expected one of {known}.")
+            raise CheckpointError(
+                f"{directory}: {registered} normalises {kind} by {mode!r:.80}; expected one of {known}."
+            )
         names = [f"{key}.{name}" for name in _STATISTICS[mode]]
         if not any(name.rpartition(".")[0] == key for name in tensors):
             warnings.warn(
@@ -253,8 +291,8 @@ def _state(directory: Path, step: Mapping[str, Any]) -> dict[str, torch.Tensor]:
     name = step.get("state_file")
     if name is None:
         return {}
-    if not isinstance(name, str) or Path(name).name != name:
-        raise CheckpointError(f"{directory}: state_file {name!r} is not the name of a file in this directory.")
+    if not isinstance(name, str) or Path(name).name != name or len(name) > 200:
+        raise CheckpointError(f"{directory}: state_file {name!r:.80} is not the name of a file in this directory.")
     return read_tensors(directory / name)
 
 

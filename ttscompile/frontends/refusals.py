@@ -6,7 +6,6 @@ configuration, an entry of a checkpoint, the name of a weight, a file in a direc
 
 from __future__ import annotations
 
-import json
 import re
 import zipfile
 from collections.abc import Iterable, Mapping
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from ..errors import CheckpointError
+from .json_files import read_json
 
 _BUILD = "Build the network with the code that trained it and use ttscompile.compile_denoiser(module, spec)"
 _HEAD = f"{_BUILD}: the action head is the module, and what the vision-language model gives it are its observations."
@@ -242,7 +242,7 @@ def _weight_names(payload: Mapping[str, Any]) -> set[str]:
 def _entries(path: Path) -> list[str]:
     """``config.json: key=value`` for the entries of a JSON file; none where it is not there or not one."""
     try:
-        config = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        config = read_json(path)
+    except CheckpointError:
         return []
-    return [f"{path.name}: {key}={value}" for key, value in config.items()] if isinstance(config, dict) else []
+    return [f"{path.name}: {key:.80}={value!s:.80}" for key, value in config.items()]

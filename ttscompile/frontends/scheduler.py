@@ -24,13 +24,15 @@ from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultist
 
 from ..config import SamplerTable
 from ..errors import CheckpointError, SpecError, TtscompileError
-from ..samplers import sampler_table
+from ..samplers.table import sampler_table
 
 SPACINGS = ("leading", "trailing", "linspace")
 SAMPLERS = ("ddpm", "ddim", "dpmsolver++")
 """Names of the samplers that can be asked for in place of a checkpoint's own."""
 MOST_TIMESTEPS = 10_000
 """Of the training; in use are 50 to 1000. diffusers computes each in Python."""
+MOST_STEPS = 1000
+"""Of a call; in use are 4 to 100. Each is evaluated with diffusers to make the table, which takes some milliseconds."""
 DPM = "dpmsolver++"
 
 _CLASSES: Mapping[str, type[Any]] = {
@@ -53,6 +55,7 @@ def configured_sampler(
     step_arguments: Mapping[str, Any],
     sampler: str | None = None,
     spacing: str | None = None,
+    where: str = "cfg.policy.noise_scheduler",
 ) -> SamplerTable:
     """The denoising loop that a checkpoint's ``noise_scheduler`` describes.
 
@@ -62,6 +65,7 @@ def configured_sampler(
         step_arguments: what the policy hands to every ``step`` of its own scheduler (``eta``).
         sampler: one of ``SAMPLERS`` in place of the scheduler's own class, on the same betas.
         spacing: of the timesteps, in place of the configured one.
+        where: the settings stand, for messages.
 
     Returns:
         The table.
@@ -76,13 +80,15 @@ def configured_sampler(
         raise SpecError(f"sampler {sampler!r} is not known; expected one of {', '.join(SAMPLERS)}.")
     if spacing is not None and spacing not in SPACINGS:
         raise SpecError(f"timestep spacing {spacing!r} is not known; expected one of {', '.join(SPACINGS)}.")
-    if steps is not None and (type(steps) is not int or steps < 1):
-        raise SpecError(f"{steps!r} denoising steps are not possible; expected a positive whole number.")
+    if steps is not None and (type(steps) is not int or not 1 <= steps <= MOST_STEPS):
+        raise SpecError(
+            f"{steps!r:.80} denoising steps are not possible; expected a positive whole number, {MOST_STEPS} at most."
+        )
 
     name = sampler or own_name
     if name is None:
         raise CheckpointError(
-            f"cfg.policy.noise_scheduler is {own or 'of no class'}; expected one of {', '.join(_CLASSES)}. To run on"
+            f"{where} is {own or 'of no class'}; expected one of {', '.join(_CLASSES)}. To run on"
             f" its betas with another sampler, ask for sampler={' or '.join(map(repr, SAMPLERS))}."
         )
     scheduler_class = next(each for key, each in _CLASSES.items() if _NAMES[key] == name)
@@ -90,18 +96,21 @@ def configured_sampler(
     unknown = sorted(set(given).difference(*map(_settings, _CLASSES.values())))
     if unknown and name == own_name:
         raise CheckpointError(
-            f"cfg.policy.noise_scheduler has settings that diffusers' {own} does not know: {', '.join(unknown)}."
+            f"{where} has settings that diffusers' {own} does not know: {', '.join(unknown)}."
             " Remove them from the configuration if they are not needed, and save the checkpoint again."
         )
     if name == DPM and own_name != DPM:
-        given = _for_dpm_solver(given)
+        given = _for_dpm_solver(given, where)
     if spacing is not None:
         given["timestep_spacing"] = spacing
     taken = _settings(scheduler_class)
     trained = given.get("num_train_timesteps", 1000)
     if type(trained) is not int or not 1 <= trained <= MOST_TIMESTEPS:
+        raise CheckpointError(f"{where}: num_train_timesteps is {trained!r:.80}; expected 1 to {MOST_TIMESTEPS}.")
+    if steps is None and trained > MOST_STEPS:
         raise CheckpointError(
-            f"cfg.policy.noise_scheduler.num_train_timesteps is {trained!r:.80}; expected 1 to {MOST_TIMESTEPS}."
+            f"{where}: num_train_timesteps is {trained}, and a call would take as many steps; expected {MOST_STEPS} at"
+            " most. Give a number of steps: steps= in Python, --steps on the command line."
         )
     try:
         scheduler = scheduler_class(**{key: value for key, value in given.items() if key in taken})
@@ -115,12 +124,11 @@ def configured_sampler(
         raise
     except Exception as error:  # settings of a wrong type fail wherever diffusers first uses them
         raise CheckpointError(
-            f"cfg.policy.noise_scheduler: diffusers refuses the settings {str(given)[:300]}:"
-            f" {type(error).__name__}: {str(error)[:200]}"
+            f"{where}: diffusers refuses the settings {str(given)[:300]}: {type(error).__name__}: {str(error)[:200]}"
         ) from error
 
 
-def _for_dpm_solver(settings: Mapping[str, Any]) -> dict[str, Any]:
+def _for_dpm_solver(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
     """Settings of DPM-Solver++ for a network that was trained with DDPM or DDIM on these.
 
     DDPM and DDIM bound the predicted sample (``clip_sample``), DPM-Solver++ has no such setting. Its dynamic
@@ -130,7 +138,7 @@ def _for_dpm_solver(settings: Mapping[str, Any]) -> dict[str, Any]:
     clips, bound = settings.get("clip_sample", True), settings.get("clip_sample_range", 1.0)
     if clips and bound != 1:
         raise SpecError(
-            f"cfg.policy.noise_scheduler.clip_sample_range is {bound}; sampler {DPM} bounds the sample at 1 or not at"
+            f"{where}: clip_sample_range is {bound!r:.80}; sampler {DPM} bounds the sample at 1 or not at"
             " all. Use ddpm or ddim."
         )
     kept = {key: value for key, value in settings.items() if key != "variance_type"}
