@@ -260,7 +260,7 @@ def test_programs_without_a_single_file(change: Callable[[Program], Program], me
 
 def test_two_gigabytes_are_too_many(monkeypatch: pytest.MonkeyPatch) -> None:
     program = toy_program()
-    monkeypatch.setattr("ttscompile.lower_single_file.LARGEST", 1000)
+    monkeypatch.setattr("ttscompile.lower.single_file.LARGEST", 1000)
     with pytest.raises(LoweringError, match="an ONNX file holds at most 2"):
         lower_single_file(program, lower_program(program), program.weights)
 
