@@ -49,7 +49,7 @@ def plan_picture(plan: PlanArray, kinds: Sequence[str], title: str) -> bytes:
 def frontier_picture(
     points: Sequence[Point], efficient: Sequence[Point], yardsticks: Mapping[str, float], title: str
 ) -> bytes:
-    """Error against latency, names as matplotlib can draw them; see ``ttscompile.plots_frontier.plot_frontier``."""
+    """Error against latency, names as matplotlib can draw them; see ``ttscompile.plots.frontier.plot_frontier``."""
     return drawn(lambda path: plot_frontier(points, efficient, yardsticks, path, plain(title, 110)))
 
 
