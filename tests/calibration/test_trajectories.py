@@ -127,6 +127,7 @@ NAN = np.where(np.arange(30).reshape(5, 2, 3) == 13, np.nan, 0).astype(np.float3
         (changed(meta=np.array("frames")), "expected 'meta' to be a JSON object"),
         (changed(meta=np.array('{"frames": 1}')), "expected 'meta' to be a JSON object"),
         (changed(meta=np.array(3)), "expected 'meta' to be a JSON object"),
+        (changed(meta=np.array("[" * 100_000)), "expected 'meta' to be a JSON object"),
         (changed(meta=np.array('{"frames": true}')), r"expected \[F, \*frame\] = \[.., 3\]"),
     ],
 )

@@ -184,7 +184,7 @@ def _meta(path: Path, value: Array | None) -> bool:
     text = value.item() if value.ndim == 0 and value.dtype.kind in "SU" else None
     try:
         meta = json.loads(text) if text is not None else None
-    except ValueError:
+    except (ValueError, RecursionError):
         meta = None
     frames = meta.get("frames", False) if isinstance(meta, dict) else None
     if not isinstance(frames, bool):
