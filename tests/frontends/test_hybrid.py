@@ -228,7 +228,7 @@ def test_weights_that_are_there_once(build: Callable[..., tuple[Any, Any]], two_
             r"pool\.nets\.bias and \S+nets\.1\.nets\.bias differ|nets\.1\.nets\.bias and \S+pool\.nets\.bias differ",
         ),
         ({f"{WRIST}nets.3.bias": torch.zeros(65)}, r"nets\.3\.bias has shape \(65,\); expected \(64,\)"),
-        ({f"{WRIST}nets.3.bias": torch.full((64,), math.nan)}, r"nets\.3\.bias holds values that are not finite"),
+        ({f"{WRIST}nets.3.bias": torch.full((64,), math.nan)}, r"nets\.3\.bias holds 64 values that are not finite"),
         ({f"{WRIST}nets.4.weight": torch.zeros(3)}, r"unexpected .*nets\.4\.weight"),
         (
             {"obs_encoder.obs_nets.third.nets.3.bias": torch.zeros(64)},

@@ -16,8 +16,9 @@ import torch
 
 from ..config import ObservationSpec
 from ..errors import CheckpointError
-from .diffusion_policy_weights import Weights, affine, names_of
+from .diffusion_policy_weights import Weights, affine
 from .robomimic_encoder import Camera, ObservationEncoder
+from .saved_weights import names_of, require_finite, require_names, require_shape
 from .transformer_for_diffusion import TransformerConfig
 
 POLICY = "DiffusionTransformerHybridImagePolicy"
@@ -182,21 +183,16 @@ def _load_camera(module: torch.nn.Module, weights: Weights, key: str) -> None:
     expected = {name: value for name, value in module.state_dict().items() if not name.endswith("num_batches_tracked")}
     missing = [prefix + name for name in expected if name not in found]
     extra = [saved[name] for name in found if name not in expected]
-    if missing or extra:
-        parts = [f"missing {names_of(missing)}"] * bool(missing) + [f"unexpected {names_of(extra)}"] * bool(extra)
-        raise CheckpointError(
-            f"the weights of the image encoder are not those of robomimic's ResNet-18 with spatial softmax and"
-            f" obs_encoder_group_norm as configured: {'; '.join(parts)}. Use ttscompile.compile_denoiser(module, spec)"
-            " for another encoder."
-        )
+    require_names(
+        missing,
+        extra,
+        "the weights of the image encoder are not those of robomimic's ResNet-18 with spatial softmax and"
+        " obs_encoder_group_norm as configured",
+        "Use ttscompile.compile_denoiser(module, spec) for another encoder.",
+    )
     for name, value in found.items():
-        if value.shape != expected[name].shape:
-            raise CheckpointError(
-                f"weight {saved[name]} has shape {tuple(value.shape)}; expected {tuple(expected[name].shape)} from"
-                " cfg.policy.shape_meta and crop_shape."
-            )
-        if not torch.isfinite(value).all():
-            raise CheckpointError(f"weight {saved[name]} holds values that are not finite; training diverged.")
+        require_shape(saved[name], value, expected[name].shape, "cfg.policy.shape_meta and crop_shape")
+        require_finite(saved[name], value)
         if name in _GRID and not torch.allclose(value, expected[name], atol=1e-6):
             raise CheckpointError(f"{saved[name]} is not the grid from -1 to 1 of a spatial softmax; it was changed.")
     module.load_state_dict(found, strict=False)

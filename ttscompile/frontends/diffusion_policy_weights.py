@@ -11,6 +11,7 @@ import torch
 
 from ..config import Affine
 from ..errors import CheckpointError
+from .saved_weights import require_finite, require_names, require_shape
 from .transformer_for_diffusion import TransformerConfig, TransformerForDiffusion
 
 _NORMALIZER_KEY = re.compile(r"normalizer\.params_dict\.\w+\.(scale|offset|input_stats\.\w+)")
@@ -51,12 +52,6 @@ def choose_weights(state_dicts: Any, use_ema: Any) -> tuple[Weights, str]:
     return {key: value.detach().to(torch.float32) for key, value in weights.items()}, found
 
 
-def names_of(keys: list[str]) -> str:
-    """A few names and how many more there are."""
-    more = f" and {len(keys) - 6} more" if len(keys) > 6 else ""
-    return ", ".join(keys[:6]) + more
-
-
 def build_network(config: TransformerConfig, weights: Weights) -> TransformerForDiffusion:
     """The network of a configuration, which is made only if the checkpoint has weights for one of its size.
 
@@ -94,24 +89,19 @@ def load_network(network: TransformerForDiffusion, weights: Weights) -> None:
         for key in weights
         if not (key.startswith("model.") or _OTHER_KEY.fullmatch(key) or _NORMALIZER_KEY.fullmatch(key))
     ]
-    if missing or extra:
-        parts = [f"missing {names_of(missing)}"] * bool(missing) + [f"unexpected {names_of(extra)}"] * bool(extra)
-        raise CheckpointError(
-            f"the weights do not fit the configuration: {'; '.join(parts)}. cfg.policy.model describes another network"
-            " than the one that was saved, or the file is incomplete."
-        )
+    require_names(
+        missing,
+        extra,
+        "the weights do not fit the configuration",
+        "cfg.policy.model describes another network than the one that was saved, or the file is incomplete.",
+    )
     for key, value in found.items():
-        if value.shape != expected[key].shape:
-            raise CheckpointError(
-                f"weight model.{key} has shape {tuple(value.shape)}; expected {tuple(expected[key].shape)} from"
-                " cfg.policy.model."
-            )
+        require_shape(f"model.{key}", value, expected[key].shape, "cfg.policy.model")
         if key in ("mask", "memory_mask"):
             if not torch.equal(value, expected[key]):
                 raise CheckpointError(f"model.{key} is not the causal mask of the original; the network was changed.")
-        elif not torch.isfinite(value).all():
-            count = int((~torch.isfinite(value)).sum())
-            raise CheckpointError(f"weight model.{key} holds {count} values that are not finite; training diverged.")
+        else:
+            require_finite(f"model.{key}", value)
     network.load_state_dict(found, strict=True)
 
 

@@ -13,6 +13,7 @@ from .clip_config import TextConfig, VisionConfig
 from .lerobot_config import LeRobotConfig
 from .lerobot_processors import read_tensors
 from .multi_task_dit import DiffusionTransformer, ObservationEncoder
+from .saved_weights import require_finite, require_names, require_shape
 
 _MOST_LAYERS = 512
 """Of all transformers together. Each is made twice, first without memory, which takes time."""
@@ -86,21 +87,15 @@ def require_weights(parts: Parts, weights: Mapping[str, torch.Tensor]) -> None:
         prefix + name: value.shape for prefix, part in parts.items() for name, value in part.state_dict().items()
     }
     missing, extra = sorted(set(expected) - set(weights)), sorted(set(weights) - set(expected))
-    if missing or extra:
-        said = [f"missing {_names(missing)}"] * bool(missing) + [f"unexpected {_names(extra)}"] * bool(extra)
-        raise CheckpointError(
-            f"the weights do not fit the configuration: {'; '.join(said)}. config.json, or the encoder's, is of"
-            " another network than the one that was saved, or the file is incomplete."
-        )
+    require_names(
+        missing,
+        extra,
+        "the weights do not fit the configuration",
+        "config.json, or the encoder's, is of another network than the one that was saved, or the file is incomplete.",
+    )
     for key, value in weights.items():
-        if value.shape != expected[key]:
-            raise CheckpointError(
-                f"weight {key} has shape {tuple(value.shape)}; expected {tuple(expected[key])} from config.json"
-                " and the encoder's configuration."
-            )
-        if not torch.isfinite(value).all():
-            count = int((~torch.isfinite(value)).sum())
-            raise CheckpointError(f"weight {key} holds {count} values that are not finite; training diverged.")
+        require_shape(key, value, expected[key], "config.json and the encoder's configuration")
+        require_finite(key, value)
 
 
 def fill(parts: Parts, weights: Mapping[str, torch.Tensor]) -> None:
@@ -109,9 +104,3 @@ def fill(parts: Parts, weights: Mapping[str, torch.Tensor]) -> None:
         part.load_state_dict(
             {key.removeprefix(prefix): value for key, value in weights.items() if key.startswith(prefix)}
         )
-
-
-def _names(keys: list[str]) -> str:
-    """A few names and how many more there are."""
-    more = f" and {len(keys) - 4} more" if len(keys) > 4 else ""
-    return ", ".join(keys[:4]) + more
