@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 MODULES = modules(ROOT)
 GRAPH = {name: imports(name, path) for name, path in MODULES.items()}
 
-BASE = {"errors", "config", "correction", "lattice", "update"}
+BASE = {"errors", "config", "correction", "lattice", "update", "versions"}
 BELOW_ARTIFACT = BASE | {"ir", "artifact"}
 COMPILER = {"capture", "frontends", "lower", "passes", "samplers"}
 MAY_IMPORT = {
@@ -30,6 +30,7 @@ MAY_IMPORT = {
     "machine": set(),
     "report": BELOW_ARTIFACT | {"machine", "plots", "points", "runtimes", "trajectories", "units", "verification"},
     "units": set(),
+    "versions": set(),
     "doctor": BELOW_ARTIFACT | {"machine", "runtimes"},
     "plots": {"errors", "lattice", "points"},
     "points": set(),

@@ -11,7 +11,7 @@ from typing import Any
 CPUINFO = Path("/proc/cpuinfo")
 PACKAGES = ("ttscompile", "numpy", "onnxruntime", "torch")
 _DOT_PRODUCTS = ("avx512_vnni", "avx_vnni", "amx_int8")
-_X86 = ("x86_64", "amd64", "i386", "i686")
+X86 = ("x86_64", "amd64", "i386", "i686")
 _INSTRUCTIONS = ("avx2", "avx512f", "avx512_vnni", "amx_int8", "asimd", "sve")
 
 
@@ -20,7 +20,7 @@ def fingerprint() -> dict[str, Any]:
 
     Nothing that names the machine or its user. Packages that are not installed are left out.
     """
-    fields = _cpuinfo()
+    fields = cpuinfo()
     flags = fields.get("flags", fields.get("Features", "")).split()
     return {
         "processor": fields.get("model name", platform.processor() or platform.machine()),
@@ -40,9 +40,9 @@ def has_integer_dot_product() -> bool | None:
     On x86 that takes VNNI or AMX: without, onnxruntime's fastest kernels sum pairs of products in 16 bits, which
     saturate. ARM processors have such sums in one form or another. None: nothing says what the processor has.
     """
-    if platform.machine().lower() not in _X86:
+    if platform.machine().lower() not in X86:
         return True
-    flags = _cpuinfo().get("flags", "").split()
+    flags = cpuinfo().get("flags", "").split()
     return any(name in flags for name in _DOT_PRODUCTS) if flags else None
 
 
@@ -55,11 +55,13 @@ def one_line(machine: dict[str, Any]) -> str:
     )
 
 
-def _cpuinfo() -> dict[str, str]:
-    """The first processor's fields of ``/proc/cpuinfo``; empty where there is no such file."""
-    if not CPUINFO.exists():
+def cpuinfo(path: Path | None = None) -> dict[str, str]:
+    """The first processor's fields of ``/proc/cpuinfo``, or of another such file; empty where there is none."""
+    try:
+        text = (CPUINFO if path is None else path).read_text(errors="replace")
+    except OSError:
         return {}
-    first = CPUINFO.read_text().split("\n\n", 1)[0]
+    first = text.split("\n\n", 1)[0]
     pairs = (line.split(":", 1) for line in first.splitlines() if ":" in line)
     return {name.strip(): value.strip() for name, value in pairs}
 

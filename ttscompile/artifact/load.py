@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -22,6 +21,7 @@ from ..ir.graph import Graph
 from ..ir.program import Binding, Block, Pieces, Program
 from ..ir.serialize import graph_from_json
 from ..lattice import PlanArray, Source, check_plan, dense_plan
+from ..versions import release
 from .archive import Unpacked, unpack
 from .codec import decode
 from .files import verify
@@ -336,17 +336,8 @@ def _check_runtime(requires: Requires, directory: Path) -> None:
     import onnxruntime
 
     found = str(onnxruntime.__version__)
-    if _release(found) < _release(requires.onnxruntime):
+    if release(found) < release(requires.onnxruntime):
         raise ArtifactError(
             f"{directory}: its graphs (opset {requires.opset}) need onnxruntime >= {requires.onnxruntime}; {found} is"
             f" installed. Run: pip install 'onnxruntime>={requires.onnxruntime}'."
         )
-
-
-def _release(version: str) -> tuple[int, ...]:
-    """``1.23.0.dev3+cpu`` as (1, 23); trailing zeros do not count."""
-    match = re.match(r"\d+(?:\.\d+)*", version)
-    numbers = [int(n) for n in match[0].split(".")] if match else [0]
-    while numbers and numbers[-1] == 0:
-        numbers.pop()
-    return tuple(numbers)

@@ -10,6 +10,7 @@ from itertools import pairwise
 from math import floor
 from pathlib import Path
 
+from ..machine import X86, cpuinfo
 from .finding import Finding, Level
 
 _X86 = {
@@ -27,7 +28,6 @@ _ARM = {"asimd": "NEON", "asimddp": "dotprod", "i8mm": "i8mm", "bf16": "BF16", "
 _AS_GOOD = {"avx_vnni": {"avx512_vnni"}, "avx512_vnni": {"avx_vnni"}}
 """What does the same, so that its absence is not worth a word."""
 
-_X86_NAMES = ("x86_64", "amd64", "i386", "i686")
 _FAST_CLOCKS = ("tsc", "arch_sys_counter", "kvm-clock", "hyperv_clocksource_tsc_page")
 _BUSY = 0.5
 """Load for each core from which timings say little."""
@@ -86,12 +86,7 @@ def available_bytes(root: Path = Path("/")) -> int | None:
 
 
 def _processor(root: Path) -> list[Finding]:
-    part, x86 = "processor", platform.machine().lower() in _X86_NAMES
-    fields = {}
-    for line in _text(root / "proc/cpuinfo").split("\n\n", 1)[0].splitlines():
-        name, separator, value = line.partition(":")
-        if separator:
-            fields[name.strip()] = value.strip()
+    part, x86, fields = "processor", platform.machine().lower() in X86, cpuinfo(root / "proc/cpuinfo")
     found = [Finding(part, "model", fields.get("model name") or platform.processor() or platform.machine())]
     flags = set((fields.get("flags") or fields.get("Features") or "").split())
     if not flags:

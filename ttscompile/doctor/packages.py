@@ -10,6 +10,7 @@ import sys
 from importlib.metadata import PackageNotFoundError, requires, version
 from typing import NamedTuple
 
+from ..versions import release
 from .finding import Finding, Level
 
 PYTHON = (3, 11)
@@ -52,15 +53,6 @@ def requirements() -> list[Requirement]:
         return []
     found = (_REQUIREMENT.match(line) for line in told)
     return [Requirement(m["name"], m["least"] or "", m["extra"] or "") for m in found if m is not None]
-
-
-def release(text: str) -> tuple[int, ...]:
-    """``2.13.0+cpu`` as (2, 13); trailing zeros do not count."""
-    match = re.match(r"\d+(?:\.\d+)*", text)
-    numbers = [int(n) for n in match[0].split(".")] if match else [0]
-    while numbers and numbers[-1] == 0:
-        numbers.pop()
-    return tuple(numbers)
 
 
 def _python() -> list[Finding]:

@@ -1,0 +1,14 @@
+"""Versions of packages, to compare them; the standard library alone, for the doctor."""
+
+from __future__ import annotations
+
+import re
+
+
+def release(text: str) -> tuple[int, ...]:
+    """``2.13.0.dev3+cpu`` as (2, 13); trailing zeros do not count."""
+    match = re.match(r"\d+(?:\.\d+)*", text)
+    numbers = [int(n) for n in match[0].split(".")] if match else [0]
+    while numbers and numbers[-1] == 0:
+        numbers.pop()
+    return tuple(numbers)
