@@ -5,11 +5,11 @@ Parameters are called as in the original. Token 0 is the sum of timestep and con
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+
+from .layers import TimestepEmbedder
 
 
 class _Attention(nn.Module):
@@ -51,16 +51,6 @@ class _Linear(nn.Module):
         return self.linear(x)
 
 
-class _Time(nn.Module):
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.mlp = nn.Sequential(nn.Linear(256, width), nn.SiLU(), nn.Linear(width, width))
-
-    def forward(self, t: Tensor) -> Tensor:
-        angle = t[:, None].float() * torch.exp(-math.log(10000) * torch.arange(128, dtype=torch.float32) / 128)
-        return self.mlp(torch.cat([angle.cos(), angle.sin()], -1))
-
-
 class CogACTHead(nn.Module):
     """``forward_with_cfg``, which doubles the batch, on a batch that is not doubled yet.
 
@@ -72,7 +62,11 @@ class CogACTHead(nn.Module):
     ) -> None:
         super().__init__()
         self.guidance = guidance
-        self.x_embedder, self.t_embedder, self.z_embedder = _Linear(actions, width), _Time(width), nn.Module()
+        self.x_embedder, self.t_embedder, self.z_embedder = (
+            _Linear(actions, width),
+            TimestepEmbedder(width),
+            nn.Module(),
+        )
         self.z_embedder.linear = nn.Linear(cognition, width)
         self.z_embedder.uncondition = nn.Parameter(torch.zeros(1, cognition))
         self.positional_embedding = nn.Parameter(torch.zeros(horizon + 1, width))

@@ -34,6 +34,18 @@ class Waves(nn.Module):
         return self.down(functional.silu(self.up(torch.cat([angle.cos(), angle.sin()], -1))))
 
 
+class TimestepEmbedder(nn.Module):
+    """DiT's: 256 waves of periods up to 10,000, then an MLP, ``[B] -> [B, width]``; RDT and CogACT have it too."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.mlp = nn.Sequential(nn.Linear(256, width), nn.SiLU(), nn.Linear(width, width))
+
+    def forward(self, t: Tensor) -> Tensor:
+        angle = t[:, None].float() * torch.exp(-math.log(10000) * torch.arange(128, dtype=torch.float32) / 128)
+        return self.mlp(torch.cat([angle.cos(), angle.sin()], -1))
+
+
 def heads(x: Tensor, count: int) -> Tensor:
     """``[B, T, E]`` to ``[B, count, T, E / count]``."""
     return x.unflatten(-1, (count, -1)).transpose(1, 2)

@@ -6,11 +6,11 @@ that is what timm 1.0.3 does, which RDT was trained with.
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+
+from .layers import TimestepEmbedder
 
 
 class _Norm(nn.Module):
@@ -64,16 +64,6 @@ class _Layer(nn.Module):
         return self.ffn(self.norm3(x)) + x
 
 
-class _Time(nn.Module):
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.mlp = nn.Sequential(nn.Linear(256, width), nn.SiLU(), nn.Linear(width, width))
-
-    def forward(self, t: Tensor) -> Tensor:
-        angle = t[:, None].float() * torch.exp(-math.log(10000) * torch.arange(128, dtype=torch.float32) / 128)
-        return self.mlp(torch.cat([angle.cos(), angle.sin()], -1))[:, None]
-
-
 class _Final(nn.Module):
     def __init__(self, width: int, out: int) -> None:
         super().__init__()
@@ -84,7 +74,7 @@ class _RDT(nn.Module):
     def __init__(self, width: int, heads: int, layers: int, horizon: int, out: int, lengths: tuple[int, int]) -> None:
         super().__init__()
         self.horizon = horizon
-        self.t_embedder, self.freq_embedder = _Time(width), _Time(width)
+        self.t_embedder, self.freq_embedder = TimestepEmbedder(width), TimestepEmbedder(width)
         self.x_pos_embed = nn.Parameter(torch.zeros(1, horizon + 3, width))
         self.lang_cond_pos_embed = nn.Parameter(torch.zeros(1, lengths[0], width))
         self.img_cond_pos_embed = nn.Parameter(torch.zeros(1, lengths[1], width))
@@ -92,7 +82,7 @@ class _RDT(nn.Module):
         self.final_layer = _Final(width, out)
 
     def forward(self, x: Tensor, frequency: Tensor, t: Tensor, language: Tensor, image: Tensor, mask: Tensor) -> Tensor:
-        x = torch.cat([self.t_embedder(t), self.freq_embedder(frequency), x], 1) + self.x_pos_embed
+        x = torch.cat([self.t_embedder(t)[:, None], self.freq_embedder(frequency)[:, None], x], 1) + self.x_pos_embed
         language = language + self.lang_cond_pos_embed[:, : language.shape[1]]
         image = image + self.img_cond_pos_embed
         for i, layer in enumerate(self.blocks):

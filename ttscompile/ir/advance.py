@@ -4,7 +4,7 @@
 
 The pieces are small; run one by one they cost more in calls than in arithmetic. Inside, the number of operations
 counts: samples are ``[D, B, T]``, so that the update is one product (``ttscompile.update``) and nothing is turned.
-What is carried from a step to the next comes in pairs ``NAME`` and ``NAME_next`` (``CARRIED``).
+What is carried from a step to the next comes in pairs ``NAME`` and ``NAME_next``; ``memory`` only where there is one.
 Push-T, 1 thread: 41 us with samples ``[B, T, D]``, a product for each coefficient and one for the correction; 31 us so.
 """
 
@@ -30,8 +30,6 @@ SAMPLE_NEXT = "sample_next"
 STREAM_NEXT = "stream_next"
 PREDICTION = "prediction"
 MEMORY_NEXT = "memory_next"
-CARRIED = (SAMPLE, MEMORY)
-"""What the sampler carries from step to step: inputs NAME, outputs NAME_next. ``memory`` only where it has memories."""
 X0_COLUMNS = ("sample_to_x0", "out_to_x0")
 """Columns of the sampler's table that are inputs of their own."""
 
