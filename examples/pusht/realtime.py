@@ -84,8 +84,8 @@ class RealTime:
         seconds: that the loop ran for.
         episodes: that were started.
         best_coverage: of each finished episode.
-        missed_ticks: without an action, or with the last one held, later in an episode than any policy that is fast
-            enough for this loop has its first chunk.
+        missed_ticks: without an action, with the last one held, or with one in reserve, because the chunk was late;
+            later in an episode than any policy that is fast enough for this loop has its first chunk.
         late_ticks: of the loop itself, by more than half a period.
         statistics: of the executor.
         feasibility: the arithmetic.
@@ -141,7 +141,7 @@ class World:
 
 
 def drive(
-    label: str, policy: NumberedNoise, hz: float, seconds: float, first_seed: int, max_hold: int, trace: Path
+    label: str, policy: NumberedNoise, hz: float, seconds: float, first_seed: int, margin_ticks: int, trace: Path
 ) -> RealTime:
     """Run episodes in real time; the loop never waits for the policy, except for the first chunk of an episode.
 
@@ -151,11 +151,11 @@ def drive(
         hz: ticks a second.
         seconds: for how long.
         first_seed: of the first episode; the next ones have the next.
-        max_hold: ticks to repeat an action for.
+        margin_ticks: ticks that a chunk shall be there before it is needed.
         trace: file to write.
     """
     settings = ExecutorSettings(
-        max_hold=max_hold, refuse_infeasible=False, warm_up=1, measured_calls=3, trace_events=1 << 17
+        margin_ticks=margin_ticks, refuse_infeasible=False, warm_up=1, measured_calls=3, trace_events=1 << 17
     )
     world = World(first_seed)
     missed = late = 0
@@ -197,13 +197,13 @@ def drive(
 
 
 def act(executor: AsyncExecutor) -> tuple[Any, bool]:
-    """The action for now, None if there is none, and whether it was computed for this tick."""
-    held = executor.holds
+    """The action for now, None if there is none, and whether its chunk came in time."""
+    bridged = executor.bridged
     try:
         action = executor.action()
     except DeadlineMissedError:
         return None, False
-    return action, executor.holds == held
+    return action, executor.bridged == bridged
 
 
 def runs_table(runs: Sequence[RealTime]) -> Table:
@@ -219,6 +219,7 @@ def runs_table(runs: Sequence[RealTime]) -> Table:
         "p99",
         "max",
         "missed ticks",
+        "of these bridged",
         "of",
         "late ticks",
     ):
@@ -234,6 +235,7 @@ def runs_table(runs: Sequence[RealTime]) -> Table:
             f"{np.mean(each.best_coverage):.2f}" if each.best_coverage else "",
             *times,
             f"{each.missed_ticks}",
+            f"{each.statistics['reserve'] + each.statistics['holds']}",
             f"{each.statistics['ticks'] + each.statistics['starved']}",
             f"{each.late_ticks}",
         )
@@ -260,7 +262,9 @@ def opened(artifact: Path, threads: int, checkpoint: Path | None) -> list[tuple[
 @click.option("--against-eager", is_flag=True, help="Also run the original network in eager PyTorch.")
 @click.option("--checkpoint", default=CHECKPOINT, show_default=True, type=click.Path(exists=True, path_type=Path))
 @click.option("--first-seed", default=100_000, show_default=True, type=click.IntRange(0))
-@click.option("--max-hold", default=3, show_default=True, type=click.IntRange(0), help="Ticks to repeat an action for.")
+@click.option(
+    "--margin-ticks", default=2, show_default=True, type=click.IntRange(0), help="Ticks that a chunk shall be early by."
+)
 @click.option("-o", "--output", default=OUTPUT, show_default=True, type=click.Path(file_okay=False, path_type=Path))
 @click.option(
     "--window", default=4.0, show_default=True, type=click.FloatRange(min=0.1), help="Seconds in the picture."
@@ -273,7 +277,7 @@ def main(
     against_eager: bool,
     checkpoint: Path,
     first_seed: int,
-    max_hold: int,
+    margin_ticks: int,
     output: Path,
     window: float,
 ) -> None:
@@ -285,7 +289,7 @@ def main(
         for hz in rates:
             with console.status(f"{label} at {hz:g} Hz"):
                 trace = output / f"trace-{label.split()[0]}-{hz:g}hz.json"
-                runs.append(drive(label, policy, hz, 60 * minutes, first_seed, max_hold, trace))
+                runs.append(drive(label, policy, hz, 60 * minutes, first_seed, margin_ticks, trace))
     machine = fingerprint()
     identity = identity_of(artifact)
     figures = [asdict(each) for each in runs]

@@ -13,6 +13,7 @@ from matplotlib.patches import Patch
 
 TICKS = {
     "tick": ("#2a9d5c", "action"),
+    "reserve": ("#b3b032", "chunk late: from its reserve"),
     "hold": ("#e9a23b", "last action held"),
     "starved": ("#d03b3b", "no action (yet)"),
 }

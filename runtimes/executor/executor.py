@@ -153,6 +153,8 @@ class AsyncExecutor:
         with self._lock:
             state = self._checked()
             start = now = self._clock.now()
+            counts = state.recorder.counts
+            reserve = counts.reserve
             action = state.play(now if t is None else t, now)
             if action is None and timeout is not None:
                 until = now + timeout
@@ -160,15 +162,14 @@ class AsyncExecutor:
                     self._clock.wait(self._news, until - now)
                     state, now = self._checked(), self._clock.now()
                     action = state.play(now if t is None else t, now)
-            held = action is None
+            name = "tick" if counts.reserve == reserve else "reserve"
             if action is None:
-                action = state.hold(now if t is None else t, now)
+                name, action = "hold", state.hold(now if t is None else t, now)
             if action is None:
                 error = state.starved(now if t is None else t, now)
         trace = self.trace
         if trace.on:
-            name = "starved" if action is None else "hold" if held else "tick"
-            trace.span(CONTROL, name, start, self._clock.now() - start)
+            trace.span(CONTROL, name if action is not None else "starved", start, self._clock.now() - start)
         if action is None:
             raise error
         return action
@@ -264,9 +265,13 @@ class AsyncExecutor:
         return self._resolved.control_hz, self._resolved.policy_hz
 
     @property
-    def holds(self) -> int:
-        """Actions that were held so far; cheaper than ``statistics``, for a loop that looks at every tick."""
-        return self._opened().recorder.counts.holds
+    def bridged(self) -> int:
+        """Actions in reserve, and held ones, given out so far because a chunk was late.
+
+        Cheaper than ``statistics``, for a loop that looks at every tick.
+        """
+        counts = self._opened().recorder.counts
+        return counts.reserve + counts.holds
 
     def now(self) -> float:
         """Seconds on the executor's clock: what times of observations and actions are compared with."""
@@ -364,7 +369,7 @@ class AsyncExecutor:
         obs = resolved.frames.observation(job.frames)
         prefix = {} if job.prefix is None else {"prefix": job.prefix[None]}
         predicted = np.asarray(self._policy.predict_action(obs, plan=job.plan, **prefix)["action_pred"])
-        last = resolved.first + resolved.horizon
+        last = resolved.first + resolved.horizon + resolved.reserve
         if (
             predicted.ndim != 3
             or len(predicted) != 1

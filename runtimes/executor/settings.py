@@ -68,12 +68,16 @@ class ExecutorSettings:
         horizon: actions of a chunk that may be played, from its observation on; None: as many as the policy executes.
             More of them, up to the end of the prediction, allow slower calls, and play actions that the policy was not
             judged on.
+        reserve: actions of a chunk after its horizon that may be played while the next chunk is late; None: all that
+            the policy predicts. They are counted, and a late chunk has missed its deadline all the same: no call is
+            planned to need them. None are kept where the guard refuses one. 0 holds the last action instead.
         rate_tolerance: how far from its place in the window a frame may be, as a share of the policy's period.
         max_age: of the newest frame of a window when a call starts; None: three periods of the policy.
         seam: how a chunk joins the one before: ``replace``; ``blend``, linear over ``blend_steps``; or ``prefix``
             (experimental), for policies that take ``prefix``, the actions that are committed already, and inpaint.
         blend_steps: control ticks.
-        max_hold: control ticks for which the last action is repeated when there is no other; then ``action`` raises.
+        max_hold: control ticks for which the last action is repeated when there is no other, not even in reserve; then
+            ``action`` raises.
             Right for positions; for velocities and differences set 0.
         margin_ticks: control ticks that a chunk shall be there before it is needed.
         warm_up: first calls of each plan whose latency does not count.
@@ -93,6 +97,7 @@ class ExecutorSettings:
     interpolation: str = "hold"
     n_obs_steps: int | None = None
     horizon: int | None = None
+    reserve: int | None = None
     rate_tolerance: float = 0.3
     max_age: float | None = None
     seam: str = "replace"
@@ -117,9 +122,10 @@ class ExecutorSettings:
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ExecutorError(f"{name} must be positive; found {value}.")
-        for name in ("blend_steps", "max_hold", "margin_ticks", "warm_up", "trace_events"):
-            if not getattr(self, name) >= 0:
-                raise ExecutorError(f"{name} must not be negative; found {getattr(self, name)}.")
+        for name in ("blend_steps", "max_hold", "margin_ticks", "warm_up", "trace_events", "reserve"):
+            value = getattr(self, name)
+            if value is not None and not value >= 0:
+                raise ExecutorError(f"{name} must not be negative; found {value}.")
         if not 0 < self.rate_tolerance < 0.5:
             raise ExecutorError(f"rate_tolerance must be between 0 and 0.5 periods; found {self.rate_tolerance}.")
         if self.interpolation not in INTERPOLATIONS:
@@ -138,7 +144,8 @@ class Resolved:
         control_hz: ticks a second.
         policy_hz: frames and actions a second.
         ticks_per_step: control ticks that an action lasts.
-        horizon: actions of a chunk that may be played.
+        horizon: actions of a chunk that are played.
+        reserve: actions after these that may be.
         first: index of the first of them in ``action_pred``.
         channels: Da.
         frames: what a frame holds.
@@ -150,6 +157,7 @@ class Resolved:
     policy_hz: float
     ticks_per_step: int
     horizon: int
+    reserve: int
     first: int
     channels: int
     frames: FrameSpec
@@ -180,6 +188,12 @@ def resolve(settings: ExecutorSettings, info: PolicyFacts, control_hz: float) ->
             f"horizon = {horizon}: the policy predicts {info.sample[0]} actions, {longest} of them from the observation"
             f" on. Give at most {longest}."
         )
+    reserve = longest - horizon if settings.reserve is None else settings.reserve
+    if reserve > longest - horizon:
+        raise ExecutorError(
+            f"reserve = {reserve}: the policy predicts {longest} actions from the observation on, and horizon ="
+            f" {horizon} are played anyway. Give at most {longest - horizon}, or None for all."
+        )
     unknown = [name for name in tiers if name not in info.plans]
     if unknown:
         raise ExecutorError(
@@ -190,6 +204,7 @@ def resolve(settings: ExecutorSettings, info: PolicyFacts, control_hz: float) ->
         policy_hz=policy_hz,
         ticks_per_step=ticks_per_step,
         horizon=horizon,
+        reserve=reserve,
         first=chunk.start,
         channels=chunk.action_dim,
         frames=FrameSpec.of(info.observation, settings.n_obs_steps or chunk.start + 1),

@@ -38,7 +38,8 @@ class Job:
         observed: time of the newest.
         plan: to run.
         started: when it was handed to the policy.
-        deadline: when the scheduled actions run out; None if there were none, and nothing can be missed.
+        deadline: when the scheduled actions run out, but for those in reserve; None if there were none, and nothing can
+            be missed.
         prefix: actions that are committed, ``[N, Da]`` from the observation on, one a step of the policy; None unless
             the seam is ``prefix``.
     """
@@ -78,7 +79,9 @@ class ExecutorState:
         period = 1 / resolved.policy_hz
         self._window = ObservationWindow(resolved.frames.steps, period, settings.rate_tolerance, resolved.max_age)
         self._grid = TickGrid(resolved.control_hz)
-        self._played: deque[tuple[int, FloatArray]] = deque(maxlen=max(resolved.horizon * resolved.ticks_per_step, 3))
+        self._played: deque[tuple[int, FloatArray]] = deque(
+            maxlen=max((resolved.horizon + resolved.reserve) * resolved.ticks_per_step, 3)
+        )
         self.recorder = Recorder(settings.statistics_window)
         self.epoch = 0
         self._job: Job | None = None
@@ -152,11 +155,14 @@ class ExecutorState:
         row = None if timeline is None else timeline.at(tick)
         if row is None or timeline is None:
             return None
-        recorder = self.recorder
-        recorder.queue_depth.add(timeline.end - tick - 1)
+        recorder, late = self.recorder, tick >= timeline.due
+        if late:
+            recorder.counts.reserve += 1
+            self._miss()
+        recorder.queue_depth.add(max(timeline.due - tick - 1, 0))
         recorder.action_age_ms.add(1e3 * (time - float(timeline.observed[tick - timeline.start])))
         recorder.tick(now)
-        self._holds, self._gap = 0, False
+        self._holds, self._gap = 0, late
         self._give(tick, row, time)
         return row.copy()
 
@@ -164,9 +170,8 @@ class ExecutorState:
         """The last action once more; None if there is none, or it was held long enough."""
         tick = self._tick(time, now)
         counts = self.recorder.counts
-        if self._timeline is not None and not self._gap:
-            self._gap = True
-            counts.deadlines_missed += 1
+        if self._timeline is not None:
+            self._miss()
         if self._last is None:
             counts.starved += 1
             return None
@@ -188,6 +193,12 @@ class ExecutorState:
         remedy = "call reset(), or observe() and wait for the next chunk with action(timeout=...)"
         message = f"no action for time {time:.6f}{since}: {reason}. Stop the robot safely; then {remedy}."
         return (StaleObservationError if stale else DeadlineMissedError)(message)
+
+    def _miss(self) -> None:
+        """The next chunk is late; counted once, however long it takes."""
+        if not self._gap:
+            self._gap = True
+            self.recorder.counts.deadlines_missed += 1
 
     def _tick(self, time: float, now: float) -> int:
         if not abs(time - now) < FAR:
@@ -261,7 +272,7 @@ class ExecutorState:
 
         Args:
             job: the call.
-            actions: ``[horizon, Da]``, the playable part of the prediction.
+            actions: ``[horizon + reserve, Da]``, the playable part of the prediction.
             now: when it was done.
 
         Returns:
@@ -286,7 +297,7 @@ class ExecutorState:
         if job.deadline is not None:
             self.recorder.slack_ms.add(1e3 * (job.deadline - now))
         late = job.deadline is not None and now > job.deadline
-        switched = self._tiers.after_call(missed=late or outcome == "overdue")
+        switched = self._tiers.after_call(missed=late or self._runs_out(now) is None)
         counts.switches_down += switched == 1
         counts.switches_up += switched == -1
         return outcome
@@ -296,30 +307,34 @@ class ExecutorState:
         self._job = None
 
     def _schedule(self, job: Job, actions: FloatArray, now: float) -> str:
-        self._refusal = self._guard.refuse(actions)
+        settings, resolved = self._settings, self._resolved
+        self._refusal = self._guard.refuse(actions[: resolved.horizon])
         if self._refusal is not None:
             return "refused"
-        settings, resolved = self._settings, self._resolved
+        if self._guard.refuse(actions[resolved.horizon :]) is not None:
+            actions = actions[: resolved.horizon]
         rows = expand(actions, resolved.ticks_per_step, settings.interpolation)
         start = self._grid.tick(job.observed)
-        new = Timeline(start, rows, np.full(len(rows), job.observed))
+        reserve = (len(actions) - resolved.horizon) * resolved.ticks_per_step
+        new = Timeline(start, rows, np.full(len(rows), job.observed), reserve)
         seam = start if self._last is None else self._last[0] + 1
         spliced = splice(self._timeline, new, seam, settings.blend_steps if settings.seam == "blend" else 0)
         if spliced is None or new.end <= self._grid.tick(now):
             return "overdue"
         played = [action for _, action in list(self._played)[-3:]]
         past = np.stack(played) if played else np.empty((0, resolved.channels), np.float32)
-        self._refusal = self._guard.refuse_motion(past, spliced.rows)
+        regular = spliced.without_reserve()
+        self._refusal = self._guard.refuse_motion(past, regular.rows)
         if self._refusal is not None:
             return "refused"
-        self._timeline = spliced
+        self._timeline = spliced if self._guard.refuse_motion(past, spliced.rows) is None else regular
         return "scheduled"
 
     def _runs_out(self, now: float) -> float | None:
         """When the first tick comes for which nothing is scheduled; None if that is so already."""
         if self._timeline is None:
             return None
-        end = self._grid.time(self._timeline.end)
+        end = self._grid.time(self._timeline.due)
         return end if end > now else None
 
     def _committed(self, observed: float, now: float) -> FloatArray:

@@ -68,6 +68,7 @@ class Counts:
     """What happened, in numbers; see ``ExecutorStatistics``. Changed under the executor's lock only."""
 
     ticks: int = 0
+    reserve: int = 0
     holds: int = 0
     starved: int = 0
     frames: int = 0
@@ -91,7 +92,8 @@ class ExecutorStatistics:
     Attributes:
         plan: that the next call runs.
         identity: of the artifact; empty for a policy that is none.
-        ticks: actions that were given out, held ones included.
+        ticks: actions that were given out, those in reserve and held ones included.
+        reserve: of these, actions after the horizon of their chunk, because the next chunk was late.
         holds: of these, the last action given out again because there was no other.
         starved: times that there was no action and none could be held, so that ``action`` raised. Before the first
             chunk of an episode this is no missed deadline.
@@ -103,7 +105,8 @@ class ExecutorStatistics:
         chunks_refused: by the guard.
         chunks_overdue: wholly in the past when they came.
         chunks_discarded: computed from observations before a reset.
-        deadlines_missed: times that the scheduled actions had run out before the next chunk came.
+        deadlines_missed: times that the scheduled actions, without those in reserve, had run out before the next chunk
+            came.
         switches_down: to a faster plan.
         switches_up: back to a slower one.
         resets: of the executor.
@@ -112,13 +115,14 @@ class ExecutorStatistics:
         observation_age_ms: of the newest frame when a call starts.
         action_age_ms: of the newest frame that an action was computed from, when it is given out.
         slack_ms: from the end of a call to when its chunk is needed; negative: it came late.
-        queue_depth: scheduled ticks after the one that is given out.
+        queue_depth: scheduled ticks after the one that is given out, without those in reserve.
         tick_ms: from one ``action`` to the next: the control rate as it is, not as it was declared.
     """
 
     plan: str
     identity: str
     ticks: int
+    reserve: int
     holds: int
     starved: int
     frames: int

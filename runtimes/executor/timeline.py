@@ -75,16 +75,28 @@ class Timeline:
         start: tick of the first row.
         rows: float32 ``[N, Da]``, one a tick.
         observed: float64 ``[N]``, time of the newest frame that each row was computed from.
+        reserve: ticks at the end that are played only while the next chunk is late.
     """
 
     start: int
     rows: FloatArray
     observed: Times
+    reserve: int = 0
 
     @property
     def end(self) -> int:
         """One past the last tick."""
         return self.start + len(self.rows)
+
+    @property
+    def due(self) -> int:
+        """First tick that the next chunk is needed for: what follows is in reserve."""
+        return self.end - self.reserve
+
+    def without_reserve(self) -> Timeline:
+        """What is played if no chunk is late."""
+        kept = max(len(self.rows) - self.reserve, 0)
+        return Timeline(self.start, self.rows[:kept], self.observed[:kept])
 
     def at(self, tick: int) -> FloatArray | None:
         """The action of a tick, a view; None if none is scheduled."""
@@ -130,7 +142,7 @@ def splice(old: Timeline | None, new: Timeline, seam: int, blend: int = 0) -> Ti
     first = max(seam, new.start)
     rows, observed = new.rows[first - new.start :].copy(), new.observed[first - new.start :]
     if old is None:
-        return Timeline(first, rows, observed)
+        return Timeline(first, rows, observed, new.reserve)
     both = min(blend, old.end - first, len(rows))
     if both > 0 and first >= old.start:
         weight = (np.arange(1, both + 1, dtype=np.float32) / (blend + 1))[:, None]
@@ -141,4 +153,4 @@ def splice(old: Timeline | None, new: Timeline, seam: int, blend: int = 0) -> Ti
         rows = np.concatenate([old.rows[kept], rows])
         observed = np.concatenate([old.observed[kept], observed])
         first = seam
-    return Timeline(first, rows, observed)
+    return Timeline(first, rows, observed, new.reserve)

@@ -19,7 +19,7 @@ from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
 
 REAL_LIMIT = 20.0
 """Seconds of real time after which a thread that should have moved is called stuck."""
-TO, TA, T = 2, 8, 16
+TO, TA = 2, 8
 
 
 class FakeClock:
@@ -127,6 +127,7 @@ class ScriptedPolicy:
         latency: seconds of each plan's calls; the slowest first.
         fault: by number of the call: ``raise``, ``hang``, ``nan``, ``shape`` or seconds that it takes instead.
         calls: what it was called with.
+        reserve: actions that it predicts beyond the TA that are executed.
     """
 
     clock: FakeClock
@@ -135,10 +136,12 @@ class ScriptedPolicy:
     actions: Callable[[np.ndarray], np.ndarray] | None = None
     calls: list[tuple[float, str, np.ndarray]] = field(default_factory=list)
     resets: list[int | None] = field(default_factory=list)
+    reserve: int = 0
 
     def __post_init__(self) -> None:
         spec, chunk = ObservationSpec((TO, 2), dtype="float64"), ChunkSpec(3, TO - 1, TO - 1 + TA)
-        self.info = Facts({"obs": spec}, chunk, (T, 3), tuple(self.latency), next(iter(self.latency)))
+        self.predicted = TO - 1 + TA + self.reserve
+        self.info = Facts({"obs": spec}, chunk, (self.predicted, 3), tuple(self.latency), next(iter(self.latency)))
         self._released = threading.Condition()
         self._hanging = False
 
@@ -154,7 +157,8 @@ class ScriptedPolicy:
         if fault == "raise":
             raise ZeroDivisionError("scripted")
         episode, seen = obs[0, -1]
-        chunk = np.stack([np.full(T, episode), np.full(T, seen), np.arange(T) - (TO - 1)], axis=1)
+        count = self.predicted
+        chunk = np.stack([np.full(count, episode), np.full(count, seen), np.arange(count) - (TO - 1)], axis=1)
         if self.actions is not None:
             chunk = self.actions(obs[0])
         if fault == "nan":

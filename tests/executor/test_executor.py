@@ -282,11 +282,13 @@ def test_settings_are_checked(made: dict[str, object], message: str) -> None:
         ({"policy_hz": 20}, 50, "no multiple of policy_hz = 20: an action would last 2.5 ticks"),
         ({"policy_hz": 20}, 10, "no multiple"),
         ({"horizon": 16}, 10, "Give at most 15"),
+        ({"horizon": 10, "reserve": 6}, 10, "Give at most 5, or None"),
+        ({"reserve": 8}, 10, "Give at most 7, or None"),
         ({"tiers": ("dense", "quick")}, 10, "no plan 'quick'; it has"),
     ],
 )
 def test_settings_have_to_fit_the_policy(made: dict[str, object], hz: float, message: str) -> None:
-    info = ScriptedPolicy(FakeClock()).info
+    info = ScriptedPolicy(FakeClock(), reserve=7).info
     with pytest.raises(ExecutorError, match=message):
         settings.resolve(ExecutorSettings(**made), info, hz)  # type: ignore[arg-type]
 

@@ -27,8 +27,12 @@ class Schedule(RuleBasedStateMachine):
 
     ticks = 0
 
-    @initialize(seam=st.sampled_from(["replace", "blend"]), ticks_per_step=st.sampled_from([1, 2]))
-    def open(self, seam: str, ticks_per_step: int) -> None:
+    @initialize(
+        seam=st.sampled_from(["replace", "blend"]),
+        ticks_per_step=st.sampled_from([1, 2]),
+        reserve=st.sampled_from([0, 5]),
+    )
+    def open(self, seam: str, ticks_per_step: int, reserve: int) -> None:
         made = ExecutorSettings(
             policy_hz=HZ,
             seam=seam,
@@ -39,7 +43,7 @@ class Schedule(RuleBasedStateMachine):
             statistics_window=64,
         )
         self.seam = seam
-        policy = ScriptedPolicy(FakeClock(), {"dense": LATENCY, "fast": LATENCY / 2})
+        policy = ScriptedPolicy(FakeClock(), {"dense": LATENCY, "fast": LATENCY / 2}, reserve=reserve)
         self.world = World(HZ * ticks_per_step, made, policy)
         self.policy = policy
         self.good, self.held, self.last = 0, 0, None
@@ -135,7 +139,7 @@ class Schedule(RuleBasedStateMachine):
     def close_and_open_another(self, wait: float) -> None:
         self.world.clock.advance(wait)
         self.teardown()
-        self.open(self.seam, round(self.world.hz / HZ))
+        self.open(self.seam, round(self.world.hz / HZ), self.policy.reserve)
 
     # What must be true
 
@@ -201,7 +205,7 @@ class Schedule(RuleBasedStateMachine):
         # A blend of two chunks is a blend of two times of observation, and still an action for now.
         ahead = seen + index / HZ - now
         assert abs(ahead + self.held / world.hz) <= 1.2 / HZ, f"stale by {-ahead} s"
-        assert -1e-3 <= index <= TA - 1 + 1e-3
+        assert -1e-3 <= index <= TA - 1 + self.policy.reserve + 1e-3
         self.last = (grid, action)
 
     def step(self) -> None:

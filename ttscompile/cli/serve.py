@@ -32,6 +32,11 @@ from ttscompile.runtimes.executor.server import ExecutorServer, ServerLimits
 )
 @click.option("--seam", type=click.Choice(["replace", "blend", "prefix"]), default="replace", show_default=True)
 @click.option("--interpolation", type=click.Choice(["hold", "linear"]), default="hold", show_default=True)
+@click.option(
+    "--reserve",
+    type=click.IntRange(min=0),
+    help="Actions to go on with while a chunk is late; else all predicted.",
+)
 @click.option("--max-hold", type=click.IntRange(min=0), default=3, show_default=True, help="Ticks to repeat an action.")
 @click.option("--max-clients", type=click.IntRange(min=1), default=8, show_default=True)
 @click.option("--max-message-bytes", type=click.IntRange(min=128), default=1 << 20, show_default=True)
@@ -47,6 +52,7 @@ def serve(
     tiers: tuple[str, ...],
     seam: str,
     interpolation: str,
+    reserve: int | None,
     max_hold: int,
     max_clients: int,
     max_message_bytes: int,
@@ -63,6 +69,7 @@ def serve(
         tiers=tiers or None,
         seam=seam,
         interpolation=interpolation,
+        reserve=reserve,
         max_hold=max_hold,
         margin_ticks=margin_ticks,
     )
