@@ -7,14 +7,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from ..artifact.ceiling import TYPICAL_SPARSITY
 from ..artifact.manifest import Manifest
 from ..errors import CalibrationError
 from ..lattice import dense_plan
 
 SPARSITY, FLOPS, LATENCY, ERROR = "target_sparsity", "target_flops", "latency_ms", "max_action_error"
 """The ways to ask."""
-
-DEFAULT_SPARSITY = 0.95
 
 
 @dataclass(frozen=True)
@@ -70,8 +69,10 @@ def goal_of(
     latency_ms: float | None = None,
     max_action_error: float | None = None,
     threads: int = 1,
+    *,
+    usual: float = TYPICAL_SPARSITY,
 ) -> Goal:
-    """The one thing that was asked for; a sparsity of 0.95 if nothing was.
+    """The one thing that was asked for; the sparsity ``usual`` if nothing was.
 
     Raises:
         CalibrationError: more than one, or a value that nothing can have.
@@ -80,7 +81,7 @@ def goal_of(
     given = {kind: value for kind, value in asked.items() if value is not None}
     if len(given) > 1:
         raise CalibrationError(f"expected one budget; found {' and '.join(given)}. They exclude each other: give one.")
-    kind, value = next(iter(given.items()), (SPARSITY, DEFAULT_SPARSITY))
+    kind, value = next(iter(given.items()), (SPARSITY, usual))
     if not isinstance(threads, int) or isinstance(threads, bool) or threads < 1:
         raise CalibrationError(f"threads: expected an integer of at least 1; found {threads!r}.")
     number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

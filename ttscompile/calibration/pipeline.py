@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..artifact.ceiling import few_steps
+from ..artifact.ceiling import few_steps, usual_sparsity
 from ..artifact.load import Artifact, load_artifact
 from ..artifact.manifest import PRUNER
 from ..artifact.write import update_calibration
@@ -82,7 +82,7 @@ def calibrate(
     Args:
         path: the artifact's directory.
         trajectories: recordings: ``.npz``, zarr, HDF5 or LeRobot data sets, see ``ttscompile.trajectories``.
-        target_sparsity: share of the cells to reuse; 0.95 if no budget is given.
+        target_sparsity: share of the cells to reuse; if no budget is given, 0.95, or what leaves four whole steps.
         strategy: how the plan is found, see ``ttscompile.calibration.strategies``.
         seed: of the split, the noise and the search.
         resume: go on where a calibration with the same arguments was interrupted; begins anew if none was.
@@ -108,8 +108,10 @@ def calibrate(
         ArtifactError: no artifact, or it cannot be written.
     """
     begun = time.monotonic()
-    goal = goal_of(target_sparsity, target_flops, latency_ms, max_action_error, threads)
+    asked = (target_sparsity, target_flops, latency_ms, max_action_error, threads)
+    goal_of(*asked)  # what cannot be is refused before anything is read
     artifact = load_artifact(Path(path))
+    goal = goal_of(*asked, usual=usual_sparsity(artifact.manifest.steps))
     spec = artifact.manifest.spec
     if not Path(path).is_dir():
         raise CalibrationError(

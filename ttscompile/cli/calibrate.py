@@ -30,7 +30,11 @@ STRATEGIES = (
 @click.command(cls=FilesCommand)
 @artifact_argument
 @trajectories_options()
-@click.option("--target-sparsity", type=float, help="Share of the cells to reuse; 0.95 if no budget is given.")
+@click.option(
+    "--target-sparsity",
+    type=float,
+    help="Share of the cells to reuse; 0.95 if no budget is given, or what leaves four steps.",
+)
 @click.option(
     "--target-flops",
     type=float,
