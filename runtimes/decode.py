@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from itertools import islice
 
@@ -11,7 +10,7 @@ import numpy as np
 from ttscompile.lattice import BoolArray
 
 from .idle import WORTH, IdleSteps
-from .lowering import Add, Lowered
+from .lowering import Lowered
 from .onnxruntime_sessions import Array
 from .workspace import Workspace
 
@@ -58,7 +57,7 @@ def _together(work: Workspace, lowered: Lowered, keep: BoolArray) -> None:
     while k < steps:
         count = lowered.counts[k]
         if work.idle is not None and lowered.idle[k] >= WORTH:
-            k = _pass_idle(work, work.idle, lane, k, done)
+            k = _pass_idle(work, work.idle, lane, k)
             continue
         if count == blocks:
             _run_dense(work, k, keep)
@@ -79,34 +78,33 @@ def _run_some(work: Workspace, lane: _Lane, k: int, done: int, kept: Sequence[bo
     """
     lowered, stream, current, blocks = lane.lowered, lane.stream, lane.current, len(kept)
     count = lowered.counts[k]
-    gaps = lowered.gaps[done + k : done + k + count + 1]
     fresh = before = _flat(work.fresh, 0)  # the first operation takes the stream from there
-    for gap, cell in zip(gaps, lowered.cells[done : done + count], strict=False):
-        if gap is not None:
-            lane.add(gap, before)
+    reached = 0
+    for cell in lowered.cells[done : done + count]:
+        b = cell - k * blocks
+        if b != reached:
+            lane.add(before)
         elif before is fresh:
             np.copyto(stream, fresh)
-        before = stream
-        b = cell - k * blocks
+        before, reached = stream, b + 1
         work.run(k, b)
         residual = current[b]
         np.add(stream, residual, stream)
         if kept[b]:
             np.copyto(work.rollout.entry(cell), work.current[b])
-    if gaps[-1] is not None:
-        lane.add(gaps[-1], before)
+    if reached != blocks:
+        lane.add(before)
     work.advance(k)
 
 
-def _pass_idle(work: Workspace, idle: IdleSteps, lane: _Lane, k: int, done: int) -> int:
+def _pass_idle(work: Workspace, idle: IdleSteps, lane: _Lane, k: int) -> int:
     """Steps in a row without a computed block, from k on; the step that follows them."""
     lowered, total = lane.lowered, _flat(idle.total, 0)
     stop = k + lowered.idle[k]
     work.enter_idle(k)
     while k < stop:
-        gap, count = lowered.gaps[done + k], lowered.alike[k]
-        assert gap is not None
-        np.copyto(total, lane.total(gap))
+        count = lowered.alike[k]
+        np.copyto(total, lane.total(count))
         idle.prepare()
         work.run_idle(k, k + count)
         k += count
@@ -119,7 +117,6 @@ def _apart(work: Workspace, lowered: Sequence[Lowered], keep: BoolArray) -> None
     blocks, everyone = len(work.current), work.streams
     room = work.sums(max(one.slots for one in lowered))
     lanes = [_Lane.of_stream(work, s, one, room) for s, one in enumerate(lowered)]
-    gaps = [iter(one.gaps[blocks + 1 :]) for one in lowered]
     takers: list[list[list[int]]] = [[[] for _ in range(blocks)] for _ in lowered[0].counts]
     for k, b, s in np.argwhere(np.stack([one.computed for one in lowered], axis=2)).tolist():
         takers[k][b].append(s)
@@ -129,13 +126,14 @@ def _apart(work: Workspace, lowered: Sequence[Lowered], keep: BoolArray) -> None
             np.copyto(work.stream, work.fresh)
         if whole:
             _run_dense_apart(work, [lanes[s] for s in whole], whole, k, keep)
-            for s in whole:
-                deque(islice(gaps[s], blocks), 0)  # there are none
+        reached = [blocks if s in whole else 0 for s in range(everyone)]
         for b, some in enumerate([] if whole else step):
             if not some:
                 continue
             for s in some:
-                lanes[s].add_next(next(gaps[s]))
+                if reached[s] != b:
+                    lanes[s].add(lanes[s].stream)
+                reached[s] = b + 1
             if len(some) == everyone:
                 work.run(k, b)
             else:
@@ -147,8 +145,9 @@ def _apart(work: Workspace, lowered: Sequence[Lowered], keep: BoolArray) -> None
                 np.add(stream, residual, stream)
                 if keep[k, b]:
                     np.copyto(work.rollout.of_stream(k * blocks + b, s), residual.reshape(lanes[s].shape))
-        for lane, rest in zip(lanes, gaps, strict=True):
-            lane.add_next(next(rest))
+        for lane, b in zip(lanes, reached, strict=True):
+            if b != blocks:
+                lane.add(lane.stream)
         work.advance(k)
 
 
@@ -186,7 +185,7 @@ class _Lane:
         self.stream, self.current = _flat(stream, 0), _flat(current, 1)
         self._table, self._sums = _flat(table, 1), _flat(sums, 1)
         self._summed = self._table if lowered.table else self.current
-        self._rows, self._from = lowered.load_rows, lowered.load_from
+        self._gaps, self._loads = iter(lowered.gaps), zip(lowered.load_rows, lowered.load_from, strict=True)
         self._entries = {cell: _flat(entry, 0) for cell, entry in entries.items()}
 
     @classmethod
@@ -197,25 +196,21 @@ class _Lane:
         entries = {cell: work.rollout.of_stream(cell, s) for cell in np.flatnonzero(lowered.rollout).tolist()}
         return cls(lowered, np.moveaxis(work.stream, axis, 0)[s], current, table, sums, entries)
 
-    def total(self, gap: Add) -> Array:
-        """The sum of a gap, which is made first if it is new."""
-        slot, start, stop, due = gap
+    def total(self, alike: int = 1) -> Array:
+        """The sum of the next gaps, so many of which add the same one; it is made first if it is new."""
+        slot, start, stop, loads = next(self._gaps)
+        for _ in islice(self._gaps, alike - 1):
+            pass
         total: Array = self._sums[slot]
         if start != stop:
-            for i in range(*due):  # faster than numpy's indexing by arrays at any length
-                source = self._from[i]
-                self._table[self._rows[i]] = self.current[~source] if source < 0 else self._entries[source]
+            for row, source in islice(self._loads, loads):  # faster than numpy's indexing by arrays at any length
+                self._table[row] = self.current[~source] if source < 0 else self._entries[source]
             np.add.reduce(self._summed[start:stop], axis=0, out=total)
         return total
 
-    def add(self, gap: Add, before: Array) -> None:
-        """The stream becomes ``before`` and a sum."""
-        np.add(before, self.total(gap), self.stream)
-
-    def add_next(self, gap: Add | None) -> None:
-        """``add`` to the stream, if any block is reused in this gap."""
-        if gap is not None:
-            self.add(gap, self.stream)
+    def add(self, before: Array) -> None:
+        """The stream becomes ``before`` and the sum of the next gap."""
+        np.add(before, self.total(), self.stream)
 
 
 def _flat(array: Array, keep: int) -> Array:

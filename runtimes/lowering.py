@@ -18,40 +18,29 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import repeat
-from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from ttscompile.lattice import UNWRITTEN, BoolArray, IntArray, PlanArray, Source, origins, require_legal
+from ttscompile.lattice import UNWRITTEN, BoolArray, PlanArray, Source, origins, require_legal
 
+Add = tuple[int, int, int, int]
+"""Add a sum to the stream, after making it if it is new: the slot where it is kept while it is needed; the first row
+that it sums; one past the last, which is the first if the sum is in its slot already; and how many of the entries of
+``Lowered.load_rows`` and ``load_from`` that are left to load before it is made."""
 
-class Add(NamedTuple):
-    """Add a sum to the stream, after making it if it is new.
-
-    Attributes:
-        slot: where the sum is kept while it is needed.
-        start: first row that it sums.
-        stop: one past the last; ``start`` if the sum is in its slot already.
-        due: entries of ``Lowered.load_rows`` and ``load_from`` to load before it is made: first, and one past the last.
-    """
-
-    slot: int
-    start: int
-    stop: int
-    due: tuple[int, int]
+Cells = npt.NDArray[np.int32]
+Positions = npt.NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
 class Lowered:
     """The instructions of one stream's plan.
 
-    A step with n computed blocks has n + 1 gaps: one before each of them, and one after the last.
-
     Attributes:
         counts: computed blocks of each step, K of them.
         cells: computed cells in order of execution, flat indices ``k * blocks + b``.
-        gaps: of all steps in order; None where no block is reused in between.
+        gaps: runs of reused blocks within a step, of all steps in order.
         slots: how many sums have to be kept at a time.
         segments: how many sums are made in the call.
         table: whether sums are over the table, and not over the last computed residuals as they are.
@@ -67,7 +56,7 @@ class Lowered:
 
     counts: tuple[int, ...]
     cells: tuple[int, ...]
-    gaps: tuple[Add | None, ...]
+    gaps: tuple[Add, ...]
     slots: int
     segments: int
     table: bool
@@ -96,139 +85,113 @@ def lower_plan(plan: PlanArray, groups: Sequence[int]) -> Lowered:
     """
     steps, blocks = plan.shape
     resolved = origins(plan, groups)
-    computed = plan == Source.COMPUTE
-    if not computed[0].all() or resolved.cell.min() == UNWRITTEN:
+    computed = plan == Source.COMPUTE.value
+    if not computed[0].all():  # after it TIMESTEP and FORWARD always find a residual
         require_legal(plan[None], groups, np.ones((1, steps, blocks), dtype=np.bool_))
 
-    # A gap is a run of reused cells within a step: neighbours in the flat order, too.
-    begins, ends = ~computed, ~computed
-    begins[:, 1:] &= computed[:, :-1]
-    ends[:, :-1] &= computed[:, 1:]
-    starts, stops = np.flatnonzero(begins), np.flatnonzero(ends) + 1
-    borrows = bool((plan == Source.FORWARD).any())
-    cells = resolved.cell.reshape(-1)
-    first = _first_alike(_in_order(cells, begins | computed) if borrows else cells, starts, stops)
-    new = first == np.arange(len(first))
-    slot, slots = _slots(first.tolist())
+    # A gap lies between two ends in the flat order; a column after the last block ends it as computed blocks do.
+    width = blocks + 1
+    cells, is_end = np.full((steps, width), UNWRITTEN, np.int32), np.ones((steps, width), np.bool_)
+    cells[:, :blocks], is_end[:, :blocks] = resolved.cell, computed
+    ends = np.flatnonzero(is_end)
+    lengths = ends[1:] - ends[:-1] - 1
+    some = np.flatnonzero(lengths)
+    lengths, stops = lengths[some], ends[some + 1]
+    starts = stops - lengths
+    maker = _makers(cells, starts, stops)
+    slot, slots = _slots(maker, len(starts))
+    made = lengths.copy()  # rows that are summed
+    made[list(maker)] = 0
 
-    table = borrows or bool(resolved.rollout.any())
-    loaded = load = load_stop = np.zeros(0, dtype=np.int64)
+    table = bool(resolved.rollout.any() or (plan == Source.FORWARD.value).any())
+    loads, load_rows, load_from = [0] * len(starts), list[int](), list[int]()
     if table:
-        loaded = _changed(resolved.cell, starts[new], stops[new])
-        load = np.searchsorted(loaded, starts)
-        load_stop = np.where(new, np.searchsorted(loaded, stops), load)
-    rows = starts % blocks
-    stop = np.where(new, rows + stops - starts, rows)
-    due = zip(load.tolist(), load_stop.tolist(), strict=True) if table else repeat((0, 0))
-    adds = map(Add._make, zip(slot, rows.tolist(), stop.tolist(), due, strict=False))
-    done = np.cumsum(computed)
-    gaps: list[Add | None] = [None] * (steps + int(done[-1]))
-    for position, add in zip((done[starts] + starts // blocks).tolist(), adds, strict=True):
-        gaps[position] = add
-    idle = ~computed.any(axis=1)
-    maker = np.full(steps, -1)
-    maker[idle] = first[np.searchsorted(starts, np.flatnonzero(idle) * blocks)]
-    joined, same = np.zeros((2, steps), np.bool_)
-    joined[:-1] = idle[:-1] & idle[1:]
-    same[:-1] = joined[:-1] & (maker[:-1] == maker[1:])
-    source = np.where(resolved.rollout.reshape(-1)[loaded], cells[loaded], ~(cells[loaded] % blocks))
+        of_gap = np.repeat(np.arange(len(made)), made)
+        at = np.arange(len(of_gap)) + (starts + made - np.cumsum(made))[of_gap]
+        load = np.flatnonzero(_changes(cells, at))
+        loads, at = np.bincount(of_gap[load], minlength=len(made)).tolist(), at[load]
+        step = at // width
+        own, adds = at - step, cells.reshape(-1)[at]
+        load_rows = (own - step * blocks).tolist()
+        load_from = np.where(adds == own, adds, ~(adds % blocks)).tolist()  # ROLLOUT alone resolves to the cell itself
+    rows = starts % width
+
+    # From the last step to the first; a gap of all blocks is a step without a computed one.
+    idle, alike, total = [0] * (steps + 1), [0] * (steps + 1), [-1] * (steps + 1)
+    for gap in np.flatnonzero(lengths == blocks)[::-1].tolist():
+        k = int(starts[gap]) // width
+        total[k] = maker.get(gap, gap)
+        idle[k] = idle[k + 1] + 1
+        alike[k] = alike[k + 1] + 1 if total[k] == total[k + 1] else 1
     return Lowered(
         counts=tuple(computed.sum(axis=1).tolist()),
         cells=tuple(np.flatnonzero(computed).tolist()),
-        gaps=tuple(gaps),
+        gaps=tuple(zip(slot, rows.tolist(), (rows + made).tolist(), loads, strict=True)),
         slots=slots,
-        segments=int(np.count_nonzero(new)),
+        segments=len(starts) - len(maker),
         table=table,
-        load_rows=tuple((loaded % blocks).tolist()),
-        load_from=tuple(source.tolist()),
-        idle=tuple((_ahead(joined) * idle).tolist()),
-        alike=tuple((_ahead(same) * idle).tolist()),
+        load_rows=tuple(load_rows),
+        load_from=tuple(load_from),
+        idle=tuple(idle[:steps]),
+        alike=tuple(alike[:steps]),
         computed=computed,
         rollout=resolved.rollout,
     )
 
 
-def _ahead(joined: BoolArray) -> IntArray:
-    """For each element how many from it on belong together; ``joined`` says it of an element and the next one."""
-    ends, each = np.flatnonzero(~joined), np.arange(len(joined))
-    length: IntArray = ends[np.searchsorted(ends, each)] - each + 1
-    return length
+def _makers(cells: Cells, starts: Positions, stops: Positions) -> dict[int, int]:
+    """For each gap that adds the same residuals as an earlier one, the first such gap.
 
-
-def _in_order(cells: IntArray, begins: BoolArray) -> IntArray:
-    """The residuals sorted within each gap, so that gaps which add the same ones hold the same numbers.
-
-    Only FORWARD needs it: without it a residual is of the block that adds it, and blocks are in order.
+    With FORWARD other blocks may add them; those of one residual or in the same order are found, nearly all.
 
     Args:
-        cells: residual of every cell, flat.
-        begins: cells at which a gap begins, and computed cells.
-    """
-    gap: IntArray = np.cumsum(begins)
-    return np.sort(gap * len(cells) + cells) % len(cells)
-
-
-def _first_alike(keys: IntArray, starts: IntArray, stops: IntArray) -> IntArray:
-    """For each gap the first gap that adds the same residuals, which may be itself.
-
-    Args:
-        keys: residual of every cell, flat.
-        starts: where the gaps begin.
+        cells: residual of every cell, ``[K, blocks + 1]``.
+        starts: where the gaps begin, flat.
         stops: where they end.
     """
-    content, seen = keys.tobytes(), dict[bytes, int]()
-    bounds = zip((keys.itemsize * starts).tolist(), (keys.itemsize * stops).tolist(), strict=True)
-    return np.array([seen.setdefault(content[i:j], n) for n, (i, j) in enumerate(bounds)], dtype=np.int64)
+    total = np.cumsum(cells)
+    hashed = (total[stops - 1] - total[starts - 1]) & 8191  # most are the only ones of theirs, and need no comparison
+    likely = np.flatnonzero(np.bincount(hashed)[hashed] > 1)
+    content, size, seen = cells.tobytes(), cells.itemsize, dict[bytes, int]()
+    bounds = zip(likely.tolist(), (size * starts[likely]).tolist(), (size * stops[likely]).tolist(), strict=True)
+    first = {gap: seen.setdefault(content[i:j], gap) for gap, i, j in bounds}
+    return {gap: maker for gap, maker in first.items() if maker != gap}
 
 
-def _slots(first: list[int]) -> tuple[list[int], int]:
+def _slots(maker: dict[int, int], gaps: int) -> tuple[list[int], int]:
     """A place for every sum, given to another one after its last use.
 
     Args:
-        first: for each gap, the gap that makes its sum.
+        maker: see ``_makers``.
+        gaps: how many there are.
 
     Returns:
-        Place of each gap's sum, and how many places there are.
+        Place of each gap's sum, and how many places there are: the last one is of the sums that are used once.
     """
-    last_use = {maker: n for n, maker in enumerate(first)}
-    of: list[int] = []
-    free: list[int] = []
-    count = 0
-    for n, maker in enumerate(first):
-        if maker != n:
-            of.append(of[maker])
-        elif free:
-            of.append(free.pop())
-        else:
-            of.append(count)
-            count += 1
-        if last_use[maker] == n:
-            free.append(of[n])
-    return of, count
+    last_use = {first: gap for gap, first in maker.items()}
+    until: list[int] = []  # of each place, the last use of the sum that it holds
+    place: dict[int, int] = {}
+    for first in sorted(last_use):
+        place[first] = next((i for i, last in enumerate(until) if last < first), len(until))
+        until[place[first] : place[first] + 1] = [last_use[first]]
+    of = [len(until)] * gaps
+    for gap, first in maker.items():
+        of[gap] = of[first] = place[first]
+    return of, len(until) + (len(place) + len(maker) < gaps)
 
 
-def _changed(cells: IntArray, starts: IntArray, stops: IntArray) -> IntArray:
-    """Reused cells of sums that are made, whose residual is not the one that the table's row holds already.
+def _changes(cells: Cells, made: Positions) -> BoolArray:
+    """Of reused cells in sums that are made, whether the table's row holds another residual than the one they add.
 
     Args:
-        cells: residual of every cell, ``[K, blocks]``.
-        starts: where the gaps begin whose sums are made; the cells of the others are not looked at.
-        stops: where they end.
-
-    Returns:
-        Flat indices, in order.
+        cells: residual of every cell, ``[K, blocks + 1]``.
+        made: the cells, flat and in order.
     """
-    steps, blocks = cells.shape
-    edges = np.zeros(cells.size + 1, dtype=np.int64)
-    edges[starts] = 1
-    edges[stops] -= 1
-    made = np.cumsum(edges[:-1]).reshape(steps, blocks)
-    by_block = np.flatnonzero(made.T)  # row after row of the table, each in order of time
-    held = cells.T.reshape(-1)[by_block]
-    changed = np.ones(len(by_block), dtype=np.bool_)
-    changed[1:] = (held[1:] != held[:-1]) | (by_block[1:] // steps != by_block[:-1] // steps)
-    taken = by_block[changed]
-    return np.sort(taken % steps * blocks + taken // steps)
+    flat, last = cells.reshape(-1), np.full(cells.shape, -1, np.int32)  # -1: the last column's, which is UNWRITTEN
+    last.reshape(-1)[made] = made
+    held = np.maximum.accumulate(last, axis=0).reshape(-1)[made - cells.shape[1]]
+    changed: BoolArray = flat[held] != flat[made]
+    return changed
 
 
 class LoweringCache:

@@ -163,18 +163,20 @@ def test_instructions_do_what_section_2_says(
 def sums(lowered: Lowered) -> list[list[tuple[str, int]]]:
     """Instructions by step, readable: ``("run", b)``, ``("new", slot)``, ``("old", slot)``."""
     listed = []
-    gaps, cells = iter(lowered.gaps), iter(lowered.cells)
-    blocks = lowered.computed.shape[1]
-    for count in lowered.counts:
+    gaps = iter(lowered.gaps)
+    for step in lowered.computed.tolist():
         line: list[tuple[str, int]] = []
-        for i in range(count + 1):
-            gap = next(gaps)
-            if gap is not None:
-                line.append(("new" if gap.start < gap.stop else "old", gap.slot))
-            if i < count:
-                line.append(("run", next(cells) % blocks))
+        for b, computed in enumerate(step):
+            if computed:
+                line.append(("run", b))
+            elif b == 0 or step[b - 1]:
+                slot, start, stop, _ = next(gaps)
+                line.append(("new" if start < stop else "old", slot))
         listed.append(line)
-    assert next(gaps, "end") == next(cells, "end") == "end"
+    assert next(gaps, "end") == "end"
+    assert lowered.counts == tuple(sum(step) for step in lowered.computed.tolist())
+    assert lowered.cells == tuple(np.flatnonzero(lowered.computed).tolist())
+    assert len(lowered.load_rows) == len(lowered.load_from) == sum(loads for *_, loads in lowered.gaps)
     return listed
 
 
