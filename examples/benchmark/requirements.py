@@ -33,7 +33,7 @@ from rounds import DENSE, EAGER, Effort, eager_contestant, measure_in_passes, ro
 import ttscompile
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.cli.output import identity_of, only_results_on_stdout, print_json, progress, results_console, run, table
-from ttscompile.cli.timing import Contestant, Measurement, original_network, plan_contestant
+from ttscompile.cli.timing import Contestant, Measurement, original_policy, plan_contestant
 from ttscompile.lattice import PlanArray
 from ttscompile.machine import fingerprint, one_line
 from ttscompile.runtimes.random_calls import random_calls
@@ -112,7 +112,7 @@ def subject(directory: Path, checkpoint: Path, plan_name: str | None) -> Subject
         TtscompileError: one of them cannot be had, or there is no such plan.
     """
     manifest = load_artifact(directory).manifest
-    module = original_network(checkpoint, manifest.spec)
+    module, _ = original_policy(checkpoint, manifest.spec)
     width = int(manifest.blocks[0].type.at(1)[-1])
     return subject_of(directory, Network(checkpoint.stem, width, module, manifest.spec), plan_name)
 

@@ -58,7 +58,7 @@ def test_what_is_no_artifact(command: str, made: bool, tmp_path: Path) -> None:
         (["calibrate", "out", "--trajectories", "a.npz", "--target-sparsity", "1"], "above 0 and below 1"),
         (["inspect", "out", "--plan", "dense"], "give --plot FILE too"),
         (["bench", "out", "--against", "eager"], "give --checkpoint FILE too"),
-        (["bench", "out", "--against", "tensorrt"], "'tensorrt' is not one of eager, onnxruntime-dense"),
+        (["bench", "out", "--against", "tensorrt"], "'tensorrt' is not one of original, eager, onnxruntime-dense"),
         (["deploy"], "No such command"),
     ],
 )

@@ -20,7 +20,8 @@ from ttscompile.cli.output import (
 from ttscompile.cli.timing import Measurement, contestants, measure
 from ttscompile.machine import fingerprint, one_line
 
-RIVALS = ("eager", "onnxruntime-dense")
+RIVALS = ("original", "eager", "onnxruntime-dense")
+"""The checkpoint with the sampler it was saved with; with the artifact's; and the artifact computed in full."""
 
 
 def _rivals(_: click.Context, __: click.Parameter, value: str) -> tuple[str, ...]:
@@ -37,7 +38,7 @@ def _rivals(_: click.Context, __: click.Parameter, value: str) -> tuple[str, ...
 @click.option("--runs", type=click.IntRange(min=1), default=20, show_default=True, help="Counted calls of each.")
 @click.option("--plan", help="Of the compiled policy; the artifact's default plan if not given.")
 @click.option("--against", default="onnxruntime-dense", show_default=True, callback=_rivals, help=", ".join(RIVALS))
-@click.option("--checkpoint", type=click.Path(path_type=Path), help="What the artifact was made from, for 'eager'.")
+@click.option("--checkpoint", type=click.Path(path_type=Path), help="For 'original' and 'eager'.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Of observations and noise.")
 @json_option
 def bench(
@@ -54,8 +55,8 @@ def bench(
 
     Every figure is of whole calls: prologue, pruner and all. Warm-up calls are not counted.
     """
-    if "eager" in against and checkpoint is None:
-        raise click.UsageError("--against eager runs the original network: give --checkpoint FILE too.")
+    if {"eager", "original"}.intersection(against) and checkpoint is None:
+        raise click.UsageError("--against eager or original runs the original network: give --checkpoint FILE too.")
     console = progress()
     with console.status("loading"):
         entered = contestants(directory, threads, plan, against, checkpoint)
@@ -100,7 +101,7 @@ def _row(m: Measurement, compiled: Measurement) -> tuple[str, ...]:
         f"{low:.4g}..{high:.4g}",
         f"{1000 / m.median_ms:.1f}",
         "" if m is compiled else f"{m.median_ms / compiled.median_ms:.1f} x",
-        f"{m.flops / 1e9:.3f}",
+        "" if m.flops is None else f"{m.flops / 1e9:.3f}",
         share(m.sparsity),
         "" if m.prologue_ms is None else f"{m.prologue_ms:.2f}",
         "" if m.pruner_ms is None else f"{m.pruner_ms:.2f}",

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 import ttscompile
-from ttscompile.artifact.ceiling import few_steps
+from ttscompile.artifact.ceiling import few_steps, many_steps
 from ttscompile.artifact.load import load_artifact
 from ttscompile.cli.output import json_option, only_results_on_stdout, print_json, progress, results
 from ttscompile.cli.summary import document, print_summary
@@ -112,6 +112,8 @@ def convert(
     summary = document(directory, artifact)
     if (warning := few_steps(artifact.manifest)) is not None:
         console.print(f"warning: {warning}", markup=False, soft_wrap=True)
+    if sampler is None and (hint := many_steps(artifact.manifest)) is not None:
+        console.print(f"hint: {hint}", markup=False, soft_wrap=True)
     if as_json:
         print_json(summary | {"stages": stages})
     else:

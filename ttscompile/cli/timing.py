@@ -20,6 +20,7 @@ from ttscompile.runtimes.random_calls import Observation, normalized, random_cal
 if TYPE_CHECKING:
     from torch import nn
 
+    from ttscompile.artifact.manifest import Manifest
     from ttscompile.frontends.eager import EagerPolicy
     from ttscompile.runtimes.policy import CompiledPolicy
 
@@ -37,7 +38,7 @@ class Contestant:
         call: one call, given an observation of one stream and noise.
         report: the report of the last call; None if there is none, and everything was computed.
         spec: of the policy.
-        dense_flops: of a call without a report.
+        dense_flops: of a call without a report; None where they are not known.
     """
 
     label: str
@@ -45,7 +46,7 @@ class Contestant:
     call: Callable[[Observation, Noise], object]
     report: Callable[[], Any]
     spec: PolicySpec
-    dense_flops: float
+    dense_flops: float | None
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ class Measurement:
         quartiles_ms: their first and third quartile.
         prologue_ms: median of the report's timing; None without reports.
         pruner_ms: likewise.
-        flops: median over the calls.
+        flops: median over the calls; None where they are not known.
         sparsity: mean share of reused cells.
         legalised: cells that had to be replaced because they were never computed, all calls together.
     """
@@ -72,7 +73,7 @@ class Measurement:
     quartiles_ms: tuple[float, float]
     prologue_ms: float | None
     pruner_ms: float | None
-    flops: float
+    flops: float | None
     sparsity: float
     legalised: int
 
@@ -90,8 +91,8 @@ def contestants(
         directory: the artifact.
         threads: of each.
         plan: of the compiled policy; None for the artifact's default.
-        against: ``eager``, ``onnxruntime-dense``.
-        checkpoint: for ``eager``.
+        against: ``original``, ``eager``, ``onnxruntime-dense``.
+        checkpoint: for ``original`` and ``eager``.
 
     Raises:
         ArtifactError: it cannot be opened.
@@ -106,7 +107,7 @@ def contestants(
         if rival == "onnxruntime-dense":
             made.append(_compiled("dense onnxruntime", directory, threads, "dense", manifest.spec, FP32))
         elif checkpoint is not None:
-            made.append(_eager(checkpoint, threads, manifest.spec, manifest.flops.dense))
+            made.append(_eager(checkpoint, threads, manifest, rival == "original"))
     return made
 
 
@@ -172,23 +173,31 @@ def plan_contestant(label: str, policy: CompiledPolicy, plan: str, spec: PolicyS
     )
 
 
-def _eager(checkpoint: Path, threads: int, spec: PolicySpec, dense_flops: float) -> Contestant:
-    """The original network in eager PyTorch, in the artifact's own denoising loop."""
+def _eager(checkpoint: Path, threads: int, manifest: Manifest, as_saved: bool) -> Contestant:
+    """The original network in eager PyTorch, in the artifact's denoising loop, or in the one it was saved with."""
     try:
         import torch
 
         from ttscompile.frontends.eager import eager_policy
+        from ttscompile.frontends.encoded import EncodedDenoiser
     except ModuleNotFoundError as error:
         raise RuntimeUnavailableError(
             f"--against eager needs {error.name}, which is not installed. Run: pip install 'ttscompile[compile]'."
         ) from error
-    module = original_network(checkpoint, spec)
+    module, original = original_policy(checkpoint, manifest.spec)
     torch.set_num_threads(threads)
-    return network_contestant("eager PyTorch", eager_policy(module, spec), spec, dense_flops)
+    if not as_saved:
+        run = eager_policy(module, manifest.spec)
+        return network_contestant("eager PyTorch", run, manifest.spec, manifest.flops.dense)
+    sampler, dense = original.sampler, manifest.flops.dense
+    # An encoder runs once a call, whatever the sampler: what it takes is not known apart.
+    flops = None if isinstance(module, EncodedDenoiser) else dense / manifest.steps * sampler.steps
+    label = f"original, {sampler.name} {sampler.steps}, eager PyTorch"
+    return network_contestant(label, eager_policy(module, original), original, flops)
 
 
-def original_network(checkpoint: Path, spec: PolicySpec) -> nn.Module:
-    """The network of the checkpoint that an artifact was made from; needs torch.
+def original_policy(checkpoint: Path, spec: PolicySpec) -> tuple[nn.Module, PolicySpec]:
+    """The network of the checkpoint that an artifact was made from, and what the checkpoint says about it; needs torch.
 
     Args:
         checkpoint: as ``convert`` took it.
@@ -210,17 +219,17 @@ def original_network(checkpoint: Path, spec: PolicySpec) -> nn.Module:
             f"{checkpoint}: expected the policy that the artifact was made from; found another one of the same shapes:"
             f" the normaliser of {', '.join(different)} differs. Give that policy's checkpoint."
         )
-    return module
+    return module, original
 
 
-def network_contestant(label: str, run: EagerPolicy, spec: PolicySpec, dense_flops: float) -> Contestant:
+def network_contestant(label: str, run: EagerPolicy, spec: PolicySpec, dense_flops: float | None) -> Contestant:
     """The whole network in PyTorch, once a step.
 
     Args:
         label: for people.
         run: of ``ttscompile.frontends.eager``.
         spec: of the policy.
-        dense_flops: of a call.
+        dense_flops: of a call; None where they are not known.
     """
     import torch
 

@@ -1,7 +1,8 @@
 """Run the original image transformer on seeded weights, and write what it gives: ``hybrid_VARIANT.npz``.
 
 Not run by the tests. Needs real-stanford/diffusion_policy (5ba07ac), ARISE-Initiative/robomimic v0.2.0 and torchvision
-importable, and this repository::
+importable, and this repository. There is no torchvision for a CPU build of torch: the files were made with a module
+in its place that has ``models.resnet18`` with torchvision's names, and the transforms that robomimic imports::
 
     PYTHONPATH=path/to/diffusion_policy:path/to/robomimic:. python -m tests.frontends.golden.make_hybrid
 """
