@@ -43,6 +43,7 @@ def make(folder: Path) -> None:
     _checkpoints(folder / "checkpoints")
     _lerobot(folder / "lerobot")
     _trajectories(folder / "trajectories")
+    _recordings(folder / "recordings")
     (folder / "states").mkdir()
     state = StateFile(folder / "states", {"model": "0" * 16, "seed": 0, "budget": {"kind": "sparsity", "value": 0.9}})
     state.progress = {"intervals": 3, "seconds": 1.5, "whole": {"4": [0, 1]}}
@@ -95,6 +96,16 @@ def _trajectories(folder: Path) -> None:
         with np.load(shared / "golden" / "tts" / "mixed_95.npz") as file:
             few = {name: file[name][:2] for name in file.files if file[name].ndim}
         np.savez(folder / "golden.npz", **few)
+
+
+def _recordings(folder: Path) -> None:
+    """Data sets as users have them."""
+    from tests.calibration.test_recordings import as_hdf5, as_lerobot, as_zarr
+    from tests.hostile import dataset_changes, hdf5_changes, zarr_changes
+
+    zarr_changes.make(folder / "zarr", as_zarr)
+    hdf5_changes.make(folder / "hdf5", as_hdf5)
+    dataset_changes.make(folder / "lerobot-dataset", as_lerobot)
 
 
 if __name__ == "__main__":

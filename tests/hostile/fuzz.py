@@ -9,6 +9,7 @@ run in processes of their own: one that crashes or hangs is a defect that is tol
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import os
 import random
@@ -24,7 +25,10 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tests.hostile.guard import Guard
 
 ROOT = Path(__file__).resolve().parents[2]
 LIMIT = 5.0
@@ -63,6 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 "cases": options.cases,
                 "refused": sum(report["refused"] for report in reports),
                 "accepted": sum(report["accepted"] for report in reports),
+                "stopped": sum(report["stopped"] for report in reports),
                 "defects": sum(len(report["defects"]) for report in reports),
                 "slowest_s": round(max((report["slowest"] for report in reports), default=0.0), 2),
                 "peak_mib": max((report["peak_mib"] for report in reports), default=0),
@@ -102,7 +107,12 @@ def _process(target: str, seed: int, first: int, stop: int, corpus: Path, work: 
         target,
         *map(str, (seed, first, stop, corpus, work)),
     ]
-    quiet = {"MALLOC_ARENA_MAX": "1", "OMP_NUM_THREADS": "1", "PYTHONFAULTHANDLER": "1"}
+    quiet = {
+        "MALLOC_ARENA_MAX": "1",
+        "OMP_NUM_THREADS": "1",
+        "PYTHONFAULTHANDLER": "1",
+        "ARROW_DEFAULT_MEMORY_POOL": "system",
+    }
     with (work / "log").open("wb") as log:
         process = subprocess.Popen(command, cwd=ROOT, env={**os.environ, **quiet}, stdout=log, stderr=log)
         changed = time.monotonic()
@@ -118,6 +128,7 @@ def _process(target: str, seed: int, first: int, stop: int, corpus: Path, work: 
     report: dict[str, Any] = json.loads(_read(work / "report") or "null") or {
         "refused": 0,
         "accepted": 0,
+        "stopped": 0,
         "slowest": 0.0,
         "peak_mib": 0,
         "defects": [],
@@ -144,7 +155,7 @@ def memory() -> str | None:
 def worker(target: str, seed: int, first: int, stop: int, corpus: Path, work: Path) -> None:
     """Run cases in this process; tells in ``case`` which one it is at, and in ``report`` what came out."""
     from tests.hostile.guard import Guard, Violation
-    from tests.hostile.targets import TARGETS, mixed, outcome
+    from tests.hostile.targets import READ_APART, TARGETS, mixed, outcome
 
     make = TARGETS.get(target, mixed)
     inside = work / "inside"
@@ -152,7 +163,15 @@ def worker(target: str, seed: int, first: int, stop: int, corpus: Path, work: Pa
     tempfile.tempdir = str(inside / "tmp")
     _warm_up(target, make, corpus, inside)
     guard = Guard(inside)
-    report: dict[str, Any] = {"refused": 0, "accepted": 0, "slowest": 0.0, "defects": [], "next": stop}
+    report: dict[str, Any] = {
+        "refused": 0,
+        "accepted": 0,
+        "stopped": 0,
+        "slowest": 0.0,
+        "defects": [],
+        "next": stop,
+    }
+    seconds_apart = 0.0
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     descriptor = os.open(work / "case", os.O_WRONLY | os.O_CREAT)
     for case in range(first, stop):
@@ -162,14 +181,18 @@ def worker(target: str, seed: int, first: int, stop: int, corpus: Path, work: Pa
         run_case = make(rng, corpus, folder)
         begun = time.process_time()
         try:
-            with guard.watching():
-                report[outcome(run_case)] += 1
+            if target in READ_APART:
+                result, seconds_apart = _forked(guard, run_case, inside / "told")
+                report[result] += 1
+            else:
+                with guard.watching():
+                    report[outcome(run_case)] += 1
         except (Exception, Violation) as error:
             told = "".join(traceback.format_exception(error, limit=-4))
             report["defects"].append(
                 {"case": case, "what": f"{type(error).__name__}: {error}"[:300], "log": told[-1500:]}
             )
-        seconds = time.process_time() - begun
+        seconds = seconds_apart if target in READ_APART else time.process_time() - begun
         report["slowest"] = max(report["slowest"], seconds)
         if seconds > LIMIT:
             report["defects"].append({"case": case, "what": f"took {seconds:.1f} s", "log": ""})
@@ -183,18 +206,59 @@ def worker(target: str, seed: int, first: int, stop: int, corpus: Path, work: Pa
     os._exit(0)  # threads of a runtime that a case left need not be waited for
 
 
+def _forked(guard: Guard, run_case: Callable[[], None], told: Path) -> tuple[str, float]:
+    """A case in a process of its own, as the product reads data sets; ``stopped`` if it crashed or met its limits.
+
+    Returns:
+        What came out, and seconds of the processor.
+
+    Raises:
+        RuntimeError: whatever came out is a defect.
+    """
+    from tests.hostile.guard import Violation
+    from tests.hostile.targets import outcome
+    from ttscompile.trajectories.apart import MORE_SECONDS
+
+    child = os.fork()
+    if child == 0:
+        resource.setrlimit(resource.RLIMIT_CPU, (MORE_SECONDS, MORE_SECONDS))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        try:
+            with guard.watching():
+                result = outcome(run_case)
+        except (Exception, Violation) as error:
+            result = "".join(traceback.format_exception(error, limit=-4))[-1500:]
+        told.write_text(result)
+        os._exit(0)
+    _, status, usage = os.wait4(child, 0)
+    seconds = usage.ru_utime + usage.ru_stime
+    if os.WIFSIGNALED(status) and os.WTERMSIG(status) != signal.SIGABRT:
+        print("stopped by", signal.Signals(os.WTERMSIG(status)).name, run_case, flush=True)
+        return "stopped", seconds
+    result = (_read(told) or b"nothing was told").decode()
+    told.unlink(missing_ok=True)
+    if result not in ("refused", "accepted"):
+        raise RuntimeError(result)
+    return result, seconds
+
+
 def _warm_up(target: str, make: Callable[..., Callable[[], None]], corpus: Path, inside: Path) -> None:
     """Import what cases import, and run some: what a first call loads and allocates is not a case's."""
     from tests.hostile import messages
-    from tests.hostile.targets import outcome
+    from tests.hostile.targets import READ_APART, outcome
 
     if target in ("checkpoint", "lerobot", "artifact", "mixed"):
         import torch
 
         torch.set_num_threads(1)
+    if target in (*READ_APART, "mixed"):
+        from ttscompile.trajectories.apart import IMPORTS
+
+        for name in (name for names in IMPORTS.values() for name in names):
+            importlib.import_module(name)
     if target in ("protocol", "mixed"):
         messages.start()
-    for i in range(30):
+    for i in range(0 if target in READ_APART else 30):
         folder = inside / "case"
         folder.mkdir()
         with suppress(Exception):  # a defect, which the cases find too

@@ -21,7 +21,7 @@ from tests.hostile.mutate import NUMBERS, TEXTS, anything, damaged
 CANARY = "canary"
 
 
-class _Runs:
+class Runs:
     """Unpickling this would make a folder, which the guard sees."""
 
     def __init__(self, function: Callable[..., Any] = os.mkdir, argument: str = f"/dev/shm/{CANARY}") -> None:
@@ -133,7 +133,7 @@ def _changed_payload(rng: random.Random, sources: list[Path], target: Path) -> N
         weights[name] = _tensor(rng, weights[name])
     elif kind == 4:
         part = rng.choice((payload, payload["state_dicts"], weights, config))
-        part[rng.choice((*part, *TEXTS))] = rng.choice((anything(rng), _Runs(), _Runs(eval, "1"), {"a": {1, 2}}, b"x"))
+        part[rng.choice((*part, *TEXTS))] = rng.choice((anything(rng), Runs(), Runs(eval, "1"), {"a": {1, 2}}, b"x"))
     else:
         for name in list(weights):
             if rng.random() < 0.1:
@@ -201,7 +201,7 @@ def write_npz(rng: random.Random, corpus: Path, target: Path) -> None:
         _store(target, entries, zipfile.ZIP_DEFLATED)
         return
     elif kind < 0.72:
-        target.write_bytes(rng.choice((entries[name], pickle.dumps(_Runs()), b"\x93NUMPY", b"")))
+        target.write_bytes(rng.choice((entries[name], pickle.dumps(Runs()), b"\x93NUMPY", b"")))
         return
     else:
         entries[name] = _saved(_array(rng))
@@ -252,7 +252,7 @@ def _array(rng: random.Random) -> Any:
     shape = rng.choice(((), (0,), (9,), (9, 2), (9, 3), (0, 2), (9, 2, 0), (1, 1, 1, 1), (9, 0)))
     kind = rng.randrange(8)
     if kind == 0:
-        return np.array([_Runs()] * 9, dtype=object)
+        return np.array([Runs()] * 9, dtype=object)
     if kind == 1:
         return np.full(shape, rng.choice((np.nan, np.inf, 1e300, -1)))
     if kind == 2:

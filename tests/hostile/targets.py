@@ -8,9 +8,11 @@ import shutil
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from unittest import mock
 
-from tests.hostile import forged, messages, pickles
+from tests.hostile import dataset_changes, forged, hdf5_changes, messages, pickles, zarr_changes
 from tests.hostile.archives import write, write_hostile
+from tests.hostile.hdf5_changes import SECRET
 from tests.hostile.mutate import changed, damaged
 from ttscompile.errors import CalibrationError, ExecutorError, TtscompileError
 
@@ -123,6 +125,31 @@ def trajectories(rng: random.Random, corpus: Path, folder: Path) -> Callable[[],
     return load
 
 
+def recording(kind: str, write_bad: Callable[[random.Random, Path, Path], Path]) -> Case:
+    """A data set in a format of others, of which two arrays are joined, or its images taken."""
+
+    def make(rng: random.Random, corpus: Path, folder: Path) -> Callable[[], None]:
+        from tests.calibration.test_recordings import read_here
+        from ttscompile.config import ObservationSpec
+        from ttscompile.trajectories import apart, load_trajectories
+
+        joined = {"obs": ObservationSpec((2, 8))}, {"obs": ("keypoint", "state:2")}
+        images = {"image": ObservationSpec((2, 3, 5, 4)), "state": ObservationSpec((2, 5))}, {"image": ("img",)}
+        path = write_bad(rng, corpus / "recordings" / kind, folder)
+        observations, sources = rng.choice((joined, joined, images))
+
+        def load() -> None:
+            with mock.patch.object(apart, "reader", read_here):
+                episodes = load_trajectories([path], observations, 2, sources)
+            for array in (array for episode in episodes for array in episode.observations.values()):
+                if not len(array) or (array == SECRET).any():
+                    raise Accepted(f"an episode of {len(array)} calls, or with numbers of another file")
+
+        return load
+
+    return make
+
+
 def protocol(rng: random.Random, corpus: Path, folder: Path) -> Callable[[], None]:
     """A message to the executor's server; a refusal is an answer that names an error of ttscompile."""
     text = messages.draw(rng)
@@ -160,9 +187,14 @@ TARGETS: dict[str, Case] = {
     "checkpoint": checkpoint,
     "lerobot": lerobot,
     "trajectories": trajectories,
+    "zarr": recording("zarr", zarr_changes.write_bad),
+    "hdf5": recording("hdf5", hdf5_changes.write_bad),
+    "lerobot-dataset": recording("lerobot-dataset", dataset_changes.write_bad),
     "protocol": protocol,
     "state": state,
 }
+READ_APART = ("zarr", "hdf5", "lerobot-dataset")
+"""Targets that are read in a process of their own: a crash of their libraries ends that process, and is told."""
 
 
 def mixed(rng: random.Random, corpus: Path, folder: Path) -> Callable[[], None]:

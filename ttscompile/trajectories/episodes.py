@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import os
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,10 +20,8 @@ import numpy.typing as npt
 
 from ..config import ObservationSpec
 from ..errors import TrajectoryError
+from .apart import frames_apart
 from .frames import Frames, observation_frames, require_proportion
-from .hdf5_file import hdf5_frames
-from .lerobot_dataset import lerobot_frames
-from .zarr_buffer import zarr_frames
 
 Array = npt.NDArray[Any]
 
@@ -81,7 +79,8 @@ def _read(
 ) -> list[Episode]:
     """Episodes of one file."""
     other = _other_format(path)
-    held, frames = _npz(path) if other is None else (other(path), True)
+    used = {part.partition(":")[0] for key in observations for part in sources.get(key, (key,))}
+    held, frames = _npz(path) if other is None else (frames_apart(path, other, sorted(used)), True)
     if sources and not frames:
         raise TrajectoryError(
             f"{path}: its rows are calls of the policy, and {sorted(sources)} are to be made of other arrays, which is"
@@ -91,7 +90,6 @@ def _read(
         raise TrajectoryError(f"the policy observes {sorted(observations)}; found arrays for {unknown}.")
     ends = _ends(path, held.ends)
     arrays = observation_frames(path, held, observations, sources)
-    used = {part.partition(":")[0] for key in observations for part in sources.get(key, (key,))}
     if other is None and (extra := sorted(set(held.names) - used)):
         warnings.warn(f"{path}: arrays {extra} are no keys of the observation, and are not used.", stacklevel=4)
     rows = {len(arrays[key]) if arrays[key].ndim else 0 for key in observations}
@@ -163,17 +161,17 @@ def read_npz(path: Path) -> dict[str, Array]:
         ) from error
 
 
-def _other_format(path: Path) -> Callable[[Path], Frames] | None:
-    """What reads a file that is no ``.npz``."""
+def _other_format(path: Path) -> str | None:
+    """What a file is that is no ``.npz``."""
     name = path.name.lower()
     if not path.exists():
         return None
     if name.endswith((".zarr", ".zarr.zip")) or (path / ".zgroup").exists() or (path / "zarr.json").exists():
-        return zarr_frames
+        return "zarr"
     if name.endswith((".hdf5", ".h5")):
-        return hdf5_frames
+        return "hdf5"
     if (path / "meta" / "info.json").exists():
-        return lerobot_frames
+        return "lerobot"
     return None
 
 

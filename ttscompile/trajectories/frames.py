@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,8 @@ Array = npt.NDArray[Any]
 MAX_RATIO, FREE_BYTES = 200, 256 * 2**20
 """Arrays may take so many times the bytes of their file, or this much; what takes more is a bomb. Deflate reaches 1000
 on zeros; recorded images 10."""
+BLOCK_BYTES = 32 * 2**20
+"""Rows are read so many bytes at a time, or one chunk."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +37,23 @@ class Frames:
     names: Sequence[str]
     read: Callable[[str], Array]
     ends: Array
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A data set that is open, in the process that reads it.
+
+    Attributes:
+        names: of the arrays.
+        read: the rows of an array by its name, F, and blocks ``[n, ...]`` of them as they are stored.
+        ends: for each episode the frame after its last, increasing.
+        order: ``[F]`` which stored row is which frame, if they are not in order.
+    """
+
+    names: Sequence[str]
+    read: Callable[[str], tuple[int, Iterator[Array]]]
+    ends: Array
+    order: Array | None = None
 
 
 def observation_frames(
@@ -61,7 +82,12 @@ def observation_frames(
         if len(arrays) == 1 and ":" not in parts[0]:
             found[key] = _as_image(arrays[0], spec.shape[1:] if spec.frames is not None else spec.shape)
         else:
-            found[key] = np.concatenate([array.reshape(len(array), -1) for array in arrays], axis=1)
+            if len({array.shape[:1] for array in arrays}) != 1:
+                shapes = {part: list(array.shape) for part, array in zip(parts, arrays, strict=True)}
+                raise TrajectoryError(f"{path}: what the observation {key!r} is made of differs in length: {shapes}.")
+            found[key] = np.concatenate(
+                [_flat(path, part, array) for part, array in zip(parts, arrays, strict=True)], axis=1
+            )
     return found
 
 
@@ -77,13 +103,20 @@ def _part(path: Path, frames: Frames, key: str, part: str) -> Array:
     array = frames.read(name)
     if not colon:
         return array
-    flat = array.reshape(len(array), -1)
+    flat = _flat(path, name, array)
     if not count.isdecimal() or not 0 < int(count) <= flat.shape[1]:
         raise TrajectoryError(
             f"{path}: {part!r} for the observation {key!r}: expected after the colon how many of the"
             f" {flat.shape[1]} numbers of {name!r} are taken."
         )
     return flat[:, : int(count)]
+
+
+def _flat(path: Path, name: str, array: Array) -> Array:
+    """Frames as ``[F, numbers]``."""
+    if not array.ndim or not array.size:
+        raise TrajectoryError(f"{path}: {name!r} is {list(array.shape)}; expected frames [F, ...] that are not empty.")
+    return array.reshape(len(array), -1)
 
 
 def _as_image(array: Array, frame: tuple[int, ...]) -> Array:
@@ -113,6 +146,47 @@ def require_proportion(path: Path, total: int, size: int) -> None:
             f"{path}: expected arrays in proportion to a file of {size} bytes, at most {MAX_RATIO} times as much; it"
             f" says {total} bytes. Record it again."
         )
+
+
+def block_rows(shape: Sequence[int], itemsize: int, chunk: int) -> int:
+    """How many rows of an array are read at once: about ``BLOCK_BYTES``, and whole chunks.
+
+    Args:
+        shape: ``[F, ...]``.
+        itemsize: bytes of a number.
+        chunk: rows of a chunk.
+    """
+    whole = BLOCK_BYTES // max(1, math.prod(shape[1:]) * itemsize * chunk)
+    return max(1, whole) * chunk
+
+
+def bytes_of(path: Path) -> int:
+    """Bytes of a file, or of all files in a directory."""
+    if path.is_dir():
+        return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
+    return path.stat().st_size
+
+
+def require_files(path: Path) -> None:
+    """Raise unless a file, or all in a directory, are files of bytes: reading a pipe or ``/dev/zero`` does not end.
+
+    Links to files are followed, which is how caches of downloads keep them; links to directories are not.
+
+    Raises:
+        TrajectoryError: names the first that is none.
+    """
+    for folder, names, files in os.walk(path) if path.is_dir() else [("", [], [os.fspath(path)])]:
+        wrong = [name for name in names if Path(folder, name).is_symlink()]
+        for name in files:
+            file = Path(folder, name)
+            system = file.is_symlink() and file.resolve().parts[1:2] in (("proc",), ("sys",), ("dev",))
+            if system or not file.is_file():
+                wrong.append(name)
+        if wrong:
+            raise TrajectoryError(
+                f"{path}: {Path(folder, wrong[0])} is a link to a directory or to nothing, a pipe or a device;"
+                " expected files and directories. Copy the recording without it."
+            )
 
 
 def require_package(path: Path, package: str) -> TrajectoryError:

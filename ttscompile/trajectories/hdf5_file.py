@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import math
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..errors import TrajectoryError
-from .frames import Array, Frames, require_package, require_proportion
+from .frames import Array, Recording, block_rows, require_files, require_package, require_proportion
+
+FILTERS = frozenset({"gzip", "lzf", "shuffle", "fletcher32"})
+"""Compression that h5py has itself; others are libraries of their own."""
 
 
-def hdf5_frames(path: Path) -> Frames:
+def hdf5_recording(path: Path) -> Recording:
     """Open a data set.
 
     Raises:
@@ -22,10 +27,11 @@ def hdf5_frames(path: Path) -> Frames:
         import h5py
     except ModuleNotFoundError as error:
         raise require_package(path, "h5py") from error
+    require_files(path)
     try:
         with h5py.File(path, "r") as file:
-            demos = sorted(_inside(path, file, "data"), key=_number)
-            groups = [_inside(path, file, f"data/{demo}/obs") for demo in demos]
+            demos = sorted(_group(path, file, "data"), key=_number)
+            groups = [_group(path, file, f"data/{demo}/obs") for demo in demos]
             lengths = [_length(path, group) for group in groups]
             names = sorted(set.intersection(*(set(group) for group in groups)))
     except TrajectoryError:
@@ -35,10 +41,13 @@ def hdf5_frames(path: Path) -> Frames:
             f"{path}: cannot be read as a data set of robomimic ({type(error).__name__}: {str(error)[:160]});"
             " expected an HDF5 file with data/DEMO/obs/NAME [F, ...]."
         ) from error
-    return Frames(names, lambda name: _read(path, demos, name), np.cumsum(lengths))
+    total = sum(lengths)
+    ends = np.cumsum(lengths) if total < 2**62 else np.zeros(0, np.int64)
+    return Recording(names, lambda name: (total, _blocks(path, demos, name)), ends)
 
 
-def _read(path: Path, demos: list[str], name: str) -> Array:
+def _blocks(path: Path, demos: list[str], name: str) -> Iterator[Array]:
+    """Rows of all demonstrations; sizes are compared with the file's before the first is read."""
     import h5py
 
     try:
@@ -46,8 +55,12 @@ def _read(path: Path, demos: list[str], name: str) -> Array:
             arrays = [_inside(path, file, f"data/{demo}/obs/{name}") for demo in demos]
             for array in arrays:
                 _require_plain(path, array)
-            require_proportion(path, sum(array.nbytes for array in arrays), path.stat().st_size)
-            return np.concatenate([array[:] for array in arrays])
+            total = sum(math.prod(array.shape) * array.dtype.itemsize for array in arrays)
+            require_proportion(path, total, path.stat().st_size)
+            for array in arrays:
+                step = block_rows(array.shape, array.dtype.itemsize, array.chunks[0] if array.chunks else 1)
+                for start in range(0, max(1, len(array)), step):
+                    yield array[start : start + step]
     except TrajectoryError:
         raise
     except Exception as error:
@@ -55,17 +68,27 @@ def _read(path: Path, demos: list[str], name: str) -> Array:
 
 
 def _inside(path: Path, file: Any, name: str) -> Any:
-    """A group or an array, no part of whose path is a link to another file."""
+    """A group or an array, no part of whose path is a link: a symbolic one may lead through one to another file."""
     import h5py
 
     walked = file
     for part in name.split("/"):
         link = walked.get(part, getlink=True)
-        if link is None or isinstance(link, h5py.ExternalLink):
-            what = "is missing" if link is None else "is a link to another file"
+        if not isinstance(link, h5py.HardLink):
+            what = "is missing" if link is None else "is a link, maybe to another file"
             raise TrajectoryError(f"{path}: {name!r} {what}; expected a data set of robomimic, data/DEMO/obs/NAME.")
         walked = walked[part]
     return walked
+
+
+def _group(path: Path, file: Any, name: str) -> Any:
+    """A group; an array in its place could have rows without end."""
+    import h5py
+
+    found = _inside(path, file, name)
+    if not isinstance(found, h5py.Group):
+        raise TrajectoryError(f"{path}: {name!r} is an array; expected a group of a data set of robomimic.")
+    return found
 
 
 def _length(path: Path, group: Any) -> int:
@@ -76,10 +99,15 @@ def _length(path: Path, group: Any) -> int:
 
 
 def _require_plain(path: Path, array: Any) -> None:
-    """Raise unless an array is numbers that are in the file itself."""
+    """Raise unless an array is numbers that are in the file itself, compressed by what is known."""
     if np.dtype(array.dtype).kind not in "biuf" or array.is_virtual or array.external:
         where = "" if np.dtype(array.dtype).kind not in "biuf" else ", with its data in other files"
         raise TrajectoryError(f"{path}: {array.name!r} is {array.dtype}{where}; expected numbers in the file itself.")
+    if unknown := sorted({str(name) for name in array._filters} - FILTERS):
+        raise TrajectoryError(
+            f"{path}: {array.name!r} is compressed by {', '.join(unknown)}; expected {', '.join(sorted(FILTERS))}."
+            " Write it again (h5repack), or save the observations as an .npz."
+        )
 
 
 def _number(demo: str) -> tuple[int, str]:

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import io
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..errors import TrajectoryError
-from .frames import Array, Frames, require_package, require_proportion
+from .frames import Array, Recording, require_files, require_package, require_proportion
 
 EPISODE, FRAME = "episode_index", "frame_index"
+ROWS, IMAGES = 4096, 8
+"""Rows that are decoded at once: a table of rows that are all the same is a thousandth of what it holds."""
 
 
-def lerobot_frames(path: Path) -> Frames:
+def lerobot_recording(path: Path) -> Recording:
     """Open a data set.
 
     Raises:
@@ -25,13 +28,17 @@ def lerobot_frames(path: Path) -> Frames:
         import pyarrow.parquet as parquet
     except ModuleNotFoundError as error:
         raise require_package(path, "pyarrow") from error
+    require_files(path / "data")
+    require_files(path / "meta")
     files = sorted((path / "data").rglob("*.parquet"))
     if not files:
         raise TrajectoryError(f"{path}: has meta/info.json and no data/**/*.parquet; expected a LeRobot data set.")
+    size = sum(file.stat().st_size for file in files)
     try:
         videos = _videos(path)
-        names = [name for name in parquet.read_schema(files[0]).names if name not in (EPISODE, FRAME)]
-        index = [_columns(parquet, file, [EPISODE, FRAME]) for file in files]
+        tables = [parquet.ParquetFile(file) for file in files]
+        names = [name for name in tables[0].schema_arrow.names if name not in (EPISODE, FRAME)]
+        episodes, numbers = (_index(path, tables, name, size) for name in (EPISODE, FRAME))
     except TrajectoryError:
         raise
     except Exception as error:  # pyarrow has its own errors, of several kinds
@@ -39,61 +46,92 @@ def lerobot_frames(path: Path) -> Frames:
             f"{path}: cannot be read as a LeRobot data set ({type(error).__name__}: {str(error)[:160]}); expected"
             f" tables with the columns {EPISODE} and {FRAME}."
         ) from error
-    episodes, numbers = (np.concatenate([table[name].to_numpy() for table in index]) for name in (EPISODE, FRAME))
+    if len(episodes) != len(numbers):
+        raise TrajectoryError(f"{path}: {EPISODE} has {len(episodes)} rows, and {FRAME} {len(numbers)}.")
     order = np.lexsort((numbers, episodes))
-    changes = np.flatnonzero(np.diff(episodes[order])) + 1
-    ends = np.append(changes, len(order))
+    ends = np.append(np.flatnonzero(np.diff(episodes[order])) + 1, len(order))
 
-    def read(name: str) -> Array:
+    def read(name: str) -> tuple[int, Iterator[Array]]:
         if name in videos:
             raise TrajectoryError(
                 f"{path}: {name!r} is a video, which is not decoded. Save its frames as images (LeRobot records a data"
                 " set so with --dataset.video=false), or the observations as an .npz."
             )
-        try:
-            rows = [_rows(path, name, _columns(parquet, file, [name])[name]) for file in files]
-        except TrajectoryError:
-            raise
-        except Exception as error:
-            raise TrajectoryError(
-                f"{path}: column {name!r} is damaged ({type(error).__name__}: {str(error)[:160]})."
-            ) from error
-        whole = np.concatenate(rows)
-        require_proportion(path, whole.nbytes, sum(file.stat().st_size for file in files))
-        return whole[order]
+        return len(order), _column(path, tables, name, size)
 
-    return Frames([*names, *videos], read, ends)
+    sorted_already = bool((order == np.arange(len(order))).all())
+    return Recording([*names, *videos], read, ends, None if sorted_already else order)
 
 
-def _columns(parquet: Any, file: Path, names: list[str]) -> Any:
-    return parquet.read_table(file, columns=names, use_threads=False)
+def _index(path: Path, tables: list[Any], name: str, size: int) -> Array:
+    found = list(_column(path, tables, name, size))
+    whole = np.concatenate(found) if found else np.zeros(0, np.int64)
+    if whole.ndim != 1 or whole.dtype.kind not in "iu":
+        raise TrajectoryError(f"{path}: column {name!r} is {whole.dtype}{list(whole.shape)}; expected integers [F].")
+    return whole
 
 
-def _rows(path: Path, name: str, column: Any) -> Array:
-    """A column as ``[F, ...]``; images, which are stored compressed, as ``[F, H, W, C]``."""
+def _column(path: Path, tables: list[Any], name: str, size: int) -> Iterator[Array]:
+    """The rows of a column, a few at a time; ends where they are more than the files can hold."""
+    total = 0
+    try:
+        for table in tables:
+            images = _images_or_numbers(path, name, table.schema_arrow.field(name).type)
+            for batch in table.iter_batches(IMAGES if images else ROWS, columns=[name], use_threads=False):
+                values = batch.column(0)
+                rows = (_image(path, name, value)[None] for value in values.to_pylist()) if images else [_rows(values)]
+                for block in rows:
+                    total += block.nbytes
+                    require_proportion(path, total, size)
+                    yield block
+    except TrajectoryError:
+        raise
+    except Exception as error:
+        raise TrajectoryError(
+            f"{path}: column {name!r} is damaged ({type(error).__name__}: {str(error)[:160]})."
+        ) from error
+
+
+def _images_or_numbers(path: Path, name: str, kind: Any) -> bool:
+    """Whether a column holds images; numbers may be in lists."""
+    from pyarrow import types
+
+    if types.is_struct(kind):
+        return True
+    inner = kind
+    while types.is_list(inner) or types.is_large_list(inner) or types.is_fixed_size_list(inner):
+        inner = inner.value_type
+    if not (types.is_integer(inner) or types.is_floating(inner) or types.is_boolean(inner)):
+        raise TrajectoryError(f"{path}: column {name!r} is {kind}; expected numbers or images.")
+    return False
+
+
+def _rows(values: Any) -> Array:
+    """Numbers as ``[n, ...]``, of lists of lists a level at a time."""
     import pyarrow
+    from pyarrow import compute
 
-    values = column.combine_chunks()
-    if pyarrow.types.is_struct(values.type):
-        return np.stack([_image(path, name, value) for value in values.to_pylist()])
-    sizes: list[int] = []
-    while pyarrow.types.is_nested(values.type):  # [[..], ..], a level at a time; ragged rows do not reshape
-        sizes.append(len(values))
+    count, inner = len(values), []
+    while pyarrow.types.is_nested(values.type):
+        lengths = compute.unique(compute.list_value_length(values)).to_pylist()
+        if len(lengths) != 1 or lengths[0] is None:
+            raise ValueError(f"lists of {str(lengths)[:80]} values; expected as many in every row")
+        inner.append(lengths[0])
         values = values.flatten()
-    array = np.asarray(values)
-    if array.dtype.kind not in "biuf":
-        raise TrajectoryError(f"{path}: column {name!r} is {column.type}; expected numbers or images.")
-    inner = [after // before for before, after in zip(sizes, [*sizes[1:], len(array)], strict=True)]
-    return array.reshape(len(column), *inner) if sizes else array
+    if values.null_count:
+        raise ValueError("missing values")
+    return np.asarray(values).reshape(count, *inner)
 
 
-def _image(path: Path, name: str, value: dict[str, Any]) -> Array:
+def _image(path: Path, name: str, value: Any) -> Array:
+    """A PNG or JPEG as ``[H, W, C]``."""
     from PIL import Image
 
-    content = value.get("bytes")
+    content = value.get("bytes") if value is not None else None
     if not isinstance(content, bytes):
         raise TrajectoryError(f"{path}: the images of {name!r} are not in the table; expected them embedded.")
     with Image.open(io.BytesIO(content), formats=("PNG", "JPEG")) as image:
+        require_proportion(path, image.width * image.height * 3, len(content))
         return np.asarray(image.convert("RGB"))
 
 
@@ -102,7 +140,7 @@ def _videos(path: Path) -> list[str]:
     try:
         features = json.loads((path / "meta" / "info.json").read_text("utf-8"))["features"]
         return [name for name, feature in features.items() if feature.get("dtype") == "video"]
-    except (OSError, ValueError, KeyError, AttributeError, RecursionError) as error:
+    except (OSError, ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
         raise TrajectoryError(
             f"{path}: meta/info.json cannot be read ({type(error).__name__}: {str(error)[:160]}); expected a LeRobot"
             " data set, whose features it names."

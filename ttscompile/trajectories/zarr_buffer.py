@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..errors import TrajectoryError
-from .frames import Array, Frames, require_package, require_proportion
+from .frames import Array, Recording, block_rows, bytes_of, require_files, require_package, require_proportion
 
 CODECS = frozenset({"blosc", "bz2", "delta", "gzip", "lz4", "lzma", "shuffle", "zlib", "zstd", "bytes", "crc32c"})
 """Compression that only computes. zarr also knows codecs that unpickle what they read."""
 
 
-def zarr_frames(path: Path) -> Frames:
+def zarr_recording(path: Path) -> Recording:
     """Open a replay buffer, a directory or zipped.
 
     Raises:
@@ -24,6 +26,7 @@ def zarr_frames(path: Path) -> Frames:
         import zarr
     except ModuleNotFoundError as error:
         raise require_package(path, "zarr") from error
+    require_files(path)
     try:
         store: Any = zarr.storage.ZipStore(path, mode="r") if path.is_file() else str(path)
         group = zarr.open_group(store, mode="r")
@@ -35,22 +38,36 @@ def zarr_frames(path: Path) -> Frames:
             f"{path}: cannot be read as a replay buffer of Diffusion Policy ({_short(error)}); expected a zarr group"
             " with data/NAME [F, ...] and meta/episode_ends [E]."
         ) from error
-    size = path.stat().st_size if path.is_file() else sum(f.stat().st_size for f in path.rglob("*") if f.is_file())
-    return Frames(names, lambda name: _read(path, data[name], size), _read(path, ends, size))
+    size = bytes_of(path)
+
+    def read(name: str) -> tuple[int, Iterator[Array]]:
+        array = data[name]
+        _require_plain(path, array, size)
+        return array.shape[0], _blocks(path, array)
+
+    _require_plain(path, ends, size)
+    return Recording(names, read, np.concatenate(list(_blocks(path, ends))))
 
 
-def _read(path: Path, array: Any, size: int) -> Array:
-    """All of an array, if nothing but numbers and compression is in it."""
+def _require_plain(path: Path, array: Any, size: int) -> None:
+    """Raise unless nothing but numbers and compression is in an array, and not more than the files can hold."""
     kind, codecs = np.dtype(array.dtype).kind, _codecs(array.metadata)
-    if kind not in "biuf" or not codecs <= CODECS:
+    if kind not in "biuf" or not codecs <= CODECS or not array.shape:
         what = f"compressed by {', '.join(sorted(codecs - CODECS))}" if kind in "biuf" else f"of dtype {array.dtype}"
+        what = what if array.shape else "a single value"
         raise TrajectoryError(
-            f"{path}: {array.path!r} is {what}; expected numbers, compressed by one of {', '.join(sorted(CODECS))}."
-            " Write it again with another compressor, or save the observations as an .npz."
+            f"{path}: {array.path!r} is {what}; expected rows of numbers, compressed by one of"
+            f" {', '.join(sorted(CODECS))}. Write it again with another compressor, or save the observations as an"
+            " .npz."
         )
-    require_proportion(path, array.nbytes, size)
+    require_proportion(path, math.prod(array.shape) * array.dtype.itemsize, size)
+
+
+def _blocks(path: Path, array: Any) -> Iterator[Array]:
+    step = block_rows(array.shape, array.dtype.itemsize, max(1, array.chunks[0]))
     try:
-        return np.asarray(array[:])
+        for start in range(0, max(1, array.shape[0]), step):
+            yield np.asarray(array[start : start + step])
     except Exception as error:  # truncated chunks and the like
         raise TrajectoryError(f"{path}: {array.path!r} is damaged ({_short(error)}). Copy it again.") from error
 
