@@ -2,9 +2,12 @@
 
     python docs/examples.py FOLDER [PAGE...]
 
-runs, in FOLDER, the console blocks under ``<!-- run -->`` and ``<!-- run: slow -->``, and writes what they print into
-the pages. FOLDER holds what the pages speak of: ``policy.ckpt``, ``compiled/`` (calibrated), ``calls.npz``.
-``tests/test_docs.py`` runs the first kind and all Python blocks, and checks that the options of all commands exist.
+runs, in FOLDER, the console blocks under ``<!-- run -->`` as they stand, and writes what they print into the pages.
+FOLDER holds what the pages speak of: ``policy.ckpt``, a link to ``examples``, and, for all pages but the tutorial, what
+the tutorial makes: ``compiled/`` and ``calls.npz``. So the tutorial comes first; it calibrates, for many minutes.
+
+``tests/test_docs.py`` follows the pages as a reader would, with shorter runs: all Python blocks and all commands,
+whether they are marked or not, but those that it names with a reason.
 """
 
 from __future__ import annotations
@@ -23,8 +26,9 @@ NOT_RUN = ("design.md", "decisions.md")
 """Pages whose examples are a contract, or history."""
 
 _FENCE = re.compile(r"^(?P<indent>\s*)```(?P<language>[\w-]*)\s*$")
-_MARK = re.compile(r"^\s*<!-- run(?P<slow>: slow)? -->\s*$")
+_MARK = re.compile(r"^\s*<!-- run -->\s*$")
 _NUMBER = re.compile(r"\b[0-9a-f]{12,64}\b|\d[\d.,]*(?:e[+-]?\d+)?")  # an identity, too
+_NUMBERS = re.compile(r"#(?:, #)+")  # a list of any length
 _RULE = re.compile(r"[─━┃│┏┓┗┛┡┩╇┳└┘┴┼├┤]+")
 ELIDED = "..."
 ALIKE = 0.6
@@ -39,8 +43,7 @@ class Block:
         page: file.
         line: number of its first line, from 0.
         language: after the fence.
-        marked: to be run.
-        slow: written anew only, not run by the tests.
+        marked: what it shows is written anew.
         lines: without the fences.
     """
 
@@ -48,7 +51,6 @@ class Block:
     line: int
     language: str
     marked: bool
-    slow: bool
     lines: tuple[str, ...]
 
     @property
@@ -79,16 +81,15 @@ def pages() -> list[Path]:
 
 def blocks(page: Path) -> list[Block]:
     """Fenced blocks of a page, in order."""
-    found, lines, i, mark = [], page.read_text().splitlines(), 0, None
+    found, lines, i, marked = [], page.read_text().splitlines(), 0, False
     while i < len(lines):
         fence = _FENCE.match(lines[i])
         if fence is not None:
-            slow = mark is not None and mark["slow"] is not None
             end = next(j for j in range(i + 1, len(lines)) if lines[j].strip() == "```")
             inside = tuple(line.removeprefix(fence["indent"]) for line in lines[i + 1 : end])
-            found.append(Block(page, i + 1, fence["language"], mark is not None, slow, inside))
+            found.append(Block(page, i + 1, fence["language"], marked, inside))
             i = end
-        mark = _MARK.match(lines[i]) if fence is None else None
+        marked = fence is None and _MARK.match(lines[i]) is not None
         i += 1
     return found
 
@@ -114,7 +115,7 @@ def commands(block: Block) -> Iterator[Command]:
 
 def words_of(line: str) -> list[str]:
     """What of a line does not change from machine to machine: its words, with numbers made equal."""
-    return _NUMBER.sub("#", _RULE.sub(" ", line)).split()
+    return _NUMBERS.sub("#", _NUMBER.sub("#", _RULE.sub(" ", line))).split()
 
 
 def likeness(shown: str, printed: str) -> float:
@@ -137,7 +138,7 @@ def missing(shown: Sequence[str], printed: Sequence[str]) -> list[str]:
 
 
 def renewed(shown: Sequence[str], printed: Sequence[str]) -> list[str]:
-    """What to show: all that was printed, or, where parts are left out, the lines most like those that were shown."""
+    """What to show: all that was printed, or, where parts are left out, the lines most like those shown, in order."""
     lines = [line.rstrip() for line in printed]
     while lines and not lines[0]:
         lines.pop(0)
@@ -145,35 +146,60 @@ def renewed(shown: Sequence[str], printed: Sequence[str]) -> list[str]:
         lines.pop()
     if not any(line.strip() == ELIDED for line in shown):
         return lines
-    kept = []
+    kept, at = [], 0
+    rest = [line for line in lines if line.strip()]
     for line in shown:
-        if line.strip() == ELIDED or not line.strip() or not lines:
+        if line.strip() == ELIDED or not line.strip() or at == len(rest):
             kept.append(line)
-        else:
-            kept.append(max(lines, key=lambda other: (likeness(line, other), likeness(other, line))))
+            continue
+        # Of equals the next one: lines come in the order in which they are shown.
+        found = [(likeness(line, other), likeness(other, line)) for other in rest[at:]]
+        if max(found)[0] >= ALIKE:
+            at += found.index(max(found)) + 1
+            kept.append(rest[at - 1])
     return kept
 
 
+def run(command: Command, folder: Path, extra: Sequence[str] = ()) -> str:
+    """What a command prints in a folder, standard error first.
+
+    Args:
+        command: as it is shown.
+        folder: to run it in.
+        extra: further options.
+
+    Raises:
+        RuntimeError: it failed.
+    """
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    # The pages are this project's own: what they tell readers to type is typed here.
+    result = subprocess.run(  # noqa: S603
+        [*command.words(), *extra],
+        cwd=folder,
+        env={**os.environ, "PATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if result.returncode:
+        raise RuntimeError(f"{command.block.name}: {command.text}\n{result.stderr}{result.stdout}")
+    return result.stderr + result.stdout
+
+
 def write(folder: Path, chosen: Sequence[Path]) -> None:
-    """Run the marked blocks of pages in a folder and put what they print into the pages."""
-    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+    """Run the marked blocks of pages in a folder, in order, and put what they print into the pages."""
     for page in chosen:
-        lines = page.read_text().splitlines()
-        for block in reversed([block for block in blocks(page) if block.marked and block.language == "console"]):
-            made: list[str] = []
+        lines, written, done = page.read_text().splitlines(), [], 0
+        for block in blocks(page):
+            if not (block.marked and block.language == "console"):
+                continue
+            written += lines[done : block.line]
+            done = block.line + len(block.lines)
             for command in commands(block):
                 sys.stderr.write(f"{block.name}: {command.text}\n")
-                # The pages are this project's own: what they tell readers to type is typed here.
-                result = subprocess.run(  # noqa: S603
-                    command.words(), cwd=folder, env=environment, capture_output=True, text=True, check=False
-                )
-                if result.returncode:
-                    raise SystemExit(f"{block.name}: {command.text}\n{result.stderr}")
-                told = result.stderr + result.stdout  # as a terminal would show them
-                source = block.lines[command.line : command.line + _length(block, command)]
-                made += [*source, *renewed(command.output, told.splitlines())]
-            lines[block.line : block.line + len(block.lines)] = made
-        page.write_text("\n".join(lines) + "\n")
+                written += block.lines[command.line : command.line + _length(block, command)]
+                written += renewed(command.output, run(command, folder).splitlines())
+        page.write_text("\n".join([*written, *lines[done:]]) + "\n")
 
 
 def _length(block: Block, command: Command) -> int:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 
 def flops(count: float) -> str:
     """FLOPs with a unit: ``16.1 GFLOP``."""
@@ -21,3 +23,12 @@ def share(part: float | None) -> str:
 def ms(milliseconds: float) -> str:
     """A time to three digits at least, without an exponent."""
     return f"{milliseconds:.3g}" if milliseconds < 1000 else f"{milliseconds:.0f}"
+
+
+def plain(value: object) -> str:
+    """A value of a record without the marks of a program: ``calibration 0, 1; validation 2``."""
+    if isinstance(value, Mapping):
+        return "; ".join(f"{str(name).replace('_', ' ')} {plain(one)}" for name, one in value.items()) or "none"
+    if isinstance(value, list | tuple):
+        return ", ".join(map(plain, value)) or "none"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

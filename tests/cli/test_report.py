@@ -26,9 +26,11 @@ from ttscompile.points import efficient
 from ttscompile.report import Given, build, facts, pictures, render, verified
 from ttscompile.report.frontier import from_comparison
 from ttscompile.report.measure import run_episode
+from ttscompile.report.page import Table
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.trajectories import Episode
+from ttscompile.units import plain
 from ttscompile.verification import Rung, Verification
 from ttscompile.verification.rung import ErrorMap
 
@@ -131,6 +133,8 @@ def test_the_page_can_be_read_on_a_phone_and_in_the_dark(page: str) -> None:
     for i, (tag, _) in enumerate(reader.tags):
         if tag == "table":
             assert reader.parents[i][-1] == "div", "a wide table scrolls by itself, not the page"
+        if tag == "img":
+            assert "div" not in reader.parents[i], "a picture fits, and can be enlarged as a whole"
     assert "figure img { display: block; max-width: 100%; height: auto; background: #ffffff" in page
 
 
@@ -147,7 +151,7 @@ def test_the_page_says_what_was_found(page: str, calibrated: Path) -> None:
         "on the frontier",
         "12.5",
         "Could not be run",
-        "K = 5 denoising steps leave reuse little room",
+        "K = 5 denoising steps",
         "at most 80.0% of the cells",
         "the first call after reset() falls back",
     ):
@@ -156,6 +160,19 @@ def test_the_page_says_what_was_found(page: str, calibrated: Path) -> None:
     drawn = pictures_of(Reader(page))
     assert len(drawn) == 7
     assert all(len(set(map(tuple, picture[::3, ::3].reshape(-1, 3)))) > 3 for picture in drawn), "a picture is empty"
+
+
+def test_words_are_set_to_the_left_and_figures_to_the_right() -> None:
+    table = Table(
+        ("", "made", "ms", "quartiles", "of it"), (("0", "schedule", "1", "1..2", ""), ("1", "", "2", "", ""))
+    )
+    assert table.text == (True, True, False, False, False)
+    assert Table(("", ""), (("steps", "5"),), prose=True).text == (True, True)
+
+
+def test_a_record_is_told_without_brackets() -> None:
+    assert plain({"safe_plan": [0, 9], "b": {}}) == "safe plan 0, 9; b none"
+    assert (plain(0.123456), plain([]), plain("a_b"), plain(None)) == ("0.1235", "none", "a_b", "None")
 
 
 def test_hostile_names_stay_text(calibrated: Path) -> None:

@@ -14,6 +14,7 @@ from ttscompile.artifact.manifest import DENSE, Manifest, abbreviated
 from ttscompile.cli.output import flops, share, table
 from ttscompile.ir.joint import OF_ALL_BLOCKS
 from ttscompile.runtimes.liveness import rollout_needs
+from ttscompile.units import plain
 
 
 def document(directory: Path, artifact: Artifact | None = None) -> dict[str, Any]:
@@ -153,8 +154,8 @@ def print_summary(summary: dict[str, Any], console: Console) -> None:
     cache = summary["rollout_cache"]
     about.add_row(
         "rollout cache",
-        f"{cache['read']} of {cache['cells']} residuals a stream, {cache['bytes_read'] / 1e6:.1f} MB, are read by its"
-        f" plans; a matrix can read all, {cache['bytes_most'] / 1e6:.1f} MB",
+        f"{cache['read']} of {cache['cells']} residuals a stream, {cache['bytes_read'] / 1e6:.1f} MB, for its plans;"
+        f" {cache['bytes_most'] / 1e6:.1f} MB for plans that you give",
     )
     about.add_row("precision", _told_precision(summary["precision"], len(summary["blocks"])))
     console.print(about)
@@ -203,15 +204,16 @@ def _print_calibration(record: dict[str, Any] | None, console: Console) -> None:
     for name, score in precision["plans"].items():
         errors = (f"{score[key]:.4g}" for key in ("error", "error_p90"))
         scores.add_row(f"{name}: {precision['name']} against fp32", *errors, "", "")
-    for name, reason in record.get("skipped", {}).items():
-        scores.add_row(f"{name}: none, {reason}", *[""] * 4)
     if scores.row_count:
         console.print(scores)
+    for name, reason in record.get("skipped", {}).items():
+        console.print(f"  {name}: none, {reason}", markup=False)  # as a row it would squeeze the figures
     made = table("calibration", "")
     for name, value in record.items():
         if name in ("plans", "precision", "sparsity", "flops_sparsity", "skipped"):
             continue  # told above
-        if isinstance(value, list | dict) and len(str(value)) > 60:
-            value = f"{len(value)} entries; see --json"
-        made.add_row(name.replace("_", " "), f"{value:.4g}" if isinstance(value, float) else str(value))
+        told = plain(value)
+        if isinstance(value, list | dict) and len(told) > 90:
+            told = f"{len(value)} entries; see --json"
+        made.add_row(name.replace("_", " "), told)
     console.print(made)

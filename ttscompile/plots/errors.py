@@ -51,7 +51,7 @@ def plot_errors(
             " Install 'ttscompile[compile]', or read the errors with --json."
         ) from error
     count, blocks = errors.shape
-    figure = Figure(figsize=(min(7.0 + 0.06 * count, 14.0), min(2.2 + 0.17 * blocks, 14.0)), layout="constrained")
+    figure = Figure(figsize=(min(6.5 + 0.03 * count, 12.0), min(2.2 + 0.17 * blocks, 14.0)), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     shown = np.log10(np.clip(np.nan_to_num(errors, nan=1.0, posinf=1.0), 10**_LEAST, 10**_MOST)).T

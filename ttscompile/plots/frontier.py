@@ -44,7 +44,7 @@ def plot_frontier(
             f"a picture needs matplotlib, and {error.name!r} is not installed. Install 'ttscompile[compile]', or read"
             " the figures with --json."
         ) from error
-    figure = Figure(figsize=(9.0, 6.0), layout="constrained")
+    figure = Figure(figsize=(7.5, 5.5), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     shown = [point for point in points if point.error > 0]
@@ -60,7 +60,7 @@ def plot_frontier(
             label=series,
         )
         for p in own:
-            axes.annotate(p.name, (p.latency_ms, p.error), xytext=(5, 4), textcoords="offset points", fontsize=7)
+            axes.annotate(p.name, (p.latency_ms, p.error), xytext=(5, 4), textcoords="offset points", fontsize=8)
     best = [point for point in efficient if point.error > 0]
     axes.step(
         [p.latency_ms for p in best],
@@ -86,7 +86,7 @@ def plot_frontier(
     axes.set_title(title, fontsize=8, loc="left")
     axes.grid(which="both", color="#dddddd", linewidth=0.5)
     axes.set_axisbelow(True)
-    figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=8)
+    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
     # A picture of the same figures is the same file: matplotlib would put its version or the date into it.
     metadata = {"Software": None} if path.suffix == ".png" else {"Date": None} if path.suffix == ".svg" else None
     try:

@@ -51,7 +51,7 @@ def plot_plan(plan: PlanArray, kinds: Sequence[str], path: str | Path, title: st
         )
     steps, blocks = plan.shape
     # No pyplot: it keeps every figure in a global list, and would choose a window system.
-    figure = Figure(figsize=(min(6.5 + 0.06 * steps, 14.0), min(1.9 + 0.17 * blocks, 14.0)), layout="constrained")
+    figure = Figure(figsize=(min(6.0 + 0.03 * steps, 12.0), min(1.9 + 0.17 * blocks, 14.0)), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     axes.imshow(

@@ -123,7 +123,6 @@ def _plans(artifact: Artifact, course: Course | None) -> Section:
                 pictures.plan_picture(plan, kinds, f"plan {name!r}"),
                 alt=f"Plan {name!r}, steps across and blocks down. {pictures.caption_of(plan)}",
                 caption=f"Plan {name!r} of one call: steps across, blocks down. {pictures.caption_of(plan)}",
-                wide=True,
             )
         )
     if course is not None:
@@ -134,7 +133,6 @@ def _plans(artifact: Artifact, course: Course | None) -> Section:
                     pictures.plan_picture(last, kinds, f"executed in call {calls - 1}"),
                     alt=f"The plan of the episode's last call. {pictures.caption_of(last)}",
                     caption=f"What the last of {calls} calls of the episode executed. {pictures.caption_of(last)}",
-                    wide=True,
                 )
             )
         drawn.append(
@@ -142,7 +140,6 @@ def _plans(artifact: Artifact, course: Course | None) -> Section:
                 pictures.shares_picture(course),
                 alt="A heat map a source: the share of calls in which a cell had this source.",
                 caption=f"Mean over {calls} calls of the episode {course.name}, a map for each source.",
-                wide=True,
             )
         )
     text = [
@@ -159,14 +156,14 @@ def _plans(artifact: Artifact, course: Course | None) -> Section:
 def _episode(course: Course) -> Section:
     low, high = float(course.sparsity.min()), float(course.sparsity.max())
     replaced = sum(course.legalised)
-    text = (
-        f"{len(course.plans)} consecutive calls of {course.name} with the default plan: between {share(low)} and"
-        f" {share(high)} of the cells were reused, {share(float(course.sparsity.mean()))} on average."
-        + (
-            f" {replaced} cells were replaced because what they read was not computed yet."
-            if replaced
-            else " Every read found what it was to read."
-        )
+    mean = share(float(course.sparsity.mean()))
+    reused = f"{mean} of the cells were reused in each."
+    if high > low:
+        reused = f"between {share(low)} and {share(high)} of the cells were reused, {mean} on average."
+    text = f"{len(course.plans)} consecutive calls of {course.name} with the default plan: {reused}" + (
+        f" {replaced} cells were replaced because what they read was not computed yet."
+        if replaced
+        else " Every read found what it was to read."
     )
     drawn = Picture(
         pictures.sparsity_picture(course),
@@ -218,7 +215,6 @@ def _frontier(artifact: Artifact, latencies: Sequence[Latency], compared: Compar
         pictures.frontier_picture(points, efficient(points), yardsticks, f"artifact {manifest.short_identity}"),
         alt="Points: action error against latency of each plan. The table has the figures.",
         caption="Action error against latency: down and left is better.",
-        wide=True,
     )
     best = efficient(points)
     rows = tuple((p.series, p.name, f"{p.error:.4g}", ms(p.latency_ms), "yes" if p in best else "") for p in points)
@@ -241,4 +237,4 @@ def _calibration(record: Mapping[str, Any] | None) -> Section:
         )
     tables = (facts.score_table(record), facts.record_table(record)) if scores else (facts.record_table(record),)
     text = "Errors on episodes that nothing was learned from, against the dense policy with the same noise."
-    return Section("Calibration", (text,) if scores else (), tables, drawn)
+    return Section("Calibration", (*((text,) if scores else ()), *facts.left_out(record)), tables, drawn)

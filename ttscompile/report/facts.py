@@ -13,7 +13,7 @@ from ..ir.flops import graph_flops
 from ..ir.graph import TensorType
 from ..ir.program import Binding
 from ..runtimes.liveness import rollout_needs
-from ..units import flops, share
+from ..units import flops, plain, share
 from .page import Section, Table
 
 _NOT_TOLD = ("plans", "precision", "sparsity", "flops_sparsity", "skipped")
@@ -164,10 +164,13 @@ def score_table(record: Mapping[str, Any]) -> Table:
         )
         for name, score in _scores(record).items()
     ]
-    for name, reason in _mapping(record.get("skipped")).items():
-        rows.append((f"{name}: none, {reason}", "", "", "", ""))
     head = ("plan", "mean action error", "90th percentile", "cells reused", "FLOPs saved")
     return Table(head, tuple(rows))
+
+
+def left_out(record: Mapping[str, Any]) -> tuple[str, ...]:
+    """Why there is no plan of a name that calibration could have made."""
+    return tuple(f"Plan {name!r}: none, {reason}." for name, reason in _mapping(record.get("skipped")).items())
 
 
 def record_table(record: Mapping[str, Any]) -> Table:
@@ -176,7 +179,7 @@ def record_table(record: Mapping[str, Any]) -> Table:
     for name, value in record.items():
         if name in _NOT_TOLD:
             continue
-        text = f"{value:.4g}" if isinstance(value, float) else str(value)
+        text = plain(value)
         rows.append((name.replace("_", " "), text if len(text) <= _LONG else f"{text[:_LONG]}…"))
     return Table(("", ""), tuple(rows), prose=True)
 

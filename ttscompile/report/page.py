@@ -12,11 +12,17 @@ from ..errors import RuntimeUnavailableError
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of text; the first column is text, the others are figures unless ``prose``."""
+    """Rows of text. A column of figures is set to the right, one with any words to the left; ``prose`` may wrap."""
 
     head: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     prose: bool = False
+
+    @property
+    def text(self) -> tuple[bool, ...]:
+        """Which columns hold words."""
+        columns = [[row[i] for row in self.rows if row[i]] for i in range(len(self.head))]
+        return tuple(i == 0 or self.prose or any(not c[0].isdigit() for c in cells) for i, cells in enumerate(columns))
 
 
 @dataclass(frozen=True)
@@ -27,13 +33,11 @@ class Picture:
         png: the file.
         alt: what it shows, for who cannot see it.
         caption: under it.
-        wide: it is scrolled on a narrow screen rather than made too small to read.
     """
 
     png: bytes
     alt: str
     caption: str
-    wide: bool = False
 
     @property
     def data(self) -> str:

@@ -1,4 +1,7 @@
-"""Pictures of a report as PNG: on white, whatever the page is on, so that their colours mean the same everywhere."""
+"""Pictures of a report as PNG: on white, whatever the page is on, so that their colours mean the same everywhere.
+
+They are narrow, so that their text can be read where a phone makes them narrower still.
+"""
 
 from __future__ import annotations
 
@@ -59,7 +62,7 @@ def shares_picture(course: Course) -> bytes:
     shares = course.shares()
     used = [source for source in Source if shares[source].any()]
     steps, blocks = shares.shape[1:]
-    figure.set_size_inches(min(6.5 + 0.06 * steps, 14.0), len(used) * min(1.0 + 0.09 * blocks, 6.0) + 0.6)
+    figure.set_size_inches(min(6.0 + 0.03 * steps, 12.0), len(used) * min(1.0 + 0.09 * blocks, 6.0) + 0.6)
     panels = figure.subplots(len(used), 1, sharex=True, squeeze=False)[:, 0]
     for axes, source in zip(panels, used, strict=True):
         drawn = axes.imshow(shares[source].T, cmap="cividis", vmin=0, vmax=1, aspect="auto", interpolation="none")
@@ -76,7 +79,7 @@ def sparsity_picture(course: Course) -> bytes:
     from matplotlib.ticker import MaxNLocator
 
     figure = _figure()
-    figure.set_size_inches(8.0, 3.6)
+    figure.set_size_inches(6.0, 3.2)
     axes = figure.add_subplot()
     calls = np.arange(len(course.sparsity))
     axes.plot(calls, 100 * course.sparsity, color=COLOURS[Source.COMPUTE], marker="o", markersize=3, linewidth=1.2)
@@ -96,7 +99,7 @@ def sparsity_picture(course: Course) -> bytes:
 def latency_picture(latencies: Sequence[Latency]) -> bytes:
     """A bar a plan, cut into what its calls spend their time on; a bar that would dwarf the others is cut off."""
     figure = _figure()
-    figure.set_size_inches(8.0, 1.5 + 0.45 * len(latencies))
+    figure.set_size_inches(6.0, 1.5 + 0.45 * len(latencies))
     axes = figure.add_subplot()
     rows = np.arange(len(latencies))[::-1]
     left = np.zeros(len(latencies))
@@ -132,7 +135,7 @@ def plans_picture(scores: Mapping[str, Mapping[str, Any]]) -> bytes:
     from matplotlib.ticker import LogFormatter
 
     figure = _figure()
-    figure.set_size_inches(8.0, 4.2)
+    figure.set_size_inches(6.0, 4.0)
     axes = figure.add_subplot()
     for name, score in scores.items():
         x, middle, high = 100 * (1 - score["sparsity"]), score["error"], score["error_p90"]

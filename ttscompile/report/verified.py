@@ -18,7 +18,8 @@ def refused(reason: str) -> Section:
 def verified(found: Verification) -> Section:
     """A row a rung, what to do about the first that failed, and where residuals differ."""
     rows = tuple(
-        (rung.name, rung.status, _number(rung.figure), _number(rung.tolerance), _told(rung)) for rung in found.rungs
+        (rung.name, rung.status, _number(rung.figure), _number(rung.tolerance), rung.unit, _told(rung))
+        for rung in found.rungs
     )
     failure = found.first_failure
     text = (
@@ -27,7 +28,10 @@ def verified(found: Verification) -> Section:
         else f"FAILED at {failure.name}. {failure.remedy} What fails above it may only follow from it."
     )
     return Section(
-        "Verification", (text,), (Table(("rung", "verdict", "error", "allowed", "found"), rows),), _map(found)
+        "Verification",
+        (text,),
+        (Table(("rung", "verdict", "error", "allowed", "of what", "found"), rows),),
+        _map(found),
     )
 
 
@@ -42,15 +46,14 @@ def _map(found: Verification) -> tuple[Picture, ...]:
         )
     )
     caption = "Relative error of every block's residual at the steps that were looked at: steps across, blocks down."
-    return (Picture(png, alt=caption, caption=caption, wide=True),)
+    return (Picture(png, alt=caption, caption=caption),)
 
 
 def _told(rung: Rung) -> str:
     place = [f"step {rung.step}"] if rung.step is not None else []
     if rung.blocks:
         place.append("blocks " + ", ".join(map(str, rung.blocks[:8])) + ("…" if len(rung.blocks) > 8 else ""))
-    unit = f" Errors are {rung.unit}." if rung.unit else ""
-    return f"{rung.told}.{unit}" + (f" First at {', '.join(place)}." if place else "")
+    return f"{rung.told}." + (f" First at {', '.join(place)}." if place else "")
 
 
 def _number(figure: float | None) -> str:
