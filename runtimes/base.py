@@ -139,7 +139,7 @@ def open_runtime(artifact: Artifact, runtime: str = "onnxruntime", threads: int 
             return OnnxRuntime(artifact, threads)
     if runtime == "reference":
         try:
-            from .reference_runtime import ReferenceRuntime
+            from .reference.runtime import ReferenceRuntime
         except ModuleNotFoundError as error:
             raise RuntimeUnavailableError(
                 f"runtime 'reference' needs torch, and {error.name!r} is not installed. Install 'ttscompile[compile]',"

@@ -27,7 +27,7 @@ from .ir.graph import Graph, TensorType, backward_slice
 from .ir.program import Block, Program
 from .ir.rows import Rows
 from .runtimes.base import pruner_plan, settle_plan
-from .runtimes.reference import ReferenceModel
+from .runtimes.reference.model import ReferenceModel
 
 STREAMS = 2
 """Streams of the call, so that what mixes streams up shows; one where that would take long or much room."""

@@ -20,7 +20,7 @@ from ttscompile.errors import ArtifactError, IllegalPlanError
 from ttscompile.lattice import dense_plan, uniform_plan
 from ttscompile.runtimes import Runtime, open_runtime
 from ttscompile.runtimes.onnxruntime_cpu import OnnxRuntime
-from ttscompile.runtimes.reference import ReferenceModel
+from ttscompile.runtimes.reference.model import ReferenceModel
 from ttscompile.runtimes.workspace import Workspace
 
 from .agreement import random_inputs

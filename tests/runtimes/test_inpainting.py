@@ -24,7 +24,7 @@ from ttscompile.lattice import dense_plan, uniform_plan
 from ttscompile.lower.program import lower_program
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.inpainting import MaskedUpdates, known_samples, noise_levels, prefix_refusal
-from ttscompile.runtimes.reference_runtime import ReferenceRuntime
+from ttscompile.runtimes.reference.runtime import ReferenceRuntime
 from ttscompile.samplers.flow import flow_matching_table
 from ttscompile.samplers.multistep import set_timesteps
 from ttscompile.samplers.table import sampler_table

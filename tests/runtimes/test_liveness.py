@@ -15,7 +15,7 @@ from ttscompile.lattice import uniform_plan
 from ttscompile.runtimes.liveness import readable_rollout, rollout_needs
 from ttscompile.runtimes.onnxruntime_cpu import OnnxRuntime
 from ttscompile.runtimes.policy import load
-from ttscompile.runtimes.reference_runtime import ReferenceRuntime
+from ttscompile.runtimes.reference.runtime import ReferenceRuntime
 
 from .agreement import random_inputs
 from .conftest import MakeArtifact

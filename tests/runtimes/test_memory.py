@@ -21,7 +21,7 @@ from ttscompile.correction import correction_flops
 from ttscompile.ir.program import Program
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy
-from ttscompile.runtimes.reference import ReferenceModel, noise_tensors
+from ttscompile.runtimes.reference.model import ReferenceModel, noise_tensors
 from ttscompile.samplers.table import sampler_table
 from ttscompile.update import update_flops
 

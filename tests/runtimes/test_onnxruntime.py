@@ -14,7 +14,7 @@ from ttscompile.artifact import Artifact
 from ttscompile.errors import ArtifactError, IllegalPlanError, ObservationError, RuntimeUnavailableError
 from ttscompile.lattice import dense_plan, legalize, uniform_plan
 from ttscompile.runtimes import Runtime, open_runtime
-from ttscompile.runtimes.reference_runtime import ReferenceRuntime
+from ttscompile.runtimes.reference.runtime import ReferenceRuntime
 from ttscompile.runtimes.workspace import Workspace
 
 from .agreement import largest_difference, random_inputs

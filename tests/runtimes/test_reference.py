@@ -13,7 +13,7 @@ from ttscompile.artifact import Artifact
 from ttscompile.errors import IllegalPlanError, PassError
 from ttscompile.ir.program import Program
 from ttscompile.lattice import PlanArray
-from ttscompile.runtimes.reference import Contexts, ReferenceModel, RolloutCache
+from ttscompile.runtimes.reference.model import Contexts, ReferenceModel, RolloutCache
 
 from .literal import Episode
 from .plans import random_plan

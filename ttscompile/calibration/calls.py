@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..config import PolicySpec
 from ..ir.graph import Graph
-from ..runtimes.reference import Contexts, ReferenceModel
+from ..runtimes.reference.model import Contexts, ReferenceModel
 from ..trajectories.episodes import Episode
 
 IntArray = npt.NDArray[np.int64]

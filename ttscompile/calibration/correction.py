@@ -16,8 +16,8 @@ from torch import Tensor
 
 from ..correction import Correction, groups_of
 from ..lattice import BoolArray, PlanArray, Source
-from ..runtimes.reference_correction import correct, features, remember
-from ..runtimes.reference_sampler import Carried
+from ..runtimes.reference.correction import correct, features, remember
+from ..runtimes.reference.sampler import Carried
 from .calls import Calls
 from .execute import Executor
 from .workers import workers

@@ -21,8 +21,8 @@ from ..artifact.load import Artifact
 from ..correction import Correction
 from ..errors import IllegalPlanError
 from ..lattice import BoolArray, PlanArray, Source
-from ..runtimes.reference import ReferenceModel
-from ..runtimes.reference_sampler import Carried
+from ..runtimes.reference.model import ReferenceModel
+from ..runtimes.reference.sampler import Carried
 from .calls import Calls, Selector
 
 

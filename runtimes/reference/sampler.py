@@ -9,9 +9,9 @@ from torch import Tensor
 
 from ttscompile.config import SamplerTable
 from ttscompile.correction import Correction
+from ttscompile.runtimes.inpainting import Known
 
-from .inpainting import Known
-from .reference_correction import correct, empty_history, remember
+from .correction import correct, empty_history, remember
 
 
 class Carried(NamedTuple):

@@ -1,6 +1,6 @@
 """The reference: what reuse means, executed literally with torch, one block after the other, differentiable.
 
-``docs/design.md`` section 2 in code; what one cell does is in ``reference_reuse``. Every other runtime is tested
+``docs/design.md`` section 2 in code; what one cell does is in ``reuse``. Every other runtime is tested
 against this one, and calibration trains through it.
 """
 
@@ -23,11 +23,11 @@ from ttscompile.ir.evaluate import Evaluator
 from ttscompile.ir.graph import Graph, TensorType
 from ttscompile.ir.program import Binding, Pieces, Program
 from ttscompile.lattice import PlanArray, Source, check_plan, require_legal
+from ttscompile.runtimes.criterion import Criterion
+from ttscompile.runtimes.inpainting import Known
 
-from .criterion import Criterion
-from .inpainting import Known
-from .reference_reuse import Caches, Cell, RolloutCache, reuse, stream_axis
-from .reference_sampler import Carried, advance, begin, hold
+from .reuse import Caches, Cell, RolloutCache, reuse, stream_axis
+from .sampler import Carried, advance, begin, hold
 
 
 @dataclass(frozen=True)
@@ -201,7 +201,7 @@ class ReferenceModel:
     def advance(
         self, carried: Carried, prediction: Tensor, noise: Tensor | None, k: int, correction: Correction | None = None
     ) -> Carried:
-        """The sampler: what is carried to step k + 1 (see ``reference_sampler``)."""
+        """The sampler: what is carried to step k + 1 (see ``sampler``)."""
         return advance(self._sampler, carried, prediction, noise, k, correction)
 
     def empty_cache(self, streams: int) -> RolloutCache:

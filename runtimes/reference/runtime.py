@@ -13,8 +13,7 @@ import torch
 from ttscompile.artifact.manifest import PRUNER
 from ttscompile.config import FloatArray, Noise
 from ttscompile.correction import Correction
-
-from .base import (
+from ttscompile.runtimes.base import (
     GIVEN,
     CallReport,
     Timings,
@@ -27,9 +26,10 @@ from .base import (
     pruner_plan,
     settle_plan,
 )
-from .inpainting import known_samples
-from .reference import ReferenceModel, noise_tensors
-from .reference_reuse import RolloutCache
+from ttscompile.runtimes.inpainting import known_samples
+
+from .model import ReferenceModel, noise_tensors
+from .reuse import RolloutCache
 
 if TYPE_CHECKING:
     from ttscompile.artifact.load import Artifact
