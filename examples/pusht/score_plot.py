@@ -14,6 +14,8 @@ from rollout import seeded_noise
 from variants import Variant
 
 WARM_UP = 2
+MARKERS = "osD^vP*"
+"""Of the variants, from fast to slow; their number and that of the colours have no common divisor."""
 
 
 @dataclass(frozen=True)
@@ -66,32 +68,24 @@ def plot_scores(
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogFormatter
 
-    figure = Figure(figsize=(8.0, 5.0), layout="constrained")
+    figure = Figure(figsize=(9.0, 4.6), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     axes.axhspan(scores[0].low, scores[0].high, color="#dddddd", zorder=0, label=f"{names[0]}, 95 % interval")
     axes.axhline(scores[0].mean, color="#888888", linewidth=1, zorder=0)
-    middle = (min(one.median for one in timed) * max(one.median for one in timed)) ** 0.5
-    for name, score, time in zip(names, scores, timed, strict=True):
+    shown = sorted(zip(timed, scores, names, strict=True), key=lambda one: one[0].median)
+    for number, (time, score, name) in enumerate(shown):  # names beside the points would lie on each other
         errors = [[score.mean - score.low], [score.high - score.mean]]
-        axes.errorbar([time.median], [score.mean], yerr=errors, fmt="o", capsize=3, markersize=5)
-        left = time.median > middle  # so that no name leaves the picture
-        axes.annotate(
-            name,
-            (time.median, score.mean),
-            xytext=(-6 if left else 6, 5),
-            textcoords="offset points",
-            ha="right" if left else "left",
-            fontsize=8,
-        )
+        told = f"{name}: {score.mean:.3f}, {time.median:.3g} ms"
+        axes.errorbar([time.median], [score.mean], yerr=errors, fmt=MARKERS[number % len(MARKERS)], capsize=3, label=told)
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter(LogFormatter())
     axes.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
     axes.set_xlabel("latency of a call, ms (median)")
     axes.set_ylabel("score, mean and 95 % interval")
-    axes.margins(x=0.15)
+    axes.margins(x=0.08)
     axes.grid(which="both", color="#eeeeee", linewidth=0.5)
     axes.set_axisbelow(True)
     axes.set_title("\n".join(fill(line, 110) for line in title.splitlines()), fontsize=8, loc="left")
-    axes.legend(loc="lower right", fontsize=8, frameon=False)
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
     figure.savefig(path, dpi=150, metadata={"Software": None} if path.suffix == ".png" else None)

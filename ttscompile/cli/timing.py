@@ -192,7 +192,7 @@ def _eager(checkpoint: Path, threads: int, manifest: Manifest, as_saved: bool) -
     sampler, dense = original.sampler, manifest.flops.dense
     # An encoder runs once a call, whatever the sampler: what it takes is not known apart.
     flops = None if isinstance(module, EncodedDenoiser) else dense / manifest.steps * sampler.steps
-    label = f"original, {sampler.name} {sampler.steps}, eager PyTorch"
+    label = f"original, {sampler.name} {sampler.steps}"
     return network_contestant(label, eager_policy(module, original), original, flops)
 
 
