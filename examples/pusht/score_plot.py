@@ -77,7 +77,8 @@ def plot_scores(
     for number, (time, score, name) in enumerate(shown):  # names beside the points would lie on each other
         errors = [[score.mean - score.low], [score.high - score.mean]]
         told = f"{name}: {score.mean:.3f}, {time.median:.3g} ms"
-        axes.errorbar([time.median], [score.mean], yerr=errors, fmt=MARKERS[number % len(MARKERS)], capsize=3, label=told)
+        marker = MARKERS[number % len(MARKERS)]
+        axes.errorbar([time.median], [score.mean], yerr=errors, fmt=marker, capsize=3, label=told)
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter(LogFormatter())
     axes.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))

@@ -37,7 +37,13 @@ def _rivals(_: click.Context, __: click.Parameter, value: str) -> tuple[str, ...
 @click.option("--threads", type=click.IntRange(min=1), default=1, show_default=True, help="Of each contestant.")
 @click.option("--runs", type=click.IntRange(min=1), default=20, show_default=True, help="Counted calls of each.")
 @click.option("--plan", help="Of the compiled policy; the artifact's default plan if not given.")
-@click.option("--against", default="onnxruntime-dense", show_default=True, callback=_rivals, help=f"{', '.join(RIVALS)}; the first two are eager PyTorch.")
+@click.option(
+    "--against",
+    default="onnxruntime-dense",
+    show_default=True,
+    callback=_rivals,
+    help=f"{', '.join(RIVALS)}; the first two are eager PyTorch.",
+)
 @click.option("--checkpoint", type=click.Path(path_type=Path), help="For 'original' and 'eager'.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Of observations and noise.")
 @json_option
