@@ -36,10 +36,10 @@ def test_the_ceiling_is_a_dense_call_over_one_that_computes_step_0_alone(flops: 
     assert no_overhead.ceiling(10) == 10  # at most K
 
 
-def test_four_steps_are_left_if_nobody_asks_for_fewer() -> None:
-    assert [usual_sparsity(steps) for steps in (400, 100, 80)] == [0.95] * 3
-    assert [round(steps * (1 - usual_sparsity(steps))) for steps in (50, 16, 10, 8)] == [4] * 4
-    assert [round(steps * (1 - usual_sparsity(steps))) for steps in (7, 4, 2)] == [3, 2, 1]
+def test_five_steps_are_left_if_nobody_asks_for_fewer() -> None:
+    assert [usual_sparsity(steps) for steps in (400, 100)] == [0.95] * 2
+    assert [round(steps * (1 - usual_sparsity(steps))) for steps in (80, 50, 16, 10)] == [5] * 4
+    assert [round(steps * (1 - usual_sparsity(steps))) for steps in (8, 7, 4, 2)] == [4, 3, 2, 1]
 
 
 def test_few_steps_are_warned_about(written: Path, flops: FlopsRecord) -> None:

@@ -7,9 +7,9 @@ from .manifest import Manifest
 TYPICAL_SPARSITY = 0.95
 """What the method's authors aim at, with 100 steps."""
 
-FEWEST_STEPS = 4
-"""Whole steps that are computed, if nobody asks for fewer. Push-T with the 16 steps of DPM-Solver++: four of them leave
-actions 0.6 px from all of them, three 2.0."""
+FEWEST_STEPS = 5
+"""Whole steps that are computed, if nobody asks for fewer. Push-T with the 16 steps of DPM-Solver++: five leave the
+score and nearly the success of all of them, four the score, three neither."""
 
 SOLVER_STEPS = 16
 """Of DPM-Solver++, as suggested in place of many steps."""
@@ -43,7 +43,7 @@ def few_steps(manifest: Manifest) -> str | None:
 def many_steps(manifest: Manifest) -> str | None:
     """A hint where a solver of higher order takes fewer steps for as good actions; None where there is none.
 
-    On Push-T four of the 16 steps of DPM-Solver++ are both faster and better than five of the 100 of DDPM.
+    On Push-T five of the 16 steps of DPM-Solver++ are a little faster than five of the 100 of DDPM, and score more.
 
     Args:
         manifest: of the artifact.

@@ -82,7 +82,7 @@ def calibrate(
     Args:
         path: the artifact's directory.
         trajectories: recordings: ``.npz``, zarr, HDF5 or LeRobot data sets, see ``ttscompile.trajectories``.
-        target_sparsity: share of the cells to reuse; if no budget is given, 0.95, or what leaves four whole steps.
+        target_sparsity: share of the cells to reuse; if no budget is given, 0.95, or what leaves five whole steps.
         strategy: how the plan is found, see ``ttscompile.calibration.strategies``.
         seed: of the split, the noise and the search.
         resume: go on where a calibration with the same arguments was interrupted; begins anew if none was.

@@ -33,7 +33,7 @@ STRATEGIES = (
 @click.option(
     "--target-sparsity",
     type=float,
-    help="Share of the cells to reuse; 0.95 if no budget is given, or what leaves four steps.",
+    help="Share of the cells to reuse; 0.95 if no budget is given, or what leaves five steps.",
 )
 @click.option(
     "--target-flops",
