@@ -14,7 +14,7 @@ from tests.hostile.guard import Violation
 from tests.hostile.targets import Accepted, outcome
 
 ROOT = Path(__file__).resolve().parents[2]
-CASES = 500
+CASES = 250
 
 
 def test_nothing_but_errors_of_its_own(tmp_path: Path) -> None:
