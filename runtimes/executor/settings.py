@@ -77,8 +77,7 @@ class ExecutorSettings:
             (experimental), for policies that take ``prefix``, the actions that are committed already, and inpaint.
         blend_steps: control ticks.
         max_hold: control ticks for which the last action is repeated when there is no other, not even in reserve; then
-            ``action`` raises.
-            Right for positions; for velocities and differences set 0.
+            ``action`` raises. Right for positions; for velocities and differences set 0.
         margin_ticks: control ticks that a chunk shall be there before it is needed.
         warm_up: first calls of each plan whose latency does not count.
         measured_calls: calls of each plan, after these, that measure its latency before the executor is ready.

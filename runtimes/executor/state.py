@@ -323,11 +323,13 @@ class ExecutorState:
             return "overdue"
         played = [action for _, action in list(self._played)[-3:]]
         past = np.stack(played) if played else np.empty((0, resolved.channels), np.float32)
-        regular = spliced.without_reserve()
-        self._refusal = self._guard.refuse_motion(past, regular.rows)
-        if self._refusal is not None:
-            return "refused"
-        self._timeline = spliced if self._guard.refuse_motion(past, spliced.rows) is None else regular
+        refusal = self._guard.refuse_motion(past, spliced.rows)
+        if refusal is not None:  # without its reserve it may do, if anything is left then
+            spliced = spliced.without_reserve()
+            self._refusal = self._guard.refuse_motion(past, spliced.rows) if len(spliced.rows) else refusal
+            if self._refusal is not None:
+                return "refused"
+        self._timeline = spliced
         return "scheduled"
 
     def _runs_out(self, now: float) -> float | None:

@@ -117,6 +117,20 @@ def test_no_reserve_is_kept_that_the_guard_refuses(bad: str) -> None:
     assert (counted.chunks_refused, counted.reserve) == (0, 0)
 
 
+def test_a_reserve_in_hand_is_not_given_up_for_a_late_chunk_that_the_guard_refuses() -> None:
+    """Nothing of the second chunk is left but its reserve, which jumps; the first one's is played to its end."""
+    policy = ScriptedPolicy(FakeClock(), {"dense": 0.3}, fault={1: 0.85}, reserve=7)
+    policy.actions = lambda obs: np.full((16, 3), 0.0 if obs[-1, 1] < 0.3 else 5.0)
+    with World(policy=policy, settings=ExecutorSettings(max_hold=0, guard=GuardLimits(max_step=1.0))) as world:
+        world.begin()
+        made, error = run_until_starved(world)
+        counted = world.executor.statistics()
+    assert not np.any(made)
+    assert counted.reserve == 7
+    assert counted.chunks_refused >= 1
+    assert "exceeds the limit" in str(error)
+
+
 def test_a_hold_of_nothing_raises_at_once() -> None:
     with World(fault={1: 1.0}, settings=ExecutorSettings(max_hold=0)) as world:
         world.begin()
