@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import random
 import shutil
 import struct
@@ -18,7 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as parquet
 from PIL import Image
 
-from tests.hostile.mutate import changed, damaged
+from tests.hostile.mutate import changed, damaged, make_no_file
 
 FEATURES = {
     "state": {"dtype": "float32", "shape": [5], "names": None},
@@ -76,12 +75,8 @@ def write_bad(rng: random.Random, corpus: Path, folder: Path) -> Path:
 def _replace(rng: random.Random, victim: Path) -> None:
     kind = rng.randrange(6)
     victim.unlink()
-    if kind == 0:
-        victim.symlink_to(rng.choice(("/etc/passwd", "/dev/zero", "/dev/stdin", ".", victim.name)))
-    elif kind == 1:
-        victim.mkdir()
-    elif kind == 2:
-        os.mkfifo(victim)
+    if kind < 3:
+        make_no_file(rng, victim, kind)
     elif kind == 3:
         victim.write_bytes(rng.choice((b"PAR1", b"PAR1" * 3, b"PARE" * 9, b"ARROW1\0\0", b"", b"\xff" * 64)))
     elif kind == 4:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+import os
 import random
+from pathlib import Path
 from typing import Any
 
 INTERESTING = (
@@ -162,6 +164,16 @@ def _change(rng: random.Random, container: Any, key: Any, places: list[tuple[Any
         container[key] = rng.choice((rng.choice(TEXTS), rng.choice(similar or [""]), value + "x", value.upper()))
     else:
         container[key] = anything(rng)
+
+
+def make_no_file(rng: random.Random, path: Path, kind: int) -> None:
+    """Make a link (0), a directory (1) or a pipe (2) where a file is expected."""
+    if kind == 0:
+        path.symlink_to(rng.choice(("/etc/passwd", "/dev/zero", "/dev/stdin", ".", path.name)))
+    elif kind == 1:
+        path.mkdir()
+    else:
+        os.mkfifo(path)
 
 
 def _holds(container: Any, key: Any) -> bool:

@@ -6,7 +6,6 @@ import bz2
 import gzip
 import json
 import lzma
-import os
 import pickle
 import random
 import shutil
@@ -17,7 +16,7 @@ from typing import Any
 import numcodecs
 
 from tests.hostile.archives import write, write_hostile
-from tests.hostile.mutate import changed, damaged
+from tests.hostile.mutate import changed, damaged, make_no_file
 from tests.hostile.pickles import Runs
 
 SIZES = (0, 1, 2, 4, 9, -1, 2**15, 2**24, 2**31, 2**40, 2**62, 2**63 - 1, 2**63, 2**64, 10**30, 1.5, True, None, "9")
@@ -155,12 +154,8 @@ def _change(rng: random.Random, path: Path, files: list[Path]) -> None:
 def _replace(rng: random.Random, victim: Path) -> None:
     kind = rng.randrange(8)
     victim.unlink()
-    if kind == 0:
-        victim.symlink_to(rng.choice(("/etc/passwd", "/dev/zero", "/dev/stdin", ".", victim.name)))
-    elif kind == 1:
-        victim.mkdir()
-    elif kind == 2:
-        os.mkfifo(victim)
+    if kind < 3:
+        make_no_file(rng, victim, kind)
     elif kind == 3:
         victim.write_bytes(pickle.dumps(Runs()))
     elif kind == 4:
