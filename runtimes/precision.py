@@ -63,8 +63,8 @@ def needs_care(precision: str) -> bool:
 def measure_precision(artifact: Artifact) -> PrecisionError:
     """Dense calls in the artifact's precision against dense calls in fp32, on random observations, with equal noise.
 
-    Observations are as ``ObservationSpec.draw`` makes them. Figures are rounded
-    to four digits, so that they rarely depend on the processor.
+    Observations are as ``ObservationSpec.draw`` makes them. Figures are rounded to four digits, so that they rarely
+    depend on the processor.
     """
     spec = artifact.manifest.spec
     calls = [(normalized(spec, obs), noise) for obs, noise in random_calls(spec, CALLS, SEED)]

@@ -43,7 +43,8 @@ def few_steps(manifest: Manifest) -> str | None:
 def many_steps(manifest: Manifest) -> str | None:
     """A hint where a solver of higher order takes fewer steps for as good actions; None where there is none.
 
-    On Push-T five of the 16 steps of DPM-Solver++ are a little faster than five of the 100 of DDPM, and score more.
+    On Push-T five of the 16 steps of DPM-Solver++ are a little faster than five of the 100 of DDPM, and score no less
+    (`docs/decisions.md`).
 
     Args:
         manifest: of the artifact.

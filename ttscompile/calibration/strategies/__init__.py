@@ -25,7 +25,7 @@ from __future__ import annotations
 
 from ...errors import CalibrationError
 from ...lattice import Source
-from ..strategies import dbcache, deepcache, delta_dit, gates, teacache
+from . import dbcache, deepcache, delta_dit, gates, teacache
 from .bac import bac
 from .base import Found, Strategy, Task
 from .evo import Evo
