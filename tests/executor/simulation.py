@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ttscompile import ChunkSpec, ObservationSpec
+from ttscompile.errors import DeadlineMissedError
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
 
 REAL_LIMIT = 20.0
@@ -230,6 +231,18 @@ class World:
         self.observe()
         self.executor.action(timeout=10.0)
         self.clock.advance(1 / self.hz)
+
+    def run_until_starved(self, ticks: int = 100) -> tuple[list[np.ndarray], DeadlineMissedError]:
+        """Tick until there is no action; the actions before that, and the error."""
+        made: list[np.ndarray] = []
+        for _ in range(ticks):
+            self.observe()
+            try:
+                made.append(self.executor.action())
+            except DeadlineMissedError as error:
+                return made, error
+            self.clock.advance(1 / self.hz)
+        raise AssertionError("never starved")
 
     def __enter__(self) -> World:
         return self

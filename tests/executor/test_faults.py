@@ -25,19 +25,6 @@ from .simulation import REAL_LIMIT, TA, FakeClock, ScriptedPolicy, World, worker
 KNOWINGLY_SLOW = ExecutorSettings(refuse_infeasible=False, max_hold=2)
 
 
-def run_until_starved(world: World, ticks: int = 100) -> tuple[list[np.ndarray], DeadlineMissedError]:
-    """Tick until there is no action; the actions before that, and the error."""
-    made: list[np.ndarray] = []
-    for _ in range(ticks):
-        world.observe()
-        try:
-            made.append(world.executor.action())
-        except DeadlineMissedError as error:
-            return made, error
-        world.clock.advance(1 / world.hz)
-    raise AssertionError("never starved")
-
-
 def test_inference_slower_than_the_horizon_holds_and_then_raises_and_says_why() -> None:
     with World(latency={"dense": 1.5}, settings=KNOWINGLY_SLOW) as world:
         for _ in range(2):
@@ -60,7 +47,7 @@ def test_inference_slower_than_the_horizon_holds_and_then_raises_and_says_why() 
 def test_a_gap_holds_the_last_action_for_a_bounded_number_of_ticks() -> None:
     with World(latency={"dense": 0.1}, fault={1: 1.0}, settings=ExecutorSettings(max_hold=3)) as world:
         world.begin()
-        made, error = run_until_starved(world)
+        made, error = world.run_until_starved()
         counted = world.executor.statistics()
         assert "the last one was held for 3 ticks" in str(error)
         assert not isinstance(error, StaleObservationError)
@@ -74,67 +61,10 @@ def test_a_gap_holds_the_last_action_for_a_bounded_number_of_ticks() -> None:
         assert world.executor.statistics().deadlines_missed == 1
 
 
-def test_a_late_chunk_is_bridged_by_what_the_last_one_predicted_beyond_its_horizon() -> None:
-    policy = ScriptedPolicy(FakeClock(), fault={1: 1.0}, reserve=4)
-    with World(policy=policy, settings=ExecutorSettings(max_hold=2)) as world:
-        world.begin()
-        made, error = run_until_starved(world)
-        counted = world.executor.statistics()
-        assert "the last one was held for 2 ticks" in str(error)
-        assert [action[2] for action in made[-6:]] == [TA, TA + 1, TA + 2, TA + 3, TA + 3, TA + 3]
-        assert (counted.reserve, counted.holds, counted.starved, counted.deadlines_missed) == (4, 2, 1, 1)
-        assert counted.queue_depth is not None
-        assert counted.queue_depth.min == 0
-
-
-def test_a_chunk_that_comes_after_its_horizon_is_played_from_its_reserve() -> None:
-    """Newer than what is left of the chunk before, and better than to hold; the deadline was missed all the same."""
-    policy = ScriptedPolicy(FakeClock(), {"dense": 0.1, "fast": 0.05}, fault={1: 0.95}, reserve=7)
-    settings = ExecutorSettings(tiers=("dense", "fast"), max_hold=0)
-    with World(policy=policy, settings=settings) as world:
-        world.begin()
-        ticks = [world.tick() for _ in range(40)]
-        counted = world.executor.statistics()
-    assert max(action[2] for action in ticks) >= TA
-    for number, action in enumerate(ticks):
-        assert action[1] + action[2] / 10 == pytest.approx(ticks[0][1] + ticks[0][2] / 10 + number / 10)
-    assert (counted.holds, counted.starved, counted.chunks_overdue) == (0, 0, 0)
-    assert counted.deadlines_missed == 1
-    assert counted.switches_down == 1
-
-
-@pytest.mark.parametrize("bad", ["bounds", "step"])
-def test_no_reserve_is_kept_that_the_guard_refuses(bad: str) -> None:
-    """What is executed is fine, so it is executed; what comes after it is not there to be played."""
-    policy = ScriptedPolicy(FakeClock(), fault={1: 1.0}, reserve=4)
-    policy.actions = lambda obs: np.where(np.arange(16)[:, None] < 1 + TA + 2, 0.0, np.full((16, 3), 5.0))
-    limits = GuardLimits(high=1.0, low=-1.0) if bad == "bounds" else GuardLimits(max_step=1.0)
-    with World(policy=policy, settings=ExecutorSettings(max_hold=0, guard=limits)) as world:
-        world.begin()
-        made, _ = run_until_starved(world)
-        counted = world.executor.statistics()
-    assert not np.any(made)
-    assert (counted.chunks_refused, counted.reserve) == (0, 0)
-
-
-def test_a_reserve_in_hand_is_not_given_up_for_a_late_chunk_that_the_guard_refuses() -> None:
-    """Nothing of the second chunk is left but its reserve, which jumps; the first one's is played to its end."""
-    policy = ScriptedPolicy(FakeClock(), {"dense": 0.3}, fault={1: 0.85}, reserve=7)
-    policy.actions = lambda obs: np.full((16, 3), 0.0 if obs[-1, 1] < 0.3 else 5.0)
-    with World(policy=policy, settings=ExecutorSettings(max_hold=0, guard=GuardLimits(max_step=1.0))) as world:
-        world.begin()
-        made, error = run_until_starved(world)
-        counted = world.executor.statistics()
-    assert not np.any(made)
-    assert counted.reserve == 7
-    assert counted.chunks_refused >= 1
-    assert "exceeds the limit" in str(error)
-
-
 def test_a_hold_of_nothing_raises_at_once() -> None:
     with World(fault={1: 1.0}, settings=ExecutorSettings(max_hold=0)) as world:
         world.begin()
-        made, _ = run_until_starved(world)
+        made, _ = world.run_until_starved()
         assert made[-1][2] == TA - 1
         assert world.executor.statistics().holds == 0
 
@@ -142,7 +72,7 @@ def test_a_hold_of_nothing_raises_at_once() -> None:
 def test_a_call_that_hangs_raises_in_time_and_the_executor_recovers_if_it_ends() -> None:
     with World(fault={1: "hang"}, settings=ExecutorSettings(max_hold=2)) as world:
         world.begin()
-        _, error = run_until_starved(world)
+        _, error = world.run_until_starved()
         assert "has been under way for" in str(error)
         with pytest.raises(DeadlineMissedError):
             world.executor.action(timeout=5.0)  # a declared timeout ends, too
@@ -271,7 +201,7 @@ def test_nan_is_not_executed() -> None:
 def test_nothing_but_nan_ends_in_an_error_that_says_so() -> None:
     with World(fault=dict.fromkeys(range(1, 100), "nan")) as world:
         world.begin()
-        _, error = run_until_starved(world)
+        _, error = world.run_until_starved()
         assert "the guard refused the last chunk: 1 of its" in str(error)
 
 
@@ -281,7 +211,7 @@ def test_a_jump_at_the_seam_is_refused() -> None:
     policy.actions = lambda obs: np.full((16, 3), 0.0 if obs[-1, 1] < 0.3 else 5.0)
     with World(policy=policy, settings=ExecutorSettings(guard=GuardLimits(max_step=1.0))) as world:
         world.begin()
-        made, error = run_until_starved(world)
+        made, error = world.run_until_starved()
         assert "its step of 5 in channel 0 exceeds the limit of 1" in str(error)
         assert not np.any(made)
 
