@@ -55,6 +55,7 @@ NOT_RUN = {
     "git clone": "there is no network",
     "source": "of the shell, and for what make would have set up",
     "cd": "of the shell",
+    "python examples/benchmark/sweep.py": "takes twenty minutes; tests/examples/test_benchmark_sweep.py runs it in short",
     ".venv/bin/pytest": "a part of this suite, or of the test of the guide's own files",
     ".venv/bin/ruff": "make lint",
     "ttscompile serve": "has no end; tests/executor/test_serve.py starts it",
