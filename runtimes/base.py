@@ -25,6 +25,8 @@ from ttscompile.lattice import BoolArray, PlanArray, Source, check_plan, legaliz
 if TYPE_CHECKING:
     from ttscompile.artifact.load import Artifact
 
+    from .inpainting import Known
+
 GIVEN = "given"
 """``CallReport.plan_name`` of a matrix that the caller gave no name."""
 
@@ -94,7 +96,7 @@ class Runtime(Protocol):
         plan_name: str | None = None,
         repair: bool = False,
         correction: Correction | None = None,
-        prefix: FloatArray | None = None,
+        known: Known | None = None,
     ) -> tuple[FloatArray, CallReport]:
         """Denoise one chunk. A call that fails after its arguments were checked ends the episode, as ``reset`` does.
 
@@ -105,8 +107,7 @@ class Runtime(Protocol):
             plan_name: for the report; None for ``pruner`` or ``given``.
             repair: legalise ``plan`` and count it, rather than refuse it when it is illegal.
             correction: of the sampler's steps, which belongs to this plan; None for none.
-            prefix: normalised actions ``[B, N, Da]`` that the sample holds from ``chunk.start`` on, see ``inpainting``;
-                None for none.
+            known: what a prefix makes known of the samples, see ``inpainting``; None for nothing.
 
         Returns:
             The denoised sample, float32 ``[B, T, D]``, and the report.
@@ -114,7 +115,7 @@ class Runtime(Protocol):
         Raises:
             IllegalPlanError: ``plan`` has the wrong shape, or is illegal and not to be repaired; or no plan was given
                 and the artifact has no pruner.
-            ObservationError: the number of streams differs from the episode's, or ``noise`` or ``prefix`` does not fit.
+            ObservationError: the number of streams differs from the episode's, or ``noise`` does not fit.
         """
 
 

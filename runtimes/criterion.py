@@ -1,7 +1,7 @@
 """Plans that are decided during the call: a criterion looks at each step and says which blocks are worth computing.
 
-A criterion is a few numbers, so it is stored in an artifact as JSON; its decisions are numpy, so every runtime takes
-the same ones. A runtime asks it once a step, between two parts of the blocks::
+A criterion is a few numbers, so it is stored in the record of a calibration as JSON. Calibration and the reference ask
+it once a step, between two parts of the blocks; the product executes one plan that it has decided::
 
     stem -> blocks 0..always-1, computed -> decide(k, feature) -> the other blocks, all computed or all reused -> tail
 

@@ -108,8 +108,14 @@ def prefix_refusal(spec: PolicySpec) -> str | None:
     return None
 
 
-def check_prefix(prefix: Any, streams: int, spec: PolicySpec) -> FloatArray:
+def check_prefix(prefix: Any, streams: int, spec: PolicySpec, refusal: str | None) -> FloatArray:
     """A prefix as a float32 array ``[B, N, Da]`` that fits the policy.
+
+    Args:
+        prefix: the caller's.
+        streams: B.
+        spec: of the policy.
+        refusal: see ``prefix_refusal``.
 
     Raises:
         ObservationError: of another kind, dtype or shape, too long or not finite; or the policy takes none.
@@ -128,28 +134,24 @@ def check_prefix(prefix: Any, streams: int, spec: PolicySpec) -> FloatArray:
             f"prefix holds {shape[1]} actions; the chunk has {room}, from its first executed one to the end of the"
             f" prediction. Give at most {room}."
         )
-    refusal = prefix_refusal(spec)
     if shape[1] and refusal is not None:
         raise ObservationError(f"the policy takes no prefix: {refusal} Call it without one.")
     check_finite(array, "prefix", "Only actions that can be executed can be committed.")
     return array
 
 
-def known_samples(spec: PolicySpec, prefix: FloatArray | None, initial: FloatArray) -> Known | None:
-    """What a prefix makes known of the samples of a call; None if it is None or empty.
+def known_samples(spec: PolicySpec, prefix: FloatArray, initial: FloatArray) -> Known | None:
+    """What a prefix makes known of the samples of a call; None if it is empty.
 
     Args:
-        spec: of the policy.
-        prefix: normalised actions ``[B, N, Da]``.
+        spec: of a policy that takes prefixes.
+        prefix: from ``check_prefix``, then normalised.
         initial: the noise that the call starts from, ``[B, T, D]``.
-
-    Raises:
-        ObservationError: see ``check_prefix``.
     """
-    if prefix is None or not check_prefix(prefix, len(initial), spec).size:
+    if not prefix.size:
         return None
     levels = noise_levels(spec.sampler)
-    assert levels is not None  # check_prefix looked
+    assert levels is not None
     start, channels = spec.chunk.start, slice(spec.chunk.action_dim)
     positions = slice(start, start + prefix.shape[1])
     signal, deviation = (each.astype(np.float32)[:, None, None, None] for each in levels)

@@ -37,7 +37,7 @@ from .base import (
     settle_plan,
 )
 from .decode import decode_first, decode_rest
-from .inpainting import known_samples
+from .inpainting import Known
 from .liveness import readable_rollout
 from .lowering import Lowered, LoweringCache
 from .onnxruntime_sessions import open_blocks, open_sessions
@@ -97,7 +97,7 @@ class OnnxRuntime:
         self._dropped: BoolArray | None = None  # computed in this episode, and not kept
         self._helper = ThreadPoolExecutor(1, "ttscompile-pruner") if "pruner" in self._manifest.pieces else None
         self._slots = max((one.slots for one in self._schedules), default=0)
-        self._workspace = self._open_workspace(1)
+        self._workspace: Workspace | None = self._open_workspace(1)
 
     @property
     def streams(self) -> int | None:
@@ -107,12 +107,12 @@ class OnnxRuntime:
     @property
     def nbytes(self) -> int:
         """Memory of the buffers of the batch size under way, the rollout cache included; weights are onnxruntime's."""
-        return self._workspace.nbytes
+        return 0 if self._workspace is None else self._workspace.nbytes
 
     @property
     def rollout_nbytes(self) -> int:
         """Memory of the rollout cache."""
-        return self._workspace.rollout.nbytes
+        return 0 if self._workspace is None else self._workspace.rollout.nbytes
 
     def reset(self) -> None:
         """Forget the rollout cache; its memory is kept for the next episode."""
@@ -127,12 +127,11 @@ class OnnxRuntime:
         plan_name: str | None = None,
         repair: bool = False,
         correction: Correction | None = None,
-        prefix: FloatArray | None = None,
+        known: Known | None = None,
     ) -> tuple[FloatArray, CallReport]:
         """Denoise one chunk; see ``base.Runtime.predict``."""
         spec = self._manifest.spec
         streams = check_call(self.streams, noise, spec.sample, spec.sampler)
-        known = known_samples(spec, prefix, noise.initial)
         cells = (streams, spec.sampler.steps, len(self._groups))
         written = np.zeros(cells, dtype=np.bool_) if self._written is None else self._written
         dropped = np.zeros(cells, dtype=np.bool_) if self._dropped is None else self._dropped
@@ -141,12 +140,12 @@ class OnnxRuntime:
         settled = None if plan is None else self._settle(plan, written, dropped, repair)
         if plan_name not in (DENSE, *self._manifest.plans):
             self._matrices = True
-        if self._workspace.streams != streams:
-            del self._workspace  # give the old memory back first
+        if self._workspace is None or self._workspace.streams != streams:
+            self._workspace = None  # give the old memory back first; there may be too little for the new
             self._workspace = self._open_workspace(streams)
-        if settled is not None:
-            self._require_blocks(settled.lowered)
         work = self._workspace
+        if settled is not None:
+            self._require_blocks(work, settled.lowered)
         keep_all = self._matrices or plan_name == DENSE
         keep = np.ones_like(self._readable) if keep_all else self._readable
 
@@ -157,14 +156,14 @@ class OnnxRuntime:
         waited = 0.0
         if settled is None:
             settled, waited = self._prune_beside_first_step(work, written, keep)
-            self._require_blocks(settled.lowered)
+            self._require_blocks(work, settled.lowered)
         else:
             decode_first(work, keep)
         decode_rest(work, settled.lowered, keep)
         sample = work.result()
         stop = time.perf_counter()
         computed = settled.plans == Source.COMPUTE
-        self._written, self._dropped = written | (computed & keep), (dropped | computed) & ~keep
+        self._written, self._dropped = np.where(computed, keep, written), np.where(computed, ~keep, dropped)
         report = CallReport(
             plan=frozen(settled.plans),
             plan_name=plan_name or (PRUNER if plan is None else GIVEN),
@@ -208,23 +207,23 @@ class OnnxRuntime:
             require_legal(plans, self._groups, written)  # says which stream
             raise
         for one, cells, gone in zip(lowered, written, dropped, strict=True):
-            if (one.rollout & gone & ~cells).any():
-                k, b = np.argwhere(one.rollout & gone & ~cells)[0].tolist()
+            if (one.rollout & gone).any():
+                k, b = np.argwhere(one.rollout & gone)[0].tolist()
                 raise IllegalPlanError(
                     f"the plan reads the ROLLOUT residual of step {k}, block {b}, which an earlier call of this episode"
                     " computed with a plan of the artifact, and did not keep: no plan of the artifact reads it."
-                    " Begin the episode with plan='dense' or with a matrix: these keep what they compute, and after a"
-                    " first matrix every call does."
+                    " Begin the episode with a matrix (one of zeros computes all, as plan='dense' does): from a first"
+                    " matrix on every call keeps what it computes."
                 )
             if (one.rollout & ~cells).any():
                 require_legal(plans, self._groups, written)
         return _Settled(plans, lowered, legalised)
 
-    def _require_blocks(self, lowered: tuple[Lowered, ...]) -> None:
+    def _require_blocks(self, work: Workspace, lowered: tuple[Lowered, ...]) -> None:
         """Open the sessions of single blocks, if these plans are the first to need them."""
-        if not self._blocks and any(one.partial or one is not lowered[0] for one in lowered):
+        if not self._blocks and any(one.partial for one in lowered):
             self._sessions |= open_blocks(self._artifact, self._threads)
-            self._workspace.bind_blocks()
+            work.bind_blocks()
             self._blocks = True
 
     def _open_workspace(self, streams: int) -> Workspace:

@@ -248,4 +248,4 @@ def failed(error: Exception) -> ArtifactError:
 
 def repeat_streams(array: Array, axis: int | None, streams: int) -> Array:
     """A contiguous copy with an axis of size 1 repeated to the number of streams; no axis, no repetition."""
-    return np.ascontiguousarray(array if axis is None else np.repeat(array, streams, axis=axis)).copy()
+    return array.copy() if axis is None else np.repeat(array, streams, axis=axis)

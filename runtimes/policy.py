@@ -15,12 +15,12 @@ import numpy.typing as npt
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import DENSE
 from ttscompile.config import FP32, ChunkSpec, FloatArray, Noise, ObservationSpec
-from ttscompile.errors import IllegalPlanError, ObservationError, TtscompileError
+from ttscompile.errors import IllegalPlanError, ObservationError, RuntimeUnavailableError, TtscompileError
 from ttscompile.ir.graph import TensorType
 
 from .arrays import check_noise, check_observation, is_tensor, like
-from .base import GIVEN, CallReport, Runtime, open_runtime
-from .inpainting import check_prefix, prefix_refusal
+from .base import CallReport, Runtime, open_runtime
+from .inpainting import check_prefix, known_samples, prefix_refusal
 from .liveness import RolloutNeeds, rollout_needs
 from .queues import Queues, is_window
 
@@ -93,7 +93,7 @@ def load(
             is not called takes no processor time.
         seed: of the noise that is drawn when none is given; None for another sequence every time.
         precision: of the weights of residual blocks: ``fp32``, which every artifact holds; None for what it was
-            converted with. The reference runtime computes in fp32 always.
+            converted with. The reference runtime computes in fp32 alone.
         plan: that ``predict_action`` uses when it is given none: ``dense`` or the name of a plan of the artifact; None
             for the artifact's default.
 
@@ -104,7 +104,11 @@ def load(
     """
     artifact = load_artifact(path)
     if runtime == "reference":
-        precision = precision or FP32
+        if precision not in (None, FP32):
+            raise RuntimeUnavailableError(
+                f"runtime 'reference' computes in {FP32!r} alone; found precision {precision!r}. Leave it out."
+            )
+        precision = FP32
     if precision is not None:
         artifact = artifact.at_precision(precision)
     if plan is not None:
@@ -132,6 +136,7 @@ class CompiledPolicy:
         self._manifest = artifact.manifest
         self._default = artifact.manifest.default_plan if plan is None else plan
         _require_plan(artifact, self._default)
+        self._prefix_refusal = prefix_refusal(artifact.manifest.spec)
         self._rng = np.random.default_rng(seed)
         self._report: CallReport | None = None
         self._queues = Queues(artifact.manifest.spec.observations)
@@ -160,7 +165,7 @@ class CompiledPolicy:
             default_plan=self._default,
             precision=manifest.precision_name,
             rollout=rollout_needs(self._artifact),
-            prefix_refusal=prefix_refusal(manifest.spec),
+            prefix_refusal=self._prefix_refusal,
         )
 
     def reset(self, seed: int | None = None) -> None:
@@ -205,7 +210,7 @@ class CompiledPolicy:
         """
         with self._alone():
             predicted = self._predict(obs_dict, noise, plan, prefix)
-            example, chunk = _example(obs_dict), self._manifest.spec.chunk
+            example, chunk = self._example(obs_dict), self._manifest.spec.chunk
             executed = predicted[:, chunk.start : chunk.stop]
             return {"action": like(executed.copy(), example), "action_pred": like(predicted.copy(), example)}
 
@@ -232,7 +237,7 @@ class CompiledPolicy:
             if self._queues.empty:
                 self._queues.extend(self._chunk(self._queues.observation(frames), noise, plan))
             self._queues.keep(frames)
-            return like(self._queues.pop().copy(), _example(batch))
+            return like(self._queues.pop().copy(), self._example(batch))
 
     def predict_action_chunk(
         self, batch: Mapping[str, Any], noise: Noise | None = None, plan: str | npt.ArrayLike | None = None
@@ -254,11 +259,11 @@ class CompiledPolicy:
             specs = self._manifest.spec.observations
             if isinstance(batch, Mapping) and is_window(batch, specs):
                 observation = {key: value for key, value in batch.items() if key in specs}
-                return like(self._chunk(observation, noise, plan).copy(), _example(batch))
+                return like(self._chunk(observation, noise, plan).copy(), self._example(batch))
             frames = self._queues.after(batch)
             chunk = self._chunk(self._queues.observation(frames), noise, plan)
             self._queues.keep(frames)
-            return like(chunk.copy(), _example(batch))
+            return like(chunk.copy(), self._example(batch))
 
     def _chunk(self, obs: Mapping[str, Any], noise: Noise | None, plan: str | npt.ArrayLike | None) -> FloatArray:
         """What is executed of a call, ``[B, Ta, Da]``."""
@@ -279,17 +284,18 @@ class CompiledPolicy:
                 " residuals are kept for each stream. Call reset() before changing the number of streams."
             )
         if prefix is not None:
-            prefix = check_prefix(prefix, streams, spec)
+            prefix = check_prefix(prefix, streams, spec, self._prefix_refusal)
             prefix = prefix if spec.chunk.normalizer is None else spec.chunk.normalizer.normalize(prefix)
         if noise is None:
             noise = self._draw(streams)
         else:
             noise = check_noise(noise, streams, self._manifest.steps, spec.sample, spec.sampler.stochastic)
         matrix, name, repair = self._plan(plan)
-        correction = self._artifact.corrections.get(name)
+        correction = None if name is None else self._artifact.corrections.get(name)
+        known = None if prefix is None else known_samples(spec, prefix, noise.initial)
         normalized = {key: _normalized(array, spec.observations[key]) for key, array in obs.items()}
         sample, self._report = self._runtime.predict(
-            normalized, noise, matrix, plan_name=name, repair=repair, correction=correction, prefix=prefix
+            normalized, noise, matrix, plan_name=name, repair=repair, correction=correction, known=known
         )
         predicted = sample[..., : spec.chunk.action_dim]
         return predicted if spec.chunk.normalizer is None else spec.chunk.normalizer.unnormalize(predicted)
@@ -301,14 +307,14 @@ class CompiledPolicy:
             return Noise(initial)
         return Noise(initial, self._rng.standard_normal((self._manifest.steps, *shape), dtype=np.float32))
 
-    def _plan(self, plan: str | npt.ArrayLike | None) -> tuple[npt.NDArray[Any] | None, str, bool]:
-        """Matrix (None: the pruner's), name for the report, and whether illegal reads are repaired."""
+    def _plan(self, plan: str | npt.ArrayLike | None) -> tuple[npt.NDArray[Any] | None, str | None, bool]:
+        """Matrix (None: the pruner's), name (None: the caller's matrix), and whether illegal reads are repaired."""
         if plan is None:
             plan = self._default
         if not isinstance(plan, str):
             given: Any = plan
             try:
-                return np.asarray(given.numpy(force=True) if is_tensor(given) else given), GIVEN, False
+                return np.asarray(given.numpy(force=True) if is_tensor(given) else given), None, False
             except (TypeError, ValueError) as error:
                 raise IllegalPlanError(
                     f"the plan is no matrix of integers ({error}); expected int8 [K, blocks] or [B, K, blocks] of"
@@ -319,6 +325,10 @@ class CompiledPolicy:
         _require_plan(self._artifact, plan)
         record = self._manifest.plans[plan]
         return (None if record.kind == "pruner" else self._artifact.schedule(plan)), plan, True
+
+    def _example(self, batch: Mapping[str, Any]) -> Any:
+        """A tensor among the observations of a batch, if there is one; what else it holds is not ours."""
+        return next((batch[key] for key in self._manifest.spec.observations if is_tensor(batch[key])), None)
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
@@ -341,11 +351,6 @@ def _require_plan(artifact: Artifact, name: str) -> None:
             f"the artifact has no plan {name!r}; it has {known}. Use one of these, or give predict_action a matrix"
             " [K, blocks] of ttscompile.Source."
         )
-
-
-def _example(batch: Mapping[str, Any]) -> Any:
-    """A tensor of the batch, if it holds any."""
-    return next((value for value in batch.values() if is_tensor(value)), None)
 
 
 def _of_one_stream(type_: TensorType) -> tuple[int, ...]:

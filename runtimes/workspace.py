@@ -178,7 +178,7 @@ class Workspace:
 
     def result(self) -> FloatArray:
         """The sample after the last step, a copy ``[B, T, D]``."""
-        return np.ascontiguousarray(self.sample[self._steps % 2].transpose(1, 2, 0))
+        return self.sample[self._steps % 2].transpose(1, 2, 0).copy()
 
     def prepare(self, correction: Correction) -> None:
         """Make what the first call with a correction would have to make."""

@@ -26,7 +26,7 @@ from ttscompile.runtimes.base import (
     pruner_plan,
     settle_plan,
 )
-from ttscompile.runtimes.inpainting import known_samples
+from ttscompile.runtimes.inpainting import Known
 
 from .model import ReferenceModel, noise_tensors
 from .reuse import RolloutCache
@@ -66,12 +66,11 @@ class ReferenceRuntime:
         plan_name: str | None = None,
         repair: bool = False,
         correction: Correction | None = None,
-        prefix: FloatArray | None = None,
+        known: Known | None = None,
     ) -> tuple[FloatArray, CallReport]:
         """Denoise one chunk; see ``base.Runtime.predict``."""
         spec = self._manifest.spec
         streams = check_call(self.streams, noise, spec.sample, spec.sampler)
-        known = known_samples(spec, prefix, noise.initial)
         cache = self._cache if self._cache is not None else self.model.empty_cache(streams)
         pruned = plan is None
         if plan is None:

@@ -115,6 +115,7 @@ def test_the_clipped_sample_is_where_the_velocity_leads() -> None:
     [
         ({"steps": 0}, "0 flow-matching steps"),
         ({"steps": True}, "True flow-matching steps"),
+        ({"steps": 4.0}, "all rise or all fall"),
         ({"steps": 4, "start": 1.0}, "all rise or all fall"),
         ({"steps": [0.0, 0.5, 0.5, 1.0]}, "all rise or all fall"),
         ({"steps": [0.0]}, "two or more"),

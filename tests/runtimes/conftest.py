@@ -1,11 +1,12 @@
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from ttscompile.artifact import Artifact
+from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.ir.program import Program
 
 from .toys import pencil_program, toy_program, written_artifact
@@ -21,6 +22,12 @@ def toy_artifact(tmp_path_factory: pytest.TempPathFactory) -> Artifact:
 @pytest.fixture(scope="session")
 def pencil_artifact(tmp_path_factory: pytest.TempPathFactory) -> Artifact:
     return written_artifact(pencil_program(), tmp_path_factory.mktemp("pencil") / "artifact")
+
+
+@pytest.fixture
+def own_artifact(toy_artifact: Artifact, tmp_path: Path) -> Artifact:
+    """A copy of the toy, for tests that change it."""
+    return load_artifact(shutil.copytree(toy_artifact.path, tmp_path / "toy"))
 
 
 @pytest.fixture

@@ -35,11 +35,10 @@ def helpers() -> list[threading.Thread]:
 
 
 @pytest.fixture
-def pruned(make_artifact: MakeArtifact) -> Artifact:
+def pruned(own_artifact: Artifact) -> Artifact:
     """A toy whose default plan is its pruner's."""
-    artifact = make_artifact(toy_program())
-    update_calibration(artifact.path, dict(artifact.pruner), {}, "tts", {"strategy": "tts"})
-    return load_artifact(artifact.path)
+    update_calibration(own_artifact.path, dict(own_artifact.pruner), {}, "tts", {"strategy": "tts"})
+    return load_artifact(own_artifact.path)
 
 
 def call(runtime: Runtime, artifact: Artifact, seed: int, plan: np.ndarray | None = None) -> np.ndarray:
@@ -203,11 +202,10 @@ def test_a_first_call_with_a_schedule_binds_nothing(
         runtime.reset()
 
 
-def test_single_blocks_are_opened_by_the_first_plan_that_needs_them(make_artifact: MakeArtifact) -> None:
-    artifact = make_artifact(toy_program())
-    runtime, other = open_runtime(artifact), open_runtime(artifact, "reference")
+def test_single_blocks_are_opened_by_the_first_plan_that_needs_them(toy_artifact: Artifact) -> None:
+    runtime, other = open_runtime(toy_artifact), open_runtime(toy_artifact, "reference")
     assert isinstance(runtime, OnnxRuntime)
-    obs, noise = random_inputs(artifact, np.random.default_rng(0), 1)
+    obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), 1)
     runtime.predict(obs, noise, uniform_plan(5, 5, 3))
     assert "block_00" not in runtime._sessions
     runtime.reset()
@@ -219,17 +217,44 @@ def test_single_blocks_are_opened_by_the_first_plan_that_needs_them(make_artifac
     assert "block_00" in runtime._sessions
 
 
-def test_single_blocks_of_an_artifact_that_has_changed_since_are_refused(make_artifact: MakeArtifact) -> None:
-    artifact = make_artifact(toy_program())
-    runtime = open_runtime(artifact)
-    obs, noise = random_inputs(artifact, np.random.default_rng(0), 1)
+def test_streams_that_compute_whole_steps_need_no_single_blocks(toy_artifact: Artifact) -> None:
+    runtime, other = open_runtime(toy_artifact), open_runtime(toy_artifact, "reference")
+    assert isinstance(runtime, OnnxRuntime)
+    obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), 3)
+    plans = np.stack([uniform_plan(5, 5, n) for n in (1, 2, 3)])
+    found, expected = (each.predict(obs, noise, plans)[0] for each in (runtime, other))
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+    assert "block_00" not in runtime._sessions
+
+
+def test_single_blocks_of_an_artifact_that_has_changed_since_are_refused(own_artifact: Artifact) -> None:
+    runtime = open_runtime(own_artifact)
+    obs, noise = random_inputs(own_artifact, np.random.default_rng(0), 1)
     partial = uniform_plan(5, 5, 3)
     partial[4, 2] = Source.COMPUTE
-    path = artifact.onnx_path("block_02")
+    path = own_artifact.onnx_path("block_02")
     path.write_bytes(path.read_bytes()[:-1] + b"?")
     with pytest.raises(ArtifactError, match=r"block_02\.onnx: expected sha256"):
         runtime.predict(obs, noise, partial)
     assert runtime.predict(obs, noise, uniform_plan(5, 5, 3))[1].computed == (15,)
+
+
+def test_a_batch_that_finds_no_memory_leaves_a_runtime_that_works(
+    toy_artifact: Artifact, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runtime = open_runtime(toy_artifact)
+    obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), 2)
+
+    def full(*_: object) -> None:
+        raise MemoryError
+
+    with monkeypatch.context() as patched:
+        patched.setattr("ttscompile.runtimes.onnxruntime_cpu.Workspace", full)
+        with pytest.raises(MemoryError):
+            runtime.predict(obs, noise, dense_plan(5, 5))
+    assert isinstance(runtime, OnnxRuntime)
+    assert runtime.nbytes == runtime.rollout_nbytes == 0
+    assert runtime.predict(obs, noise, dense_plan(5, 5))[1].computed == (25, 25)
 
 
 def test_a_workspace_is_given_back_when_the_batch_changes(toy_artifact: Artifact) -> None:

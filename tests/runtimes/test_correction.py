@@ -18,7 +18,6 @@ from ttscompile.runtimes import open_runtime
 
 from .agreement import random_inputs
 from .plans import random_plan
-from .toys import toy_program, written_artifact
 
 
 def random_correction(artifact: Artifact, rng: np.random.Generator) -> Correction:
@@ -60,13 +59,14 @@ def test_a_correction_of_one_call_is_gone_in_the_next(toy_artifact: Artifact) ->
 
 
 @pytest.fixture
-def corrected(tmp_path: Path) -> tuple[Path, Correction, np.ndarray]:
-    artifact = written_artifact(toy_program(), tmp_path / "toy")
-    manifest = artifact.manifest
-    correction = random_correction(artifact, np.random.default_rng(0))
+def corrected(own_artifact: Artifact) -> tuple[Path, Correction, np.ndarray]:
+    manifest = own_artifact.manifest
+    correction = random_correction(own_artifact, np.random.default_rng(0))
     plan = uniform_plan(manifest.steps, len(manifest.groups), 2)
-    update_calibration(artifact.path, None, {"fast": plan, "bare": plan}, "fast", {}, corrections={"fast": correction})
-    return artifact.path, correction, plan
+    update_calibration(
+        own_artifact.path, None, {"fast": plan, "bare": plan}, "fast", {}, corrections={"fast": correction}
+    )
+    return own_artifact.path, correction, plan
 
 
 @pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
@@ -88,6 +88,16 @@ def test_it_belongs_to_the_plan_of_its_name(corrected: tuple[Path, Correction, n
     assert np.abs(named - bare).max() > 1e-2
     dense = call(plan="dense")
     assert np.abs(dense - named).max() > 1e-3
+
+
+def test_a_matrix_has_none_whatever_plans_are_called(corrected: tuple[Path, Correction, np.ndarray]) -> None:
+    path, correction, plan = corrected
+    update_calibration(path, None, {"given": plan, "bare": plan}, "given", {}, corrections={"given": correction})
+    policy = ttscompile.load(path)
+    obs, noise = random_inputs(load_artifact(path), np.random.default_rng(1), 1)
+    named, bare, matrix = (policy.predict_action(obs, noise, each)["action"] for each in ("given", "bare", plan))
+    np.testing.assert_array_equal(bare, matrix)
+    assert np.abs(named - bare).max() > 1e-2
 
 
 def test_the_first_call_binds_nothing(

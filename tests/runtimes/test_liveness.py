@@ -18,22 +18,19 @@ from ttscompile.runtimes.policy import load
 from ttscompile.runtimes.reference.runtime import ReferenceRuntime
 
 from .agreement import random_inputs
-from .conftest import MakeArtifact
-from .toys import toy_program
 
 C, T, R = Source.COMPUTE, Source.TIMESTEP, Source.ROLLOUT
 ENTRY = 3 * 4 * 4
 
 
 @pytest.fixture
-def scheduled(make_artifact: MakeArtifact) -> Artifact:
+def scheduled(own_artifact: Artifact) -> Artifact:
     """A toy with two schedules; one of them reads two rollout entries."""
-    artifact = make_artifact(toy_program())
     reads = uniform_plan(5, 5, 2)
     reads[2, 1] = reads[3, 4] = R
     schedules = {"plain": uniform_plan(5, 5, 2), "reads": reads}
-    update_calibration(artifact.path, None, schedules, "plain", {})
-    return load_artifact(artifact.path)
+    update_calibration(own_artifact.path, None, schedules, "plain", {})
+    return load_artifact(own_artifact.path)
 
 
 def test_schedules_say_exactly_what_they_read(scheduled: Artifact, toy_artifact: Artifact) -> None:
@@ -65,11 +62,10 @@ def head(**changes: float) -> dict[str, np.ndarray]:
     ],
 )
 def test_a_pruner_is_known_by_the_bounds_of_its_logits(
-    make_artifact: MakeArtifact, changes: dict[str, float], cells: list[list[int]]
+    own_artifact: Artifact, changes: dict[str, float], cells: list[list[int]]
 ) -> None:
-    artifact = make_artifact(toy_program())
-    update_calibration(artifact.path, dict(artifact.pruner), {}, "tts", {})
-    artifact = load_artifact(artifact.path)
+    update_calibration(own_artifact.path, dict(own_artifact.pruner), {}, "tts", {})
+    artifact = load_artifact(own_artifact.path)
     assert readable_rollout(artifact).all()  # the toy's own pruner is of another form
     assert np.argwhere(readable_rollout(replace(artifact, pruner=head(**changes)))).tolist() == cells
 
@@ -102,6 +98,26 @@ def test_a_matrix_may_read_what_dense_calls_and_matrices_computed(scheduled: Art
     runtime.reset()
     with pytest.raises(IllegalPlanError, match="step 1, block 0 .*never computed"):
         runtime.predict(obs, noise, reads)
+
+
+def test_a_matrix_reads_no_older_residual_than_the_last_computed(scheduled: Artifact) -> None:
+    """A dense call keeps all; a plan of the artifact then computes cells anew, and does not keep them."""
+    runtime, reference = OnnxRuntime(scheduled), ReferenceRuntime(scheduled)
+    rng = np.random.default_rng(0)
+    plain = scheduled.schedule("plain")
+    for name in ("dense", "plain"):
+        obs, noise = random_inputs(scheduled, rng, 1)
+        for each in (runtime, reference):
+            each.predict(obs, noise, scheduled.schedule(name), plan_name=name, repair=name != "dense")
+    (k,) = np.flatnonzero((plain == C).all(axis=1))[1:]
+    row = np.arange(5)[:, None] == k
+    gone, there = np.where(row, R, plain), np.where(row, T, np.where(plain == T, R, plain))
+    with pytest.raises(IllegalPlanError, match=rf"step {k}, block 0, .* did not keep"):
+        runtime.predict(obs, noise, gone)
+    found, expected = (each.predict(obs, noise, there)[0] for each in (runtime, reference))
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+    with pytest.raises(IllegalPlanError, match=rf"step {k}, block 0, .* did not keep"):  # that call computed none of it
+        runtime.predict(obs, noise, gone)
 
 
 def test_a_first_matrix_after_a_plan_of_the_artifact_is_told_what_was_not_kept(scheduled: Artifact) -> None:

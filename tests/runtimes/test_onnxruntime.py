@@ -183,6 +183,16 @@ def test_what_a_call_gave_stays_as_it_was(runtime: Runtime, toy_artifact: Artifa
     assert np.array_equal(report.plan, plan)
 
 
+@pytest.mark.parametrize("name", ["onnxruntime", "reference"])
+def test_a_sample_of_one_dimension_stays_as_it_was(pencil_artifact: Artifact, name: str) -> None:
+    """Its transposition moves nothing in memory."""
+    runtime = open_runtime(pencil_artifact, name)
+    obs = {"obs": np.array([[-32]], np.float32)}
+    sample, _ = runtime.predict(obs, Noise(np.full((1, 1, 1), 35, np.float32)), dense_plan(2, 1))
+    runtime.predict(obs, Noise(np.full((1, 1, 1), 40, np.float32)), dense_plan(2, 1))
+    assert sample.item() == 44
+
+
 def test_a_call_that_fails_half_way_ends_the_episode(toy_artifact: Artifact, monkeypatch: pytest.MonkeyPatch) -> None:
     runtime = open_runtime(toy_artifact)
     obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), 2)
@@ -243,12 +253,11 @@ except RuntimeUnavailableError as error:
 
 
 def test_a_graph_that_onnxruntime_refuses_is_an_artifact_error(
-    make_artifact: MakeArtifact, capfd: pytest.CaptureFixture[str]
+    own_artifact: Artifact, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    artifact = make_artifact(toy_program())
-    artifact.onnx_path("dense_step").write_bytes(b"no graph")
+    own_artifact.onnx_path("dense_step").write_bytes(b"no graph")
     with pytest.raises(ArtifactError, match=r"dense_step\.onnx.*cannot load"):
-        open_runtime(artifact)
+        open_runtime(own_artifact)
     assert capfd.readouterr().out == ""
 
 

@@ -81,13 +81,12 @@ def test_the_default_plan_is_dense_until_calibration(quick: CompiledPolicy) -> N
     assert (report.plan_name, report.computed, report.legalised) == ("dense", (25, 25), (0, 0))
 
 
-def test_plans_of_the_artifact_by_name(make_artifact: MakeArtifact) -> None:
-    artifact = make_artifact(toy_program())
+def test_plans_of_the_artifact_by_name(own_artifact: Artifact) -> None:
     mixed = uniform_plan(5, 5, 2)
     mixed[1] = R
-    update_calibration(artifact.path, dict(artifact.pruner), {"mixed": mixed}, "tts", {"strategy": "tts"})
+    update_calibration(own_artifact.path, dict(own_artifact.pruner), {"mixed": mixed}, "tts", {"strategy": "tts"})
     for runtime in ("onnxruntime", "reference"):
-        policy = load(artifact.path, runtime)
+        policy = load(own_artifact.path, runtime)
         assert set(policy.info.plans) == {"dense", "mixed", "tts"}
         assert policy.info.default_plan == "tts"
         names = []

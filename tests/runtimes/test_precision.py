@@ -12,7 +12,7 @@ import ttscompile
 from tests.calibration import policies
 from ttscompile import Noise, TtscompileError
 from ttscompile.artifact import load_artifact
-from ttscompile.errors import ArtifactError
+from ttscompile.errors import ArtifactError, RuntimeUnavailableError
 from ttscompile.runtimes import open_runtime, precision
 from ttscompile.runtimes.random_calls import random_calls
 
@@ -75,6 +75,8 @@ def test_fp32_of_an_int8_artifact_is_the_fp32_artifact(int8: Path, fp32: Path) -
 
 def test_the_reference_runtime_computes_in_fp32(int8: Path) -> None:
     assert ttscompile.load(int8, "reference").info.precision == "fp32"
+    with pytest.raises(RuntimeUnavailableError, match="'reference' computes in 'fp32' alone; found precision 'int8'"):
+        ttscompile.load(int8, "reference", precision="int8")
     with pytest.raises(ArtifactError, match="'bf16': expected one that the artifact holds"):
         ttscompile.load(int8, precision="bf16")
 

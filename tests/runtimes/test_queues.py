@@ -182,6 +182,12 @@ def test_select_action_computes_when_the_chunk_is_used_up(policy: CompiledPolicy
 
 
 @pytest.mark.parametrize("method", ["select_action", "predict_action_chunk"])
+def test_tensors_that_are_no_observations_do_not_make_the_action_one(policy: CompiledPolicy, method: str) -> None:
+    batch = {"index": torch.zeros(1), "obs": np.zeros((1, 2), np.float32)}
+    assert isinstance(getattr(policy, method)(batch), np.ndarray)
+
+
+@pytest.mark.parametrize("method", ["select_action", "predict_action_chunk"])
 def test_a_call_that_fails_keeps_no_frame(policy: CompiledPolicy, method: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Made again with a right plan and noise, it sees the same frames as one that did not fail."""
     monkeypatch.setattr("ttscompile.runtimes.policy.is_window", lambda *_: False)  # the toy's windows are frames

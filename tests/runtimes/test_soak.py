@@ -9,22 +9,20 @@ from pathlib import Path
 
 import pytest
 
+from ttscompile.artifact import Artifact
 from ttscompile.artifact.write import update_calibration
 
-from .conftest import MakeArtifact
 from .soak import EPISODE, median_slope
-from .toys import toy_program
 
 pytestmark = pytest.mark.alone
 
 SOAK = Path(__file__).with_name("soak.py")
 
 
-def test_calls_are_repeatable_and_leave_nothing_behind(make_artifact: MakeArtifact) -> None:
-    artifact = make_artifact(toy_program())
-    update_calibration(artifact.path, dict(artifact.pruner), {}, "tts", {"strategy": "tts"})
+def test_calls_are_repeatable_and_leave_nothing_behind(own_artifact: Artifact) -> None:
+    update_calibration(own_artifact.path, dict(own_artifact.pruner), {}, "tts", {"strategy": "tts"})
     # A process of its own: this one has the memory of a thousand other tests to give back or to keep.
-    command = [sys.executable, str(SOAK), str(artifact.path), "--calls", str(60 * EPISODE)]
+    command = [sys.executable, str(SOAK), str(own_artifact.path), "--calls", str(60 * EPISODE)]
     result = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
     assert result["repeatable"]
     assert len(result["rss_mb"]) == 10

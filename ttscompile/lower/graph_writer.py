@@ -98,8 +98,9 @@ class GraphWriter:
         return [names[value.name] for value in graph.output]
 
     def _weight(self, tensor: TensorProto, weights: Weights) -> str:
-        if tensor.raw_data or not _has_elements(tensor):
-            return self.constant(numpy_helper.to_array(tensor), numpy_helper.to_array(tensor).dtype)
+        if tensor.raw_data or 0 in tensor.dims:
+            made = numpy_helper.to_array(tensor)
+            return self.constant(made, made.dtype)
         value = weights.get(tensor.name)
         if value is None or value.shape != tuple(tensor.dims):
             raise LoweringError(
@@ -123,7 +124,3 @@ def tensor(name: str, dtype: npt.DTypeLike, shape: Sequence[int | str] | None = 
 def sequence(name: str) -> ValueInfoProto:
     """A sequence of float32 tensors."""
     return helper.make_tensor_sequence_value_info(name, TensorProto.FLOAT, None)
-
-
-def _has_elements(tensor: TensorProto) -> bool:
-    return 0 not in tensor.dims

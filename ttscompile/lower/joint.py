@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
 from onnx import GraphProto, ModelProto, NodeProto, TensorProto, ValueInfoProto, helper
 
-from ..ir.graph import Batch, Graph, TensorType
+from ..ir.graph import Graph, TensorType
 from ..ir.joint import CONTEXT, DENSE_STEP, JOINT, RESIDUAL, STREAM, dense_step_outputs, halves, join
+from .onnx_model import opsets, value_info
 
 
 def join_blocks(blocks: Sequence[Graph], models: Mapping[str, ModelProto]) -> ModelProto:
@@ -26,11 +26,11 @@ def join_blocks(blocks: Sequence[Graph], models: Mapping[str, ModelProto]) -> Mo
     # Runtimes refuse a stream that changes its type; the sizes that are declared here then are those of every block.
     stream = next(iter(blocks[0].inputs.values()))
 
-    result = _tensor(RESIDUAL, stream)
+    result = value_info(RESIDUAL, stream)
 
     def branch(first: int, stop: int, depth: int) -> GraphProto:
         name = f"{RESIDUAL}.{first}.{stop}" if depth else RESIDUAL
-        output = _tensor(name, stream)
+        output = value_info(name, stream)
         if stop - first == 1:
             return _leaf(own[first], tuple(blocks[first].inputs), [STREAM, *joint.places[first]], output, f"b{first}")
         middle = halves(first, stop)
@@ -45,8 +45,8 @@ def join_blocks(blocks: Sequence[Graph], models: Mapping[str, ModelProto]) -> Mo
         return GraphProto(name=f"blocks.{first}.{stop}", node=[node], output=[output])
 
     root = branch(0, len(own), 0)
-    inputs = [_tensor(name, TensorType((), "bool")) for name in joint.switches]
-    inputs += [_tensor(name, type_) for name, type_ in ((STREAM, stream), *joint.slots)]
+    inputs = [value_info(name, TensorType((), "bool")) for name in joint.switches]
+    inputs += [value_info(name, type_) for name, type_ in ((STREAM, stream), *joint.slots)]
     graph = GraphProto(name=JOINT, node=root.node, input=inputs, output=[result], initializer=root.initializer)
     return _model(own, graph)
 
@@ -67,7 +67,7 @@ def chain_blocks(blocks: Sequence[Graph], models: Mapping[str, ModelProto]) -> M
     last, *residuals = dense_step_outputs(len(blocks))
     for b, (block, model, residual) in enumerate(zip(blocks, own, residuals, strict=True)):
         inputs = [before, *(CONTEXT + name for name in list(block.inputs)[1:])]
-        leaf = _leaf(model, tuple(block.inputs), inputs, _tensor(residual, stream), f"b{b}")
+        leaf = _leaf(model, tuple(block.inputs), inputs, value_info(residual, stream), f"b{b}")
         small = {tensor.name: f"b{b}.{tensor.name}" for tensor in leaf.initializer if tensor.raw_data}
         for tensor in leaf.initializer:
             tensor.name = small.get(tensor.name, tensor.name)
@@ -77,20 +77,17 @@ def chain_blocks(blocks: Sequence[Graph], models: Mapping[str, ModelProto]) -> M
         after = last if b == len(blocks) - 1 else f"{STREAM}.{b}"
         nodes += [*leaf.node, helper.make_node("Add", [before, residual], [after], name=f"add.{b}")]
         before = after
-    given = [_tensor(STREAM, stream), *(_tensor(CONTEXT + name, type_) for name, type_ in contexts.items())]
-    made = [_tensor(name, stream) for name in (last, *residuals)]
+    given = [value_info(STREAM, stream), *(value_info(CONTEXT + name, type_) for name, type_ in contexts.items())]
+    made = [value_info(name, stream) for name in (last, *residuals)]
     graph = GraphProto(name=DENSE_STEP, node=nodes, input=given, output=made, initializer=weights.values())
     return _model(own, graph)
 
 
 def _model(own: Sequence[ModelProto], graph: GraphProto) -> ModelProto:
-    domains: dict[str, int] = {}
-    for entry in (entry for model in own for entry in model.opset_import):
-        domains[entry.domain] = max(entry.version, domains.get(entry.domain, 0))
     return ModelProto(
         ir_version=max(model.ir_version for model in own),
         producer_name="ttscompile",
-        opset_import=[helper.make_opsetid(domain, version) for domain, version in sorted(domains.items())],
+        opset_import=opsets(own),
         graph=graph,
     )
 
@@ -113,8 +110,3 @@ def _leaf(
         copy.output.extend(names.get(value, f"{prefix}.{value}") for value in node.output)
         nodes.append(copy)
     return GraphProto(name=model.graph.name, node=nodes, initializer=graph.initializer, output=[output])
-
-
-def _tensor(name: str, type_: TensorType) -> ValueInfoProto:
-    sizes = [str(n) if isinstance(n, Batch) else n for n in type_.shape]
-    return helper.make_tensor_value_info(name, helper.np_dtype_to_tensor_dtype(np.dtype(type_.dtype)), sizes)

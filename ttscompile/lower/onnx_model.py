@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import onnx
 from onnx import AttributeProto, GraphProto, ModelProto, NodeProto, TensorProto, ValueInfoProto, helper
@@ -77,8 +77,8 @@ def name_model(exported: ModelProto, name: str, inputs: Values, constants: Value
         opset_import=[o for o in exported.opset_import if o.domain in domains],
         graph=GraphProto(
             name=name,
-            input=[_value_info(own, type_) for own, type_ in inputs],
-            output=[_value_info(own, type_) for own, type_ in outputs],
+            input=[value_info(own, type_) for own, type_ in inputs],
+            output=[value_info(own, type_) for own, type_ in outputs],
             initializer=[*empty, *kept.values()],
             node=nodes,
         ),
@@ -116,6 +116,20 @@ def live_nodes(nodes: Sequence[NodeProto], outputs: set[str]) -> list[NodeProto]
     return live[::-1]
 
 
+def opsets(models: Iterable[ModelProto]) -> list[onnx.OperatorSetIdProto]:
+    """The newest opset of each domain that the models use."""
+    newest: dict[str, int] = {}
+    for entry in (entry for model in models for entry in model.opset_import):
+        newest[entry.domain] = max(entry.version, newest.get(entry.domain, 0))
+    return [helper.make_opsetid(domain, version) for domain, version in sorted(newest.items())]
+
+
+def value_info(name: str, type_: TensorType) -> ValueInfoProto:
+    """A value's name and type; sizes that depend on the batch are dynamic dimensions."""
+    shape = [str(n) if isinstance(n, Batch) else n for n in type_.shape]
+    return helper.make_tensor_value_info(name, _dtype(type_), shape)
+
+
 def _shared(tensor: TensorProto, kept: dict[bytes, TensorProto], names: Iterator[str]) -> str:
     """Name of the small constant with this value; one for all that are equal."""
     data = onnx.numpy_helper.to_array(tensor).tobytes()
@@ -151,11 +165,6 @@ def _fresh_names(prefix: str, taken: set[str]) -> Iterator[str]:
         if f"{prefix}{number}" not in taken:
             yield f"{prefix}{number}"
         number += 1
-
-
-def _value_info(name: str, type_: TensorType) -> ValueInfoProto:
-    shape = [str(n) if isinstance(n, Batch) else n for n in type_.shape]
-    return helper.make_tensor_value_info(name, _dtype(type_), shape)
 
 
 def _dims(type_: TensorType) -> list[int]:

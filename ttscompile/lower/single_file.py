@@ -48,12 +48,12 @@ from ..update import columns, diagonals, rows
 from .contexts import Contexts
 from .graph_writer import GraphWriter, Weights, tensor
 from .loop import GROUP, DenoisingLoop, LoopInputs
+from .onnx_model import IR_VERSION, opsets
 from .plan import LoweredPlan, lower_plan
 
 CORRECTION, CORRECTION_BIAS, ANCHORS = "correction", "correction_bias", "correction_anchors"
 """Inputs of the whole call that carry a schedule's correction."""
 
-IR_VERSION = 10
 LARGEST = 2**31 - 1
 """Bytes of a file that protobuf reads."""
 
@@ -97,13 +97,10 @@ def lower_single_file(program: Program, models: Mapping[str, ModelProto], weight
     _write_actions(main, sample, spec)
     main.rename(plan.executed, "executed_plan")
     _write_cache(main, plan, stored, residuals, (spec.sampler.steps, len(groups)))
-    domains: dict[str, int] = {}
-    for entry in (entry for model in models.values() for entry in model.opset_import):
-        domains[entry.domain] = max(entry.version, domains.get(entry.domain, 0))
     model = ModelProto(
         ir_version=IR_VERSION,
         producer_name="ttscompile",
-        opset_import=[helper.make_opsetid(domain, version) for domain, version in sorted(domains.items())],
+        opset_import=opsets(models.values()),
         graph=main.graph("ttscompile", outputs, inputs),
     )
     if model.ByteSize() > LARGEST:

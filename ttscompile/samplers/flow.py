@@ -69,13 +69,13 @@ def flow_matching_table(
 
 def _times(steps: int | Sequence[float], start: float, end: float) -> npt.NDArray[np.float64]:
     """The N + 1 times."""
-    if isinstance(steps, int):
+    if isinstance(steps, (int, np.integer)):
         if isinstance(steps, bool) or steps < 1:
             raise SpecError(f"{steps!r} flow-matching steps are not possible; expected a positive whole number.")
         times = start + (end - start) * np.arange(steps + 1) / steps
     else:
         times = np.asarray(steps, np.float64)
-    lengths = np.diff(times)
+    lengths = np.diff(np.atleast_1d(times))
     if times.ndim != 1 or len(times) < 2 or not np.isfinite(times).all() or not (lengths * lengths[0] > 0).all():
         raise SpecError(f"flow-matching times must all rise or all fall, and be two or more; found {times.tolist()}.")
     return times

@@ -3,7 +3,7 @@
 The maths of DDPM and DDIM is not written down here a second time: every coefficient is measured on the scheduler
 itself, in float64, and the finished table is held against it on random inputs. Whatever does not have the form of
 ``SamplerTable`` (dynamic thresholding, scaled inputs, learned variances) is refused. DPM-Solver++, which remembers, is
-measured in ``samplers_multistep``; flow matching needs no scheduler (``samplers_flow``).
+measured in ``multistep``; flow matching needs no scheduler (``flow``).
 """
 
 from __future__ import annotations
