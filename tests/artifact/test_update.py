@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import subprocess
@@ -13,10 +14,11 @@ import pytest
 
 from tests.artifact.folders import contents
 from tests.artifact.test_archive import packed
-from tests.artifact.tiny import tiny_models, tiny_program
+from tests.artifact.tiny import CHANNELS, HORIZON, STEPS, tiny_models, tiny_program
 from ttscompile.artifact import load_artifact
 from ttscompile.artifact.manifest import Manifest, PlanRecord
 from ttscompile.artifact.write import update_calibration, write_artifact
+from ttscompile.correction import no_correction
 from ttscompile.errors import ArtifactError, IllegalPlanError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -118,6 +120,11 @@ BAD: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"record": {"x": np.zeros(2)}}, ArtifactError, "expected JSON"),
     ({"record": {"sparsity": 1.5}}, ArtifactError, r"sparsity: expected a number in 0\.\.1"),
     ({"model_identity": "0" * 64}, ArtifactError, "converted again"),
+    (
+        {"schedules": {}, "corrections": {"tts": no_correction(STEPS, (HORIZON, CHANNELS))}},
+        ArtifactError,
+        "exactly when there are sched",
+    ),
 ]
 
 
@@ -169,6 +176,18 @@ def test_one_at_a_time(written: Path) -> None:
     finally:
         os.close(descriptor)
     update(written)
+
+
+def test_a_file_system_without_locks_is_an_error(written: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refusing(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    before = contents(written)
+    with monkeypatch.context() as patch:
+        patch.setattr(fcntl, "flock", refusing)
+        with pytest.raises(ArtifactError, match="cannot be locked, and was not changed: .*No locks available"):
+            update(written)
+    assert contents(written) == before
 
 
 def test_an_open_artifact_survives_an_update(written: Path) -> None:

@@ -182,6 +182,9 @@ class _Judged(WholeSteps):
     def __init__(self) -> None:
         self.asked: list[tuple[int, ...]] = []
 
+    def correcting(self, full_steps: int) -> float:
+        return 0.0
+
     def errors(self, steps: Any) -> Errors:
         self.asked.append(tuple(steps))
         return Errors(1 / len(steps), 10 / len(steps))

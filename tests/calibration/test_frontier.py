@@ -165,6 +165,10 @@ def test_the_command_prints_the_same_as_a_table_and_as_json(
     assert record["with"] == [{"path": str(other_sampler), "identity": other}]
     assert "held-out calls" in (tmp_path / "f.svg").read_text()
     assert "warning: this artifact" in told.stderr
+    lost = runner.invoke(main, ["compare", *arguments, "--json", "--plot", str(tmp_path / "none" / "f.png")])
+    assert lost.exit_code == 2
+    assert json.loads(lost.stdout)["identity"] == identity  # what took minutes is told all the same
+    assert "folder that exists" in lost.stderr
     shown = runner.invoke(main, ["compare", *arguments])
     assert shown.exit_code == 0, shown.stderr
     assert "* Another sampler" in shown.stdout

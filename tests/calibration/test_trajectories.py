@@ -48,8 +48,17 @@ def test_calls_are_divided_into_episodes(file: Path) -> None:
 
 def test_compressed_files_and_several_files(file: Path, tmp_path: Path) -> None:
     np.savez_compressed(file, **arrays())
-    other = saved(tmp_path / "other.npz", **arrays(7))
+    other = saved(tmp_path / "other.npz", **{**arrays(7), "obs": arrays(7)["obs"] + 1})
     assert [e.calls for e in load_trajectories([file, str(other)], SPECS, 2)] == [2, 3, 2, 5]
+
+
+def test_an_episode_that_is_given_twice_is_used_once(file: Path, tmp_path: Path) -> None:
+    """Or it could be learned from and held out."""
+    saved(file, **arrays())
+    both = saved(tmp_path / "both.npz", **arrays(7))  # the first episode is the same, the second longer
+    with pytest.warns(UserWarning, match=r"given before are left out: calls.npz\[0\], calls.npz\[1\], both.npz\[0\]\."):
+        episodes = load_trajectories([file, file, both], SPECS, 2)
+    assert [episode.name for episode in episodes] == ["calls.npz[0]", "calls.npz[1]", "both.npz[1]"]
 
 
 def test_numbers_take_the_dtype_of_the_specification(file: Path) -> None:

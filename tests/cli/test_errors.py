@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import json
+import shutil
 import sys
 from pathlib import Path
 
@@ -10,6 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 from ttscompile.cli import main
+from ttscompile.cli.output import print_json
 from ttscompile.errors import TrajectoryError
 from ttscompile.trajectories import read_npz
 
@@ -83,6 +87,47 @@ def test_pictures_that_cannot_be_drawn(compiled_pusht: Path, tmp_path: Path) -> 
     for path in (corrupt, single):
         with pytest.raises(TrajectoryError, match=path.name):
             read_npz(path)
+
+
+def test_what_the_system_refuses_is_one_message(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", "out/x")
+
+    monkeypatch.setattr(sys.modules["ttscompile.cli.inspect"], "load_artifact", full)
+    result = CliRunner().invoke(main, ["inspect", "out"])
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr == "error: [Errno 28] No space left on device: 'out/x'\n"
+
+
+@pytest.mark.parametrize(("command", "hint"), [("inspect", ""), ("calibrate", "; the same command with --resume goes")])
+def test_an_interruption_is_no_failed_check(command: str, hint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys.modules["ttscompile.cli.inspect"], "load_artifact", interrupted)
+    monkeypatch.setattr("ttscompile.calibrate", interrupted, raising=False)
+    arguments = ["--trajectories", "calls.npz"] if command == "calibrate" else []
+    result = CliRunner().invoke(main, [command, "out", *arguments])
+    assert result.exit_code == 130
+    assert result.stderr.startswith(f"interrupted{hint}")
+
+
+def test_a_folder_of_something_else_is_refused_before_the_checkpoint_is_read(no_checkpoint: Path) -> None:
+    result = CliRunner().invoke(main, ["convert", str(no_checkpoint), "-o", str(no_checkpoint.parent)])
+    assert result.exit_code == 2
+    assert "expected an empty directory or a ttscompile artifact; found one that holds notes.ckpt" in result.stderr
+
+
+def test_figures_that_are_no_numbers_are_null(capsys: pytest.CaptureFixture[str]) -> None:
+    print_json({"a": float("nan"), "b": [1.5, (float("inf"), np.float64("nan"))], "c": {"d": "nan"}})
+    assert json.loads(capsys.readouterr().out) == {"a": None, "b": [1.5, [None, None]], "c": {"d": "nan"}}
+
+
+def test_names_are_shown_as_they_are(toy_compiled: Path, tmp_path: Path) -> None:
+    directory = Path(shutil.copytree(toy_compiled, tmp_path / "[red]x :car:"))
+    result = CliRunner().invoke(main, ["inspect", str(directory)])
+    assert result.exit_code == 0
+    assert "[red]x :car:" in "".join(result.stdout.split("\n")).replace("  ", "")
 
 
 def test_an_error_that_is_nobodys_fault_is_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -55,13 +55,14 @@ def test_a_broken_one_gives_status_1_and_says_where_and_what_to_do(artifact: Pat
     assert drawn.startswith("<?xml")
 
 
-def test_a_damaged_one_gives_status_1_and_cannot_be_drawn(artifact: Path, tmp_path: Path) -> None:
+def test_a_damaged_one_gives_status_1_drawn_or_not(artifact: Path, tmp_path: Path) -> None:
     (artifact / "stem.onnx").unlink()
     result = run("verify", artifact, "--json")
     assert result.exit_code == 1
     assert json.loads(result.stdout)["first_failure"] == "integrity"
     result = run("verify", artifact, "--plot", tmp_path / "errors.png")
-    assert result.exit_code == 2
+    assert result.exit_code == 1
+    assert "FAILED at integrity" in result.stdout
     assert "there is nothing to draw" in result.stderr
 
 

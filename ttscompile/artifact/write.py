@@ -6,7 +6,7 @@ import fcntl
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +21,7 @@ from ..errors import ArtifactError
 from ..ir.program import Binding, Program
 from ..ir.serialize import graph_to_json
 from .bind import Place, bind, rebind
-from .codec import encode
+from .codec import decode, encode
 from .files import (
     PARTIAL,
     content_hash,
@@ -97,7 +97,7 @@ def write_artifact(
             not fit each other. Nothing is changed then.
     """
     target = Path(os.path.realpath(directory))
-    _require_replaceable(target)
+    require_replaceable(target)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         recover(target)
@@ -179,8 +179,9 @@ def update_calibration(
                 pruner=artifact.pruner if pruner_weights is None else pruner_weights,
             )
             manifest = _store_golden_plans(directory, manifest, {} if golden is None else golden(after))
-            manifest = _identified(manifest)
-            replace_file(directory / MANIFEST, encode(manifest))
+            content = encode(_identified(manifest))
+            manifest = decode(content)  # refuses what nobody could load
+            replace_file(directory / MANIFEST, content)
         except OSError as error:
             raise ArtifactError(
                 f"{directory}: cannot be updated: {error}. It has its old plans or the new ones, whole."
@@ -268,8 +269,13 @@ def _identified(manifest: Manifest) -> Manifest:
     return replace(manifest, identity=identity, model_identity=model_identity)
 
 
-def _require_replaceable(target: Path) -> None:
-    """Raise unless the target is free, empty, or an artifact and nothing else: users' files are never removed."""
+def require_replaceable(directory: str | os.PathLike[str]) -> None:
+    """Raise unless a directory is free, empty, or an artifact and nothing else: users' files are never removed.
+
+    Raises:
+        ArtifactError: it is something else.
+    """
+    target = Path(os.path.realpath(directory))
     if not target.exists():
         return
     if not target.is_dir():
@@ -291,17 +297,18 @@ def _start(path: Path) -> bytes:
 @contextmanager
 def _locked(directory: Path) -> Iterator[None]:
     """Keep other processes from changing the artifact; a crash releases it."""
-    descriptor = os.open(directory, os.O_RDONLY)
-    try:
+    with ExitStack() as held:
         try:
+            descriptor = os.open(directory, os.O_RDONLY)
+            held.callback(os.close, descriptor)
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise ArtifactError(
                 f"{directory}: another process is changing the artifact. Try again when it is done."
             ) from None
+        except OSError as error:  # no permission; a file system without locks
+            raise ArtifactError(f"{directory}: cannot be locked, and was not changed: {error}.") from error
         yield
-    finally:
-        os.close(descriptor)
 
 
 def _store_plans(

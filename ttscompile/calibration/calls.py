@@ -11,12 +11,17 @@ import torch
 from torch import Tensor
 
 from ..config import PolicySpec
+from ..errors import CalibrationError
 from ..ir.graph import Graph
 from ..runtimes.reference.model import Contexts, ReferenceModel
 from ..trajectories.episodes import Episode
 
 IntArray = npt.NDArray[np.int64]
 FloatArray = npt.NDArray[np.float32]
+
+LARGEST = 1e30
+"""Error of actions that are not numbers, or off by more: finite, so that means and comparisons of plans mean something,
+and a record can hold them."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +35,16 @@ class Split:
 
     calibration: tuple[int, ...]
     validation: tuple[int, ...]
+
+
+def require_seed(seed: int) -> None:
+    """Refuse what no random numbers begin with.
+
+    Raises:
+        CalibrationError: it is negative.
+    """
+    if seed < 0:
+        raise CalibrationError(f"seed: expected an integer of at least 0; found {seed}.")
 
 
 def split_episodes(count: int, fraction: float, seed: int) -> Split:
@@ -193,7 +208,7 @@ class Actions:
         return part.reshape(*part.shape[:-2], self.size)
 
     def errors(self, samples: Tensor, targets: Tensor, units: bool) -> FloatArray:
-        """Mean absolute difference of the executed actions of each call.
+        """Mean absolute difference of the executed actions of each call; at most ``LARGEST``, also where they are NaN.
 
         Args:
             samples: ``[..., N, T, D]``.
@@ -206,4 +221,4 @@ class Actions:
         difference = (self.executed(samples) - self.executed(targets)).abs()
         if units:
             difference = (difference.reshape(*difference.shape[:-1], -1, len(self._scale)) / self._scale).flatten(-2)
-        return np.asarray(difference.mean(-1).numpy(), dtype=np.float32)
+        return np.asarray(difference.mean(-1).nan_to_num(nan=LARGEST).clamp(max=LARGEST).numpy(), dtype=np.float32)

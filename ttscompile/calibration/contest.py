@@ -18,6 +18,7 @@ from ..points import MeasuredPoint
 from ..runtimes.base import open_runtime
 from ..runtimes.policy import CompiledPolicy
 from ..trajectories.episodes import Episode
+from .calls import LARGEST
 
 WARM_UP = 2
 """Rounds that are not timed; their actions count."""
@@ -126,7 +127,9 @@ def _call(policy: CompiledPolicy, obs: Mapping[str, Array], noise: Noise, plan: 
 
 
 def _error(actions: Array, dense: Array) -> float:
-    return float(np.abs(actions - dense).mean())
+    with np.errstate(invalid="ignore", over="ignore"):
+        difference = np.abs(actions - dense).mean()
+    return float(np.nan_to_num(difference, nan=LARGEST, posinf=LARGEST))
 
 
 def _noise(artifact: Artifact, draw: np.random.Generator) -> Noise:

@@ -39,7 +39,7 @@ class Families:
     Args:
         whole: compares.
         state: of the calibration.
-        clock: nothing new is begun when the time is up.
+        clock: nothing is begun that would end, with the correction and the judgement that follow, after its limit.
         bar: shows the progress.
     """
 
@@ -47,7 +47,6 @@ class Families:
 
     def __init__(self, whole: WholeSteps, state: StateFile, clock: Clock, bar: Bar) -> None:
         self._whole, self._state, self._clock, self._bar = whole, state, clock, bar
-        self._longest = 0.0
 
     def best(self, full_steps: int, what: str, crowding: Sequence[float] = CROWDING) -> Best | None:
         """The best of the family of ``full_steps`` computed steps, of those that there was time for; None if of none.
@@ -64,7 +63,7 @@ class Families:
             errors = self._errors(steps)
             if errors is None:
                 break
-            if found is None or not errors[0] >= found[0]:
+            if found is None or errors[0] < found[0]:
                 found = (*errors, steps)
             self._bar.update(number + 1, f"error {found[1]:.4g}", self._clock.left())
         return None if found is None else Best(found[2], found[1])
@@ -74,12 +73,11 @@ class Families:
         known = self._state.progress.setdefault(self.KEY, {})
         key = ",".join(map(str, steps))
         if key not in known:
-            start = self._clock.elapsed()
-            if start + self._longest > self._clock.limit:
+            # All plans together are judged on fewer calls than one is compared on: that takes no longer.
+            if 2 * self._whole.comparing(len(steps)) + self._whole.correcting(len(steps)) > self._clock.left():
                 return None
             errors = self._whole.errors(steps)
             known[key] = [errors.normalised, errors.units]
-            self._longest = max(self._longest, self._clock.elapsed() - start)
             self._state.progress["seconds"] = self._clock.elapsed()
             self._state.save()
         with self._state.reading():

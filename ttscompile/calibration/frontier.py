@@ -28,7 +28,7 @@ from ..runtimes.base import open_runtime
 from ..runtimes.policy import CompiledPolicy
 from ..trajectories.episodes import Episode, load_trajectories
 from .budget import cells_of, goal_of
-from .calls import Actions, Split, sample_calls, split_episodes
+from .calls import Actions, Split, require_seed, sample_calls, split_episodes
 from .contest import Entrant, Progress, measure
 from .execute import Executor
 from .latency import with_plans
@@ -80,11 +80,12 @@ def compare(
     """
     if calls < 1 or learned < 2:
         raise CalibrationError(f"expected at least 1 call and 2 to learn from; found {calls} and {learned}.")
+    require_seed(seed)
     artifact = load_artifact(path)
     spec = artifact.manifest.spec
     steps, blocks = artifact.manifest.steps, len(artifact.manifest.blocks)
     budgets = {one: cells_of(goal_of(target_sparsity=one), artifact.manifest, False) for one in sparsities}
-    compared = {_unique(other.name, others): load_artifact(other) for other in others}
+    compared = {_unique(other.resolve().name, others): load_artifact(other) for other in others}
     for name, other in compared.items():
         _require_same_policy(artifact, other, name)
     episodes = load_trajectories(trajectories, spec.observations, spec.chunk.stop - spec.chunk.start, observation)
@@ -196,7 +197,7 @@ def _unique(name: str, others: Sequence[Path]) -> str:
     Raises:
         CalibrationError: there are two.
     """
-    if sum(other.name == name for other in others) > 1:
+    if sum(other.resolve().name == name for other in others) > 1:
         raise CalibrationError(f"two artifacts are called {name!r}; their points could not be told apart. Rename one.")
     return name
 

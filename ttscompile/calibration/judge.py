@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import numpy as np
-
 from ..artifact.load import Artifact
 from ..artifact.manifest import Manifest
 from ..errors import CalibrationFailedError
 from ..lattice import PlanArray, uniform_plan
 from ..runtimes.base import pruner_plan
 from .budget import ERROR, FLOPS, Goal
-from .calls import Actions, Calls
+from .calls import LARGEST, Actions, Calls
 from .execute import Executor
 from .named import Named
 from .result import CalibrationResult, PlanScore
@@ -92,7 +90,7 @@ def require_success(result: CalibrationResult, goal: Goal, is_baseline: bool) ->
     """
     chosen, baseline = result.plans[result.default_plan], result.plans[UNIFORM]
     what = f"plan {result.default_plan!r} of strategy {result.strategy!r}"
-    if not np.isfinite(chosen.error):
+    if chosen.error > LARGEST / 1e6:  # the mean of some calls, one of which is that far off
         raise CalibrationFailedError(f"the actions of {what} are not numbers. The artifact is as it was.")
     if chosen.sparsity < result.target_sparsity - 1e-9:
         raise CalibrationFailedError(

@@ -59,8 +59,9 @@ def measure_budget(artifact: Artifact, goal: Goal, pruned: bool) -> Budget:
     steps, blocks = artifact.manifest.steps, len(artifact.manifest.blocks)
     names = {full: f"{full} steps" for full in range(1, steps + 1)}
     plans = {name: uniform_plan(steps, blocks, full) for full, name in names.items()}
-    runtime = open_runtime(with_plans(artifact, plans), "onnxruntime", goal.threads)
-    policy = CompiledPolicy(with_plans(artifact, plans), runtime, seed=0)
+    whole = with_plans(artifact, plans)
+    runtime = open_runtime(whole, "onnxruntime", goal.threads)
+    policy = CompiledPolicy(whole, runtime, seed=0)
     obs = {key: np.zeros((1, *one.shape), one.dtype) for key, one in artifact.manifest.spec.observations.items()}
     waited = _pruner_ms(artifact, runtime) if pruned else 0.0
     measured: dict[int, float] = {}
@@ -105,7 +106,10 @@ def median_ms(call: Callable[[], object]) -> float:
 def _pruner_ms(artifact: Artifact, runtime: Runtime) -> float:
     """For how long the loop waits for the pruner's plan, in milliseconds; whatever the plan is."""
     spec = artifact.manifest.spec
-    obs = {key: np.zeros((1, *one.shape), np.float32) for key, one in spec.observations.items()}
+    obs = {
+        key: np.zeros((1, *one.shape), one.dtype if one.normalizer is None else np.float32)
+        for key, one in spec.observations.items()
+    }
     noise = Noise(np.zeros((1, *spec.sample), np.float32), np.zeros((spec.sampler.steps, 1, *spec.sample), np.float32))
     waits = []
     for _ in range(WARM_UP + FEWEST):

@@ -20,7 +20,7 @@ from ..errors import CalibrationError
 from ..record_golden import record_plans
 from ..trajectories.episodes import Episode, load_trajectories
 from .budget import ERROR, LATENCY, Budget, Goal, cells_of, goal_of
-from .calls import Actions, Calls, split_episodes
+from .calls import Actions, Calls, require_seed, split_episodes
 from .clock import Clock
 from .execute import Executor
 from .families import Families, budget_of_error
@@ -40,7 +40,7 @@ from .whole_steps import WholeSteps
 CALLS_A_MINUTE = 64
 """Calls to learn from, for each minute of the time limit."""
 
-MOST_CALLS = 1024
+FEWEST_CALLS, MOST_CALLS = 64, 1024
 
 CALLS_A_FEATURE = 3
 """Calls to learn from at least, for each number that a correction reads. On Push-T (97 of them, 95 %) one that is
@@ -73,7 +73,7 @@ def calibrate(
     Targets come from the dense policy with the same noise. Plans are judged on episodes that they were not learned
     from. After every interval of some seconds the state is saved in the artifact's directory: whatever stops the
     process, a call with ``resume`` goes on from there, and ends where it would have ended. The same arguments give the
-    same bytes, unless the time limit cuts the search short, or the budget is a latency, which is measured.
+    same bytes, unless the time limit cuts something short, or the budget is a latency, which is measured.
 
     At most one budget: ``target_sparsity``, ``target_flops``, ``latency_ms`` or ``max_action_error``. Beside the plan
     that keeps it, ``schedule``, the artifact gets ``uniform``, the baseline; and with strategy ``tts`` ``safe``, which
@@ -85,13 +85,15 @@ def calibrate(
         target_sparsity: share of the cells to reuse; if no budget is given, 0.95, or what leaves five whole steps.
         strategy: how the plan is found, see ``ttscompile.calibration.strategies``.
         seed: of the split, the noise and the search.
-        resume: go on where a calibration with the same arguments was interrupted; begins anew if none was.
+        resume: go on where a calibration with the same arguments was interrupted, with the same calls whatever
+            ``max_minutes`` is now; begins anew if none was.
         target_flops: share of the FLOPs of a dense call to save, prologue and pruner counted.
         latency_ms: of a call with onnxruntime on this machine. Measured once, for as many whole steps as fit.
         max_action_error: mean absolute error of the executed actions on held-out episodes, in their units; the plan is
             the sparsest that was found below it. Strategy ``tts`` only.
         threads: of the calls that are timed for ``latency_ms``.
-        max_minutes: after this time the best plan so far is taken. Also decides how many calls are used.
+        max_minutes: the best plan so far is taken in time to be finished by then, as far as what was done before lets
+            it be known; what has to be done at least is done. Also decides how many calls are used.
         validation_fraction: of the episodes.
         observation: by key, the arrays of a recording that it is made of, where they are called otherwise.
         max_intervals: an end that does not depend on the machine's speed; None for the strategy's own.
@@ -117,7 +119,7 @@ def calibrate(
         raise CalibrationError(
             f"{path}: only a directory can be calibrated. Unzip the artifact and give the directory."
         )
-    budget = _known_budget(artifact, goal, strategy, validation_fraction, max_minutes)
+    budget = _known_budget(artifact, goal, strategy, validation_fraction, max_minutes, seed)
     episodes = load_trajectories(trajectories, spec.observations, spec.chunk.stop - spec.chunk.start, observation)
     if len(episodes) < 2:
         raise CalibrationError(
@@ -125,8 +127,9 @@ def calibrate(
             " learned from. Record more; about sixteen are enough."
         )
     split = split_episodes(len(episodes), validation_fraction, seed)
-    fewest = CALLS_A_FEATURE * (FEATURES * spec.sample[0] + 1)
-    limit = int(np.clip(CALLS_A_MINUTE * max_minutes, min(fewest, MOST_CALLS), MOST_CALLS))
+    features = FEATURES * spec.sample[0] + 1
+    fewest = min(CALLS_A_FEATURE * features, MOST_CALLS) if strategy == "tts" else FEWEST_CALLS
+    limit = int(np.clip(CALLS_A_MINUTE * max_minutes, fewest, MOST_CALLS))
     state = StateFile(
         Path(path),
         {
@@ -136,12 +139,12 @@ def calibrate(
             "strategy": strategy,
             "seed": seed,
             "validation_fraction": validation_fraction,
-            "calls": limit,
             "max_intervals": max_intervals,
         },
     )
     if not (resume and state.load()):
         state.remove()
+    limit = state.progress.setdefault("calls", limit)  # whatever time there is to go on
     clock = Clock(begun, float(state.progress.get("seconds", 0.0)), 60 * max_minutes)
     if goal.kind == LATENCY:
         budget = _timed_budget(artifact, goal, strategy, state, clock)
@@ -150,7 +153,15 @@ def calibrate(
     with Bar(progress) as bar:
         if (warning := few_steps(artifact.manifest)) is not None:
             bar.warn(warning)
-        sets = {name: with_targets(executor, name, calls, state, clock, bar) for name, calls in sets.items()}
+        least = {"calibration": fewest, "validation": limit}
+        sets = {
+            name: with_targets(executor, name, calls, least[name], state, clock, bar) for name, calls in sets.items()
+        }
+        if clock.left() < 0:
+            bar.warn(
+                f"{max_minutes:g} minutes were over when the dense policy had answered the calls to learn from:"
+                f" strategy {strategy!r} needs {fewest}. Its search is the shortest there is; allow more time."
+            )
         kinds = tuple(block.kind for block in artifact.manifest.blocks)
         task = Task(executor, Actions(spec), sets["calibration"], len(kinds), seed, artifact.pruner, kinds)
         whole = WholeSteps(task)
@@ -159,7 +170,8 @@ def calibrate(
             budget = budget_of_error(families, goal, artifact.manifest.steps, len(kinds))
         task = replace(task, budget=budget.cells)
         searching = clock.until(1 - SHARE) if strategy == "tts" else clock
-        found, intervals, stopped = search_plan(open_strategy(strategy, task), state, searching, bar, max_intervals)
+        search = open_strategy(strategy, task, whole)
+        found, intervals, stopped = search_plan(search, state, searching, bar, max_intervals)
         if goal.kind == ERROR:
             found, budget = _relax(artifact, families, whole, task, found, budget, sets["validation"])
         named = named_plans(families, whole, task, strategy, budget.cells)
@@ -210,13 +222,16 @@ def _write(
     )
 
 
-def _known_budget(artifact: Artifact, goal: Goal, strategy: str, fraction: float, minutes: float) -> Budget | None:
+def _known_budget(
+    artifact: Artifact, goal: Goal, strategy: str, fraction: float, minutes: float, seed: int
+) -> Budget | None:
     """The budget where nothing has to be run for it; refuses what cannot be satisfied before any work."""
     require_strategy(strategy)
     if not 0 < fraction < 1 or not minutes > 0:
         raise CalibrationError(
             f"expected validation_fraction between 0 and 1 and max_minutes above 0; found {fraction} and {minutes}."
         )
+    require_seed(seed)
     if goal.kind == ERROR and strategy != "tts":
         raise CalibrationError(
             f"max_action_error needs strategy 'tts'; found {strategy!r}. Give this strategy a target_sparsity, a"

@@ -35,10 +35,11 @@ def search_plan(search: Strategy, state: StateFile, clock: Clock, bar: Bar, most
     number, longest, cut = first, 0.0, False
     while number < count and not search.done:
         start = clock.elapsed()
-        if number > 0 and start + longest > clock.limit:
+        end = start + longest + search.settling
+        if number > 0 and end > clock.limit:
             return search.found(), number, "time limit"
         closing = search.closing * longest
-        if number > 0 and closing <= CLOSING_SHARE * clock.limit and start + longest + closing > clock.limit:
+        if number > 0 and closing <= CLOSING_SHARE * clock.limit and end + closing > clock.limit:
             search.close()
             cut = True
         search.advance(number)

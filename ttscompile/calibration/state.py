@@ -95,8 +95,17 @@ class StateFile:
             raise CalibrationError(f"{self._path}: the state of the calibration cannot be written: {error}.") from error
 
     def remove(self) -> None:
-        """Forget everything."""
-        self._path.unlink(missing_ok=True)
+        """Forget everything.
+
+        Raises:
+            CalibrationError: the directory cannot be written.
+        """
+        try:
+            self._path.unlink(missing_ok=True)
+        except OSError as error:
+            raise CalibrationError(
+                f"{self._path}: cannot be removed: {error}. Give an artifact that can be written."
+            ) from error
         self.arrays, self.progress = {}, {}
 
     @contextmanager
@@ -152,8 +161,8 @@ def _check_progress(progress: Value) -> None:
     members = progress.members()
     if "seconds" in members and members["seconds"].number() < 0:
         members["seconds"].fail("a time that is not negative")
-    if "intervals" in members:
-        members["intervals"].integer()
+    for name in {"calls", "intervals", "calibration targets", "validation targets"} & set(members):
+        members[name].integer()
     if "latency" in members:
         fields = members["latency"].keys("cells", "measured")
         fields["cells"].integer(1)

@@ -19,19 +19,25 @@ from .workers import workers
 REPEATS = 8
 """How often an observation may be learned from, each time with another noise."""
 
+SHARE = 0.5
+"""Of the time limit: when it is over, no more targets are made than there have to be."""
+
 TARGETS_AT_ONCE = 16
 """Dense calls that go through the loop together, on one core; after a round of these the state is saved."""
 
 
-def with_targets(executor: Executor, name: str, calls: Calls, state: StateFile, clock: Clock, bar: Bar) -> Calls:
-    """The calls with what the dense policy answers to them.
+def with_targets(
+    executor: Executor, name: str, calls: Calls, least: int, state: StateFile, clock: Clock, bar: Bar
+) -> Calls:
+    """The calls with what the dense policy answers to them; the first of them where the time does not do for all.
 
     Args:
         executor: of the policy.
         name: of the calls in the state.
         calls: without targets.
+        least: as many are needed whatever the time.
         state: remembers what was computed.
-        clock: only counts: targets are needed whatever the time.
+        clock: with the limit of the calibration.
         bar: shows the progress.
     """
     known = state.get("targets").get(name)
@@ -41,12 +47,18 @@ def with_targets(executor: Executor, name: str, calls: Calls, state: StateFile, 
         with state.reading():
             path = torch.cat([path, torch.from_numpy(known)])
     bar.stage(f"dense, {name}", calls.count, len(path))
-    for found in dense_rounds(executor, calls, len(path)):
-        path = torch.cat([path, *found])
+    rounds, key = dense_rounds(executor, calls, len(path)), f"{name} targets"
+    # A calibration that was interrupted later goes on with as many as it had then.
+    count = min(calls.count, int(state.progress.get(key, calls.count)))
+    while len(path) < count and (len(path) < least or clock.elapsed() < SHARE * clock.limit):
+        path = torch.cat([path, *next(rounds)])
         state.put("targets", {**state.get("targets"), name: path.numpy()})
         state.progress["seconds"] = clock.elapsed()
         state.save()
         bar.update(len(path), "", clock.left())
+    state.progress[key] = len(path)
+    if len(path) < calls.count:
+        calls = executor.selector.calls(calls, np.arange(len(path)))
     return calls.answered(path)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -39,6 +40,9 @@ class WholeSteps:
         task: see ``Task``; its budget is not used.
     """
 
+    _pace = 0.0
+    """Seconds that a comparison took, for each step that its schedule computes; the most so far."""
+
     def __init__(self, task: Task) -> None:
         self._task = task
         order = task.draw(0).permutation(task.calls.count)
@@ -66,9 +70,21 @@ class WholeSteps:
             return None
         return fit_correction(self._task.executor, self.plan(steps), self._task.calls)
 
+    def comparing(self, full_steps: int) -> float:
+        """Seconds that ``errors`` of a schedule takes, by those so far; 0 before any."""
+        return self._pace * full_steps
+
+    def correcting(self, full_steps: int) -> float:
+        """Seconds that ``correction`` of a schedule takes, likewise."""
+        share = self._task.calls.count / (self._fitted.count + 2 * self._compared.count)
+        return (1 + share) * self.comparing(full_steps)
+
     def _with_and_without(self, steps: Sequence[int]) -> tuple[Errors, Errors]:
+        begun = time.monotonic()
         fitted = fit_correction(self._task.executor, self.plan(steps), self._fitted)
-        return self._errors(steps, fitted), self._errors(steps, None)
+        errors = self._errors(steps, fitted), self._errors(steps, None)
+        self._pace = max(self._pace, (time.monotonic() - begun) / len(steps))
+        return errors
 
     def _errors(self, steps: Sequence[int], correction: Correction | None) -> Errors:
         task, calls = self._task, self._compared

@@ -1,11 +1,12 @@
 """The command ``ttscompile``: one file a command.
 
-Exit status: 0 done; 1 a check failed; 2 bad usage or bad input. Results go to standard output, as a table or with
-``--json`` as one JSON document and nothing else; progress and warnings go to standard error.
+Exit status: 0 done; 1 a check failed; 2 bad usage or bad input; 130 interrupted. Results go to standard output, as a
+table or with ``--json`` as one JSON document and nothing else; progress and warnings go to standard error.
 """
 
 from __future__ import annotations
 
+import errno
 from typing import Any
 
 import click
@@ -34,6 +35,15 @@ class _Commands(click.Group):
             failed_check = isinstance(error, CalibrationFailedError)
             click.echo(f"{'failed' if failed_check else 'error'}: {error}", err=True)
             ctx.exit(1 if failed_check else 2)
+        except OSError as error:  # a full disk, a file that may not be read
+            if error.errno == errno.EPIPE:
+                raise  # nobody reads on: click ends without a word
+            click.echo(f"error: {error}", err=True)
+            ctx.exit(2)
+        except KeyboardInterrupt:
+            resumes = ctx.invoked_subcommand == "calibrate"
+            click.echo("interrupted" + "; the same command with --resume goes on" * resumes, err=True)
+            ctx.exit(130)
 
 
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})

@@ -63,13 +63,12 @@ def bench(
     """
     if {"eager", "original"}.intersection(against) and checkpoint is None:
         raise click.UsageError("--against eager or original runs the original network: give --checkpoint FILE too.")
-    console = progress()
+    console, identity = progress(), identity_of(directory)
     with console.status("loading"):
         entered = contestants(directory, threads, plan, against, checkpoint)
     if entered[0].plan == "dense":
         console.print(
             f"warning: {directory} runs dense: it is not calibrated, or --plan dense was given.",
-            markup=False,
             soft_wrap=True,
         )
     with console.status("timing") as status:
@@ -77,7 +76,7 @@ def bench(
     if as_json:
         print_json(
             {
-                "identity": identity_of(directory),
+                "identity": identity,
                 "machine": fingerprint(),
                 "threads": threads,
                 "runs": runs,
@@ -95,8 +94,8 @@ def bench(
         " Speed-up: how many times faster the first row is. Prologue and pruner: their ms of the call.",
         soft_wrap=True,
     )
-    print_identity(identity_of(directory), output)
-    output.print(one_line(fingerprint()), markup=False, soft_wrap=True)
+    print_identity(identity, output)
+    output.print(one_line(fingerprint()), soft_wrap=True)
 
 
 def _row(m: Measurement, compiled: Measurement) -> tuple[str, ...]:

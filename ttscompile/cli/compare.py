@@ -105,6 +105,7 @@ def compare(
         raise RuntimeUnavailableError(
             f"compare needs {error.name}, which is not installed. Run: pip install 'ttscompile[compile]'."
         ) from error
+    identities = {path: identity_of(path) for path in (directory, *others)}  # of what is measured now
     columns = (TextColumn("{task.description:<28}"), BarColumn(bar_width=24), MofNCompleteColumn(), TimeElapsedColumn())
     told = progress()
     with only_results_on_stdout(), Progress(*columns, console=told, disable=not told.is_terminal) as bar:
@@ -124,19 +125,20 @@ def compare(
             progress=lambda what, done, total: bar.update(task, description=what, completed=done, total=total),
         )
     for warning in found.warnings:
-        told.print(f"warning: {warning}", markup=False, soft_wrap=True)
+        told.print(f"warning: {warning}", soft_wrap=True)
     machine = one_line(fingerprint())
-    if picture is not None:
-        title = f"{directory.name}: {found.calls} held-out calls, {threads} thread{'s' * (threads > 1)}\n{machine}"
-        plot_frontier(found.points, found.efficient(), found.yardsticks, picture, title)
-        told.print(f"wrote {picture}", markup=False, soft_wrap=True)
     if as_json:
-        compared = [{"path": str(path), "identity": identity_of(path)} for path in others]
-        print_json({"identity": identity_of(directory), "with": compared, "machine": fingerprint(), **found.to_json()})
+        compared = [{"path": str(path), "identity": identities[path]} for path in others]
+        print_json({"identity": identities[directory], "with": compared, "machine": fingerprint(), **found.to_json()})
     else:
         _print(found, results(), machine)
-        for path in (directory, *others):
-            results().print(f"{path}: identity {abbreviated(identity_of(path))}", markup=False, soft_wrap=True)
+        for path, identity in identities.items():
+            results().print(f"{path}: identity {abbreviated(identity)}", soft_wrap=True)
+    if picture is not None:
+        name = directory.resolve().name
+        title = f"{name}: {found.calls} held-out calls, {threads} thread{'s' * (threads > 1)}\n{machine}"
+        plot_frontier(found.points, found.efficient(), found.yardsticks, picture, title)
+        told.print(f"wrote {picture}", soft_wrap=True)
 
 
 def _print(found: Frontier, output: Console, machine: str) -> None:
@@ -175,5 +177,5 @@ def _print(found: Frontier, output: Console, machine: str) -> None:
         )
     output.print(f"Yardstick: two dense calls are apart {apart}.", soft_wrap=True)
     for name, reason in found.skipped.items():
-        output.print(f"{name}: left out: {reason}", markup=False, soft_wrap=True)
-    output.print(machine, markup=False, soft_wrap=True)
+        output.print(f"{name}: left out: {reason}", soft_wrap=True)
+    output.print(machine, soft_wrap=True)

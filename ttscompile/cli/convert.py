@@ -93,7 +93,7 @@ def convert(
             status.update(f"compiling: after {name}")
             if explain:
                 for i, note in enumerate(notes or ("nothing to do",)):
-                    console.print(f"{name if i == 0 else '':<22}{note}", markup=False, soft_wrap=True)
+                    console.print(f"{name if i == 0 else '':<22}{note}", soft_wrap=True)
 
         ttscompile.convert(
             checkpoint,
@@ -111,9 +111,9 @@ def convert(
     artifact = load_artifact(directory)
     summary = document(directory, artifact)
     if (warning := few_steps(artifact.manifest)) is not None:
-        console.print(f"warning: {warning}", markup=False, soft_wrap=True)
+        console.print(f"warning: {warning}", soft_wrap=True)
     if sampler is None and (hint := many_steps(artifact.manifest)) is not None:
-        console.print(f"hint: {hint}", markup=False, soft_wrap=True)
+        console.print(f"hint: {hint}", soft_wrap=True)
     if as_json:
         print_json(summary | {"stages": stages})
     else:

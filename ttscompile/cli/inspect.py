@@ -45,7 +45,7 @@ def inspect(directory: Path, picture: Path | None, name: str | None, observation
         name = name or _drawn_by_default(artifact, observation)
         plan = _plan(artifact, name, observation)
         plot_plan(plan, [block.kind for block in artifact.manifest.blocks], picture, f"plan {name!r}")
-        progress().print(f"wrote {picture}", markup=False, soft_wrap=True)
+        progress().print(f"wrote {picture}", soft_wrap=True)
     if as_json:
         print_json(summary)
     else:
@@ -61,7 +61,6 @@ def _drawn_by_default(artifact: Artifact, observation: Path | None) -> str:
     progress().print(
         f"plan {default!r} is made for each observation, and none was given: drawing {SCHEDULE!r}, the schedule that"
         " it departs from",
-        markup=False,
         soft_wrap=True,
     )
     return SCHEDULE

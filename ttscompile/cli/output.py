@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
@@ -31,16 +32,15 @@ _WIDTH = 110
 _SCRIPTS_WIDTH = 150
 
 
-def results() -> Console:
-    """Console for results, on standard output."""
-    console = Console(highlight=False)
-    return console if console.is_terminal else Console(highlight=False, width=_WIDTH)
+def results(width: int = _WIDTH) -> Console:
+    """Console for results, on standard output; names and paths are shown as they are, whatever brackets they have."""
+    console = Console(highlight=False, markup=False, emoji=False)
+    return console if console.is_terminal else Console(highlight=False, markup=False, emoji=False, width=width)
 
 
 def results_console() -> Console:
     """The same for scripts of ``examples``, whose tables are wider."""
-    console = Console(highlight=False)
-    return console if console.is_terminal else Console(highlight=False, width=_SCRIPTS_WIDTH)
+    return results(_SCRIPTS_WIDTH)
 
 
 def run(command: click.Command) -> None:
@@ -54,7 +54,7 @@ def run(command: click.Command) -> None:
 
 def progress() -> Console:
     """Console for progress and warnings, on standard error."""
-    return Console(stderr=True, highlight=False)
+    return Console(stderr=True, highlight=False, markup=False, emoji=False)
 
 
 @contextmanager
@@ -65,8 +65,16 @@ def only_results_on_stdout() -> Iterator[None]:
 
 
 def print_json(document: Mapping[str, Any]) -> None:
-    """Write one JSON document to standard output; refuses NaN and infinity, which are not JSON."""
-    click.echo(json.dumps(document, indent=2, allow_nan=False))
+    """Write one JSON document to standard output; NaN and infinity, which JSON has not, are null."""
+    click.echo(json.dumps(_without_nan(document), indent=2, allow_nan=False))
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _without_nan(one) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def table(*columns: str) -> Table:

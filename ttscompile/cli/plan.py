@@ -123,7 +123,7 @@ def _print(
         )
     output.print(made)
     for name, each in judged.items():
-        output.print(f"{name}: {each.explain()}", markup=False, soft_wrap=True)
+        output.print(f"{name}: {each.explain()}", soft_wrap=True)
     output.print(
         f"Of {runs} calls with {threads} thread{'s' * (threads > 1)}; the longest has to fit. Hz: of the policy, with"
         " as many control ticks an action as here.",
@@ -141,7 +141,7 @@ def _print(
                 f"{one.work_us:.1f}",
             )
         output.print(made)
-    output.print(one_line(fingerprint()), markup=False, soft_wrap=True)
+    output.print(one_line(fingerprint()), soft_wrap=True)
 
 
 def _jitter(policy: CompiledPolicy, name: str, policy_hz: float, latency: float, seconds: float) -> dict[str, Jitter]:

@@ -16,6 +16,8 @@ from ttscompile.cli.output import artifact_argument, only_results_on_stdout, pro
 from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
 from ttscompile.errors import ArtifactError, OutputError, ReportError
 from ttscompile.report import Given, Section, build, refused, render, verified
+from ttscompile.report.frontier import from_comparison
+from ttscompile.report.page import require_packages
 from ttscompile.report.verified import NOT_RUN
 from ttscompile.trajectories import Episode, load_trajectories
 
@@ -56,6 +58,7 @@ def report(
     """
     if not output.absolute().parent.is_dir():
         raise OutputError(f"{output}: the report cannot be written: no such folder. Give one that exists.")
+    require_packages()  # before minutes of work
     console = progress()
     artifact = load_artifact(directory)
     manifest = artifact.manifest
@@ -64,7 +67,7 @@ def report(
         chunk = manifest.spec.chunk
         recorded = load_trajectories(trajectories, manifest.spec.observations, chunk.stop - chunk.start, sources)
         episode = _chosen(recorded, number)
-    compared = None if comparison is None else _document(comparison)
+    compared = None if comparison is None else from_comparison(_document(comparison))
     with only_results_on_stdout(), console.status("loading") as status:
         passed, section = True, NOT_RUN
         if verifies:
@@ -78,7 +81,6 @@ def report(
         raise OutputError(f"{output}: the report cannot be written: {error}. Give a folder that exists.") from error
     results().print(
         f"wrote {output}, {len(page) / 1e6:.2f} MB, on artifact {manifest.short_identity}",
-        markup=False,
         soft_wrap=True,
     )
     if not passed:

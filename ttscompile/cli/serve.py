@@ -80,7 +80,6 @@ def serve(
     if host not in ("127.0.0.1", "::1", "localhost"):
         console.print(
             f"warning: {host} may be reached from other machines, and whoever reaches it can drive the robot.",
-            markup=False,
             soft_wrap=True,
         )
     with executor:

@@ -207,7 +207,7 @@ def _print_calibration(record: dict[str, Any] | None, console: Console) -> None:
     if scores.row_count:
         console.print(scores)
     for name, reason in record.get("skipped", {}).items():
-        console.print(f"  {name}: none, {reason}", markup=False)  # as a row it would squeeze the figures
+        console.print(f"  {name}: none, {reason}")  # as a row it would squeeze the figures
     made = table("calibration", "")
     for name, value in record.items():
         if name in ("plans", "precision", "sparsity", "flops_sparsity", "skipped"):

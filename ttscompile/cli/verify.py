@@ -12,7 +12,6 @@ from ttscompile.artifact.manifest import abbreviated
 from ttscompile.cli.output import artifact_argument, json_option, only_results_on_stdout, print_json, progress, results
 from ttscompile.cli.output import table as make_table
 from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
-from ttscompile.errors import OutputError
 from ttscompile.machine import fingerprint, one_line
 from ttscompile.plots.errors import plot_errors
 from ttscompile.verification import Verification
@@ -60,29 +59,27 @@ def verify(
     for rung in found.rungs:
         if rung.status == SKIPPED:
             told = f"warning: {rung.name} was skipped: {rung.told.rstrip('.')}. {rung.remedy}"
-            console.print(told, markup=False, soft_wrap=True)
-    if picture is not None:
-        _draw(found, picture)
-        console.print(f"wrote {picture}", markup=False, soft_wrap=True)
+            console.print(told, soft_wrap=True)
     if as_json:
         print_json({"machine": fingerprint(), "threads": threads, **found.to_json()})
     else:
         _print(found, results())
+    if picture is not None:
+        console.print(_draw(found, picture), soft_wrap=True)
     if not found.passed:
         context.exit(1)
 
 
-def _draw(found: Verification, picture: Path) -> None:
+def _draw(found: Verification, picture: Path) -> str:
+    """Draw, and say so."""
     errors = found.map
     if errors is None:
-        raise OutputError(
-            f"{picture}: there is nothing to draw: the artifact failed before its residuals were looked at"
-            f" ({found.rungs[0].told})."
-        )
-    title = f"{Path(found.path).name}, identity {abbreviated(found.identity or '')}"
+        return f"warning: {picture}: there is nothing to draw: the residuals were not looked at."
+    title = f"{Path(found.path).resolve().name}, identity {abbreviated(found.identity or '')}"
     plot_errors(
         errors.errors, errors.steps.tolist(), errors.kinds, errors.tolerance, picture, title, errors.cells, errors.plan
     )
+    return f"wrote {picture}"
 
 
 def _print(found: Verification, output: Console) -> None:
@@ -92,10 +89,10 @@ def _print(found: Verification, output: Console) -> None:
     for rung in found.rungs:
         made.add_row(rung.name, rung.status, _number(rung.figure), _number(rung.tolerance), rung.unit)
     identity = "unknown" if found.identity is None else abbreviated(found.identity)
-    output.print(f"{found.path}: identity {identity}", markup=False, soft_wrap=True)
+    output.print(f"{found.path}: identity {identity}", soft_wrap=True)
     output.print(made)
     for rung in found.rungs:
-        output.print(f"{rung.name}: {rung.told.rstrip('.')}.", markup=False, soft_wrap=True)
+        output.print(f"{rung.name}: {rung.told.rstrip('.')}.", soft_wrap=True)
     failure = found.first_failure
     skipped = sum(rung.status == SKIPPED for rung in found.rungs)
     if failure is None:
@@ -104,8 +101,8 @@ def _print(found: Verification, output: Console) -> None:
         told = f"FAILED at {failure.name}{_place(failure)}. {failure.remedy}"
         if above := [rung.name for rung in found.rungs if rung.status == FAILED and rung is not failure]:
             told += f" What fails above it may only follow from it: {', '.join(above)}."
-    output.print(told, markup=False, soft_wrap=True)
-    output.print(one_line(fingerprint()), markup=False, soft_wrap=True)
+    output.print(told, soft_wrap=True)
+    output.print(one_line(fingerprint()), soft_wrap=True)
 
 
 def _place(rung: Rung) -> str:

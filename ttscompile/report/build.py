@@ -14,7 +14,7 @@ from ..report import facts, pictures
 from ..runtimes.policy import CompiledPolicy
 from ..trajectories.episodes import Episode
 from ..units import flops, ms, share
-from .frontier import Compared, from_comparison, from_record
+from .frontier import Compared, from_record
 from .measure import Course, Latency, measure_parts, run_episode
 from .page import Page, Picture, Section, Table, require_packages
 from .verified import NOT_RUN
@@ -31,14 +31,14 @@ class Given:
 
     Attributes:
         episode: recorded observations; None for none.
-        comparison: what ``ttscompile compare --json`` printed; None for none.
+        comparison: points and yardsticks of one; None for none.
         verification: what was found; see ``verified``.
         threads: of the calls that are timed.
         runs: counted calls of each plan.
     """
 
     episode: Episode | None = None
-    comparison: Mapping[str, Any] | None = None
+    comparison: Compared | None = None
     verification: Section = NOT_RUN
     threads: int = 1
     runs: int = 10
@@ -57,11 +57,9 @@ def build(
 
     Raises:
         RuntimeUnavailableError: matplotlib or Jinja2 is not installed.
-        ReportError: the comparison is not what ``compare --json`` prints.
     """
     manifest = artifact.manifest
     require_packages()
-    compared = None if given.comparison is None else from_comparison(given.comparison)
     progress("timing calls")
     latencies = measure_parts(policy, (DENSE, *manifest.plans), given.runs)
     course = None
@@ -78,7 +76,7 @@ def build(
         _plans(artifact, course),
         *(() if course is None else (_episode(course),)),
         _latency(latencies, given, manifest.default_plan),
-        _frontier(artifact, latencies, compared),
+        _frontier(artifact, latencies, given.comparison),
         _calibration(record),
         given.verification,
         facts.limits(artifact),

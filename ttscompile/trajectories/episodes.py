@@ -7,6 +7,7 @@ replay buffer of Diffusion Policy, an HDF5 file of robomimic and a LeRobot data 
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import warnings
@@ -62,7 +63,8 @@ def load_trajectories(
             are called otherwise; ``NAME:N`` are the first N numbers of one.
 
     Returns:
-        The episodes in the order of the files. Rows after the last end of an episode are left out, with a warning.
+        The episodes in the order of the files. Rows after the last end of an episode are left out, with a warning; so
+        is an episode that equals one before it.
 
     Raises:
         TrajectoryError: names the file, what was expected, what it holds, and what to do.
@@ -71,7 +73,24 @@ def load_trajectories(
         paths = [paths]
     if not paths:
         raise TrajectoryError("no trajectory files were given. Name at least one .npz with recorded episodes.")
-    return [episode for path in paths for episode in _read(Path(path), observations, action_steps, sources or {})]
+    read = [episode for path in paths for episode in _read(Path(path), observations, action_steps, sources or {})]
+    return _different(read)
+
+
+def _different(episodes: Sequence[Episode]) -> list[Episode]:
+    """The episodes without those that were there before: they could be learned from and held out at once."""
+    found: dict[bytes, Episode] = {}
+    again = []
+    for episode in episodes:
+        digest = hashlib.sha256()
+        for _, array in sorted(episode.observations.items()):
+            digest.update(np.ascontiguousarray(array).data)
+        if found.setdefault(digest.digest(), episode) is not episode:
+            again.append(episode.name)
+    if again:
+        told = ", ".join(again[:5]) + ", .." * (len(again) > 5)
+        warnings.warn(f"episodes that were given before are left out: {told}.", stacklevel=3)
+    return list(found.values())
 
 
 def _read(

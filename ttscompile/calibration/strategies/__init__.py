@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from ...errors import CalibrationError
 from ...lattice import Source
+from ..whole_steps import WholeSteps
 from . import dbcache, deepcache, delta_dit, gates, teacache
 from .bac import bac
 from .base import Found, Strategy, Task
@@ -88,8 +89,13 @@ def require_reach(name: str, steps: int, blocks: int, budget: int) -> None:
     require_cells(name, least, steps, blocks, budget)
 
 
-def open_strategy(name: str, task: Task) -> Strategy:
+def open_strategy(name: str, task: Task, whole: WholeSteps | None = None) -> Strategy:
     """The strategy of this name, ready to begin.
+
+    Args:
+        name: of the strategy.
+        task: see ``Task``.
+        whole: of the same calls, for ``tts``; None makes one.
 
     Raises:
         CalibrationError: there is none, or it cannot keep the budget.
@@ -98,7 +104,7 @@ def open_strategy(name: str, task: Task) -> Strategy:
     require_reach(name, model.steps, model.blocks, task.budget)
     match name:
         case "tts":
-            return Tts(task)
+            return Tts(task, whole or WholeSteps(task))
         case "interval":
             return Interval(task)
         case "bac":

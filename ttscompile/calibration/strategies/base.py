@@ -77,6 +77,10 @@ class Strategy(Protocol):
     intervals: int
     closing: int
 
+    @property
+    def settling(self) -> float:
+        """Seconds that ``found`` takes, about."""
+
     def advance(self, interval: int) -> None:
         """Do interval number ``interval``, of ``intervals``; they are done in order."""
 

@@ -33,6 +33,7 @@ class Evo:
 
     intervals = GENERATIONS
     closing = 0
+    settling = 0.0
 
     def __init__(self, task: Task) -> None:
         self._task = task

@@ -42,6 +42,7 @@ class Fixed:
 
     intervals = 1
     closing = 0
+    settling = 0.0
 
     def __init__(self, task: Task, choose: Callable[[Task], Chosen]) -> None:
         self._task, self._choose = task, choose

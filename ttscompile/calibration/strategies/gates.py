@@ -55,6 +55,7 @@ class Gates:
 
     intervals = INTERVALS
     closing = 0
+    settling = 0.0
 
     def __init__(self, task: Task, reuse: Source, whole: int = 0) -> None:
         self._task, self._reuse = task, reuse

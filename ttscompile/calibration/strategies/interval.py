@@ -16,6 +16,7 @@ class Interval:
 
     intervals = 1
     closing = 0
+    settling = 0.0
     done = True
     loss = float("nan")
 

@@ -125,6 +125,7 @@ class Online:
 
     intervals = 1
     closing = 0
+    settling = 0.0
 
     def __init__(self, task: Task, propose: Callable[[Task], Sequence[tuple[Criterion, float]]]) -> None:
         self._task, self._propose = task, propose

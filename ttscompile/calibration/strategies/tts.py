@@ -17,6 +17,7 @@ import numpy as np
 from ...correction import Correction
 from ...lattice import PlanArray
 from ..adaptation import Adaptation
+from ..head import has_head
 from ..whole_steps import WholeSteps
 from .base import Array, Found, Task
 
@@ -25,17 +26,22 @@ DISTANCES = (8, 4, 2, 1)
 
 
 class Tts:
-    """See the module."""
+    """See the module.
 
-    def __init__(self, task: Task) -> None:
-        self._task, self._whole = task, WholeSteps(task)
+    Args:
+        task: see ``Task``.
+        whole: compares schedules on the calls of ``task``.
+    """
+
+    def __init__(self, task: Task, whole: WholeSteps) -> None:
+        self._task, self._whole = task, whole
         model = task.executor.model
         self._full = min(max(1, task.budget // model.blocks), model.steps)
         self._steps: tuple[int, ...] = tuple(range(self._full))
         self._loss = float("nan")
         self._crowded = self._whole.crowded(self._full)
         self._moves = [(distance, i) for distance in DISTANCES for i in range(1, self._full)]
-        self.closing = Adaptation.INTERVALS
+        self.closing = Adaptation.INTERVALS if has_head(task.pruner) else 0
         self.intervals = len(self._crowded) + len(self._moves) + self.closing
         self._adaptation: Adaptation | None = None
         self._correction: Correction | None = None
@@ -54,6 +60,11 @@ class Tts:
     def done(self) -> bool:
         """Whether the schedule is settled, and the pruner fitted to it."""
         return self._adaptation is not None and self._adaptation.done
+
+    @property
+    def settling(self) -> float:
+        """The correction, if it is not fitted yet."""
+        return 0.0 if self._adaptation is not None else self._whole.correcting(self._full)
 
     def close(self) -> None:
         """Settle the schedule, with a correction from all calls."""

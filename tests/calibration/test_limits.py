@@ -1,0 +1,188 @@
+"""The time limit, seeds, and errors that are no numbers: what a calibration does at its edges."""
+
+from __future__ import annotations
+
+import errno
+import time
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from ttscompile import ObservationSpec
+from ttscompile.artifact.load import load_artifact
+from ttscompile.calibration import calibrate, targets
+from ttscompile.calibration.calls import LARGEST, Actions, split_episodes
+from ttscompile.calibration.clock import Clock
+from ttscompile.calibration.contest import _error
+from ttscompile.calibration.execute import Executor
+from ttscompile.calibration.families import Families
+from ttscompile.calibration.frontier import compare
+from ttscompile.calibration.latency import _pruner_ms
+from ttscompile.calibration.progress import Bar
+from ttscompile.calibration.search import search_plan
+from ttscompile.calibration.state import FILE, StateFile
+from ttscompile.calibration.strategies.tts import Tts
+from ttscompile.calibration.targets import draw_calls, with_targets
+from ttscompile.calibration.whole_steps import WholeSteps
+from ttscompile.errors import CalibrationError
+from ttscompile.lattice import uniform_plan
+from ttscompile.trajectories import load_trajectories
+
+from . import policies
+from .strategies.tasks import make_task
+
+
+class _Hand(Clock):
+    """A clock that is moved by hand."""
+
+    now = 0.0
+
+    def elapsed(self) -> float:
+        return self.now
+
+
+class _Slow:
+    """A search whose intervals take 10 s, and whose plan takes 25 s more to be finished."""
+
+    intervals, closing, settling, done, loss = 50, 0, 25.0, False, 1.0
+    plan = uniform_plan(4, 2, 2)
+
+    def __init__(self, clock: _Hand) -> None:
+        self._clock = clock
+
+    def advance(self, interval: int) -> None:
+        self._clock.now += 10
+
+    def state(self) -> dict[str, Any]:
+        return {}
+
+    def found(self) -> str:
+        self._clock.now += self.settling
+        return "found"
+
+
+def test_the_search_ends_in_time_for_what_its_plan_still_takes(tmp_path: Path) -> None:
+    clock = _Hand(0.0, 0.0, 100.0)
+    search: Any = _Slow(clock)
+    with Bar(shown=False) as bar:
+        found, intervals, stopped = search_plan(search, StateFile(tmp_path, {}), clock, bar, None)
+    assert (found, intervals, stopped) == ("found", 7, "time limit")
+    assert clock.now == 95.0
+
+
+def test_a_family_is_not_begun_that_cannot_be_finished(compiled: Path, recording: Path, tmp_path: Path) -> None:
+    """Compared, then fitted on all calls and judged."""
+    whole = WholeSteps(make_task(compiled, recording, 20, calls=24))
+    assert whole.comparing(3) == whole.correcting(3) == 0.0  # nothing is known yet
+    begun = time.monotonic()
+    whole.errors((0, 4, 8))
+    pace = whole.comparing(1)
+    assert 0 < 3 * pace <= time.monotonic() - begun
+    assert whole.correcting(1) == pytest.approx((1 + 24 / (18 + 2 * 6)) * pace)
+    needed = 2 * whole.comparing(4) + whole.correcting(4)
+    with Bar(shown=False) as bar:
+        for limit, made in ((0.9 * needed, False), (1.1 * needed, True)):
+            families = Families(whole, StateFile(tmp_path, {}), _Hand(0.0, 0.0, limit), bar)
+            assert (families.best(4, "", (2.0,)) is not None) == made
+
+
+def test_when_half_of_the_time_is_over_no_more_targets_are_made_than_needed(
+    compiled: Path, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(targets, "TARGETS_AT_ONCE", 2)
+    artifact = load_artifact(compiled)
+    executor, spec = Executor(artifact), artifact.manifest.spec
+    episodes = load_trajectories([recording], spec.observations, 4)
+    calls = draw_calls(executor, spec, episodes, split_episodes(6, 0.25, 0), 16, 4, 0)["calibration"]
+    state, fresh, clock = StateFile(tmp_path, {}), StateFile(tmp_path, {}), _Hand(0.0, 0.0, 100.0)
+    clock.now = 51.0
+    with Bar(shown=False) as bar:
+        few = with_targets(executor, "calibration", calls, 3, state, clock, bar)
+        assert few.count == min(max(4, 2 * torch.get_num_threads()), 16)  # whole rounds, a worker's part is two calls
+        clock.now = 0.0
+        again = with_targets(executor, "calibration", calls, 3, state, clock, bar)  # as after an interruption
+        whole = with_targets(executor, "calibration", calls, 3, fresh, clock, bar)
+    assert (again.count, whole.count) == (few.count, calls.count)
+    assert few.path is not None
+    assert whole.path is not None
+    torch.testing.assert_close(few.path, whole.path[: few.count], rtol=0, atol=0)
+    np.testing.assert_array_equal(few.episodes, calls.episodes[: few.count])
+
+
+def test_only_corrections_need_many_calls(artifact: Path, recording: Path) -> None:
+    result = calibrate(artifact, [recording], 0.7, "interval", progress=False, max_minutes=1e-6)
+    assert result.calls["calibration"] == 64
+
+
+def test_without_a_pruner_no_time_is_kept_for_it(compiled: Path, recording: Path) -> None:
+    task = make_task(compiled, recording, 20, calls=4)
+    with_head, without = (Tts(one, WholeSteps(one)) for one in (task, replace(task, pruner={})))
+    assert (with_head.closing, without.closing) == (5 if task.pruner else 0, 0)
+
+
+def test_errors_that_are_no_numbers_are_large_ones(compiled: Path) -> None:
+    actions = Actions(load_artifact(compiled).manifest.spec)
+    samples = torch.zeros(3, policies.HORIZON, policies.CHANNELS)
+    samples[0] = float("nan")
+    samples[1] = -float("inf")
+    for units in (False, True):
+        errors = actions.errors(samples, torch.zeros_like(samples), units)
+        np.testing.assert_array_equal(errors, np.array([LARGEST, LARGEST, 0], np.float32))
+    assert _error(np.array([np.inf]), np.array([np.inf])) == LARGEST
+    assert _error(np.array([3.0]), np.array([1.0])) == 2.0
+
+
+def test_a_baseline_that_diverges_is_worse_than_any_plan(
+    artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = Executor.run
+
+    def diverging(self: Executor, plans: Any, calls: Any) -> torch.Tensor:
+        samples = run(self, plans, calls)
+        samples[torch.tensor([np.array_equal(plan, uniform_plan(*plan.shape, 5)) for plan in plans])] = float("nan")
+        return samples
+
+    monkeypatch.setattr(Executor, "run", diverging)
+    result = calibrate(artifact, [recording], 0.55, "deepcache", progress=False, max_minutes=1e-6)
+    assert result.plans["uniform"].error == pytest.approx(LARGEST)
+    assert result.validation_error < 1
+    record = load_artifact(artifact).manifest.calibration or {}
+    assert record["plans"]["uniform"]["error"] == pytest.approx(LARGEST)
+
+
+def test_a_negative_seed_is_refused(artifact: Path, recording: Path) -> None:
+    with pytest.raises(CalibrationError, match="seed: expected an integer of at least 0; found -1"):
+        calibrate(artifact, [recording], 0.7, seed=-1, progress=False)
+    with pytest.raises(CalibrationError, match="found -1"):
+        compare(artifact, [recording], [], [], seed=-1)
+
+
+def test_a_state_that_cannot_be_removed_is_an_error(
+    artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def read_only(self: Path, missing_ok: bool = False) -> None:
+        raise OSError(errno.EROFS, "Read-only file system", str(self))
+
+    monkeypatch.setattr(Path, "unlink", read_only)
+    with pytest.raises(CalibrationError, match=f"{FILE}: cannot be removed.*Read-only"):
+        calibrate(artifact, [recording], 0.7, progress=False)
+
+
+def test_the_pruner_is_timed_with_observations_as_the_network_takes_them(compiled: Path) -> None:
+    artifact = load_artifact(compiled)
+    observations = {"obs": artifact.manifest.spec.observations["obs"], "tokens": ObservationSpec((4,), dtype="int64")}
+    manifest = replace(artifact.manifest, spec=replace(artifact.manifest.spec, observations=observations))
+    given: list[dict[str, Any]] = []
+
+    def predict(obs: dict[str, Any], noise: Any) -> tuple[None, Any]:
+        given.append({key: str(value.dtype) for key, value in obs.items()})
+        return None, SimpleNamespace(timings=SimpleNamespace(wait_pruner=0.25))
+
+    runtime: Any = SimpleNamespace(predict=predict, reset=lambda: None)
+    assert _pruner_ms(replace(artifact, manifest=manifest), runtime) == 0.25
+    assert given[0] == {"obs": "float32", "tokens": "int64"}
