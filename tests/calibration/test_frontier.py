@@ -94,9 +94,11 @@ def test_nothing_is_written(planned: Path, recording: Path) -> None:
     assert {path.name: path.read_bytes() for path in planned.iterdir()} == before
 
 
-def test_it_says_when_corrections_have_too_few_calls(planned: Path, recording: Path) -> None:
-    found = compare(planned, [recording], ["tts"], [0.8], calls=1, learned=8, intervals=6)
-    assert "tts fits corrections of 48 features from at most 8 calls" in found.warnings[1]
+def test_it_says_when_a_search_had_too_little_time_or_too_few_calls(planned: Path, recording: Path) -> None:
+    found = compare(planned, [recording], ["tts", "interval"], [0.8], calls=1, learned=8, max_minutes=0)
+    assert {(point.series, point.name) for point in found.points} >= {("tts", "0.8"), ("interval", "0.8")}
+    assert found.warnings[1] == "the limit of 0 minutes cut the search short of tts 0.8: see --max-minutes."
+    assert "tts fits corrections of 48 features from at most 8 calls" in found.warnings[2]
 
 
 def test_a_strategy_that_cannot_reach_a_sparsity_is_left_out_with_the_reason(planned: Path, recording: Path) -> None:

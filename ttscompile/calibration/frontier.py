@@ -11,8 +11,9 @@ calls are apart that start alike and draw differently is the yardstick for its e
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,7 @@ from .calls import Actions, Split, require_seed, sample_calls, split_episodes
 from .contest import Entrant, Progress, measure
 from .execute import Executor
 from .latency import with_plans
-from .strategies import Task, plan_of, require_reach
+from .strategies import Found, Task, plan_of, require_reach
 from .targets import dense_rounds, draw_calls
 
 LEARNED = 256
@@ -55,6 +56,7 @@ def compare(
     threads: int = 1,
     seed: int = 0,
     intervals: int | None = None,
+    max_minutes: float = 3.0,
     progress: Progress = lambda what, done, total: None,
 ) -> Frontier:
     """Measure plans against each other. Nothing is written.
@@ -71,6 +73,7 @@ def compare(
         threads: of onnxruntime.
         seed: of the split, the calls, the noise and the searches.
         intervals: of a search, at most; None for the strategy's own number.
+        max_minutes: of a search; what it has found by then takes part, and a warning says so.
         progress: told how far it is.
 
     Raises:
@@ -106,10 +109,14 @@ def compare(
                 skipped[f"{strategy} {sparsity:g}"] = str(error)
                 continue
             wished.append((strategy, sparsity))
-    plans, corrections = _find(artifact, episodes, split, wished, budgets, learned, seed, intervals, progress)
+    search = partial(plan_of, intervals=intervals, seconds=60 * max_minutes)
+    plans, corrections, cut = _find(artifact, episodes, split, wished, budgets, learned, seed, search, progress)
     entrants = _enter(artifact, plans, corrections, compared, wished, threads)
     chosen = sample_calls(episodes, split.validation, calls, seed)
     warnings = _warnings(artifact, split, compared)
+    if cut:
+        told = f"the limit of {max_minutes:g} minutes cut the search short of {', '.join(cut)}: see --max-minutes."
+        warnings = (*warnings, told)
     if "tts" in strategies and learned < FEATURES * spec.sample[0]:
         few = (
             f"tts fits corrections of {FEATURES * spec.sample[0]} features from at most {learned} calls: its points are"
@@ -128,14 +135,15 @@ def _find(
     budgets: Mapping[float, int],
     limit: int,
     seed: int,
-    intervals: int | None,
+    search: Callable[[str, Task], tuple[Found, bool]],
     progress: Progress,
-) -> tuple[dict[str, PlanArray], dict[str, Correction]]:
-    """Plans of strategies, with their corrections, by ``strategy sparsity``."""
+) -> tuple[dict[str, PlanArray], dict[str, Correction], list[str]]:
+    """Plans of strategies, with their corrections, by ``strategy sparsity``; and which of these had too little time."""
     plans: dict[str, PlanArray] = {}
     corrections: dict[str, Correction] = {}
+    cut: list[str] = []
     if not wished:
-        return plans, corrections
+        return plans, corrections, cut
     spec, executor = artifact.manifest.spec, Executor(artifact)
     learned = draw_calls(executor, spec, episodes, split, limit, 1, seed)["calibration"]
     progress("dense calls to learn from", 0, learned.count)
@@ -150,12 +158,13 @@ def _find(
     for number, (strategy, sparsity) in enumerate(wished):
         name = f"{strategy} {sparsity:g}"
         progress(f"search: {name}", number, len(wished))
-        proposal = plan_of(strategy, replace(task, budget=budgets[sparsity]), intervals)
+        proposal, short = search(strategy, replace(task, budget=budgets[sparsity]))
         plans[name] = proposal.schedule
+        cut += [name] * short
         if proposal.correction is not None:
             corrections[name] = proposal.correction
     progress("search", len(wished), len(wished))
-    return plans, corrections
+    return plans, corrections, cut
 
 
 def _enter(

@@ -75,6 +75,9 @@ def _sparsities(_: click.Context, __: click.Parameter, value: str) -> tuple[floa
     "--learned-calls", type=click.IntRange(min=2), default=256, show_default=True, help="To learn from, at most."
 )
 @click.option("--threads", type=click.IntRange(min=1), default=1, show_default=True, help="Of onnxruntime.")
+@click.option(
+    "--max-minutes", type=click.FloatRange(min=0), default=3.0, show_default=True, help="Of each search, about."
+)
 @click.option("--intervals", type=click.IntRange(min=1), help="Of each search, at most; for a quick look.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Of the split, the noise and the searches.")
 @click.option("--plot", "picture", type=click.Path(path_type=Path), help="Draw into this file (.png, .svg, .pdf).")
@@ -89,6 +92,7 @@ def compare(
     calls: int,
     learned_calls: int,
     threads: int,
+    max_minutes: float,
     intervals: int | None,
     seed: int,
     picture: Path | None,
@@ -122,6 +126,7 @@ def compare(
             threads=threads,
             seed=seed,
             intervals=intervals,
+            max_minutes=max_minutes,
             progress=lambda what, done, total: bar.update(task, description=what, completed=done, total=total),
         )
     for warning in found.warnings:

@@ -108,7 +108,7 @@ def test_the_residuals_are_those_of_the_reference(compiled: Path, recording: Pat
 
 
 def test_the_plan_reads_timestep_only(compiled: Path, recording: Path) -> None:
-    found = plan_of("bac", make_task(compiled, recording, 20))
+    found, _ = plan_of("bac", make_task(compiled, recording, 20))
     assert set(np.unique(found.schedule)) == {Source.COMPUTE, Source.TIMESTEP}
 
 

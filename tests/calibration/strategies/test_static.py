@@ -59,7 +59,7 @@ def test_delta_dit_of_one_block_is_dense() -> None:
 
 def test_a_rule_takes_the_parameters_with_the_lowest_error(compiled: Path, recording: Path) -> None:
     task = make_task(compiled, recording, 34)
-    found = plan_of("delta-dit", task)
+    found, _ = plan_of("delta-dit", task)
     plans = [plan for plan, _ in delta_dit.candidates(10, 6, 34)]
     samples = task.executor.run(plans, task.calls)
     errors = task.actions.errors(samples, task.calls.targets, units=False).mean(1)

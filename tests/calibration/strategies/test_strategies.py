@@ -52,7 +52,7 @@ def run(strategy: Strategy, first: int = 0) -> Found:
 )
 def test_a_plan_is_legal_and_within_the_budget(compiled: Path, recording: Path, name: str, budget: int) -> None:
     task = make_task(compiled, recording, budget, calls=8)
-    found = plan_of(name, task)
+    found, _ = plan_of(name, task)
     model = task.executor.model
     assert found.schedule.shape == (model.steps, model.blocks)
     assert found.schedule.dtype == np.int8
@@ -83,7 +83,7 @@ def test_going_on_from_a_state_ends_where_another_run_ends(compiled: Path, recor
 @pytest.mark.parametrize("name", ["evo", "dip-go", "tts"])
 def test_a_search_beats_even_steps(compiled: Path, recording: Path, name: str) -> None:
     task = make_task(compiled, recording, 20, calls=24)
-    plans = [plan_of("interval", task).schedule, plan_of(name, task).schedule]
+    plans = [plan_of("interval", task)[0].schedule, plan_of(name, task)[0].schedule]
     samples = task.executor.run(plans, task.calls)
     even, searched = task.actions.errors(samples, task.calls.targets, units=False).mean(1)
     assert searched < even
@@ -102,13 +102,13 @@ def test_a_budget_out_of_reach_is_refused_and_the_next_cell_is_not(
         open_strategy(name, make_task(compiled, recording, least - 1))
     with pytest.raises(CalibrationError, match=f"leaves {least - 1}"):
         require_reach(name, 10, 6, least - 1)
-    found = plan_of(name, make_task(compiled, recording, least))
+    found, _ = plan_of(name, make_task(compiled, recording, least))
     assert int((found.schedule == Source.COMPUTE).sum()) == least
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_one_call_is_enough(compiled: Path, recording: Path, name: str) -> None:
-    found = plan_of(name, make_task(compiled, recording, BUDGET, calls=1))
+    found, _ = plan_of(name, make_task(compiled, recording, BUDGET, calls=1))
     assert int((found.schedule == Source.COMPUTE).sum()) <= BUDGET
 
 
@@ -119,8 +119,8 @@ def test_an_unknown_name_is_refused() -> None:
 
 def test_fewer_intervals_than_a_strategy_has(compiled: Path, recording: Path) -> None:
     task = make_task(compiled, recording, BUDGET)
-    assert plan_of("evo", task, 2).notes == {"generations": 2}
-    assert plan_of("evo", task, 1000).notes == {"generations": 4}
+    assert plan_of("evo", task, 2)[0].notes == {"generations": 2}
+    assert plan_of("evo", task, 1000)[0].notes == {"generations": 4}
 
 
 def test_every_strategy_is_described() -> None:

@@ -23,6 +23,9 @@ plan, nor an artifact, nor the runtimes' sums of reused residuals could say or h
 
 from __future__ import annotations
 
+import math
+import time
+
 from ...errors import CalibrationError
 from ...lattice import Source
 from ..whole_steps import WholeSteps
@@ -127,24 +130,34 @@ def open_strategy(name: str, task: Task, whole: WholeSteps | None = None) -> Str
             return Online(task, dbcache.dbcache)
 
 
-def plan_of(name: str, task: Task, intervals: int | None = None) -> Found:
+def plan_of(name: str, task: Task, intervals: int | None = None, seconds: float = math.inf) -> tuple[Found, bool]:
     """What a strategy finds, whether or not it is any better than the uniform schedule: for comparisons.
 
     Args:
         name: of the strategy.
         task: see ``Task``.
         intervals: how many at most; None for the strategy's own number.
+        seconds: after which nothing more is begun but the first interval.
+
+    Returns:
+        What was found, and whether the time cut the search short.
 
     Raises:
         CalibrationError: there is no such strategy, or it cannot keep the budget.
     """
+    begun = time.monotonic()
     strategy = open_strategy(name, task)
     count = strategy.intervals if intervals is None else min(intervals, strategy.intervals)
     closing = min(strategy.closing, count - 1)
+    longest = 0.0
     for interval in range(count):
         if strategy.done:
             break
+        start = time.monotonic() - begun
+        if interval and start + longest + strategy.settling > seconds:
+            return strategy.found(), True
         if closing and interval == count - closing:
             strategy.close()
         strategy.advance(interval)
-    return strategy.found()
+        longest = max(longest, time.monotonic() - begun - start)
+    return strategy.found(), False
