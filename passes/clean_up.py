@@ -11,7 +11,7 @@ import torch
 
 from ttscompile.ir.dataflow import reaching
 from ttscompile.ir.evaluate import Evaluator
-from ttscompile.ir.graph import Argument, Batch, Graph, Node, Ref, TensorType
+from ttscompile.ir.graph import Graph, Node, Ref, TensorType
 from ttscompile.ir.program import Pieces, Program
 
 from .base import Pass, PassResult
@@ -94,7 +94,7 @@ def fold_constants(graph: Graph, weights: Weights) -> Graph:
     known = set(graph.constants)
     folded: list[Node] = []
     for node in graph.nodes:
-        if all(name in known for name in node.refs()) and not _mentions_batch(node):
+        if all(name in known for name in node.refs()) and not node.mentions_batch():
             folded.append(node)
             known.add(node.name)
     if not folded:
@@ -122,20 +122,11 @@ def fold_constants(graph: Graph, weights: Weights) -> Graph:
         renamed = {n.name: f"{n.name}.constant" for n in outputs}
         for old, new in renamed.items():
             constants[new] = constants.pop(old)
-            weights[new] = weights.pop(old)
+            weights[new] = weights[old]  # which another graph may read as a constant
             rest.append(Node(old, "aten.clone.default", (Ref(new),), (), (types[old],), "constant output"))
         first = [n for n in rest if n.name in renamed]
         rest = first + [n for n in rest if n.name not in renamed]
     return replace(graph, constants=constants, nodes=tuple(rest))
-
-
-def _mentions_batch(node: Node) -> bool:
-    def inside(argument: Argument) -> bool:
-        if isinstance(argument, tuple):
-            return any(map(inside, argument))
-        return isinstance(argument, Batch)
-
-    return any(map(inside, node.args)) or any(inside(v) for _, v in node.kwargs)
 
 
 def merge_repeated(graph: Graph) -> Graph:

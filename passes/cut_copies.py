@@ -69,9 +69,9 @@ def _axis(type_: TensorType, argument: Argument) -> int | None:
 
 
 def _multiple(size: Argument, of: Batch) -> int | None:
-    """How many batches a boundary lies from the start."""
+    """How many batches a boundary lies from the start; a negative one is counted from the end, as in Python."""
     if isinstance(size, Batch):
-        return size.multiple
+        return min(max(size.multiple + of.multiple * (size.multiple < 0), 0), of.multiple)
     if size is None or (isinstance(size, int) and size >= 2**31):
         return of.multiple
     return 0 if size == 0 else None

@@ -56,7 +56,9 @@ def find_residual_blocks(graph: Graph, sample: str) -> BlockTable:
     Raises:
         NoResidualBlocksError: there is no such addition; names the node at which the search ended.
     """
-    points = dominators(graph, [sample], graph.outputs)
+    # A split is no stream, whatever the type of its first part.
+    several = {node.name for node in graph.nodes if len(node.types) > 1}
+    points = [name for name in dominators(graph, [sample], graph.outputs) if name not in several]
     if sample not in points:
         raise NoResidualBlocksError(f"the output does not depend on the sample %{sample}.")
     loop = reachable_from(graph, [sample])

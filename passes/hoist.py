@@ -11,7 +11,7 @@ import numpy.typing as npt
 import torch
 
 from ttscompile.config import SamplerTable
-from ttscompile.ir.binding import bindings
+from ttscompile.ir.binding import bindings, input_bindings
 from ttscompile.ir.evaluate import Evaluator
 from ttscompile.ir.flops import graph_flops
 from ttscompile.ir.graph import Graph, Node, Ref, TensorType, backward_slice
@@ -48,7 +48,7 @@ class Hoist(Pass):
         """Hoist."""
         assert program.pieces is not None
         spec = program.spec
-        inputs = {spec.timestep_argument: Binding.TABLE, **dict.fromkeys(spec.observations, Binding.CONDITION)}
+        inputs = input_bindings(spec)
         prologue, renamed = _name_inputs(program.pieces.condition)
         known = bindings(prologue, inputs)
         pieces = _sink(_rename_contexts(program.pieces, renamed), prologue, known)
@@ -184,7 +184,7 @@ def _evaluate_tables(
 
 def _notes(program: Program, pieces: Pieces) -> tuple[str, ...]:
     steps = program.spec.sampler.steps
-    dense = program.dense_flops or graph_flops(program.denoiser) * steps
+    dense = max(program.dense_flops or graph_flops(program.denoiser) * steps, 1)
     loop = sum(graph_flops(g) for g in _loop(pieces)) * steps
     once = graph_flops(pieces.condition)
     batch = graph_flops(pieces.step) * steps if pieces.step is not None else 0

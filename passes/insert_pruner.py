@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from ttscompile.ir.dataflow import dominators, reaching
 from ttscompile.ir.flops import graph_flops, node_flops
-from ttscompile.ir.graph import Argument, Batch, Graph, Node, Ref, TensorType
+from ttscompile.ir.graph import Argument, Batch, Enum, Graph, Node, Ref, TensorType
 from ttscompile.ir.program import Binding, Program
 
 from .base import Pass, PassResult
@@ -66,6 +66,11 @@ class InsertPruner(Pass):
         inputs = sum(math.prod(_read(types[f])) for f in features)
         head = self._fitted(inputs, steps, blocks, program.dense_flops)
         parameters = head._parameters(inputs, steps, blocks)
+        if taken := sorted(parameters.keys() & program.weights.keys()):
+            raise self.fail(
+                f"the module has weights of its own called {', '.join(taken)}, as those of the plan head are."
+                " Rename the submodule 'pruner'."
+            )
         graph = head._head({f: types[f] for f in features}, parameters, steps, blocks)
         pieces = replace(program.pieces, condition=condition, pruner=graph, features=features)
         pieces = replace(pieces, bindings={**pieces.bindings, **dict.fromkeys(features, Binding.CONDITION)})
@@ -166,7 +171,7 @@ def _stream(type_: TensorType) -> tuple[int, ...]:
 def _read(type_: TensorType) -> tuple[int, ...]:
     """What the head reads of it: the longest axes averaged, of size 1, until there are at most ``MAX_FEATURE``."""
     sizes = list(_stream(type_))
-    while type_.dtype == "float32" and math.prod(sizes) > MAX_FEATURE:
+    while math.prod(sizes) > MAX_FEATURE:
         sizes[sizes.index(max(sizes))] = 1
     return tuple(sizes)
 
@@ -186,7 +191,8 @@ def _features(program: Program) -> tuple[Graph, tuple[str, ...]]:
     for name in dominators(graph, graph.inputs, graph.outputs):
         node = producers.get(name)
         worked = not arithmetic.isdisjoint(reaching(graph, [name]))
-        if worked and node is not None and len(node.types) == 1 and types[name].batch_axis is not None:
+        readable = types[name].batch_axis is not None and types[name].dtype == "float32"
+        if worked and node is not None and len(node.types) == 1 and readable:
             chosen = name
     if chosen is not None:
         outputs = graph.outputs if chosen in graph.outputs else (*graph.outputs, chosen)
@@ -194,7 +200,10 @@ def _features(program: Program) -> tuple[Graph, tuple[str, ...]]:
     nodes = list(graph.nodes)
     features: list[str] = []
     for key, type_ in graph.inputs.items():
-        name = f"{key}.feature"
-        nodes.append(Node(name, "aten.clone.default", (Ref(key),), (), (type_,), "feature of the plan head"))
+        name, read = f"{key}.feature", replace(type_, dtype="float32")
+        feature = Node(name, "aten.clone.default", (Ref(key),), (), (read,), "feature of the plan head")
+        if type_ != read:  # tokens, say
+            feature = replace(feature, op="aten._to_copy.default", kwargs=(("dtype", Enum("dtype", read.dtype)),))
+        nodes.append(feature)
         features.append(name)
     return replace(graph, nodes=tuple(nodes), outputs=(*graph.outputs, *features)), tuple(features)

@@ -75,10 +75,12 @@ class Partition(Pass):
         return PassResult(replace(program, pieces=pieces), True, ("nodes: " + ", ".join(counts),))
 
     def ensures(self, program: Program) -> None:
-        """Nothing in a loop piece reads timestep or observation except as a context."""
-        assert program.pieces is not None
-        if len(program.pieces.blocks) != len(program.blocks):
-            raise self.fail(f"{len(program.pieces.blocks)} pieces for {len(program.blocks)} blocks.")
+        """Every loop piece reads its stream, and otherwise what the prologue gives."""
+        pieces = program.pieces
+        assert pieces is not None
+        for graph in (pieces.stem, *pieces.blocks, pieces.tail):
+            if unknown := set(list(graph.inputs)[1:]).difference(pieces.condition.outputs):
+                raise self.fail(f"a loop piece reads {sorted(unknown)}, which the prologue does not give.")
 
 
 def _prologue(graph: Graph, outside: Iterable[str], sample: str) -> Graph:

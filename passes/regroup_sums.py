@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from ttscompile.ir.dataflow import dominators, reachable_from
+from ttscompile.ir.dataflow import dominators, reachable_from, reaching
 from ttscompile.ir.graph import Graph, Node, Ref
 from ttscompile.ir.program import Program
 
@@ -57,8 +57,10 @@ class RegroupSums(Pass):
             notes.append(f"%{node.name} ({node.source or 'source unknown'}): {len(branches)} branches in parallel")
         if not new:
             return PassResult(program, False)
-        nodes = tuple(n for node in graph.nodes for n in new.get(node.name, [node]))
-        return PassResult(replace(program, denoiser=replace(graph, nodes=nodes)), True, tuple(notes))
+        regrouped = replace(graph, nodes=tuple(n for node in graph.nodes for n in new.get(node.name, [node])))
+        live = reaching(regrouped, graph.outputs)  # without the sums that were inside
+        regrouped = replace(regrouped, nodes=tuple(n for n in regrouped.nodes if n.name in live))
+        return PassResult(replace(program, denoiser=regrouped), True, tuple(notes))
 
 
 def _plain(node: Node) -> bool:

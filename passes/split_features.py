@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from ttscompile.ir.binding import bindings
+from ttscompile.ir.binding import bindings, input_bindings
 from ttscompile.ir.graph import Argument, Node, Ref, TensorType
-from ttscompile.ir.program import Binding, Program
+from ttscompile.ir.program import Program
 
 from .base import Pass, PassResult
 
@@ -40,8 +40,7 @@ class SplitFeatures(Pass):
         """Split in the prologue."""
         assert program.pieces is not None
         prologue, spec = program.pieces.condition, program.spec
-        inputs = {spec.timestep_argument: Binding.TABLE, **dict.fromkeys(spec.observations, Binding.CONDITION)}
-        known, producers, types = bindings(prologue, inputs), prologue.producers(), prologue.types()
+        known, producers, types = bindings(prologue, input_bindings(spec)), prologue.producers(), prologue.types()
         nodes: list[Node] = []
         split = 0
         for node in prologue.nodes:
@@ -70,7 +69,9 @@ def _parts(node: Node, producers: Mapping[str, Node], types: Mapping[str, Tensor
     operands = cat.args[0]
     assert isinstance(operands, tuple)
     parts = [operand.name for operand in operands if isinstance(operand, Ref)]
-    return parts if all(isinstance(types[part].shape[-1], int) for part in parts) else []
+    # A concatenation may change the dtype of a part.
+    fits = all(isinstance(types[p].shape[-1], int) and types[p].dtype == cat.type.dtype for p in parts)
+    return parts if fits else []
 
 
 def _sum(node: Node, parts: list[str], types: Mapping[str, TensorType]) -> list[Node]:

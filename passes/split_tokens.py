@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from ttscompile.ir.binding import bindings, join
+from ttscompile.ir.binding import bindings, input_bindings, join
 from ttscompile.ir.graph import GETITEM, Argument, Batch, Graph, Node, Ref, Size, TensorType
 from ttscompile.ir.program import Binding, Program
 
@@ -54,18 +54,13 @@ class SplitTokens(Pass):
         """Split in the prologue."""
         assert program.pieces is not None
         prologue = program.pieces.condition
-        splitter = _Splitter(prologue, _input_bindings(program))
+        splitter = _Splitter(prologue, input_bindings(program.spec))
         rewritten = splitter.run()
         if not splitter.split_at:
             return PassResult(program, False, tuple(splitter.notes))
         return PassResult(
             replace(program, pieces=replace(program.pieces, condition=rewritten)), True, tuple(splitter.notes)
         )
-
-
-def _input_bindings(program: Program) -> dict[str, Binding]:
-    names = dict.fromkeys(program.spec.observations, Binding.CONDITION)
-    return {program.spec.timestep_argument: Binding.TABLE, **names}
 
 
 class _Splitter:
@@ -80,7 +75,6 @@ class _Splitter:
         self.nodes: list[Node] = []
         self.notes: list[str] = []
         self.split_at: list[str] = []
-        self.pushed: dict[str, int] = {}
 
     def run(self) -> Graph:
         for node in self.graph.nodes:
@@ -142,6 +136,8 @@ class _Splitter:
         operands = node.args[0]
         assert isinstance(operands, tuple)
         names = [o.name for o in operands if isinstance(o, Ref)]
+        if any(self.types[name].dtype != node.type.dtype for name in names):
+            return False  # apart, what is another dtype in the whole would be computed with in its own
         axis = _positive(node.args[1] if len(node.args) > 1 else 0, node.type)
         pieces: list[tuple[str, int]] = []
         for name in names:

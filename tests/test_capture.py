@@ -11,7 +11,9 @@ from torch import nn
 from tests.passes.specs import toy_spec
 from ttscompile.capture import capture
 from ttscompile.errors import CaptureError
+from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Batch, TensorType
+from ttscompile.ir.verify import verify_graph
 
 
 class Denoiser(nn.Module):
@@ -52,12 +54,44 @@ def test_the_users_module_is_not_touched() -> None:
         (lambda y, t, o: (y, y), "returns 2 values"),
         (lambda y, t, o: y[:, :2], r"returns float32\[B, 2, 2\]; expected the type of its sample, float32\[B, 4, 2\]"),
         (lambda y, t, o: y.double(), "returns float64"),
+        (lambda y, t, o: (y.bfloat16() + 1).float(), r"_to_copy \(test_capture.py:\d+ in \S+\) computes in bfloat16"),
         (lambda y, t, o: torch.cat([y, y, y[:1]])[: y.shape[0]], "not a multiple of the batch size"),
     ],
 )
 def test_what_cannot_be_compiled_is_refused(then: Callable[..., object], message: str) -> None:
     with pytest.raises(CaptureError, match=message):
         capture(Denoiser(then), toy_spec())
+
+
+def test_a_constant_made_of_the_number_of_streams_is_refused() -> None:
+    with pytest.raises(CaptureError, match="makes constants of the batch size: .* Every stream"):
+        capture(Denoiser(lambda y, t, o: y * torch.tensor(float(y.shape[0]))), toy_spec())
+
+
+def test_a_buffer_may_have_the_name_of_an_operation() -> None:
+    class Rotates(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.cos = nn.Buffer(torch.rand(2))
+
+        def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
+            return sample * self.cos + timestep.cos()[:, None, None]
+
+    module = Rotates()
+    graph, weights = capture(module, toy_spec())
+    verify_graph(graph, "denoiser")
+    values = {"sample": torch.randn(2, 4, 2), "timestep": torch.tensor([1, 2]), "obs": torch.randn(2, 3)}
+    with torch.no_grad():
+        expected = module(**values)
+    found = evaluate(graph, {name: torch.from_numpy(value) for name, value in weights.items()}, values)
+    torch.testing.assert_close(found, (expected,))
+
+
+def test_a_module_that_cannot_be_copied_is_refused() -> None:
+    module = Denoiser(lambda y, t, o: y * module.scale)
+    module.scale = nn.Parameter(torch.rand(2)).exp()
+    with pytest.raises(CaptureError, match="Denoiser cannot be copied: .*call torch.nn.utils.remove_weight_norm"):
+        capture(module, toy_spec())
 
 
 def test_state_that_changes_is_refused() -> None:

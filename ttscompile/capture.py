@@ -18,7 +18,7 @@ import torch
 from torch import nn
 from torch.export.graph_signature import InputKind, OutputKind
 
-from .capture_batch import BATCHES, unify_batch
+from .capture_batch import BATCHES, REMEDY, unify_batch
 from .config import PolicySpec
 from .errors import CaptureError
 from .ir.graph import GETITEM, Argument, Batch, Enum, Graph, Node, Ref, Size, TensorType
@@ -36,7 +36,7 @@ Weights = dict[str, npt.NDArray[np.generic]]
 def capture(module: nn.Module, spec: PolicySpec) -> tuple[Graph, Weights]:
     """Capture ``module(sample, timestep, **observations)``, one denoising step, for any number of streams.
 
-    The module is copied, set to eval mode and to float32; the user's object is not touched.
+    The module is copied to the CPU, set to eval mode and to float32; the user's object is not touched.
 
     Args:
         module: takes ``spec.sample_argument`` float32 ``[B, T, D]``, ``spec.timestep_argument`` ``[B]`` of the dtype of
@@ -50,18 +50,27 @@ def capture(module: nn.Module, spec: PolicySpec) -> tuple[Graph, Weights]:
     Raises:
         CaptureError: torch.export failed, or the graph uses what the compiler cannot express; names the node.
     """
-    module = copy.deepcopy(module).float().eval()
+    try:
+        module = copy.deepcopy(module).cpu().float().eval()
+    except RuntimeError as error:
+        raise CaptureError(
+            f"{type(module).__name__} cannot be copied: {error} Of a weight that is computed from others, call"
+            " torch.nn.utils.remove_weight_norm or parametrize.remove_parametrizations first."
+        ) from error
     try:
         return _Converter(*_traced(module, spec, EXAMPLE_STREAMS, symbolic=True)).convert(spec)
     except CaptureError as error:
         # torch.export cannot prove everything that is true of a symbolic batch; with numbers there is nothing to prove.
         try:
-            (left, weights), (right, _) = (
+            (left, weights), (right, others) = (
                 _Converter(*_traced(module, spec, streams, symbolic=False)).convert(spec) for streams in BATCHES
             )
         except CaptureError:
             raise error from error.__cause__
-    return unify_batch(left, right), weights
+    unified = unify_batch(left, right)
+    if differ := [name for name, value in weights.items() if not np.array_equal(value, others[name], equal_nan=True)]:
+        raise CaptureError(f"the module makes constants of the batch size: {', '.join(differ)}.{REMEDY}")
+    return unified, weights
 
 
 def _traced(
@@ -143,6 +152,7 @@ class _Converter:
         self.examples = examples
         self.symbolic = len(next(iter(examples.values()))) == EXAMPLE_STREAMS
         self.names: dict[torch.fx.Node, str] = {}
+        self.taken: set[str] = set()
         self.symbol: Any = None
 
     def convert(self, spec: PolicySpec) -> tuple[Graph, Weights]:
@@ -172,6 +182,7 @@ class _Converter:
             self.names[fx_node] = target
             constants[target] = self._type(fx_node, fx_node.meta["val"])
             weights[target] = state[target].detach().cpu().contiguous().numpy()  # the module is a copy
+        self.taken = {*inputs, *constants}
         for fx_node in self.exported.graph.nodes:
             if fx_node.op == "call_function" and (node := self._node(fx_node)) is not None:
                 nodes.append(node)
@@ -222,9 +233,18 @@ class _Converter:
                 f"%{fx_node.name} ({_source(fx_node)}) computes with complex numbers, which an artifact cannot hold."
                 " Write the rotary embedding with cosine and sine: left * cos - right * sin, right * cos + left * sin."
             )
-        self.names[fx_node] = fx_node.name
+        if any(v.dtype is torch.bfloat16 for v in values):
+            raise CaptureError(
+                f"%{fx_node.name} ({_source(fx_node)}) computes in bfloat16, for which onnxruntime has no arithmetic."
+                " Weights are captured as float32: cast to the dtype of a weight, or not at all."
+            )
+        name = fx_node.name
+        while name in self.taken:  # by a weight or an observation: a buffer ``cos`` beside the operation
+            name += "_"
+        self.taken.add(name)
+        self.names[fx_node] = name
         return Node(
-            name=fx_node.name,
+            name=name,
             op=op,
             args=tuple(self._argument(fx_node, a) for a in fx_node.args),
             kwargs=tuple((k, self._argument(fx_node, a)) for k, a in sorted(fx_node.kwargs.items())),
@@ -254,7 +274,10 @@ class _Converter:
         outputs = self.exported.graph_signature.output_specs
         mutated = [o.target for o in outputs if o.kind is not OutputKind.USER_OUTPUT]
         if mutated:
-            raise CaptureError(f"the module changes its own buffers {mutated} when called; a denoiser must be pure.")
+            raise CaptureError(
+                f"the module changes its own buffers or inputs {mutated} when called; a denoiser must be pure."
+                " Change a clone of them instead."
+            )
         (output,) = [n for n in self.exported.graph.nodes if n.op == "output"]
         results = output.args[0]
         if len(results) != 1 or not isinstance(results[0], torch.fx.Node):

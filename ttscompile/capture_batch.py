@@ -26,23 +26,23 @@ def unify_batch(left: Graph, right: Graph) -> Graph:
     """
     inputs = {name: _type(name, type_, right.inputs[name]) for name, type_ in left.inputs.items()}
     if left.constants != right.constants:
-        raise CaptureError(f"the module makes constants that depend on the batch size.{_REMEDY}")
+        raise CaptureError(f"the module makes constants that depend on the batch size.{REMEDY}")
     if len(left.nodes) != len(right.nodes) or left.outputs != right.outputs:
         raise CaptureError(
             f"the module takes {len(left.nodes)} operations for a batch of {BATCHES[0]} and {len(right.nodes)} for"
-            f" {BATCHES[1]}.{_REMEDY}"
+            f" {BATCHES[1]}.{REMEDY}"
         )
     nodes = tuple(_node(a, b) for a, b in zip(left.nodes, right.nodes, strict=True))
     return Graph(inputs, left.constants, nodes, left.outputs)
 
 
-_REMEDY = " Every stream of a batch must be computed alike, whatever their number: no loop or branch on the batch size."
+REMEDY = " Every stream of a batch must be computed alike, whatever their number: no loop or branch on the batch size."
 
 
 def _node(left: Node, right: Node) -> Node:
     where = f"%{left.name} ({left.source})"
     if (left.name, left.op) != (right.name, right.op):
-        raise CaptureError(f"{where} is {left.op} for a batch of {BATCHES[0]} and {right.op} for another.{_REMEDY}")
+        raise CaptureError(f"{where} is {left.op} for a batch of {BATCHES[0]} and {right.op} for another.{REMEDY}")
     return Node(
         left.name,
         left.op,
@@ -55,7 +55,7 @@ def _node(left: Node, right: Node) -> Node:
 
 def _arguments(where: str, left: tuple[Argument, ...], right: tuple[Argument, ...]) -> tuple[Argument, ...]:
     if len(left) != len(right):
-        raise CaptureError(f"{where} has {len(left)} arguments or {len(right)}, by the batch size.{_REMEDY}")
+        raise CaptureError(f"{where} has {len(left)} arguments or {len(right)}, by the batch size.{REMEDY}")
     return tuple(_argument(where, a, b) for a, b in zip(left, right, strict=True))
 
 
@@ -65,13 +65,13 @@ def _argument(where: str, left: Argument, right: Argument) -> Argument:
     if type(left) is int and type(right) is int:
         return _size(where, left, right)
     if left != right:
-        raise CaptureError(f"{where} has the argument {left} or {right}, by the batch size.{_REMEDY}")
+        raise CaptureError(f"{where} has the argument {left} or {right}, by the batch size.{REMEDY}")
     return left
 
 
 def _type(where: str, left: TensorType, right: TensorType) -> TensorType:
     if len(left.shape) != len(right.shape) or left.dtype != right.dtype:
-        raise CaptureError(f"{where} is {left} or {right}, by the batch size.{_REMEDY}")
+        raise CaptureError(f"{where} is {left} or {right}, by the batch size.{REMEDY}")
     return TensorType(tuple(_size(where, a, b) for a, b in zip(left.shape, right.shape, strict=True)), left.dtype)
 
 
@@ -81,7 +81,7 @@ def _size(where: str, left: Size, right: Size) -> Size:
     if left == right:
         return left
     multiple = left // BATCHES[0]
-    if multiple < 1 or (left, right) != (multiple * BATCHES[0], multiple * BATCHES[1]):
+    if not multiple or (left, right) != (multiple * BATCHES[0], multiple * BATCHES[1]):  # negative: from the end
         raise CaptureError(
             f"a size at {where} is {left} for a batch of {BATCHES[0]} and {right} for {BATCHES[1]}, which is not a"
             " multiple of the batch size. Only the batch may vary; write the other sizes as numbers."

@@ -14,10 +14,10 @@ from torch import nn
 from .artifact.files import replace_file
 from .artifact.load import load_artifact
 from .artifact.precision import LoweredBlocks
-from .artifact.write import write_artifact
+from .artifact.write import require_replaceable, write_artifact
 from .capture import capture
 from .config import FP32, PolicySpec
-from .errors import ArtifactError
+from .errors import ArtifactError, PassError
 from .frontends import load_checkpoint_policy
 from .frontends.encoded import EncodedDenoiser
 from .ir.dataflow import reachable_from
@@ -98,6 +98,7 @@ def convert(
     """
     if precision != FP32:
         require_precision(precision)  # before minutes of work
+    require_replaceable(directory)
     module, spec = load_checkpoint_policy(
         checkpoint, format=format, sampler=sampler, steps=steps, spacing=spacing, task=task, encoders=encoders
     )
@@ -213,7 +214,6 @@ def transform(module: nn.Module, spec: PolicySpec, *, explain: Explain = _silent
         CleanUp(),
     ):
         program = _run(each, program, explain)
-    verify(program)
     return program
 
 
@@ -228,5 +228,9 @@ def _dense_flops(module: nn.Module, graph: Graph, spec: PolicySpec) -> int:
 
 def _run(each: Pass, program: Program, explain: Explain) -> Program:
     result = each(program)
+    try:
+        verify(result.program)
+    except PassError as error:
+        raise PassError(f"after {each.name}: {error}") from error
     explain(each.name, result.notes)
     return result.program

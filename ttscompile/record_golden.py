@@ -78,7 +78,7 @@ def _record_original(module: nn.Module, program: Program) -> Golden:
     initial = draw.standard_normal(shape, dtype=np.float32)
     draws = draw.standard_normal((steps, *shape), dtype=np.float32) if spec.sampler.stochastic else None
 
-    copied = copy.deepcopy(module).float().eval()
+    copied = copy.deepcopy(module).cpu().float().eval()
     watch = _Watch(copied, spec)
     tensors = {key: torch.from_numpy(value) for key, value in normalized.items()}
     sample = eager_policy(copied, spec)(tensors, Noise(initial, draws)).numpy()

@@ -14,6 +14,7 @@ from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 
 from ttscompile.errors import CheckpointError, SpecError
 from ttscompile.frontends import load_checkpoint_policy
+from ttscompile.frontends.diffusion_policy_weights import choose_weights
 from ttscompile.samplers.table import sampler_table
 
 Build = Callable[..., dict[str, Any]]
@@ -134,6 +135,27 @@ def test_half_precision_is_loaded_as_float32(payload: Build, save: Save) -> None
 
 
 @pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("model.", "model._orig_mod."),
+        ("model.", "model.module."),
+        ("", "_orig_mod."),
+        ("", "module."),
+        ("", "_orig_mod.module."),
+    ],
+)
+def test_wrappers_of_torch_are_taken_off(payload: Build, old: str, new: str) -> None:
+    """As torch.compile and DistributedDataParallel name the weights, of the network or of the whole policy."""
+    states = {"ema_model": payload()["state_dicts"]["ema_model"]}
+    expected, _ = choose_weights(states, True)
+    states["ema_model"] = {
+        new + key.removeprefix(old) if key.startswith(old) else key: value for key, value in expected.items()
+    }
+    found, _ = choose_weights(states, True)
+    assert list(found) == list(expected) and list(states["ema_model"]) != list(expected)
+
+
+@pytest.mark.parametrize(
     "key", ["model.head.bias", "model.decoder.layers.0.norm3.weight", "model.mask", "model.cond_obs_emb.weight"]
 )
 def test_missing_weights_are_named(payload: Build, save: Save, key: str) -> None:
@@ -243,6 +265,7 @@ def test_checkpoint_of_something_else(payload: Build, save: Save, part: str) -> 
             "noise_scheduler is PNDMScheduler.*sampler='ddpm'",
         ),
         ("noise_scheduler", {"karras": True}, "does not know: karras"),
+        ("noise_scheduler", {"predict_epsilon": False}, "predict_epsilon contradicts prediction_type = 'epsilon'"),
         ("noise_scheduler", {"beta_schedule": "none"}, "diffusers refuses the settings"),
         ("training", {"use_ema": "maybe"}, "use_ema is 'maybe'"),
     ],
@@ -278,6 +301,18 @@ def test_the_checkpoints_own_sampler(payload: Build, save: Save) -> None:
     built["cfg"]["policy"]["eta"] = 0.5
     assert load_checkpoint_policy(save(built))[1].sampler.stochastic
     assert not load_checkpoint_policy(save(built), sampler="ddpm")[1].sampler.out_to_next.any()
+
+
+def test_settings_of_old_schedulers(payload: Build, save: Save) -> None:
+    """diffusers before 0.11 said ``predict_epsilon``; hydra's own entries say nothing about the policy."""
+    built = payload()
+    policy = built["cfg"]["policy"]
+    policy["noise_scheduler"] |= {"predict_epsilon": True, "_convert_": "all"}
+    policy["model"] |= {"_recursive_": False}
+    assert load_checkpoint_policy(save(built))[1].sampler.sample_to_x0.any()
+    del policy["noise_scheduler"]["prediction_type"]
+    policy["noise_scheduler"]["predict_epsilon"] = False
+    assert not load_checkpoint_policy(save(built))[1].sampler.sample_to_x0.any()
 
 
 def test_sample_prediction(payload: Build, save: Save) -> None:

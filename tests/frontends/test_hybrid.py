@@ -22,7 +22,7 @@ from ttscompile.errors import CheckpointError
 from ttscompile.frontends import diffusion_policy, load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.encoded import EncodedDenoiser
-from ttscompile.frontends.robomimic_encoder import ResidualBlock
+from ttscompile.frontends.robomimic_encoder import ResidualBlock, SpatialSoftmax
 from ttscompile.ir.flops import graph_flops
 from ttscompile.ir.program import Program
 from ttscompile.lower.program import lower_graph
@@ -193,7 +193,7 @@ def test_random_crops_become_the_centre(build: Callable[..., tuple[Any, Any]]) -
     with pytest.warns(UserWarning, match=r"eval_fixed_crop is false.*takes the centre"):
         module, _ = build(eval_fixed_crop=False)
     # Margins of 5 and 7 pixels: 2.5 and 3.5 are rounded to even numbers.
-    assert {(c.top, c.left, c.height, c.width) for c in module.encoder.cameras} == {(2, 4, 36, 36)}
+    assert {(c.crop.top, c.crop.left, *c.crop.size) for c in module.encoder.cameras} == {(2, 4, 36, 36)}
 
 
 def test_only_the_crop_matters(build: Callable[..., tuple[Any, Any]]) -> None:
@@ -217,6 +217,21 @@ def test_weights_that_are_there_once(build: Callable[..., tuple[Any, Any]], two_
     for without in (".nets.0.nets.", ".backbone."):
         found = build(without=without)[0].state_dict()
         assert all(torch.equal(found[key], expected[key]) for key in expected)
+
+
+def test_the_grid_of_half_precision_is_exact(build: Callable[..., tuple[Any, Any]], two_cameras: Payload) -> None:
+    """The grid of the spatial softmax was rounded with the weights, and is known without them."""
+    meta, grid = copy.deepcopy(two_cameras["cfg"]["policy"]["shape_meta"]), SpatialSoftmax(4, 4)
+    weights = dict(two_cameras["state_dicts"]["ema_model"])
+    for key, each in meta["obs"].items():
+        if each.get("type") == "rgb":
+            each["shape"] = [3, 100, 100]
+            names = (f"obs_encoder.obs_nets.{key}.{part}.pos_" for part in ("pool", "nets.1"))
+            weights |= {name + axis: grid.get_buffer(f"pos_{axis}") for name in names for axis in "xy"}
+    halved = {key: value.bfloat16() for key, value in weights.items()}
+    module, _ = build(halved, shape_meta=meta, crop_shape=None)
+    for camera in module.encoder.cameras:
+        assert torch.equal(camera.pool.pos_x, grid.pos_x) and torch.equal(camera.pool.pos_y, grid.pos_y)
 
 
 @pytest.mark.parametrize(

@@ -92,6 +92,11 @@ def test_learned_positions_and_plain_attention(tmp_path: Path) -> None:
         torch.testing.assert_close(module.denoiser(x, t, condition), expected, rtol=1e-4, atol=1e-4)
 
 
+def test_a_whole_number_is_a_base(tmp_path: Path) -> None:
+    """JSON written by hand says 10000."""
+    assert type(read_lerobot_config(save_policy(tmp_path, rope_base=10000)).network.rope_base) is float
+
+
 @pytest.mark.parametrize("separate", [False, True])
 def test_condition_of_two_cameras(tmp_path: Path, separate: bool) -> None:
     """Each frame is [state, camera, camera, instruction], as transformers' CLIP and plain arithmetic make it."""

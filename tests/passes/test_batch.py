@@ -82,11 +82,41 @@ def test_the_stream_of_a_doubled_batch_has_an_axis_of_streams(
         assert all(type_.batch_axis is not None for type_ in piece.inputs.values())
 
 
+def test_boundaries_may_be_counted_from_the_end() -> None:
+    b = Builder()
+    x = b.input("sample", B, 4, 2)
+    both = b.op("both", "cat.default", TWICE, (x, x), 0)
+    given = b.op("given", "slice.Tensor", (B, 4, 2), both, 0, 0, Batch(-1))
+    free = b.op("free", "slice.Tensor", (B, 4, 2), both, 0, Batch(-1), 2**63 - 1)
+    cut = CutCopies()(Program(toy_spec(), b.graph(given, free), {})).program.denoiser
+    assert [n.args[2] for n in cut.nodes if n.op == "aten.select.int"] == [0, 1]
+    assert unify_batch(graph(10, -5), graph(14, -7)).nodes[0].args[3] == Batch(-1)
+
+
 def test_rows_of_unknown_order_are_refused() -> None:
     b = Builder()
     both = b.op("both", "index_select.default", TWICE, b.input("x", B, 4, 2), 0, b.constant("order", 6))
     with pytest.raises(PassError, match=r"%both : float32\[2\*B, 4, 2\] has several rows a stream"):
         unfold(b.graph(both), ["both"])
+
+
+def test_heads_in_a_doubled_batch_lie_behind_the_streams() -> None:
+    b = Builder()
+    x = b.input("x", B, 4, 8)
+    both = b.op("both", "cat.default", (Batch(2), 4, 8), (x, x), 0)
+    heads = b.op("heads", "reshape.default", (Batch(2), 4, 2, 4), both, (Batch(2), 4, 2, 4))
+    turned = b.op("turned", "transpose.int", (Batch(2), 2, 4, 4), heads, 1, 2)
+    folded = b.op("folded", "reshape.default", (Batch(4), 4, 4), turned, (Batch(4), 4, 4))
+    back = b.op("back", "reshape.default", (Batch(2), 2, 16), folded, (Batch(2), 2, 16))
+    more = b.op("more", "cat.default", (Batch(6), 4, 4), (folded, b.op("one", "exp.default", (Batch(2), 4, 4), x)), 0)
+    found = unfold(b.graph(back, more), ["both", "folded", "back"])
+    assert {name: rows.unfolded.shape for name, rows in found.items()} == {
+        "both": (2, B, 4, 8),
+        "folded": (2, B, 2, 4, 4),
+        "back": (2, B, 2, 16),
+    }
+    with pytest.raises(PassError, match="%more .* cannot be seen"):
+        unfold(b.graph(more), ["more"])
 
 
 def test_values_with_an_axis_of_streams_are_left_alone() -> None:

@@ -8,7 +8,7 @@ from torch import nn
 
 from tests.passes.graphs import B, Builder, chain
 from ttscompile.errors import NoResidualBlocksError
-from ttscompile.ir.graph import Graph, Ref
+from ttscompile.ir.graph import GETITEM, Graph, Node, Ref, TensorType
 from ttscompile.passes.find_residual_blocks import find_residual_blocks
 
 
@@ -33,6 +33,18 @@ def test_the_order_of_operands_does_not_matter() -> None:
     b.op("a", "add.Tensor", (B, 4, 8), f, x)
     (block,) = find_residual_blocks(b.graph(Ref("a")), "x").blocks
     assert (block.stream, block.residual) == ("x", "f")
+
+
+def test_a_split_is_no_stream() -> None:
+    """Its first part has the stream's type, and everything goes through it."""
+    b = Builder()
+    wide = b.op("wide", "linear.default", (B, 4, 16), b.input("x", B, 4, 2), b.constant("w", 16, 2))
+    part = TensorType((B, 4, 8), "float32")
+    b.nodes.append(Node("split", "aten.chunk.default", (wide, 2, -1), (), (part, part)))
+    b.nodes += [Node(f"part{i}", GETITEM, (Ref("split"), i), (), (part,)) for i in range(2)]
+    h = b.residual("a", b.op("sum", "add.Tensor", (B, 4, 8), Ref("part0"), Ref("part1")))
+    (block,) = find_residual_blocks(b.graph(h), "x").blocks
+    assert (block.stream, block.residual) == ("sum", "a.f")
 
 
 def test_gated_residual_includes_the_gate() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,12 +13,14 @@ from torch import nn
 
 from tests.passes.specs import toy_spec
 from ttscompile import PolicySpec
+from ttscompile.driver import _run as _pass
 from ttscompile.driver import transform
 from ttscompile.errors import NoResidualBlocksError, PassError
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.flops import graph_flops
 from ttscompile.ir.graph import Graph
 from ttscompile.ir.program import Binding, Pieces, Program
+from ttscompile.passes.base import PassResult
 from ttscompile.passes.clean_up import CleanUp
 from ttscompile.passes.hoist import Hoist
 from ttscompile.passes.insert_pruner import InsertPruner
@@ -273,6 +276,16 @@ class LongObservation(nn.Module):
 
     def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
         return sample + self.ff(sample * obs[:, :4, :2] * obs[:, -4:, -2:])
+
+
+def test_a_pass_that_breaks_the_program_is_named() -> None:
+    class Breaks(InsertReuse):
+        def call(self, program: Program) -> PassResult:
+            return PassResult(replace(program, weights={}), True)
+
+    _, program = compiled("tokens")
+    with pytest.raises(PassError, match=r"^after Breaks: denoiser: constant %\S+ has no value"):
+        _pass(Breaks(), program, lambda stage, notes: None)
 
 
 def test_pruner_averages_a_feature_that_is_huge() -> None:

@@ -36,8 +36,10 @@ def test_parallel_branches_become_one_residual() -> None:
     total = b.op("s", "add.Tensor", SHAPE, x, f)
     total = b.op("y", "add.Tensor", SHAPE, b.op("t", "add.Tensor", SHAPE, g, total), h)
     graph, modified = regrouped(b.graph(total))
-    (block,) = find_residual_blocks(graph, "sample").blocks
+    table = find_residual_blocks(graph, "sample")
+    (block,) = table.blocks
     assert modified and block.stream == "sample" and block.residual == "y.branches1"
+    assert not any(said.startswith(("%s ", "%t ")) for said in table.declined)  # they are gone
 
 
 def test_two_blocks_in_a_row_stay_two() -> None:

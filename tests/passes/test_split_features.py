@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import nn
 
+from tests.passes.graphs import B, Builder
 from ttscompile.capture import capture
 from ttscompile.config import ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
 from ttscompile.errors import PassError
@@ -21,7 +22,7 @@ from ttscompile.passes.clean_up import CleanUp
 from ttscompile.passes.find_residual_blocks import find_residual_blocks
 from ttscompile.passes.hoist import Hoist
 from ttscompile.passes.partition import Partition
-from ttscompile.passes.split_features import SplitFeatures
+from ttscompile.passes.split_features import SplitFeatures, _parts
 from ttscompile.passes.split_tokens import SplitTokens
 
 
@@ -76,6 +77,16 @@ def test_modulations_become_a_sum_of_a_table_and_a_condition() -> None:
 def test_features_of_one_binding_time_are_left_alone() -> None:
     result = SplitFeatures()(_program(False))
     assert not result.modified
+
+
+def test_features_of_another_dtype_stay_together() -> None:
+    b = Builder()
+    parts = (b.input("time", B, 2), b.input("count", B, 3, dtype="int64"))
+    b.op("gate", "linear.default", (B, 4), b.op("both", "cat.default", (B, 5), parts, 1), b.constant("w", 4, 5))
+    graph = b.graph(Ref("gate"))
+    assert _parts(graph.nodes[1], graph.producers(), graph.types()) == []
+    floats = {name: replace(type_, dtype="float32") for name, type_ in graph.types().items()}
+    assert _parts(graph.nodes[1], graph.producers(), floats) == ["time", "count"]
 
 
 def test_runs_before_hoist_only() -> None:

@@ -75,6 +75,14 @@ def test_token_wise_work_moves_above_the_concatenation(rule: str) -> None:
     assert_same(graph, result)
 
 
+def test_tokens_of_another_dtype_stay_together() -> None:
+    b = Builder()
+    time, obs = b.input("time", B, 1, 8), b.input("obs", B, 2, 8, dtype="int64")
+    joined = b.op("tokens", "cat.default", (B, 3, 8), (time, obs), 1)
+    result, splitter = split(b.graph(b.op("y", "linear.default", (B, 3, 4), joined, b.constant("w", 4, 8))))
+    assert not splitter.split_at and len(result.nodes) == 2
+
+
 NEAR_MISSES: dict[str, Callable[[Builder, Ref], Ref]] = {
     "softmax over tokens": lambda b, t: b.op("y", "softmax.int", (B, 3, 8), t, 1),
     "norm over tokens": lambda b, t: b.op("y", "layer_norm.default", (B, 3, 8), t, (3, 8)),

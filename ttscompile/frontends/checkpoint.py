@@ -20,6 +20,7 @@ from torch.serialization import get_unsafe_globals_in_checkpoint, safe_globals
 from ..errors import CheckpointError
 
 _DEEPEST = 64  # nesting of a configuration; a real one has about 6 levels, a cycle has no end
+_HYDRA = ("_convert_", "_recursive_")  # how hydra is to instantiate what the other entries describe
 _MOST_VALUES = 100_000  # of a configuration; a real one has about 300, one whose parts are shared can have 2^60
 
 
@@ -219,7 +220,8 @@ def _plain(value: Any, where: str, depth: int, values: Iterator[int]) -> Any:
             raise CheckpointError(f"{where}: a configuration object without {key}; the checkpoint is malformed.")
         return _plain(state[key], where, depth + 1, values)
     if isinstance(value, dict):
-        return {str(name): _plain(item, f"{where}.{name}", depth + 1, values) for name, item in value.items()}
+        items = {str(name): item for name, item in value.items() if name not in _HYDRA}
+        return {name: _plain(item, f"{where}.{name}", depth + 1, values) for name, item in items.items()}
     if isinstance(value, (list, tuple)):
         return [_plain(item, f"{where}[{i}]", depth + 1, values) for i, item in enumerate(value)]
     if value is None or isinstance(value, (str, int, float, bool)):

@@ -11,7 +11,7 @@ import torch
 
 from ..config import Affine
 from ..errors import CheckpointError
-from .saved_weights import require_finite, require_names, require_shape
+from .saved_weights import require_finite, require_names, require_shape, unwrapped
 from .transformer_for_diffusion import TransformerConfig, TransformerForDiffusion
 
 _NORMALIZER_KEY = re.compile(r"normalizer\.params_dict\.\w+\.(scale|offset|input_stats\.\w+)")
@@ -44,7 +44,7 @@ def choose_weights(state_dicts: Any, use_ema: Any) -> tuple[Weights, str]:
     weights = state_dicts[found]
     if not isinstance(weights, dict):
         raise CheckpointError(f"state_dicts.{found} is a {type(weights).__name__}; expected a dictionary of tensors.")
-    weights = {str(key): value for key, value in weights.items() if not str(key).endswith(_COUNTERS)}
+    weights = {unwrapped(str(key)): value for key, value in weights.items() if not str(key).endswith(_COUNTERS)}
     for key, value in weights.items():
         if not isinstance(value, torch.Tensor) or value.layout != torch.strided or not value.is_floating_point():
             what = f"{value.dtype} tensor" if isinstance(value, torch.Tensor) else type(value).__name__

@@ -156,7 +156,7 @@ class _Reader:
 
     def network(self, action_dim: int) -> DiTConfig:
         base = self.settings.get("rope_base", 10000.0)
-        if not isinstance(base, float) or not base > 1:
+        if type(base) not in (int, float) or not 1 < base < 2**63:
             raise self.error(f"rope_base is {base!r:.80}; expected a number above 1")
         config = DiTConfig(
             action_dim=action_dim,
@@ -167,7 +167,7 @@ class _Reader:
             timestep_embed_dim=self.number("timestep_embed_dim", 256),
             use_positional_encoding=self.flag("use_positional_encoding", False),
             use_rope=self.flag("use_rope", True),
-            rope_base=base,
+            rope_base=float(base),
         )
         width, heads = config.hidden_dim, config.num_heads
         if width % heads or (config.use_rope and width // heads % 2):

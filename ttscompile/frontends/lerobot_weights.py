@@ -13,7 +13,7 @@ from .clip_config import TextConfig, VisionConfig
 from .lerobot_config import LeRobotConfig
 from .lerobot_processors import read_tensors
 from .multi_task_dit import DiffusionTransformer, ObservationEncoder
-from .saved_weights import require_finite, require_names, require_shape
+from .saved_weights import require_finite, require_names, require_shape, unwrapped
 
 _MOST_LAYERS = 512
 """Of all transformers together. Each is made twice, first without memory, which takes time."""
@@ -31,7 +31,8 @@ def read_weights(path: Path) -> dict[str, torch.Tensor]:
     found: dict[str, torch.Tensor] = {}
     for key, value in read_tensors(path).items():
         # transformers 4 saves an encoder below a level of its own, which transformers 5 leaves out.
-        short = key.replace(".model.vision_model.", ".model.").replace(".text_encoder.text_model.", ".text_encoder.")
+        short = unwrapped(key).replace(".model.vision_model.", ".model.")
+        short = short.replace(".text_encoder.text_model.", ".text_encoder.")
         if short.endswith(".position_ids"):
             continue
         if not value.is_floating_point():

@@ -17,6 +17,8 @@ import numpy as np
 import torch
 from torch import nn
 
+from .image_geometry import ResizeCrop
+
 KEYPOINTS = 32
 FEATURES = 64
 """Width of a camera's features; both as in robomimic's image experiments, which Diffusion Policy takes over."""
@@ -126,20 +128,16 @@ class CameraEncoder(nn.Module):
     def __init__(self, camera: Camera, norm: Norm) -> None:
         super().__init__()
         self.camera = camera
-        channels, *size = camera.shape
-        height, width = camera.crop or size
-        # As torchvision's center_crop: halves are rounded to the even number.
-        self.top, self.left = (round((room - used) / 2) for room, used in zip(size, (height, width), strict=True))
-        self.height, self.width = height, width
+        channels, height, width = camera.shape
+        self.crop = ResizeCrop(height, width, crop=camera.crop)
+        height, width = self.crop.size
         self.backbone = ResNet18(channels, norm)
         self.pool = SpatialSoftmax(math.ceil(height / _SHRINKS), math.ceil(width / _SHRINKS))
         self.linear = nn.Linear(2 * KEYPOINTS, FEATURES)
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
         """``[N, C, H, W]`` -> ``[N, 64]``."""
-        x = images
-        if self.camera.crop is not None:
-            x = x[:, :, self.top : self.top + self.height, self.left : self.left + self.width]
+        x = self.crop(images)
         if (self.camera.scale, self.camera.offset) != (1.0, 0.0):
             x = x * self.camera.scale + self.camera.offset
         return torch.relu(self.linear(self.pool(self.backbone(x))))

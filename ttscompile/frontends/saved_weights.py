@@ -18,6 +18,11 @@ def names_of(keys: Sequence[str]) -> str:
     return ", ".join(keys[:SHOWN]) + more
 
 
+def unwrapped(name: str) -> str:
+    """The name of a weight without the levels that ``torch.compile`` and ``DistributedDataParallel`` put around it."""
+    return ".".join(part for part in name.split(".") if part not in ("_orig_mod", "module"))
+
+
 def require_names(missing: Sequence[str], extra: Sequence[str], what: str, remedy: str) -> None:
     """Refuse weights some of which are missing, or of something else.
 

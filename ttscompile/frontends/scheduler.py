@@ -93,6 +93,13 @@ def configured_sampler(
         )
     scheduler_class = next(each for key, each in _CLASSES.items() if _NAMES[key] == name)
     given = {key: value for key, value in settings.items() if key != "_target_"}
+    old = given.pop("predict_epsilon", None)  # what diffusers before 0.11 called it
+    if old is not None:
+        predicts = "epsilon" if old else "sample"
+        if given.setdefault("prediction_type", predicts) != predicts:
+            raise CheckpointError(
+                f"{where}: predict_epsilon contradicts prediction_type = {given['prediction_type']!r}."
+            )
     unknown = sorted(set(given).difference(*map(_settings, _CLASSES.values())))
     if unknown and name == own_name:
         raise CheckpointError(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from .graph import Argument, Batch, Graph, Node
+from ..config import PolicySpec
+from .graph import Graph
 from .program import Binding
 
 _RANK = {Binding.CONSTANT: 0, Binding.TABLE: 1, Binding.CONDITION: 1, Binding.STEP: 2, Binding.LOOP: 3}
@@ -15,6 +16,11 @@ def join(left: Binding, right: Binding) -> Binding:
     if left is not right and _RANK[left] == _RANK[right]:
         return Binding.STEP
     return left if _RANK[left] >= _RANK[right] else right
+
+
+def input_bindings(spec: PolicySpec) -> dict[str, Binding]:
+    """Binding of what the prologue reads: timestep and observations."""
+    return {spec.timestep_argument: Binding.TABLE, **dict.fromkeys(spec.observations, Binding.CONDITION)}
 
 
 def bindings(graph: Graph, inputs: Mapping[str, Binding]) -> dict[str, Binding]:
@@ -32,7 +38,7 @@ def bindings(graph: Graph, inputs: Mapping[str, Binding]) -> dict[str, Binding]:
     shaped: set[str] = set()  # of nothing but constants and the batch size
     for node in graph.nodes:
         read = list(node.refs())
-        if (_batch_shaped(node) or not shaped.isdisjoint(read)) and all(
+        if (node.mentions_batch() or not shaped.isdisjoint(read)) and all(
             found[name] is Binding.CONSTANT or name in shaped for name in read
         ):
             shaped.add(node.name)
@@ -44,10 +50,3 @@ def bindings(graph: Graph, inputs: Mapping[str, Binding]) -> dict[str, Binding]:
                 binding = join(binding, found[name])
         found[node.name] = binding
     return found
-
-
-def _batch_shaped(node: Node) -> bool:
-    def inside(argument: Argument) -> bool:
-        return any(map(inside, argument)) if isinstance(argument, tuple) else isinstance(argument, Batch)
-
-    return any(map(inside, node.args)) or any(inside(v) for _, v in node.kwargs)

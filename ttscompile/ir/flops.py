@@ -5,10 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from ..errors import PassError
 from .graph import Graph, Node, Ref, TensorType
-
-_ELEMENTWISE_FREE = 0
 
 
 def _shape(types: Mapping[str, TensorType], argument: object) -> tuple[int, ...]:
@@ -17,11 +14,7 @@ def _shape(types: Mapping[str, TensorType], argument: object) -> tuple[int, ...]
 
 
 def node_flops(node: Node, types: Mapping[str, TensorType]) -> int:
-    """FLOPs of one node for one stream.
-
-    Raises:
-        PassError: an einsum whose equation cannot be read.
-    """
+    """FLOPs of one node for one stream."""
     base = node.op.split(".")[1] if node.op.startswith("aten.") else node.op
     if base in ("linear", "mm", "matmul", "bmm"):
         contracted = _shape(types, node.args[0])[-1]
@@ -33,19 +26,26 @@ def node_flops(node: Node, types: Mapping[str, TensorType]) -> int:
         return 2 * math.prod(query[:-1]) * key[-2] * (query[-1] + value[-1])
     if base.startswith("conv") or base == "convolution":
         weight = _shape(types, node.args[1])
-        return 2 * math.prod(node.type.at(1)) * math.prod(weight[1:])
+        # A transposed one spreads each input, where a plain one gathers each output.
+        each = _shape(types, node.args[0]) if "transpose" in base else node.type.at(1)
+        return 2 * math.prod(each) * math.prod(weight[1:])
     if base == "einsum":
         return _einsum_flops(node, types)
-    return _ELEMENTWISE_FREE
+    return 0
 
 
 def _einsum_flops(node: Node, types: Mapping[str, TensorType]) -> int:
-    equation, operands = node.args[0], node.args[1]
-    if not isinstance(equation, str) or not isinstance(operands, tuple) or "." in equation:
-        raise PassError(f"cannot count the FLOPs of {node}: write the einsum without an ellipsis.")
-    sizes: dict[str, int] = {}
+    """The product of all sizes; axes under an ellipsis are called by their place from the right."""
+    equation, operands = node.args[:2]
+    assert isinstance(equation, str)
+    assert isinstance(operands, tuple)
+    sizes: dict[str | int, int] = {}
     for term, operand in zip(equation.replace(" ", "").split("->")[0].split(","), operands, strict=True):
-        sizes.update(zip(term, _shape(types, operand), strict=True))
+        left, _, right = term.partition("...")
+        shape = _shape(types, operand)
+        names = (*left, *range(len(shape) - len(left) - len(right), 0, -1), *right)
+        for name, size in zip(names, shape, strict=True):
+            sizes[name] = max(size, sizes.get(name, 1))
     return 2 * math.prod(sizes.values())
 
 

@@ -100,6 +100,10 @@ class Node:
         for _, value in self.kwargs:
             yield from _refs(value)
 
+    def mentions_batch(self) -> bool:
+        """Whether the batch size is among its arguments."""
+        return any(map(_mentions_batch, self.args)) or any(_mentions_batch(a) for _, a in self.kwargs)
+
     def renamed(self, rename: Callable[[str], str]) -> Node:
         """The same operation on other values; its own name is kept."""
         return replace(
@@ -184,6 +188,10 @@ def _refs(argument: Argument) -> Iterator[str]:
     elif isinstance(argument, tuple):
         for item in argument:
             yield from _refs(item)
+
+
+def _mentions_batch(argument: Argument) -> bool:
+    return any(map(_mentions_batch, argument)) if isinstance(argument, tuple) else isinstance(argument, Batch)
 
 
 def _rename(argument: Argument, rename: Callable[[str], str]) -> Argument:

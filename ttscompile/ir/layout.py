@@ -206,7 +206,7 @@ class _Sinker:
         """The nodes, with outputs that were views computed and called by their names."""
         names: dict[str, str] = {}
         own = {node.name for node in self.graph.nodes} | set(self.graph.inputs) | set(self.graph.constants)
-        for output in self.graph.outputs:
+        for output in dict.fromkeys(self.graph.outputs):
             if output not in self.views:
                 continue
             computed = self.compute_name(output)

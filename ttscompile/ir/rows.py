@@ -2,26 +2,27 @@
 
 Guidance runs the network on a doubled batch; attention folds its heads into the batch. Caches, plans and tables are a
 stream's own, so a value that crosses from one piece of the program to another needs an axis of size exactly B: it
-crosses as ``[m, B, ...]`` or ``[B, m, ...]``, which is a reshape.
+crosses as ``[m, B, ...]``, ``[B, m, ...]``, or ``[c, B, r, ...]`` where both happened, which is a reshape.
 """
 
 from __future__ import annotations
 
-import enum
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from ..errors import PassError
-from .graph import Batch, Graph, Node, Ref, Size, TensorType
+from .graph import GETITEM, Batch, Graph, Node, Ref, Size, TensorType
 
 _RESHAPE = "aten.reshape.default"
 
 
-class Order(enum.Enum):
-    """Which factor of an axis ``m * B`` is the outer one."""
+class _Layout(NamedTuple):
+    """The factors of an axis ``copies * B * rows``, outermost first."""
 
-    COPIES = "copies"  # [m, B]: the whole batch, m times
-    STREAMS = "streams"  # [B, m]: m rows of each stream
+    copies: int
+    rows: int
 
 
 @dataclass(frozen=True)
@@ -59,81 +60,74 @@ def unfold(graph: Graph, names: Iterable[str]) -> dict[str, Rows]:
     wanted = [n for n in names if types[n].batch_axis is None and _axis(types[n]) is not None]
     if not wanted:
         return {}
-    orders = _orders(graph, types)
-    return {name: _rows(name, types[name], orders.get(name)) for name in wanted}
+    layouts = _layouts(graph, types)
+    return {name: _rows(name, types[name], layouts.get(name)) for name in wanted}
 
 
 def _axis(type_: TensorType) -> int | None:
     return next((i for i, size in enumerate(type_.shape) if isinstance(size, Batch)), None)
 
 
-def _rows(name: str, type_: TensorType, order: Order | None) -> Rows:
+def _rows(name: str, type_: TensorType, layout: _Layout | None) -> Rows:
     axis = _axis(type_)
     assert axis is not None
-    if order is None:
+    if layout is None:
         raise PassError(
             f"%{name} : {type_} has several rows a stream, and it cannot be seen which. Double the batch with"
             " torch.cat, repeat or repeat_interleave, and keep its order."
         )
-    size = type_.shape[axis]
-    assert isinstance(size, Batch)
-    factors: tuple[Size, Size] = (size.multiple, Batch()) if order is Order.COPIES else (Batch(), size.multiple)
+    factors: list[Size] = [n for n in (layout.copies, Batch(), layout.rows) if n != 1]
     shape = (*type_.shape[:axis], *factors, *type_.shape[axis + 1 :])
     return Rows(name, type_, f"{name}.rows", replace(type_, shape=shape))
 
 
-def _orders(graph: Graph, types: Mapping[str, TensorType]) -> dict[str, Order]:
-    """The order of every value with an axis ``m * B`` of which it is known."""
-    known: dict[str, Order] = {}
+def _layouts(graph: Graph, types: Mapping[str, TensorType]) -> dict[str, _Layout]:
+    """The layout of every value with an axis of streams of which it is known."""
+    known = {name: _Layout(1, 1) for name, type_ in types.items() if type_.batch_axis is not None}
     for node in graph.nodes:
         axis = _axis(node.type)
-        if axis is None or node.type.batch_axis is not None:
+        read = [name for name in node.refs() if _axis(types[name]) is not None]
+        if axis is None or node.name in known or not read or not all(name in known for name in read):
             continue
-        order = _made(node, axis, types)
-        if order is None:
-            inherited = {
-                known.get(n) for n in node.refs() if types[n].batch_axis is None and _axis(types[n]) is not None
-            }
-            order = inherited.pop() if len(inherited) == 1 else None
-        if order is not None:
-            known[node.name] = order
+        layout = _made(node, axis, [types[name] for name in read], [known[name] for name in read])
+        if layout is not None:
+            known[node.name] = layout
     return known
 
 
-def _made(node: Node, axis: int, types: Mapping[str, TensorType]) -> Order | None:
-    """The order that an operation gives to an axis ``m * B`` which its arguments do not have."""
-    streams = [types[n] for n in node.refs() if types[n].batch_axis is not None]
-    if not streams:
+def _made(node: Node, axis: int, read: Sequence[TensorType], layouts: Sequence[_Layout]) -> _Layout | None:
+    """The layout that an operation gives to an axis ``m * B`` of its result; None if it cannot be seen."""
+    size, (copies, rows) = node.type.shape[axis], layouts[0]
+    assert isinstance(size, Batch)
+    base = node.op if node.op == GETITEM else node.op.split(".")[1]
+    if base in ("repeat", "tile"):
+        copies = size.multiple // rows
+    elif base == "repeat_interleave":
+        rows = size.multiple // copies
+    elif base in ("reshape", "view", "_unsafe_view", "flatten"):
+        # What lies behind a stream in memory stays behind it.
+        before, after = _axis(read[0]), _numbers(node.type.shape[axis + 1 :])
+        assert before is not None
+        rows, rest = divmod(rows * _numbers(read[0].shape[before + 1 :]), after or 1)
+        if rest or not after or not rows:
+            return None
+        copies = size.multiple // rows
+    elif base == "cat" and _joined(node) == axis and len({layout.rows for layout in layouts}) == 1:
+        copies = sum(layout.copies for layout in layouts)
+    elif len(set(layouts)) > 1:
         return None
-    match node.op.split(".")[1]:
-        case "cat":
-            joined = node.args[1] if len(node.args) > 1 else 0
-            return Order.COPIES if isinstance(joined, int) and joined % len(node.type.shape) == axis else None
-        case "repeat" | "tile":
-            return Order.COPIES
-        case "repeat_interleave":
-            return Order.STREAMS
-        case "reshape" | "view" | "_unsafe_view" | "flatten":
-            return _merged(streams[0].shape, node.type.shape, axis)
-    return None
+    return _Layout(copies, rows) if copies * rows == size.multiple else None
 
 
-def _merged(before: tuple[Size, ...], after: tuple[Size, ...], axis: int) -> Order | None:
-    """A reshape that merges an axis of size B with its neighbours."""
-    inner = _numbers(after[axis + 1 :])
-    position = before.index(Batch())
-    behind, factor = _numbers(before[position + 1 :]), after[axis]
-    assert isinstance(factor, Batch)
-    if behind == inner:
-        return Order.COPIES
-    return Order.STREAMS if behind == inner * factor.multiple else None
+def _joined(node: Node) -> int:
+    axis = node.args[1] if len(node.args) > 1 else 0
+    assert isinstance(axis, int)
+    return axis % len(node.type.shape)
 
 
 def _numbers(sizes: tuple[Size, ...]) -> int:
-    product = 1
-    for size in sizes:
-        product *= size if isinstance(size, int) else 0
-    return product
+    """Product of sizes; 0 if the batch is among them."""
+    return math.prod(size if isinstance(size, int) else 0 for size in sizes)
 
 
 def crossing_inputs(graph: Graph, rows: Mapping[str, Rows]) -> Graph:

@@ -1,25 +1,23 @@
-"""Invariants of graphs and programs, checked at entry and exit of the driver and after every pass under test."""
+"""Invariants of graphs and programs, which the driver checks after capture and after every pass."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 from ..errors import PassError
-from .graph import Graph, Node, TensorType
+from .graph import Graph, Node
 from .program import Binding, Program
 
 
 def verify_graph(graph: Graph, what: str) -> None:
-    """Check one graph: names unique, values defined before use, outputs defined, one type a result.
+    """Check one graph: names unique, values defined before use, outputs defined, results typed.
 
     Raises:
         PassError: names the graph, the node with its source line, and its neighbours.
     """
-    defined: dict[str, TensorType] = {}
-    for name, type_ in (*graph.inputs.items(), *graph.constants.items()):
-        if name in defined:
-            raise PassError(f"{what}: %{name} is both an input and a constant.")
-        defined[name] = type_
+    if both := sorted(graph.inputs.keys() & graph.constants.keys()):
+        raise PassError(f"{what}: %{both[0]} is both an input and a constant.")
+    defined = {*graph.inputs, *graph.constants}
     for position, node in enumerate(graph.nodes):
         if node.name in defined:
             raise PassError(f"{what}: %{node.name} is defined twice.\n{_around(graph, position)}")
@@ -29,7 +27,7 @@ def verify_graph(graph: Graph, what: str) -> None:
                 raise PassError(f"{what}: %{node.name} reads %{name}, which is not defined there.\n{where}")
         if not node.types:
             raise PassError(f"{what}: %{node.name} has no result.\n{_around(graph, position)}")
-        defined[node.name] = node.type
+        defined.add(node.name)
     for name in graph.outputs:
         if name not in defined:
             raise PassError(f"{what}: the output %{name} is not defined; {len(graph.nodes)} nodes.")
@@ -96,8 +94,6 @@ def _verify_pieces(program: Program) -> None:
         if len(graph.outputs) != 1 or graph.types()[graph.outputs[0]] != flows_out:
             given = [str(graph.types()[o]) for o in graph.outputs]
             raise PassError(f"{what}: gives {given}; expected one {flows_out}.")
-    if not pieces.bindings:
-        return  # before hoist every context comes from the prologue
     provided = {Binding.CONDITION: set(pieces.condition.outputs), Binding.TABLE: set(pieces.tables)}
     provided[Binding.STEP] = set(pieces.step.outputs) if pieces.step is not None else set()
     consumers = [(what, list(graph.inputs)[1:]) for what, graph, _, _ in loop]
@@ -105,12 +101,15 @@ def _verify_pieces(program: Program) -> None:
         consumers.append(("step", list(pieces.step.inputs)))
     for what, contexts in consumers:
         for name in contexts:
-            binding = pieces.bindings.get(name)
+            # Before hoist every context comes from the prologue.
+            binding = pieces.bindings.get(name) if pieces.bindings else Binding.CONDITION
             if binding is None or name not in provided.get(binding, ()):
                 raise PassError(f"{what}: nothing provides its context %{name} (binding {binding}).")
     for name in pieces.features:
         if name not in pieces.condition.outputs:
             raise PassError(f"pruner: its feature %{name} is not an output of the condition graph.")
+    if pieces.pruner is not None and tuple(pieces.pruner.inputs) != pieces.features:
+        raise PassError(f"pruner: reads {list(pieces.pruner.inputs)}; its features are {list(pieces.features)}.")
 
 
 def _around(graph: Graph, position: int, radius: int = 2) -> str:

@@ -1,0 +1,74 @@
+"""Programs that are legal and unusual, made by hand, through the passes that meet them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from tests.passes.graphs import B, Builder
+from tests.passes.specs import toy_spec
+from ttscompile import ObservationSpec
+from ttscompile.errors import PassError
+from ttscompile.ir.evaluate import evaluate
+from ttscompile.ir.graph import Ref
+from ttscompile.ir.program import Program
+from ttscompile.passes.find_residual_blocks import find_residual_blocks
+from ttscompile.passes.hoist import Hoist
+from ttscompile.passes.insert_pruner import InsertPruner
+from ttscompile.passes.partition import Partition
+
+SHAPE = (B, 4, 2)
+
+
+def hoisted(builder: Builder, result: Ref, observation: ObservationSpec) -> Program:
+    """The program of a graph of ``sample``, ``timestep`` and ``obs``, up to hoist."""
+    graph = builder.graph(result)
+    weights = {name: torch.randn(type_.at(1)).numpy() for name, type_ in graph.constants.items()}
+    spec = replace(toy_spec(), observations={"obs": observation})
+    program = Program(spec, graph, weights, find_residual_blocks(graph, "sample").blocks)
+    return Hoist()(Partition()(program).program).program
+
+
+def inputs(dtype: str) -> tuple[Builder, Ref, Ref]:
+    """A builder, the sample and the observation."""
+    b = Builder()
+    sample = b.input("sample", *SHAPE)
+    b.input("timestep", B, dtype="int64")
+    return b, sample, b.input("obs", B, 3, dtype=dtype)
+
+
+def test_a_network_without_products_is_hoisted() -> None:
+    b, sample, obs = inputs("float32")
+    gate = b.op("gate", "mean.dim", (B, 1, 1), b.op("row", "unsqueeze.default", (B, 1, 3), obs, 1), (2,), True)
+    residual = b.op("f", "tanh.default", SHAPE, b.op("g", "mul.Tensor", SHAPE, sample, gate))
+    program = hoisted(b, b.op("y", "add.Tensor", SHAPE, sample, residual), ObservationSpec((3,)))
+    assert [block.flops for block in program.blocks] == [0]
+
+
+def labelled() -> Program:
+    """Labels that go through an embedding: no arithmetic has made anything that the pruner could read."""
+    b, sample, obs = inputs("int64")
+    rows = b.op("e", "embedding.default", (B, 3, 2), b.constant("w", 9, 2), obs)
+    gate = b.op("gate", "mean.dim", (B, 1, 2), rows, (1,), True)
+    linear = b.op("f", "linear.default", SHAPE, sample, b.constant("v", 2, 2))
+    total = b.op("y", "add.Tensor", SHAPE, sample, b.op("g", "mul.Tensor", SHAPE, linear, gate))
+    return hoisted(b, total, ObservationSpec((3,), dtype="int64", window=False, bounds=(0, 8)))
+
+
+def test_pruner_reads_whole_numbers_as_floats() -> None:
+    program = InsertPruner()(labelled()).program
+    pieces = program.pieces
+    assert pieces is not None and pieces.pruner is not None and pieces.features == ("obs.feature",)
+    weights = {name: torch.from_numpy(value) for name, value in program.weights.items()}
+    values = evaluate(pieces.condition, weights, {"obs": torch.tensor([[0, 4, 8], [1, 2, 3]])})
+    (logits,) = evaluate(pieces.pruner, weights, dict(zip(pieces.condition.outputs, values, strict=True)))
+    assert logits.shape == (2, 5, 1, 4) and logits.isfinite().all()
+
+
+def test_a_weight_with_a_name_of_the_plan_head_is_refused() -> None:
+    program = labelled()
+    named = replace(program, weights={**program.weights, "pruner.hidden.bias": program.weights["v"]})
+    with pytest.raises(PassError, match=r"weights of its own called pruner\.hidden\.bias"):
+        InsertPruner()(named)
