@@ -339,7 +339,7 @@ class AsyncExecutor:
             longest = next(iter(self._feasibility.values())).max_latency
             raise InfeasibleError(
                 f"no plan is fast enough for this loop. {sums}. Use a plan whose calls take at most"
-                f" {1e3 * longest:.4g} ms, a lower rate, or a longer horizon (ExecutorSettings.horizon);"
+                f" {1e3 * longest:.4g} ms, a lower rate, or more of each chunk (ExecutorSettings.horizon and reserve);"
                 " 'ttscompile plan DIR' says what is feasible."
             )
         tiers = possible or resolved.tiers[-1:]

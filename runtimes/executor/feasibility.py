@@ -1,14 +1,16 @@
 """Whether a policy keeps up with a control loop. No clock, no threads.
 
-A call starts when a frame comes, and its chunk plays out ``horizon`` after that. The next call can start when this one
-is done, with the next frame that comes then, and must be done ``margin`` before the actions run out::
+A call starts when a frame comes. The next one starts when the policy would have executed a chunk, ``play`` later, or as
+much sooner as it must to be done ``margin`` before the actions of the first run out::
 
-    frame: call n             frame: call n + 1                       actions of n run out
-       |=====latency=======|......|=====latency=======|----margin---->|
-       |                   |<--frame period at most                   |
-       |<---------------------------- horizon ----------------------->|
+    frame: call n                  frame: call n + 1                      what n predicted runs out
+       |=====latency=======|.........|=====latency=======|----margin---->|.............|
+       |<----------- play ---------->|
+       |<------------------------------ horizon ------------------------>|
 
-So the calls follow each other without a gap in the actions if ``frame period + 2 * latency + margin <= horizon``.
+It can start when the first is done, with the next frame that comes then. So the calls follow each other without a gap
+in the actions if ``frame period + 2 * latency + margin <= horizon``, which is ``play + latency + margin``, or all that
+is predicted, if that is less.
 """
 
 from __future__ import annotations
@@ -26,8 +28,9 @@ class Feasibility:
         latency: the longest call that has to be reckoned with.
         control_hz: rate of the control loop.
         policy_hz: rate of observations and actions in the policy's own time.
-        horizon_steps: actions of a chunk that may be played.
+        horizon_steps: actions of a chunk that the policy executes: ``play``.
         margin_ticks: control ticks that a chunk shall be there before it is needed.
+        reserve_steps: actions after these that may be played.
     """
 
     latency: float
@@ -35,6 +38,7 @@ class Feasibility:
     policy_hz: float
     horizon_steps: int
     margin_ticks: int
+    reserve_steps: int = 0
 
     @property
     def frame(self) -> float:
@@ -47,9 +51,14 @@ class Feasibility:
         return self.margin_ticks / self.control_hz
 
     @property
+    def predicted(self) -> float:
+        """How long the actions of a chunk last, from its observation on, if all that may be played are."""
+        return (self.horizon_steps + self.reserve_steps) / self.policy_hz
+
+    @property
     def horizon(self) -> float:
-        """How long the actions of a chunk last, from its observation on."""
-        return self.horizon_steps / self.policy_hz
+        """From the observation of a chunk to when the next one must be there."""
+        return min(self.horizon_steps / self.policy_hz + self.latency + self.margin, self.predicted)
 
     @property
     def needed(self) -> float:
@@ -59,13 +68,15 @@ class Feasibility:
     @property
     def max_latency(self) -> float:
         """The longest call with which this would be feasible; not positive if none would be."""
-        return (self.horizon - self.frame - self.margin) / 2
+        alone = (self.horizon_steps - 1) / self.policy_hz
+        return min(alone, (self.predicted - self.frame - self.margin) / 2)
 
     @property
     def max_policy_hz(self) -> float:
         """The fastest rate of this latency, with as many control ticks an action as now; 0 if there is none."""
         ticks_per_step = self.control_hz / self.policy_hz
-        return max(self.horizon_steps - 1 - self.margin_ticks / ticks_per_step, 0.0) / (2 * self.latency)
+        covered = (self.horizon_steps + self.reserve_steps - 1 - self.margin_ticks / ticks_per_step) / 2
+        return max(min(self.horizon_steps - 1, covered), 0.0) / self.latency
 
     @property
     def feasible(self) -> bool:
@@ -75,10 +86,12 @@ class Feasibility:
     def explain(self) -> str:
         """The arithmetic on one line, in milliseconds."""
         sign = "<=" if self.feasible else ">"
+        steps, whole = self.horizon_steps + self.reserve_steps, self.horizon == self.predicted
+        lasts = f"{steps} actions" if whole else f"{self.horizon_steps} actions + latency + margin"
         return (
             f"frame period {1e3 * self.frame:.4g} + 2 x latency {1e3 * self.latency:.4g}"
             f" + margin {1e3 * self.margin:.4g} = {1e3 * self.needed:.4g} ms {sign} {1e3 * self.horizon:.4g} ms ="
-            f" {self.horizon_steps} actions at {self.policy_hz:g} Hz"
+            f" {lasts} at {self.policy_hz:g} Hz"
         )
 
     def to_json(self) -> dict[str, Any]:

@@ -65,12 +65,12 @@ class ExecutorSettings:
             has to be a multiple of it.
         interpolation: between actions, if the control loop is faster than the policy: ``hold`` or ``linear``.
         n_obs_steps: To; None: what the policy's chunking implies, ``start + 1``.
-        horizon: actions of a chunk that may be played, from its observation on; None: as many as the policy executes.
-            More of them, up to the end of the prediction, allow slower calls, and play actions that the policy was not
-            judged on.
-        reserve: actions of a chunk after its horizon that may be played while the next chunk is late; None: all that
-            the policy predicts. They are counted, and a late chunk has missed its deadline all the same: no call is
-            planned to need them. None are kept where the guard refuses one. 0 holds the last action instead.
+        horizon: actions from one call to the next; None: as many as the policy executes of a chunk.
+        reserve: actions of a chunk after its horizon that may be played; None: all that the policy predicts. Of these
+            as many are planned with as a call and the margin take, so that a chunk which comes late by its latency is
+            played for as much longer. What is left bridges a chunk that misses its deadline; that is counted. None are
+            kept where the guard refuses one. With 0 no action is played that the policy would not execute, calls start
+            sooner, and nothing but the last action is left for a chunk that is late.
         rate_tolerance: how far from its place in the window a frame may be, as a share of the policy's period.
         max_age: of the newest frame of a window when a call starts; None: three periods of the policy.
         seam: how a chunk joins the one before: ``replace``; ``blend``, linear over ``blend_steps``; or ``prefix``

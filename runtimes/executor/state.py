@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import floor
 
 import numpy as np
 
@@ -315,8 +316,8 @@ class ExecutorState:
             actions = actions[: resolved.horizon]
         rows = expand(actions, resolved.ticks_per_step, settings.interpolation)
         start = self._grid.tick(job.observed)
-        reserve = (len(actions) - resolved.horizon) * resolved.ticks_per_step
-        new = Timeline(start, rows, np.full(len(rows), job.observed), reserve)
+        judged = resolved.horizon * resolved.ticks_per_step
+        new = Timeline(start, rows, np.full(len(rows), job.observed), max(len(rows) - judged - self._ahead(), 0))
         seam = start if self._last is None else self._last[0] + 1
         spliced = splice(self._timeline, new, seam, settings.blend_steps if settings.seam == "blend" else 0)
         if spliced is None or new.end <= self._grid.tick(now):
@@ -325,12 +326,16 @@ class ExecutorState:
         past = np.stack(played) if played else np.empty((0, resolved.channels), np.float32)
         refusal = self._guard.refuse_motion(past, spliced.rows)
         if refusal is not None:  # without its reserve it may do, if anything is left then
-            spliced = spliced.without_reserve()
+            spliced = spliced.until(start + judged)
             self._refusal = self._guard.refuse_motion(past, spliced.rows) if len(spliced.rows) else refusal
             if self._refusal is not None:
                 return "refused"
         self._timeline = spliced
         return "scheduled"
+
+    def _ahead(self) -> int:
+        """Ticks from the frame that the next call starts with to when its chunk is needed."""
+        return self._settings.margin_ticks + floor(self._latencies[self.plan].bound * self._resolved.control_hz) + 1
 
     def _runs_out(self, now: float) -> float | None:
         """When the first tick comes for which nothing is scheduled; None if that is so already."""
@@ -358,4 +363,6 @@ class ExecutorState:
 
 def feasibility(settings: ExecutorSettings, resolved: Resolved, latency: float) -> Feasibility:
     """The arithmetic of one latency with these settings."""
-    return Feasibility(latency, resolved.control_hz, resolved.policy_hz, resolved.horizon, settings.margin_ticks)
+    return Feasibility(
+        latency, resolved.control_hz, resolved.policy_hz, resolved.horizon, settings.margin_ticks, resolved.reserve
+    )

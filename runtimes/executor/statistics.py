@@ -93,7 +93,7 @@ class ExecutorStatistics:
         plan: that the next call runs.
         identity: of the artifact; empty for a policy that is none.
         ticks: actions that were given out, those in reserve and held ones included.
-        reserve: of these, actions after the horizon of their chunk, because the next chunk was late.
+        reserve: of these, actions beyond what was planned with, because the next chunk was late.
         holds: of these, the last action given out again because there was no other.
         starved: times that there was no action and none could be held, so that ``action`` raised. Before the first
             chunk of an episode this is no missed deadline.

@@ -93,9 +93,9 @@ class Timeline:
         """First tick that the next chunk is needed for: what follows is in reserve."""
         return self.end - self.reserve
 
-    def without_reserve(self) -> Timeline:
-        """What is played if no chunk is late."""
-        kept = max(len(self.rows) - self.reserve, 0)
+    def until(self, tick: int) -> Timeline:
+        """What is scheduled before a tick, none of it in reserve."""
+        kept = max(min(tick - self.start, len(self.rows)), 0)
         return Timeline(self.start, self.rows[:kept], self.observed[:kept])
 
     def at(self, tick: int) -> FloatArray | None:

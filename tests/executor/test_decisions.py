@@ -29,14 +29,41 @@ def test_the_arithmetic_of_push_t() -> None:
     assert at_50.to_json()["feasible"] is True
 
 
-@given(st.floats(1e-4, 1), st.sampled_from([1, 2, 5]), st.integers(2, 32), st.integers(0, 3))
+def test_what_is_predicted_beyond_what_is_executed_lets_calls_take_longer() -> None:
+    """Push-T predicts 15 actions from the observation on, and executes 8."""
+    at_50 = Feasibility(0.04, 50, 50, 8, 1, reserve_steps=7)
+    assert at_50.max_latency == pytest.approx(0.13)  # with its double, a frame and a tick, 15 actions
+    assert at_50.explain() == (
+        "frame period 20 + 2 x latency 40 + margin 20 = 120 ms <= 220 ms = 8 actions + latency + margin at 50 Hz"
+    )
+    slow = Feasibility(0.131, 50, 50, 8, 1, reserve_steps=7)
+    assert not slow.feasible
+    assert slow.explain().endswith("= 302 ms > 300 ms = 15 actions at 50 Hz")
+    long = Feasibility(0.04, 50, 50, 8, 1, reserve_steps=50)
+    assert long.max_latency == pytest.approx(0.14)  # a call is done when the next one starts
+
+
+@given(st.floats(1e-4, 1), st.sampled_from([1, 2, 5]), st.integers(2, 32), st.integers(0, 3), st.integers(0, 40))
 def test_the_fastest_feasible_rate_is_feasible_and_no_faster_one_is(
-    latency: float, ticks: int, horizon: int, margin: int
+    latency: float, ticks: int, horizon: int, margin: int, reserve: int
 ) -> None:
-    hz = Feasibility(latency, 10.0 * ticks, 10.0, horizon, margin).max_policy_hz
+    def at(hz: float) -> Feasibility:
+        return Feasibility(latency, hz * ticks, hz, horizon, margin, reserve)
+
+    hz = at(10.0).max_policy_hz
     if hz > 0:
-        assert Feasibility(latency, hz * 0.999 * ticks, hz * 0.999, horizon, margin).feasible
-        assert not Feasibility(latency, hz * 1.001 * ticks, hz * 1.001, horizon, margin).feasible
+        assert at(hz * 0.999).feasible
+        assert not at(hz * 1.001).feasible
+
+
+@given(st.floats(1e-4, 1), st.integers(2, 32), st.integers(0, 3), st.integers(0, 40))
+def test_the_longest_feasible_call_is_feasible_and_no_longer_one_is(
+    latency: float, horizon: int, margin: int, reserve: int
+) -> None:
+    longest = Feasibility(latency, 10.0, 10.0, horizon, margin, reserve).max_latency
+    if longest > 0:
+        assert Feasibility(longest * 0.999, 10.0, 10.0, horizon, margin, reserve).feasible
+        assert not Feasibility(longest * 1.001 + 1e-9, 10.0, 10.0, horizon, margin, reserve).feasible
 
 
 def test_the_longest_of_the_last_calls_counts() -> None:

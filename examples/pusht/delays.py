@@ -1,0 +1,244 @@
+"""What latency does to a policy that is played by the executor, and what seam, margin and horizon do about it.
+
+    python examples/pusht/delays.py build/pusht/compiled --hz 50 --latency-ms 0,20,40,80 --seams replace,blend,prefix
+
+The world takes a step each tick and never waits, not for the first chunk of an episode either: the agent stands still
+until it comes. A call takes as long as ``--latency-ms`` says, in simulated time, so the result is the same on every
+machine and no time is spent waiting. Latencies that are too long for the loop are played too: where there is no action,
+the agent stays where it is. Seeds and differences are as in ``evaluate.py``; the baseline is the policy for which the
+world waits, and which executes all actions of a chunk.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+import numpy as np
+from delays_plot import plot_delays
+from delays_world import Driven, Setup, drive
+from episodes import Episodes
+from evaluate import Evaluation, summarise
+from jobs import fill_cache
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+from rollout import Rollout, run_episodes
+from variants import first_seed_option, open_variant, results_console, run, runtime_option
+
+from ttscompile.cli.output import identity_of, print_identity
+
+T = TypeVar("T")
+SEEDS_A_JOB = 4
+_opened = lru_cache(open_variant)  # one for each process
+
+
+def drive_all(
+    text: str,
+    runtime: str,
+    setups: Sequence[Setup],
+    seeds: Sequence[int],
+    jobs: int,
+    on_done: Callable[[int], None],
+) -> dict[Setup, list[Driven]]:
+    """Run every setup on every seed.
+
+    Args:
+        text: artifact and plan, as ``open_variant`` takes them.
+        runtime: of ``ttscompile.load``; each process has one thread of arithmetic.
+        setups: to run.
+        seeds: of the episodes.
+        jobs: processes.
+        on_done: told the number of episodes that are done.
+    """
+    parts = [(setup, seeds[i : i + SEEDS_A_JOB]) for setup in setups for i in range(0, len(seeds), SEEDS_A_JOB)]
+    found: dict[tuple[Setup, int], Driven] = {}
+    # A fork of a process that has threads of onnxruntime would wait for them for ever.
+    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+        running = {pool.submit(_drive, text, runtime, setup, some): setup for setup, some in parts}
+        for future in as_completed(running):
+            for driven in future.result():
+                found[running[future], driven.episode.seed] = driven
+            on_done(len(found))
+    return {setup: [found[setup, seed] for seed in seeds] for setup in setups}
+
+
+def _drive(text: str, runtime: str, setup: Setup, seeds: Sequence[int]) -> list[Driven]:
+    """Some episodes of one setup."""
+    return [drive(_opened(text, runtime, 1), setup, seed) for seed in seeds]
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What one setup came to.
+
+    Attributes:
+        evaluation: against the policy for which the world waits.
+        calls: of the policy in an episode, mean.
+        age: ticks from the observation that an action was computed from to when it was executed: mean over episodes of
+            their medians; None if there never was an action.
+        bridged: share of the ticks that had an action in reserve, or the last one held, because a chunk was late.
+        still: share of the ticks that had no action.
+    """
+
+    evaluation: Evaluation
+    calls: float
+    age: float | None
+    bridged: float
+    still: float
+
+    def to_json(self) -> dict[str, Any]:
+        """The figures, and the score of every seed."""
+        return {**vars(self), "evaluation": self.evaluation.to_json()}
+
+
+def figures(setup: Setup, driven: Sequence[Driven], baseline: Rollout) -> Figures:
+    """Figures of one setup.
+
+    Args:
+        setup: that was driven.
+        driven: an episode a seed.
+        baseline: of the same seeds.
+    """
+    rollout = Rollout(tuple(each.episode for each in driven), ())
+    steps = sum(len(each.episode.targets) for each in driven)
+    ages = [each.age for each in driven if each.age is not None]
+    return Figures(
+        evaluation=summarise(setup.label, rollout, baseline),
+        calls=float(np.mean([len(each.episode.windows) for each in driven])),
+        age=float(np.mean(ages)) if ages else None,
+        bridged=sum(each.bridged for each in driven) / steps,
+        still=sum(each.still for each in driven) / steps,
+    )
+
+
+def delays_table(found: dict[Setup, Figures], baseline: Evaluation) -> Table:
+    """The figures, a setup a row, and the synchronous policy first."""
+    episodes = baseline.rollout.episodes
+    table = Table(
+        title=f"Push-T, {len(episodes)} episodes, seeds {episodes[0].seed}..{episodes[-1].seed}, mean and 95 % interval"
+    )
+    table.add_column("latency, ms", justify="right")
+    table.add_column("setup")
+    for column in ("score", "success", "score, difference", "calls", "age, ticks", "bridged", "standing still"):
+        table.add_column(column, justify="right")
+    calls = np.mean([len(each.windows) for each in episodes])
+    table.add_row("", "the world waits", str(baseline.score), f"{baseline.success.mean:.3f}", "", f"{calls:.1f}")
+    for setup, each in found.items():
+        evaluation = each.evaluation
+        table.add_row(
+            f"{setup.latency_ms:g}",
+            setup.label,
+            str(evaluation.score),
+            f"{evaluation.success.mean:.3f}",
+            str(evaluation.score_difference),
+            f"{each.calls:.1f}",
+            "" if each.age is None else f"{each.age:.1f}",
+            f"{each.bridged:.1%}",
+            f"{each.still:.1%}",
+        )
+    return table
+
+
+def several(kind: Callable[[str], T], least: float = 0) -> Callable[[Any, Any, str], list[T]]:
+    """A callback for an option that takes several values, with commas between."""
+
+    def parse(context: Any, parameter: Any, text: str) -> list[T]:
+        try:
+            values = [kind(each) for each in text.split(",")]
+        except ValueError as error:
+            raise click.BadParameter(str(error)) from error
+        if any(isinstance(value, int | float) and not least <= value < float("inf") for value in values):
+            raise click.BadParameter(f"{text!r} must be {least:g} or more.")
+        return list(dict.fromkeys(values))
+
+    return parse
+
+
+@click.command()
+@click.argument("variant", metavar="DIR[:PLAN]")
+@click.option("--latency-ms", "latencies", default="0,30,60,300,600", show_default=True, callback=several(float))
+@click.option("--seams", default="replace", show_default=True, callback=several(str), help="replace, blend, prefix.")
+@click.option("--margins", default="1", show_default=True, callback=several(int), help="Ticks.")
+@click.option(
+    "--horizons",
+    default="0",
+    show_default=True,
+    callback=several(int),
+    help="Actions from one call to the next; 0: as many as the policy executes.",
+)
+@click.option("--hz", default=10.0, show_default=True, type=click.FloatRange(min=0.1), help="Ticks a second.")
+@click.option("--episodes", default=48, show_default=True, type=click.IntRange(1))
+@first_seed_option
+@runtime_option
+@click.option("--jobs", default=1, show_default=True, type=click.IntRange(1), help="Processes, of one thread each.")
+@click.option(
+    "--cache",
+    type=click.Path(file_okay=False, path_type=Path),
+    default=Path("build/pusht/episodes"),
+    show_default=True,
+    help="Where the baseline's episodes are kept, as by evaluate.py.",
+)
+@click.option("--plot", "picture", type=click.Path(dir_okay=False, path_type=Path), help="Draw score against latency.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON document instead of a table.")
+def main(
+    variant: str,
+    latencies: list[float],
+    seams: list[str],
+    margins: list[int],
+    horizons: list[int],
+    hz: float,
+    episodes: int,
+    first_seed: int,
+    runtime: str,
+    jobs: int,
+    cache: Path,
+    picture: Path | None,
+    as_json: bool,
+) -> None:
+    """Drive the policy of DIR through the executor with latencies that are given, and compare with waiting for it."""
+    opened = open_variant(variant, runtime, 1)
+    seeds = range(first_seed, first_seed + episodes)
+    setups = [
+        Setup(latency, seam, margin, horizon or None, hz)
+        for seam, margin, horizon, latency in product(seams, margins, horizons, latencies)
+    ]
+    for setup in setups:
+        setup.settings(opened.plan or opened.policy.info.default_plan)  # refused now, not after the baseline
+    with Progress(console=Console(stderr=True)) as progress:
+        waiting = progress.add_task("the world waits", total=episodes)
+        going = progress.add_task("the world goes on", total=episodes * len(setups))
+        fill_cache(
+            [variant], seeds, SEEDS_A_JOB, runtime, cache, jobs, lambda _, n: progress.update(waiting, completed=n)
+        )
+        rollout = run_episodes(
+            opened.policy, seeds, opened.noise, SEEDS_A_JOB, opened.plan, cache=Episodes(cache, opened, runtime)
+        )
+        driven = drive_all(variant, runtime, setups, seeds, jobs, lambda n: progress.update(going, completed=n))
+    baseline = summarise("the world waits", rollout, rollout)
+    found = {setup: figures(setup, each, rollout) for setup, each in driven.items()}
+    identity = identity_of(Path(variant.partition(":")[0]))
+    if picture is not None:
+        title = f"Push-T at {hz:g} Hz, {episodes} paired episodes of {variant}; latency simulated"
+        scores = {setup: each.evaluation.score for setup, each in found.items()}
+        plot_delays(scores, baseline.score, picture, title)
+    if as_json:
+        rows = [{**vars(setup), **each.to_json()} for setup, each in found.items()]
+        document = {"identity": identity, "variant": variant, "baseline": baseline.to_json(), "setups": rows}
+        click.echo(json.dumps(document, indent=2, allow_nan=False))
+    else:
+        console = results_console()
+        console.print(delays_table(found, baseline))
+        print_identity(identity, console)
+
+
+if __name__ == "__main__":
+    run(main)

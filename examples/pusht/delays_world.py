@@ -1,0 +1,229 @@
+"""Push-T under ``AsyncExecutor`` with a latency that is given: nothing waits, and every run is the same.
+
+The world takes one step a tick, whether there is an action or not; a call of the policy takes as long as it is told to,
+on a clock of the simulation. The machine's speed has no part in what comes out.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from environment import FloatArray, PushT, observation
+from rollout import Episode, seeded_noise
+from variants import Variant
+
+from ttscompile import AsyncExecutor, ExecutorSettings
+from ttscompile.errors import DeadlineMissedError
+
+TINY = 1e-9
+"""Seconds; what is meant to happen at one time is not told apart by rounding."""
+STUCK = 0.1
+"""Seconds of real time after which the simulation looks whether the executor's thread is still alive."""
+
+
+class LockStepClock:
+    """``Clock`` on which one thread runs at a time: the executor's only while the simulation hands over to it."""
+
+    def __init__(self) -> None:
+        self._now, self._until = 0.0, float("inf")
+        self._go, self._parked = threading.Semaphore(0), threading.Semaphore(0)
+        self._worker: threading.Thread | None = None
+        self._free = False
+
+    def now(self) -> float:
+        """Seconds since the start of the simulation."""
+        return self._now
+
+    # The executor's thread
+
+    def wait(self, condition: threading.Condition, timeout: float | None) -> None:
+        """See ``Clock.wait``."""
+        if self._free:
+            condition.wait(timeout)
+            return
+        self._until = float("inf") if timeout is None else self._now + timeout
+        condition.release()
+        try:
+            self._park()
+        finally:
+            condition.acquire()
+
+    def take(self, seconds: float) -> None:
+        """Return when so much time has passed."""
+        end = self._now + seconds
+        while not self._free and self._now < end - TINY:
+            self._until = end
+            self._park()
+
+    def _park(self) -> None:
+        self._worker = threading.current_thread()
+        self._parked.release()
+        self._go.acquire()
+
+    # The simulation's thread
+
+    def join(self) -> None:
+        """Return when the executor's thread waits, or has ended: once, when it was started."""
+        while not self._parked.acquire(timeout=STUCK):
+            if self._worker is not None and not self._worker.is_alive():
+                return
+
+    def advance(self, when: float) -> None:
+        """Move to a time. What the executor's thread wanted to do before that is done on the way."""
+        while self._until < when - TINY:
+            self._now = max(self._until, self._now)
+            self._hand_over()
+        self._now = when
+
+    def settle(self) -> None:
+        """Let the executor's thread do what is to be done now."""
+        self._hand_over()
+        while self._until <= self._now + TINY:
+            self._now = max(self._until, self._now)
+            self._hand_over()
+
+    def free(self) -> None:
+        """Let the executor's thread go; it waits in real time from now on, and calls take none."""
+        self._free = True
+        self._go.release()
+
+    def _hand_over(self) -> None:
+        self._until = float("inf")
+        self._go.release()
+        self.join()
+
+
+class DelayedPolicy:
+    """A policy whose calls take a given time, with noise that depends on a seed and the number of the call only.
+
+    Attributes:
+        windows: ``[2, 20]``, the observation of each call since the last reset.
+    """
+
+    def __init__(self, variant: Variant, clock: LockStepClock, latency: float) -> None:
+        self._variant, self._clock, self._latency = variant, clock, latency
+        self.info = variant.policy.info
+        self._seed = 0
+        self.windows: list[FloatArray] = []
+
+    def reset(self, seed: int | None = None) -> None:
+        """A new episode."""
+        self._variant.policy.reset()
+        self._seed, self.windows = seed or 0, []
+
+    def predict_action(self, obs_dict: Mapping[str, Any], *, plan: str, prefix: Any = None) -> Mapping[str, Any]:
+        """One call, with the next noise."""
+        noise = seeded_noise(self._variant.noise, [self._seed], len(self.windows))
+        self.windows.append(obs_dict["obs"][0])
+        given = {} if prefix is None else {"prefix": prefix}
+        predicted: Mapping[str, Any] = self._variant.policy.predict_action(obs_dict, noise=noise, plan=plan, **given)
+        self._clock.take(self._latency)
+        return predicted
+
+
+@dataclass(frozen=True)
+class Setup:
+    """How the policy is driven.
+
+    Attributes:
+        latency_ms: of every call; the executor knows it.
+        seam: as in ``ExecutorSettings``.
+        margin: ticks that a chunk shall be there before it is needed.
+        horizon: actions from one call to the next; None for as many as the policy executes.
+        hz: ticks a second, each one step of the environment.
+    """
+
+    latency_ms: float
+    seam: str
+    margin: int
+    horizon: int | None
+    hz: float
+
+    @property
+    def label(self) -> str:
+        """All but the latency."""
+        horizon = "" if self.horizon is None else f", horizon {self.horizon}"
+        return f"{self.seam}, margin {self.margin}{horizon}"
+
+    def settings(self, plan: str) -> ExecutorSettings:
+        """Of the executor.
+
+        Raises:
+            ExecutorError: this is not possible.
+        """
+        return ExecutorSettings(
+            seam=self.seam,
+            margin_ticks=self.margin,
+            horizon=self.horizon,
+            tiers=(plan,),
+            refuse_infeasible=False,
+            trace_events=0,
+        )
+
+
+@dataclass(frozen=True)
+class Driven:
+    """One episode.
+
+    Attributes:
+        episode: what happened.
+        still: ticks without any action, in which the agent was told to stay where it is; those before the first chunk
+            are among them.
+        bridged: ticks with an action in reserve or with the last one held, because a chunk was late.
+        age: ticks from the observation that an action was computed from to when it was executed, median; None if there
+            never was an action.
+    """
+
+    episode: Episode
+    still: int
+    bridged: int
+    age: float | None
+
+
+def drive(variant: Variant, setup: Setup, seed: int) -> Driven:
+    """Run one episode. The world never waits, not for the first chunk either: the agent stands still until it comes.
+
+    Args:
+        variant: policy and plan.
+        setup: how it is driven.
+        seed: of the initial state and of the noise.
+    """
+    plan = variant.plan or variant.policy.info.default_plan
+    clock, world = LockStepClock(), PushT()
+    world.reset(seed)
+    latency = setup.latency_ms / 1e3
+    policy = DelayedPolicy(variant, clock, latency)
+    executor = AsyncExecutor(policy, setup.hz, setup.settings(plan), clock=clock, latencies={plan: latency})
+    still = 0
+    try:
+        clock.join()
+        executor.reset(seed)
+        clock.settle()
+        while not world.done:
+            clock.advance(len(world.targets) / setup.hz)
+            executor.observe({"obs": observation(world.states[-1])})
+            clock.settle()
+            try:
+                target = executor.action()
+            except DeadlineMissedError:
+                still += 1
+                target = world.states[-1][:2].astype(np.float32)
+            world.execute(target[None])
+        statistics = executor.statistics()
+    finally:
+        clock.free()
+        executor.close(timeout=120)
+    age = statistics.action_age_ms
+    episode = Episode(
+        seed=seed,
+        windows=np.array(policy.windows),
+        states=np.stack(world.states),
+        targets=np.stack(world.targets),
+        coverages=np.array(world.coverages),
+    )
+    bridged = statistics.reserve + statistics.holds
+    return Driven(episode, still, bridged, None if age is None else age.p50 * setup.hz / 1e3)
