@@ -43,6 +43,8 @@ class Bar:
 
     def stage(self, what: str, total: int, done: int = 0) -> None:
         """Begin something of ``total`` parts, ``done`` of which were done before."""
+        if not (self._progress.disable or self._progress.console.is_terminal):  # a log has no bar
+            self._progress.console.print(f"{what}: {total - done} to do", markup=False, soft_wrap=True)
         self._progress.update(self._task, description=what, total=total, completed=done, note="", left="")
 
     def update(self, done: int, note: str, seconds_left: float | None) -> None:

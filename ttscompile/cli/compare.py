@@ -114,6 +114,12 @@ def compare(
     told = progress()
     with only_results_on_stdout(), Progress(*columns, console=told, disable=not told.is_terminal) as bar:
         task = bar.add_task("loading", total=None)
+
+        def tell(what: str, done: int, total: int) -> None:
+            if not told.is_terminal and what != bar.tasks[task].description:  # a log has no bar
+                told.print(what, soft_wrap=True)
+            bar.update(task, description=what, completed=done, total=total)
+
         found = measure(
             directory,
             trajectories,
@@ -127,7 +133,7 @@ def compare(
             seed=seed,
             intervals=intervals,
             max_minutes=max_minutes,
-            progress=lambda what, done, total: bar.update(task, description=what, completed=done, total=total),
+            progress=tell,
         )
     for warning in found.warnings:
         told.print(f"warning: {warning}", soft_wrap=True)
