@@ -112,8 +112,8 @@ def test_what_cannot_be_compared_is_refused(
 ) -> None:
     with pytest.raises(CalibrationError, match="same checkpoint; found other weights"):
         compare(planned, [recording], [], [], [linear_policy])
-    with pytest.raises(CalibrationError, match="two artifacts are called 'compiled'"):
-        compare(planned, [recording], [], [], [planned, linear_policy])
+    with pytest.raises(CalibrationError, match=f"two artifacts are called '{planned.name}'"):
+        compare(planned, [recording], [], [], [planned, shutil.copytree(planned, tmp_path / planned.name)])
     with pytest.raises(CalibrationError, match="'magic'; expected one of tts"):
         compare(planned, [recording], ["magic"], [0.5])
     with pytest.raises(CalibrationError, match=r"at most 0\.9 of the 10 x 6"):
