@@ -3,8 +3,9 @@
 //     episode MODEL.onnx FOLDER CALLS [THREADS]
 //
 // runs CALLS calls of one episode. Call r reads its inputs from FOLDER/r/NAME.bin, raw numbers in the machine's byte
-// order: the observations, initial_noise, step_noise (if the sampler is stochastic), plan, rollout_keep. The rollout
-// cache is handed from call to call here. Prints one line of actions a call; times go to standard error.
+// order: the observations, initial_noise, step_noise (if the sampler is stochastic), plan, rollout_keep; and, where there
+// are such files, the plan's correction_anchors, correction and correction_bias, without which nothing is corrected. The
+// rollout cache is handed from call to call here. Prints one line of actions a call; times go to standard error.
 #include <onnxruntime_c_api.h>
 
 #include <chrono>
@@ -34,6 +35,7 @@ void check(OrtStatus* status) {
 struct Input {
   ONNXTensorElementDataType type;
   std::vector<int64_t> shape;  // -1 where the model leaves it open
+  bool optional;               // the model has a value for it
 };
 
 // Numbers of one tensor, and the tensor that reads them where they are.
@@ -66,18 +68,21 @@ std::vector<char> read(const std::string& path) {
   return {std::istreambuf_iterator<char>(file), std::istreambuf_iterator<char>()};
 }
 
-std::map<std::string, Input> inputs_of(OrtSession* session, OrtAllocator* allocator) {
+void add_inputs(std::map<std::string, Input>& inputs, OrtSession* session, OrtAllocator* allocator, bool optional) {
+  const auto counted = optional ? ort->SessionGetOverridableInitializerCount : ort->SessionGetInputCount;
+  const auto named = optional ? ort->SessionGetOverridableInitializerName : ort->SessionGetInputName;
+  const auto typed = optional ? ort->SessionGetOverridableInitializerTypeInfo : ort->SessionGetInputTypeInfo;
   size_t count = 0;
-  check(ort->SessionGetInputCount(session, &count));
-  std::map<std::string, Input> inputs;
+  check(counted(session, &count));
   for (size_t i = 0; i < count; ++i) {
     char* name = nullptr;
     OrtTypeInfo* info = nullptr;
     const OrtTensorTypeAndShapeInfo* tensor = nullptr;
-    check(ort->SessionGetInputName(session, i, allocator, &name));
-    check(ort->SessionGetInputTypeInfo(session, i, &info));
+    check(named(session, i, allocator, &name));
+    check(typed(session, i, &info));
     check(ort->CastTypeInfoToTensorInfo(info, &tensor));
     Input input{};
+    input.optional = optional;
     size_t rank = 0;
     check(ort->GetTensorElementType(tensor, &input.type));
     check(ort->GetDimensionsCount(tensor, &rank));
@@ -87,7 +92,6 @@ std::map<std::string, Input> inputs_of(OrtSession* session, OrtAllocator* alloca
     ort->ReleaseTypeInfo(info);
     check(ort->AllocatorFree(allocator, name));
   }
-  return inputs;
 }
 
 void wrap(Tensor& tensor, ONNXTensorElementDataType type, OrtMemoryInfo* memory) {
@@ -143,15 +147,18 @@ void run(const std::string& model, const std::string& folder, int calls, int thr
   check(ort->GetAllocatorWithDefaultOptions(&allocator));
   check(ort->CreateCpuMemoryInfo(OrtArenaAllocator, OrtMemTypeDefault, &memory));
 
-  const std::map<std::string, Input> inputs = inputs_of(session, allocator);
+  std::map<std::string, Input> inputs;
+  add_inputs(inputs, session, allocator, false);
+  add_inputs(inputs, session, allocator, true);
   const std::vector<const char*> outputs = {"action", "rollout_rows_next", "rollout_index_next"};
   std::map<std::string, Tensor> tensors;
   for (int r = 0; r < calls; ++r) {
     std::vector<const char*> names;
     std::vector<const OrtValue*> values;
     for (const auto& [name, input] : inputs) {
-      if (name != "rollout_rows" && name != "rollout_index")
-        load(tensors[name], input, folder + "/" + std::to_string(r) + "/" + name + ".bin", memory);
+      if (name == "rollout_rows" || name == "rollout_index") continue;
+      const std::string path = folder + "/" + std::to_string(r) + "/" + name + ".bin";
+      if (!input.optional || std::ifstream(path)) load(tensors[name], input, path, memory);
     }
     if (r == 0) {  // a new episode: no residuals yet
       Tensor& rows = tensors["rollout_rows"];

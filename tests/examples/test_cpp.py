@@ -14,7 +14,9 @@ import pytest
 from tests.lower.test_single_file import Episode, groups, inputs, make
 from tests.runtimes.plans import random_plan
 from tests.runtimes.toys import toy_program
+from ttscompile.correction import no_correction
 from ttscompile.lattice import Source
+from ttscompile.lower.single_file import ANCHORS, CORRECTION, CORRECTION_BIAS
 
 SOURCE = Path(__file__).resolve().parents[2] / "examples" / "cpp" / "main.cpp"
 CALLS = 5
@@ -49,14 +51,19 @@ def test_an_episode_is_what_python_computes(program: Path, tmp_path: Path, strea
     (tmp_path / "call.onnx").write_bytes(model)
     rng = np.random.default_rng(streams)
     episode, written, expected = Episode(model, streams), np.zeros((8, 7), np.bool_), []
-    reads = np.zeros(4, int)
+    reads, feeds = np.zeros(4, int), {}
+    if streams == 2:  # of a calibrated schedule
+        empty = no_correction(8, toy.spec.sample)
+        numbers = [rng.normal(0, 0.01, each.shape).astype(np.float32) for each in (empty.weights, empty.bias)]
+        feeds = dict(zip((ANCHORS, CORRECTION, CORRECTION_BIAS), (np.arange(8) % 3 == 0, *numbers), strict=True))
     for r in range(CALLS):
         plan = random_plan(rng, 8, groups(toy), written, 0.3)
         obs, drawn = inputs(policy, rng, streams)
-        expected.append(episode.call(obs, drawn, plan)["action"].ravel())
+        expected.append(episode.call(obs, drawn, plan, **feeds)["action"].ravel())
         written |= plan == Source.COMPUTE
         reads += np.bincount(plan.ravel(), minlength=4)
-        given = {**obs, "initial_noise": drawn.initial, "plan": plan, "rollout_keep": np.ones((8, 7), np.bool_)}
+        given = {**obs, **feeds, "initial_noise": drawn.initial, "plan": plan}
+        given["rollout_keep"] = np.ones((8, 7), np.bool_)
         if drawn.steps is not None:
             given["step_noise"] = drawn.steps
         (tmp_path / str(r)).mkdir()

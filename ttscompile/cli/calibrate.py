@@ -66,7 +66,7 @@ STRATEGIES = (
     type=click.FloatRange(min=0, min_open=True),
     default=15.0,
     show_default=True,
-    help="Then the best plan so far is taken; also decides how many calls are used.",
+    help="All in all, about: the best plan found by then is taken. Also decides how many calls are used.",
 )
 @click.option("--resume", is_flag=True, help="Go on where a calibration that was interrupted stopped.")
 @json_option

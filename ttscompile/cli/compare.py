@@ -76,7 +76,11 @@ def _sparsities(_: click.Context, __: click.Parameter, value: str) -> tuple[floa
 )
 @click.option("--threads", type=click.IntRange(min=1), default=1, show_default=True, help="Of onnxruntime.")
 @click.option(
-    "--max-minutes", type=click.FloatRange(min=0), default=3.0, show_default=True, help="Of each search, about."
+    "--max-minutes",
+    type=click.FloatRange(min=0),
+    default=3.0,
+    show_default=True,
+    help="Limit of each search, about; there is one for each strategy and sparsity.",
 )
 @click.option("--intervals", type=click.IntRange(min=1), help="Of each search, at most; for a quick look.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Of the split, the noise and the searches.")

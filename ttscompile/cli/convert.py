@@ -22,7 +22,7 @@ from ttscompile.config import FP32, PRECISIONS
     type=click.Choice(["auto", "diffusion_policy", "lerobot"]),
     default="auto",
     show_default=True,
-    help="Of CHECKPOINT.",
+    help="Of CHECKPOINT; auto finds out.",
 )
 @click.option(
     "--sampler",
