@@ -21,6 +21,7 @@ from torch.export.graph_signature import InputKind, OutputKind
 from .capture_batch import BATCHES, REMEDY, unify_batch
 from .config import PolicySpec
 from .errors import CaptureError
+from .ir.evaluate import without_stack_traces
 from .ir.graph import GETITEM, Argument, Batch, Enum, Graph, Node, Ref, Size, TensorType
 
 EXAMPLE_STREAMS = 3
@@ -85,7 +86,9 @@ def _traced(
         with warnings.catch_warnings(), _masks_as_given():
             # torch.export warns about its own use of a deprecated class
             warnings.filterwarnings("ignore", message=".*LeafSpec.*", category=FutureWarning)
-            return _export(module, given, symbolic).run_decompositions({}), examples
+            exported = _export(module, given, symbolic)
+            with without_stack_traces():  # each operation keeps the one that it was captured with
+                return exported.run_decompositions({}), examples
     except Exception as error:  # torch.export raises whatever the user's code or its own machinery raises
         raise CaptureError(
             f"torch.export could not capture {type(module).__name__}: {type(error).__name__}: {error}\n"

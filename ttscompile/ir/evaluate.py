@@ -7,10 +7,12 @@ ONNX models are checked against it.
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, TypeAlias
 
 import torch
+import torch.fx.config
 
 from ttscompile.errors import CaptureError, ObservationError
 
@@ -66,6 +68,17 @@ def resolve_op(node: Node) -> Callable[..., Any]:
             " its noise argument: call eval() on the module, and remove dropout and sampling inside the denoiser."
         )
     return overload
+
+
+@contextmanager
+def without_stack_traces() -> Iterator[None]:
+    """While torch traces a graph: it would look up and format Python's stack for every operation."""
+    before = torch.fx.config.do_not_emit_stack_traces
+    torch.fx.config.do_not_emit_stack_traces = True
+    try:
+        yield
+    finally:
+        torch.fx.config.do_not_emit_stack_traces = before
 
 
 def evaluate(

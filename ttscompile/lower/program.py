@@ -20,7 +20,7 @@ import torch
 
 from ..errors import LoweringError
 from ..ir.advance import fuse_advance
-from ..ir.evaluate import resolve_op
+from ..ir.evaluate import resolve_op, without_stack_traces
 from ..ir.graph import Argument, Batch, Enum, Graph, Node, Ref, TensorType
 from ..ir.idle import IDLE
 from ..ir.joint import DENSE_STEP, JOINT
@@ -176,7 +176,7 @@ def _run_exporter(graphs: list[Graph]) -> onnx.ModelProto:
             examples.append(_example(type_))
             sizes = [(axis, n.multiple) for axis, n in enumerate(type_.shape) if isinstance(n, Batch)]
             dynamic.append({axis: multiple * streams if multiple > 1 else streams for axis, multiple in sizes})
-    with _quiet(), torch.no_grad():
+    with _quiet(), without_stack_traces(), torch.no_grad():
         module, shapes = _build(graphs), tuple(dynamic)
         program = torch.export.export(module, tuple(examples), dynamic_shapes=shapes, strict=False)
         result = torch.onnx.export(program, (), dynamo=True, opset_version=OPSET, verbose=False)
