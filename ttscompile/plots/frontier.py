@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from math import log
 from pathlib import Path
+from textwrap import wrap
 
 from ..errors import OutputError, RuntimeUnavailableError
 from ..points import Point
@@ -12,6 +14,9 @@ COLOURS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#0
 """Okabe and Ito's palette, without the yellow that white paper swallows."""
 
 MARKERS = "osD^vP*"
+
+_TITLE_WIDTH = 105
+"""Characters."""
 
 _TOLD = {
     "steps": "dense, same initial sample, other draws",
@@ -59,8 +64,9 @@ def plot_frontier(
             color=COLOURS[i % len(COLOURS)],
             label=series,
         )
-        for p in own:
-            axes.annotate(p.name, (p.latency_ms, p.error), xytext=(5, 4), textcoords="offset points", fontsize=8)
+    for i, p in enumerate(shown):
+        above = 4 + 8 * sum(_near(p, other) for other in shown[:i])
+        axes.annotate(p.name, (p.latency_ms, p.error), xytext=(5, above), textcoords="offset points", fontsize=8)
     best = [point for point in efficient if point.error > 0]
     axes.step(
         [p.latency_ms for p in best],
@@ -82,8 +88,9 @@ def plot_frontier(
     for axis in (axes.xaxis, axes.yaxis):  # 40 rather than 4 x 10^1
         axis.set_major_formatter(LogFormatter())
         axis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
-    axes.margins(x=0.08)
-    axes.set_title(title, fontsize=8, loc="left")
+    axes.margins(x=0.08, y=0.1)
+    lines = [line for part in title.splitlines() for line in wrap(part, _TITLE_WIDTH)]
+    axes.set_title("\n".join(lines), fontsize=8, loc="left")
     axes.grid(which="both", color="#dddddd", linewidth=0.5)
     axes.set_axisbelow(True)
     figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
@@ -95,3 +102,8 @@ def plot_frontier(
         raise OutputError(
             f"{path}: the picture cannot be written: {error}. Give a .png, .svg or .pdf in a folder that exists."
         ) from error
+
+
+def _near(p: Point, other: Point) -> bool:
+    """Whether the names of two points would cover each other."""
+    return abs(log(p.latency_ms / other.latency_ms)) < 0.15 and abs(log(p.error / other.error)) < 0.2
