@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 import importlib.util
+import re
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
 import ttscompile
+from ttscompile.ir.program import Program
+
+from .once import Once
 
 if TYPE_CHECKING:
     from _pytest.terminal import TerminalReporter
+    from torch import nn
 
 ROOT = Path(__file__).resolve().parents[1]
+DEEPER = re.compile(r"model\.decoder\.layers\.[1-9]")
 NO_SHARED = "NO GOLDEN FILES: no folder 'shared' with DESIGN.md and golden/ beside the repository or an ancestor of it"
 
 
@@ -55,8 +63,89 @@ def pusht_checkpoint() -> Path:
 
 
 @pytest.fixture(scope="session")
-def compiled_pusht(pusht_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The artifact of the Push-T policy, not calibrated. Compiled once a run: copy it before changing it."""
-    directory = tmp_path_factory.mktemp("pusht") / "compiled"
-    ttscompile.convert(pusht_checkpoint, directory)
-    return directory
+def once(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Once:
+    """Folders that all modules and workers of this run share: read them only."""
+    own = tmp_path_factory.getbasetemp()
+    return Once((own.parent if hasattr(request.config, "workerinput") else own) / "once")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def exporter(once: Once) -> Iterator[None]:
+    """Torch's exporter is what most tests of compiled policies would wait for."""
+    if importlib.util.find_spec("torch") is None:
+        yield
+        return
+    from .exporter import exported_once
+
+    with exported_once(once.directory / "exports"):
+        yield
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> Iterator[None]:
+    """Policies that are run with more of torch's threads change them for the process, and so for the next test."""
+    yield
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def compiled_pusht(pusht_checkpoint: Path, once: Once) -> Path:
+    """The artifact of the Push-T policy, not calibrated, and ``call.onnx``, its single file, beside it.
+
+    Compiled once a run: copy it before changing it.
+    """
+
+    def convert(directory: Path) -> Program:
+        return ttscompile.convert(pusht_checkpoint, directory, single_file=directory.parent / "call.onnx")
+
+    return once.compiled("pusht", convert)[0]
+
+
+@pytest.fixture(scope="session")
+def one_layer_checkpoint(pusht_checkpoint: Path, once: Once) -> Path:
+    """The Push-T policy with the first of its eight layers: three blocks, converted in seconds."""
+
+    def save(directory: Path) -> None:
+        import torch
+
+        from ttscompile.frontends.checkpoint import plain_config, read_checkpoint
+
+        payload = read_checkpoint(pusht_checkpoint)
+        config = plain_config(payload["cfg"])
+        config["policy"]["model"]["n_layer"] = 1
+        weights = {name: value for name, value in payload["state_dicts"]["ema_model"].items() if not DEEPER.match(name)}
+        directory.mkdir()
+        torch.save({"cfg": config, "state_dicts": {"ema_model": weights}, "pickles": {}}, directory / "policy.ckpt")
+
+    return once.folder("one_layer", save) / "policy.ckpt"
+
+
+@pytest.fixture(scope="session")
+def compiled_layer(one_layer_checkpoint: Path, once: Once) -> Path:
+    """The artifact of ``one_layer_checkpoint``: 100 steps, a block of each kind. Copy it before changing it."""
+    return once.compiled("one layer", lambda directory: ttscompile.convert(one_layer_checkpoint, directory))[0]
+
+
+@pytest.fixture(scope="session")
+def compiled_module(once: Once) -> Callable[[str], tuple[nn.Module, Path]]:
+    """By name in ``tests.passes.test_pipeline.MODULES``: the module, and the folder of its artifact and single file.
+
+    They are called ``artifact`` and ``new/call.onnx``; nobody made ``new`` before.
+    """
+
+    def compiled(name: str) -> tuple[nn.Module, Path]:
+        import torch
+
+        from .passes.test_pipeline import MODULES, spec
+
+        torch.manual_seed(0)
+        module = MODULES[name]().eval()
+
+        def compile_denoiser(directory: Path) -> Program:
+            file = directory.parent / "new" / "call.onnx"
+            return ttscompile.compile_denoiser(module, spec(), directory, single_file=file)
+
+        return module, once.compiled(f"module {name}", compile_denoiser)[0].parent
+
+    return compiled

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from torch import nn
 
 import ttscompile
 from tests.passes.test_pipeline import MODULES, spec
@@ -23,11 +25,8 @@ def policy_stream(name: str) -> tuple[int, ...]:
 
 
 @pytest.mark.parametrize("name", MODULES)
-def test_from_a_module_to_both_runtimes(name: str, tmp_path: Path) -> None:
-    torch.manual_seed(0)
-    module = MODULES[name]().eval()
-    ttscompile.compile_denoiser(module, spec(), tmp_path / "compiled")
-
+def test_from_a_module_to_both_runtimes(name: str, compiled_module: Callable[[str], tuple[nn.Module, Path]]) -> None:
+    module, folder = compiled_module(name)
     rng = np.random.default_rng(0)
     obs = rng.standard_normal((STREAMS, 3, 7), dtype=np.float32)
     noise = ttscompile.Noise(rng.standard_normal((STREAMS, 4, 2), dtype=np.float32))
@@ -36,12 +35,12 @@ def test_from_a_module_to_both_runtimes(name: str, tmp_path: Path) -> None:
         for t in spec().sampler.timesteps:
             sample = sample - 0.1 * module(sample, torch.full((STREAMS,), int(t)), torch.from_numpy(obs))
     for runtime in ("reference", "onnxruntime"):
-        policy = ttscompile.load(tmp_path / "compiled", runtime=runtime)
+        policy = ttscompile.load(folder / "artifact", runtime=runtime)
         assert {block.shape for block in policy.info.blocks} == {policy_stream(name)}
         found = policy.predict_action({"obs": obs}, noise=noise, plan="dense")["action_pred"]
         np.testing.assert_allclose(found, sample.numpy(), rtol=1e-5, atol=1e-6)
 
-    artifact = load_artifact(tmp_path / "compiled")
+    artifact = load_artifact(folder / "artifact")
     left, right = open_runtime(artifact, "onnxruntime"), open_runtime(artifact, "reference")
     for streams in (1, STREAMS):
         assert largest_difference(artifact, left, right, rng, streams, calls=4) < 1e-5

@@ -69,7 +69,10 @@ class CompiledPolicy:
         """HTTP: POST ``{"obs": {key: nested lists}}``; answers ``{"action": nested lists}``."""
         body = await request.json()
         specs = self._policy.info.observation
-        obs = {key: np.asarray(value, specs[key].dtype) for key, value in body["obs"].items() if key in specs}
+        try:
+            obs = {key: np.asarray(value, specs[key].dtype) for key, value in body["obs"].items() if key in specs}
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            return {"error": f"expected {{'obs': {{key: nested lists}}}}: {error}"}
         answer = await self.predict(obs)
         if isinstance(answer, Exception):
             return {"error": str(answer)}
@@ -81,9 +84,12 @@ class CompiledPolicy:
 
     def _check(self, obs: dict[str, Any]) -> None:
         specs = self._policy.info.observation
+        if obs.keys() != specs.keys():
+            raise ttscompile.TtscompileError(f"expected an observation of {sorted(specs)}; found {sorted(obs)}.")
         for key, spec in specs.items():
-            array = obs.get(key)
-            if not isinstance(array, np.ndarray) or array.shape != spec.shape or not np.isfinite(array).all():
+            array = obs[key]
+            fits = isinstance(array, np.ndarray) and (array.shape, array.dtype) == (spec.shape, spec.dtype)
+            if not fits or not np.isfinite(array).all():
                 raise ttscompile.TtscompileError(
                     f"observation {key!r} must be {spec.dtype} {list(spec.shape)}, finite."
                 )

@@ -33,4 +33,4 @@ class MonotonicClock:
 
     def wait(self, condition: threading.Condition, timeout: float | None) -> None:
         """See ``Clock.wait``."""
-        condition.wait(timeout)
+        condition.wait(None if timeout is None else min(timeout, threading.TIMEOUT_MAX))

@@ -95,6 +95,7 @@ class AsyncExecutor:
         self._failure_told = False
         self._closing = False
         self._waiting = False  # the worker has nothing to do
+        self._timed = False  # and looks again by itself
         self._reset_due = True
         self._reset_seed: int | None = None
         self._feasibility: dict[str, Feasibility] = {}
@@ -130,7 +131,7 @@ class AsyncExecutor:
             state = self._checked()
             now = self._clock.now()
             state.observe(frame, now if t is None else t, now)
-            if self._waiting and state.next_start(now) == now:
+            if self._waiting and (start := state.next_start(now)) is not None and (start == now or not self._timed):
                 self._work.notify()
 
     def action(self, t: float | None = None, timeout: float | None = None) -> FloatArray:
@@ -359,7 +360,7 @@ class AsyncExecutor:
                 start = state.next_start(now)
                 if start is not None and start <= now:
                     return state.begin(now)
-                self._waiting = True
+                self._waiting, self._timed = True, start is not None
                 self._clock.wait(self._work, None if start is None else start - now)
                 self._waiting = False
         return None

@@ -3,14 +3,14 @@
 A call starts when a frame comes. The next one starts when the policy would have executed a chunk, ``play`` later, or as
 much sooner as it must to be done ``margin`` before the actions of the first run out::
 
-    frame: call n                  frame: call n + 1                      what n predicted runs out
-       |=====latency=======|.........|=====latency=======|----margin---->|.............|
-       |<----------- play ---------->|
-       |<------------------------------ horizon ------------------------>|
+    frame: call n                  frame: call n + 1                   what n predicted runs out
+       |=====latency=======|.........|=====latency=======|----margin---->|
+       |<----------- play ---------->|                                   |
+       |<--------------------------- predicted ------------------------->|
 
-It can start when the first is done, with the next frame that comes then. So the calls follow each other without a gap
-in the actions if ``frame period + 2 * latency + margin <= horizon``, which is ``play + latency + margin``, or all that
-is predicted, if that is less.
+It can start when the first is done. If it has to start before the policy would have executed a chunk, it starts with
+the last frame that comes early enough, which may be a frame period sooner than it has to. So the calls follow each
+other without a gap in the actions if ``frame period + 2 * latency + margin <= predicted`` and ``latency <= play``.
 """
 
 from __future__ import annotations
@@ -51,54 +51,56 @@ class Feasibility:
         return self.margin_ticks / self.control_hz
 
     @property
+    def play(self) -> float:
+        """How long the policy executes a chunk."""
+        return self.horizon_steps / self.policy_hz
+
+    @property
     def predicted(self) -> float:
         """How long the actions of a chunk last, from its observation on, if all that may be played are."""
         return (self.horizon_steps + self.reserve_steps) / self.policy_hz
 
     @property
-    def horizon(self) -> float:
-        """From the observation of a chunk to when the next one must be there."""
-        return min(self.horizon_steps / self.policy_hz + self.latency + self.margin, self.predicted)
-
-    @property
     def needed(self) -> float:
-        """The least horizon."""
+        """How long they have to last."""
         return self.frame + 2 * self.latency + self.margin
 
     @property
     def max_latency(self) -> float:
         """The longest call with which this would be feasible; not positive if none would be."""
-        alone = (self.horizon_steps - 1) / self.policy_hz
-        return min(alone, (self.predicted - self.frame - self.margin) / 2)
+        return min(self.play, (self.predicted - self.frame - self.margin) / 2)
 
     @property
     def max_policy_hz(self) -> float:
         """The fastest rate of this latency, with as many control ticks an action as now; 0 if there is none."""
         ticks_per_step = self.control_hz / self.policy_hz
         covered = (self.horizon_steps + self.reserve_steps - 1 - self.margin_ticks / ticks_per_step) / 2
-        return max(min(self.horizon_steps - 1, covered), 0.0) / self.latency
+        return max(min(self.horizon_steps, covered), 0.0) / self.latency
 
     @property
     def feasible(self) -> bool:
         """Whether the calls keep up."""
-        return self.needed <= self.horizon + 1e-12
+        return self.needed <= self.predicted + 1e-12 and self.latency <= self.play
 
     def explain(self) -> str:
         """The arithmetic on one line, in milliseconds."""
-        sign = "<=" if self.feasible else ">"
-        steps, whole = self.horizon_steps + self.reserve_steps, self.horizon == self.predicted
-        lasts = f"{steps} actions" if whole else f"{self.horizon_steps} actions + latency + margin"
+        covered = self.needed <= self.predicted + 1e-12
+        if covered and not self.feasible:
+            lasts = f"{1e3 * self.play:.4g} ms = {self.horizon_steps} actions"
+            return f"latency {1e3 * self.latency:.4g} ms > {lasts} at {self.policy_hz:g} Hz, to the next call"
         return (
             f"frame period {1e3 * self.frame:.4g} + 2 x latency {1e3 * self.latency:.4g}"
-            f" + margin {1e3 * self.margin:.4g} = {1e3 * self.needed:.4g} ms {sign} {1e3 * self.horizon:.4g} ms ="
-            f" {lasts} at {self.policy_hz:g} Hz"
+            f" + margin {1e3 * self.margin:.4g} = {1e3 * self.needed:.4g} ms {'<=' if covered else '>'}"
+            f" {1e3 * self.predicted:.4g} ms = {self.horizon_steps + self.reserve_steps} actions"
+            f" at {self.policy_hz:g} Hz"
         )
 
     def to_json(self) -> dict[str, Any]:
         """As plain JSON values."""
         return asdict(self) | {
             "needed": self.needed,
-            "horizon": self.horizon,
+            "play": self.play,
+            "predicted": self.predicted,
             "max_latency": self.max_latency,
             "max_policy_hz": self.max_policy_hz,
             "feasible": self.feasible,

@@ -21,7 +21,8 @@ class GuardLimits:
         high: largest action; likewise.
         margin: share of the normaliser's range by which an action may be outside of it. A normaliser by mean and
             deviation, or by quantiles, has no range, and sets no bounds: give ``low`` and ``high``.
-        max_step: largest change of an action from one control tick to the next, seams included; None for no limit.
+        max_step: largest change of an action from one control tick to the next, seams included; None for no limit. A
+            loop that skips ticks, or goes on after an error without a reset, sees the changes of all of them at once.
         max_jerk: largest third difference over control ticks, ``a[3] - 3 a[2] + 3 a[1] - a[0]``; None for no limit.
     """
 

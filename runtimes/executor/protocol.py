@@ -22,6 +22,12 @@ METHODS: dict[str, frozenset[str]] = {
     "statistics": frozenset(),
 }
 """Method -> the parameters that it may have."""
+DTYPES = {
+    name: dtype
+    for dtype in map(np.dtype, ("<i1", "<i2", "<i4", "<i8", "<u1", "<u2", "<u4", "<u8", "<f2", "<f4", "<f8"))
+    for name in (dtype.name, dtype.str, dtype.str[1:])
+}
+"""What a packed array may be of, by each of its names: ``uint8``, ``|u1``, ``u1``."""
 MOST_SECONDS = 1e15
 """Times are less than this, either way."""
 
@@ -107,7 +113,8 @@ def _array(key: str, value: Any, dtype: str) -> Array:
             limits = np.iinfo(dtype)
             if array.min() < limits.min or array.max() > limits.max:
                 raise ProtocolError(f"observation {key[:40]!r} has a number that is no {dtype}.")
-        return array.astype(dtype)
+        with np.errstate(over="ignore"):  # what becomes infinite is refused as that
+            return array.astype(dtype)
     except (ValueError, OverflowError) as error:
         raise ProtocolError(f"observation {key[:40]!r} is no array: {str(error)[:200]}.") from error
 
@@ -115,14 +122,14 @@ def _array(key: str, value: Any, dtype: str) -> Array:
 def _packed(key: str, value: dict[str, Any]) -> Array:
     """``{"dtype": "uint8", "shape": [96, 96, 3], "base64": "..."}``: little-endian, the last axis fastest."""
     try:
-        dtype = np.dtype(str(value["dtype"])).newbyteorder("<")
-        shape = tuple(int(n) for n in value["shape"])
-        if dtype.kind not in "iuf" or min(shape, default=1) < 0:
+        dtype = DTYPES.get(str(value["dtype"]))  # a look-up: numpy would parse what else it is given as Python
+        shape = tuple(value["shape"])
+        if dtype is None or not all(type(n) is int and n >= 0 for n in shape):
             raise ProtocolError(f"observation {key[:40]!r} must be of integers or floats, with a shape that is one.")
         content = base64.b64decode(value["base64"], validate=True)
         array: Array = np.frombuffer(content, dtype).reshape(shape)
         return array.astype(dtype.newbyteorder("="))
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise ProtocolError(
             f"observation {key[:40]!r} must be lists of numbers, or an object with dtype, shape and base64:"
             f" {str(error)[:200]}."

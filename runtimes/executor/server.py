@@ -113,7 +113,8 @@ class ExecutorServer:
             )
         except OSError as error:
             raise ExecutorError(
-                f"cannot listen on {host}:{port}: {error.strerror}. Choose another port; 0 takes any that is free."
+                f"cannot listen on {host}:{port}: {error.strerror}. Choose another port (0 takes any that is free), or"
+                " an address of this machine."
             ) from error
         try:
             on_start(next(iter(server.sockets)).getsockname()[1])

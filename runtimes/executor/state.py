@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import floor
 
 import numpy as np
 
@@ -94,6 +93,7 @@ class ExecutorState:
         self._grid.clear()
         self._played.clear()
         self._timeline: Timeline | None = None
+        self._due = 0  # first tick that the next chunk is needed for; what is scheduled after that is in reserve
         self._last: tuple[int, FloatArray] | None = None  # tick and action that were given out last
         self._used = float("-inf")  # time of the newest frame that a call was made from
         self._holds = 0
@@ -156,11 +156,11 @@ class ExecutorState:
         row = None if timeline is None else timeline.at(tick)
         if row is None or timeline is None:
             return None
-        recorder, late = self.recorder, tick >= timeline.due
+        recorder, late = self.recorder, tick >= self._due
         if late:
             recorder.counts.reserve += 1
             self._miss()
-        recorder.queue_depth.add(max(timeline.due - tick - 1, 0))
+        recorder.queue_depth.add(max(self._due - tick - 1, 0))
         recorder.action_age_ms.add(1e3 * (time - float(timeline.observed[tick - timeline.start])))
         recorder.tick(now)
         self._holds, self._gap = 0, late
@@ -245,18 +245,18 @@ class ExecutorState:
     def next_start(self, now: float) -> float | None:
         """When the next call has to start; None: not before something new is observed.
 
-        As late as the last frame allows that comes early enough: with that frame a call can only start later, not
-        better, so it starts when the frame comes.
+        It starts when a frame comes: the one as many actions after that of the chunk before as the policy executes, or
+        the last that is to be expected early enough, if that is sooner. If that does not come, with the one before.
         """
-        window = self._window.complete
+        window, timeline = self._window.complete, self._timeline
         if window is None or window.time <= self._used or now - window.time > self._resolved.max_age:
             return None
         runs_out = self._runs_out(now)
-        if runs_out is None:
+        if timeline is None or runs_out is None or window.time + self._window.interval / 2 > self._executed(timeline):
             return now
-        margin = self._settings.margin_ticks / self._resolved.control_hz
-        latest = runs_out - self._latencies[self.plan].bound - margin
-        return max(latest, now) if window.time + self._window.interval < latest - SAME_TIME else now
+        latest = runs_out - self._takes
+        comes = window.time + self._window.interval + self._window.delay
+        return max(latest, now) if comes < latest - SAME_TIME else now
 
     def begin(self, now: float) -> Job:
         """Start the call that ``next_start`` announced."""
@@ -301,6 +301,8 @@ class ExecutorState:
         switched = self._tiers.after_call(missed=late or self._runs_out(now) is None)
         counts.switches_down += switched == 1
         counts.switches_up += switched == -1
+        if switched:
+            self._plan_ahead()
         return outcome
 
     def fail(self) -> None:
@@ -317,7 +319,7 @@ class ExecutorState:
         rows = expand(actions, resolved.ticks_per_step, settings.interpolation)
         start = self._grid.tick(job.observed)
         judged = resolved.horizon * resolved.ticks_per_step
-        new = Timeline(start, rows, np.full(len(rows), job.observed), max(len(rows) - judged - self._ahead(), 0))
+        new = Timeline(start, rows, np.full(len(rows), job.observed))
         seam = start if self._last is None else self._last[0] + 1
         spliced = splice(self._timeline, new, seam, settings.blend_steps if settings.seam == "blend" else 0)
         if spliced is None or new.end <= self._grid.tick(now):
@@ -331,23 +333,38 @@ class ExecutorState:
             if self._refusal is not None:
                 return "refused"
         self._timeline = spliced
+        self._plan_ahead()
         return "scheduled"
 
-    def _ahead(self) -> int:
-        """Ticks from the frame that the next call starts with to when its chunk is needed."""
-        return self._settings.margin_ticks + floor(self._latencies[self.plan].bound * self._resolved.control_hz) + 1
+    @property
+    def _takes(self) -> float:
+        """Seconds that the next call has to start before its chunk is needed."""
+        return self._latencies[self.plan].bound + self._settings.margin_ticks / self._resolved.control_hz
+
+    def _executed(self, timeline: Timeline) -> float:
+        """When the policy would have executed the newest chunk, and so observes again."""
+        return float(timeline.observed[-1]) + self._resolved.horizon / self._resolved.policy_hz
+
+    def _plan_ahead(self) -> None:
+        """Say what of the schedule is in reserve: what goes on for longer than the next call has to take.
+
+        At least half a tick is left between the two, so that a frame which comes so late still starts its call.
+        """
+        if self._timeline is not None:
+            done = self._executed(self._timeline) + self._window.delay + self._takes
+            self._due = min(self._grid.tick(done) + 1, self._timeline.end)
 
     def _runs_out(self, now: float) -> float | None:
         """When the first tick comes for which nothing is scheduled; None if that is so already."""
         if self._timeline is None:
             return None
-        end = self._grid.time(self._timeline.due)
+        end = self._grid.time(self._due)
         return end if end > now else None
 
     def _committed(self, observed: float, now: float) -> FloatArray:
         """Actions from the observation to when this call will be done, one a step of the policy, ``[N, Da]``."""
         tick, step = self._grid.tick(observed), self._resolved.ticks_per_step
-        until = self._grid.tick(now + (self._latencies[self.plan].bound))
+        until = self._grid.tick(now + self._latencies[self.plan].bound)
         played = dict(self._played)
         rows: list[FloatArray] = []
         while tick <= until and len(rows) < self._resolved.horizon:

@@ -75,26 +75,19 @@ class Timeline:
         start: tick of the first row.
         rows: float32 ``[N, Da]``, one a tick.
         observed: float64 ``[N]``, time of the newest frame that each row was computed from.
-        reserve: ticks at the end that are played only while the next chunk is late.
     """
 
     start: int
     rows: FloatArray
     observed: Times
-    reserve: int = 0
 
     @property
     def end(self) -> int:
         """One past the last tick."""
         return self.start + len(self.rows)
 
-    @property
-    def due(self) -> int:
-        """First tick that the next chunk is needed for: what follows is in reserve."""
-        return self.end - self.reserve
-
     def until(self, tick: int) -> Timeline:
-        """What is scheduled before a tick, none of it in reserve."""
+        """What is scheduled before a tick."""
         kept = max(min(tick - self.start, len(self.rows)), 0)
         return Timeline(self.start, self.rows[:kept], self.observed[:kept])
 
@@ -142,7 +135,7 @@ def splice(old: Timeline | None, new: Timeline, seam: int, blend: int = 0) -> Ti
     first = max(seam, new.start)
     rows, observed = new.rows[first - new.start :].copy(), new.observed[first - new.start :]
     if old is None:
-        return Timeline(first, rows, observed, new.reserve)
+        return Timeline(first, rows, observed)
     both = min(blend, old.end - first, len(rows))
     if both > 0 and first >= old.start:
         weight = (np.arange(1, both + 1, dtype=np.float32) / (blend + 1))[:, None]
@@ -153,4 +146,4 @@ def splice(old: Timeline | None, new: Timeline, seam: int, blend: int = 0) -> Ti
         rows = np.concatenate([old.rows[kept], rows])
         observed = np.concatenate([old.observed[kept], observed])
         first = seam
-    return Timeline(first, rows, observed, new.reserve)
+    return Timeline(first, rows, observed)

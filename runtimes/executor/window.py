@@ -120,10 +120,11 @@ class ObservationWindow:
         self._times: list[float] = []
         self._frames: list[Frame] = []
         self._complete: Window | None = None
+        self._delay = 0.0
 
     def clear(self) -> None:
         """A new episode."""
-        self._times, self._frames, self._complete = [], [], None
+        self._times, self._frames, self._complete, self._delay = [], [], None, 0.0
 
     @property
     def complete(self) -> Window | None:
@@ -135,6 +136,11 @@ class ObservationWindow:
         """Seconds until the next frame is to be expected: what the last two were apart, the policy's period at most."""
         times = self._times
         return min(times[-1] - times[-2], self._period) if len(times) > 1 else self._period
+
+    @property
+    def delay(self) -> float:
+        """Seconds from when the newest frame was taken to when it came."""
+        return self._delay
 
     def add(self, time: float, frame: Frame, now: float) -> str:
         """Take a frame.
@@ -156,6 +162,8 @@ class ObservationWindow:
             return "replaced"
         if time < self._oldest(now):
             return "late"
+        if place == len(times):
+            self._delay = max(now - time, 0.0)
         times.insert(place, time)
         frames.insert(place, frame)
         keep = max(bisect_left(times, self._oldest(times[-1])), len(times) - MOST_FRAMES)

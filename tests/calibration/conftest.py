@@ -8,24 +8,22 @@ from pathlib import Path
 import pytest
 
 import ttscompile
+from tests.once import Once
 
 from . import policies
 
 
 @pytest.fixture(scope="session")
-def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def compiled(once: Once) -> Path:
     """A small nonlinear policy with a stochastic sampler, not calibrated."""
-    directory = tmp_path_factory.mktemp("mixer") / "compiled"
-    ttscompile.compile_denoiser(policies.Mixer(0).eval(), policies.spec(), directory)
-    return directory
+    return policies.compiled(once)
 
 
 @pytest.fixture(scope="session")
-def linear_policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def linear_policy(once: Once) -> Path:
     """A policy without a nonlinearity: first-order predictions are exact."""
-    directory = tmp_path_factory.mktemp("linear") / "compiled"
-    ttscompile.compile_denoiser(policies.Mixer(1, linear=True).eval(), policies.spec(clip=None), directory)
-    return directory
+    module, spec = policies.Mixer(1, linear=True).eval(), policies.spec(clip=None)
+    return once.compiled("linear mixer", lambda directory: ttscompile.compile_denoiser(module, spec, directory))[0]
 
 
 @pytest.fixture

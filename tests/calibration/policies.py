@@ -8,6 +8,8 @@ import numpy as np
 import torch
 from torch import nn
 
+import ttscompile
+from tests.once import Once
 from ttscompile import Affine, ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
 
 STEPS, HORIZON, CHANNELS, WIDTH, LAYERS = 10, 8, 2, 32, 3
@@ -64,6 +66,14 @@ def spec(noise: float = 0.05, clip: float | None = 1.0) -> PolicySpec:
         sampler=table,
         chunk=ChunkSpec(CHANNELS, 1, 5, actions),
     )
+
+
+def compiled(once: Once, precision: str = "fp32") -> Path:
+    """The artifact of ``Mixer(0)``, not calibrated: made once a run, so a test that changes it takes a copy."""
+    module = Mixer(0).eval()
+    return once.compiled(
+        f"mixer {precision}", lambda path: ttscompile.compile_denoiser(module, spec(), path, precision=precision)
+    )[0]
 
 
 def record(path: Path, episodes: int = 6, seed: int = 0) -> Path:

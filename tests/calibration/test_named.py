@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +21,15 @@ def short_search(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tts, "DISTANCES", (1,))
 
 
-@pytest.fixture
-def result(artifact: Path, recording: Path, short_search: None) -> CalibrationResult:
-    """Four of ten steps."""
-    return calibrate(artifact, [recording], 0.6, progress=False, max_minutes=1)
+@pytest.fixture(scope="module")
+def calibrated(
+    compiled: Path, recording: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, CalibrationResult]:
+    """Four of ten steps; not to be changed."""
+    directory = Path(shutil.copytree(compiled, tmp_path_factory.mktemp("named") / "compiled"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tts, "DISTANCES", (1,))
+        return directory, calibrate(directory, [recording], 0.6, progress=False, max_minutes=1)
 
 
 def computed(artifact: Path, name: str) -> list[int]:
@@ -34,8 +40,9 @@ def computed(artifact: Path, name: str) -> list[int]:
 
 
 def test_safe_computes_twice_as_much_and_fast_half_each_with_its_own_score(
-    artifact: Path, result: CalibrationResult
+    calibrated: tuple[Path, CalibrationResult],
 ) -> None:
+    artifact, result = calibrated
     loaded = load_artifact(artifact)
     assert {name: len(computed(artifact, name)) for name in ("safe", "schedule", "fast")} == {
         "safe": 8,
@@ -53,7 +60,8 @@ def test_safe_computes_twice_as_much_and_fast_half_each_with_its_own_score(
     assert record["skipped"] == {}
 
 
-def test_a_plan_is_chosen_when_loading_or_calling(artifact: Path, result: CalibrationResult) -> None:
+def test_a_plan_is_chosen_when_loading_or_calling(calibrated: tuple[Path, CalibrationResult]) -> None:
+    artifact, result = calibrated
     policy = ttscompile.load(artifact, plan="safe", seed=0)
     obs = {"obs": np.zeros((1, 2, 3), np.float32)}
     assert policy.info.default_plan == "safe"

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
 
-import ttscompile
+from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration import calibrate
 
@@ -14,10 +15,8 @@ from . import policies
 
 
 @pytest.fixture
-def int8(tmp_path: Path) -> Path:
-    directory = tmp_path / "compiled"
-    ttscompile.compile_denoiser(policies.Mixer(0).eval(), policies.spec(), directory, precision="int8")
-    return directory
+def int8(once: Once, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(policies.compiled(once, "int8"), tmp_path / "compiled"))
 
 
 def test_the_error_of_the_precision_has_figures_of_its_own(int8: Path, compiled: Path, recording: Path) -> None:

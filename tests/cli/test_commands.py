@@ -1,4 +1,4 @@
-"""The commands on the Push-T policy: what they print is one JSON document, or tables that say the same."""
+"""The commands on a layer of the Push-T policy: what they print is one JSON document, or tables that say the same."""
 
 from __future__ import annotations
 
@@ -23,33 +23,33 @@ def run(*arguments: object) -> Any:
 
 
 @pytest.fixture(scope="module")
-def scheduled(compiled_pusht: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The Push-T artifact with a uniform schedule of 5 full steps as its default plan."""
+def scheduled(compiled_layer: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The artifact with a uniform schedule of 5 full steps as its default plan."""
     directory = tmp_path_factory.mktemp("scheduled") / "compiled"
-    shutil.copytree(compiled_pusht, directory)
-    update_calibration(directory, None, {"uniform": uniform_plan(100, 24, 5)}, "uniform", {"strategy": "uniform"})
+    shutil.copytree(compiled_layer, directory)
+    update_calibration(directory, None, {"uniform": uniform_plan(100, 3, 5)}, "uniform", {"strategy": "uniform"})
     return directory
 
 
 @pytest.fixture(scope="module")
-def pruned(compiled_pusht: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The Push-T artifact with its untrained pruner as the default plan."""
+def pruned(compiled_layer: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The artifact with its untrained pruner as the default plan."""
     from ttscompile.artifact.load import load_artifact
 
     directory = tmp_path_factory.mktemp("pruned") / "compiled"
-    shutil.copytree(compiled_pusht, directory)
+    shutil.copytree(compiled_layer, directory)
     weights = {name: np.array(array) for name, array in load_artifact(directory).pruner.items()}
     update_calibration(directory, weights, {}, "tts", {"strategy": "tts"})
     return directory
 
 
-def test_convert_says_what_it_made_and_explains_on_standard_error(pusht_checkpoint: Path, tmp_path: Path) -> None:
+def test_convert_says_what_it_made_and_explains_on_standard_error(one_layer_checkpoint: Path, tmp_path: Path) -> None:
     arguments = ("--sampler", "ddim", "--steps", "4", "--explain", "--json")
-    result = run("convert", pusht_checkpoint, "-o", tmp_path / "compiled", *arguments)
+    result = run("convert", one_layer_checkpoint, "-o", tmp_path / "compiled", *arguments)
     made = json.loads(result.stdout)
     assert made["sampler"]["name"] == "ddim"
     assert made["sampler"]["steps"] == 4
-    assert len(made["blocks"]) == 24
+    assert len(made["blocks"]) == 3
     stages = [stage["stage"] for stage in made["stages"]]
     assert stages[0] == "capture"
     assert stages[-1] == "write"
@@ -115,8 +115,8 @@ def test_a_plan_that_is_not_there_is_named_beside_those_that_are(scheduled: Path
     assert "has no plan 'best'; it has ['dense', 'uniform']" in result.stderr
 
 
-def test_bench_times_everybody_on_the_same_calls(scheduled: Path, pusht_checkpoint: Path) -> None:
-    arguments = ("--runs", 2, "--against", "eager,onnxruntime-dense", "--checkpoint", pusht_checkpoint, "--json")
+def test_bench_times_everybody_on_the_same_calls(scheduled: Path, one_layer_checkpoint: Path) -> None:
+    arguments = ("--runs", 2, "--against", "eager,onnxruntime-dense", "--checkpoint", one_layer_checkpoint, "--json")
     made = json.loads(run("bench", scheduled, *arguments).stdout)
     assert made["machine"]["cores"] >= 1
     compiled, eager, dense = made["contestants"]
@@ -127,7 +127,7 @@ def test_bench_times_everybody_on_the_same_calls(scheduled: Path, pusht_checkpoi
     assert compiled["flops"] < dense["flops"] < eager["flops"]
 
 
-def test_bench_prints_a_table_and_warns_of_a_dense_artifact(compiled_pusht: Path) -> None:
-    result = run("bench", compiled_pusht, "--runs", 1)
+def test_bench_prints_a_table_and_warns_of_a_dense_artifact(compiled_layer: Path) -> None:
+    result = run("bench", compiled_layer, "--runs", 1)
     assert "dense onnxruntime" in result.stdout
     assert "is not calibrated" in result.stderr

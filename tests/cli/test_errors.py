@@ -74,14 +74,13 @@ def test_bad_usage(arguments: list[str], reason: str) -> None:
     assert "Traceback" not in result.stderr
 
 
-@pytest.mark.slow
-def test_pictures_that_cannot_be_drawn(compiled_pusht: Path, tmp_path: Path) -> None:
+def test_pictures_that_cannot_be_drawn(toy_compiled: Path, tmp_path: Path) -> None:
     corrupt, single = tmp_path / "corrupt.npz", tmp_path / "single.npy"
     corrupt.write_bytes(b"PK\x03\x04 and nothing else")
     np.save(single, np.zeros(3))
     plots = [["--plot", str(tmp_path / "no folder" / "x.png")], ["--plot", str(tmp_path / "x.foo")]]
     for arguments in plots:
-        result = CliRunner().invoke(main, ["inspect", str(compiled_pusht), *arguments])
+        result = CliRunner().invoke(main, ["inspect", str(toy_compiled), *arguments])
         assert (result.exit_code, result.stdout) == (2, "")
         assert "the picture cannot be written" in result.stderr
     for path in (corrupt, single):

@@ -24,11 +24,11 @@ def run(*arguments: object) -> Any:
 
 
 @pytest.fixture(scope="module")
-def converted(pusht_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
-    """The Push-T policy with eight-bit weights and few steps, and what the command said."""
+def converted(one_layer_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """A layer of the Push-T policy with eight-bit weights and few steps, and what the command said."""
     directory = tmp_path_factory.mktemp("int8") / "compiled"
     options = ("--sampler", "ddim", "--steps", STEPS, "--precision", "int8", "--json")
-    result = run("convert", pusht_checkpoint, "-o", directory, *options)
+    result = run("convert", one_layer_checkpoint, "-o", directory, *options)
     assert result.exit_code == 0, result.stderr
     return directory, json.loads(result.stdout)
 
@@ -36,17 +36,17 @@ def converted(pusht_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) 
 def test_convert_and_inspect_say_the_precision_and_its_error(converted: tuple[Path, dict[str, Any]]) -> None:
     directory, told = converted
     stage = next(stage for stage in told.pop("stages") if stage["stage"] == "lower_precision")
-    assert stage["notes"][0].startswith("int8: 48 matrices of 24 of 24 blocks")
+    assert stage["notes"][0].startswith("int8: 6 matrices of 3 of 3 blocks")
     assert json.loads(run("inspect", directory, "--json").stdout) == told
     record = told["precision"]
-    assert (record["name"], record["blocks"]) == ("int8", 24)
-    assert 7.0e6 < record["bytes"] < 8.0e6
+    assert (record["name"], record["blocks"]) == ("int8", 3)
+    assert 0.85e6 < record["bytes"] < 1.0e6
     assert 0.02 < record["error"]["mean"] < 2.0, "of 512 pixels"
     text = " ".join(run("inspect", directory).stdout.split())
-    assert "int8 weights in 24 of 24 blocks" in text and "random observations" in text
+    assert "int8 weights in 3 of 3 blocks" in text and "random observations" in text
 
 
-def test_pusht_is_the_reference_within_the_stated_tolerance(converted: tuple[Path, dict[str, Any]]) -> None:
+def test_it_is_the_reference_within_the_stated_tolerance(converted: tuple[Path, dict[str, Any]]) -> None:
     directory, told = converted
     rng = np.random.default_rng(100)
     obs = {"obs": rng.uniform(100, 400, (1, 2, 20)).astype(np.float32)}
@@ -60,10 +60,10 @@ def test_pusht_is_the_reference_within_the_stated_tolerance(converted: tuple[Pat
     assert 1e-5 < difference / largest < told["precision"]["error"]["tolerance"]
 
 
-def test_fp32_is_the_default_and_inspect_says_so(compiled_pusht: Path) -> None:
-    told = json.loads(run("inspect", compiled_pusht, "--json").stdout)
+def test_fp32_is_the_default_and_inspect_says_so(toy_compiled: Path) -> None:
+    told = json.loads(run("inspect", toy_compiled, "--json").stdout)
     assert told["precision"] == {"name": "fp32", "blocks": 0, "bytes": 0, "error": None}
-    assert "fp32" in run("inspect", compiled_pusht).stdout
+    assert "fp32" in run("inspect", toy_compiled).stdout
 
 
 def test_bf16_is_refused_with_the_reason_before_the_checkpoint_is_read(tmp_path: Path) -> None:

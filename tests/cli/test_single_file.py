@@ -16,9 +16,9 @@ from ttscompile.cli import main
 
 
 @pytest.mark.parametrize("precision", ["fp32", "int8"])
-def test_convert_writes_one_file_of_the_same_policy(pusht_checkpoint: Path, tmp_path: Path, precision: str) -> None:
-    file = tmp_path / "pusht.onnx"
-    command = ["convert", pusht_checkpoint, "-o", tmp_path / "compiled", "--single-file", file]
+def test_convert_writes_one_file_of_the_same_policy(one_layer_checkpoint: Path, tmp_path: Path, precision: str) -> None:
+    file = tmp_path / "policy.onnx"
+    command = ["convert", one_layer_checkpoint, "-o", tmp_path / "compiled", "--single-file", file]
     command += ["--sampler", "ddim", "--steps", 4, "--precision", precision, "--json"]
     result = CliRunner().invoke(main, [str(word) for word in command], catch_exceptions=False)
     assert result.exit_code == 0, result.stderr
@@ -29,11 +29,11 @@ def test_convert_writes_one_file_of_the_same_policy(pusht_checkpoint: Path, tmp_
     rng = np.random.default_rng(0)
     obs = {"obs": rng.uniform(100, 400, (1, 2, 20)).astype(np.float32)}
     noise = Noise(rng.standard_normal((1, 16, 2), dtype=np.float32))
-    plan = np.zeros((4, 24), np.int8)
+    plan = np.zeros((4, 3), np.int8)
     plan[2] = ttscompile.Source.TIMESTEP
     expected = policy.predict_action(obs, noise=noise, plan=plan)["action"]
-    feeds = {**obs, "initial_noise": noise.initial, "plan": plan, "rollout_keep": np.zeros((4, 24), np.bool_)}
-    feeds |= {"rollout_rows": np.zeros((0, 1, 16, 256), np.float32), "rollout_index": np.full((4, 24), -1)}
+    feeds = {**obs, "initial_noise": noise.initial, "plan": plan, "rollout_keep": np.zeros((4, 3), np.bool_)}
+    feeds |= {"rollout_rows": np.zeros((0, 1, 16, 256), np.float32), "rollout_index": np.full((4, 3), -1)}
     session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
     (found,) = session.run(["action"], feeds)
     # Actions are pixels, 0 to 512; int8 rounds values that differ in the last bit to different integers.

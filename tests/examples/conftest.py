@@ -5,15 +5,16 @@ from pathlib import Path
 
 import pytest
 
+from tests.once import Once
+
 for _folder in ("benchmark", "pusht"):
     sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / _folder))
 
 
 @pytest.fixture(scope="session")
-def tiny_artifact(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def tiny_artifact(once: Once) -> Path:
     """Of the benchmark's smallest network: 8 steps, 3 blocks, plans that reuse nothing and half of the cells."""
     from networks import compile_with_plans, random_network
 
-    directory = tmp_path_factory.mktemp("tiny") / "compiled"
-    compile_with_plans(random_network(16, "ddim", 8, layers=1), directory, (0.0, 0.5, 0.98))
-    return directory
+    network = random_network(16, "ddim", 8, layers=1)
+    return once.folder("tiny", lambda directory: compile_with_plans(network, directory, (0.0, 0.5, 0.98)))

@@ -24,14 +24,16 @@ WRONG = textwrap.dedent(
 
     async def ask(handle):
         good = [handle.predict.remote({"obs": np.full(2, i, np.float32)}) for i in range(4)]
-        bad = handle.predict.remote({"obs": np.zeros(3, np.float32)})
-        return await asyncio.gather(*good, bad, return_exceptions=True)
+        wrong = np.zeros(3, np.float32), np.zeros(2, np.float64), np.array(["a", "b"])
+        bad = [handle.predict.remote({"obs": array}) for array in wrong]
+        return await asyncio.gather(*good, *bad, return_exceptions=True)
 
     handle = serve.run(CompiledPolicy.bind(sys.argv[1]))
-    *good, bad = asyncio.run(ask(handle))
+    *good, shape, dtype, text = asyncio.run(ask(handle))
     serve.shutdown()
     assert all(answer.shape == (2, 2) for answer in good), good
-    assert "observation 'obs' must be float32 [2]" in str(bad), bad
+    for bad in (shape, dtype, text):
+        assert "observation 'obs' must be float32 [2]" in str(bad), bad
     print("done")
     """
 )

@@ -33,14 +33,15 @@ def test_what_is_predicted_beyond_what_is_executed_lets_calls_take_longer() -> N
     """Push-T predicts 15 actions from the observation on, and executes 8."""
     at_50 = Feasibility(0.04, 50, 50, 8, 1, reserve_steps=7)
     assert at_50.max_latency == pytest.approx(0.13)  # with its double, a frame and a tick, 15 actions
-    assert at_50.explain() == (
-        "frame period 20 + 2 x latency 40 + margin 20 = 120 ms <= 220 ms = 8 actions + latency + margin at 50 Hz"
-    )
+    assert at_50.explain() == ("frame period 20 + 2 x latency 40 + margin 20 = 120 ms <= 300 ms = 15 actions at 50 Hz")
     slow = Feasibility(0.131, 50, 50, 8, 1, reserve_steps=7)
     assert not slow.feasible
     assert slow.explain().endswith("= 302 ms > 300 ms = 15 actions at 50 Hz")
     long = Feasibility(0.04, 50, 50, 8, 1, reserve_steps=50)
-    assert long.max_latency == pytest.approx(0.14)  # a call is done when the next one starts
+    assert long.max_latency == pytest.approx(0.16)  # a call is done when the next one starts
+    slow = Feasibility(0.161, 50, 50, 8, 1, reserve_steps=50)
+    assert not slow.feasible
+    assert slow.explain() == "latency 161 ms > 160 ms = 8 actions at 50 Hz, to the next call"
 
 
 @given(st.floats(1e-4, 1), st.sampled_from([1, 2, 5]), st.integers(2, 32), st.integers(0, 3), st.integers(0, 40))

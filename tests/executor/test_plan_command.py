@@ -25,7 +25,7 @@ def test_it_says_what_is_feasible_with_the_arithmetic(toy_compiled: Path) -> Non
     dense = document["plans"][name]
     assert name == "dense"
     assert dense["feasible"]
-    assert dense["horizon"] == pytest.approx(0.4)
+    assert (dense["play"], dense["predicted"]) == pytest.approx((0.4, 0.4))
     assert dense["needed"] == pytest.approx(0.2 + 2 * dense["latency"])
     assert dense["latency"] * 1e3 >= dense["median_ms"]
     assert document["jitter"] is None
@@ -52,6 +52,7 @@ def test_jitter_is_measured_and_printed(toy_compiled: Path) -> None:
         (["--control-hz", 25, "--policy-hz", 10], "no multiple of policy_hz"),
         (["--control-hz", 10, "--plan", "quick"], "no plan 'quick'"),
         (["--control-hz", 10, "--horizon", 9], "Give at most 2"),
+        (["--control-hz", 10, "--reserve", 1], "Give at most 0"),
         ([], "--control-hz"),
     ],
 )

@@ -26,7 +26,7 @@ HZ, HORIZON, LATENCY = 10.0, 12, 0.2
 @pytest.fixture(scope="module")
 def inpainting(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The toy with DDIM and eleven actions a chunk."""
-    program = toy_program(horizon=HORIZON)
+    program = toy_program(pruner=False, horizon=HORIZON)
     table = sampler_table(DDIMScheduler(num_train_timesteps=50, beta_schedule="squaredcos_cap_v2"), steps=5)
     program = replace(program, spec=replace(program.spec, sampler=table))
     return written_artifact(program, tmp_path_factory.mktemp("inpainting") / "artifact").path

@@ -25,6 +25,8 @@ def test_requests_are_read_and_frames_converted() -> None:
     for wrong in ([[256, 0]], [[-1, 0]], [[1.5, 0]], [["1", 0]], [[10**30, 0]]):
         with pytest.raises(ProtocolError, match="image"):
             read_frame({"image": wrong}, frames)
+    beyond = read_frame({"obs": [1e300]}, FrameSpec.of({"obs": ObservationSpec((1, 1))}, 1))["obs"]
+    assert beyond.tolist() == [np.inf]  # without a warning; ``observe`` refuses it
 
 
 JSON = st.recursive(
@@ -33,8 +35,9 @@ JSON = st.recursive(
     max_leaves=12,
 )
 FRAMES = FrameSpec.of({"obs": ObservationSpec((2, 3)), "image": ObservationSpec((2, 2, 2), dtype="uint8")}, 2)
-DTYPES = JSON | st.sampled_from(["f4", "O", "U3", "M8[s]"])
-PACKED = st.fixed_dictionaries({"dtype": DTYPES, "shape": JSON, "base64": JSON})
+DTYPES = JSON | st.sampled_from(["f4", "O", "U3", "M8[s]", ",", "2)", "(1,", "a5"])
+SHAPES = JSON | st.lists(st.integers(0, 10**30) | st.just(float("inf")), max_size=3)
+PACKED = st.fixed_dictionaries({"dtype": DTYPES, "shape": SHAPES, "base64": JSON})
 
 
 @given(st.text() | st.binary() | JSON.map(json.dumps))

@@ -126,19 +126,35 @@ def test_arrays_may_be_packed(url: str) -> None:
         ('{"method": "observe", "obs": {"obs": ["1", "2"]}}', "ProtocolError", "lists of numbers"),
         ('{"method": "observe", "obs": {"obs": [1e999, 0]}}', "ObservationError", "finite"),
         (
-            '{"method": "observe", "obs": {"obs": {"dtype": "O", "shape": [1], "base64": ""}}}',
-            "ProtocolError",
-            "integers",
-        ),
-        (
             '{"method": "observe", "obs": {"obs": {"dtype": "f8", "shape": [9], "base64": ""}}}',
             "ProtocolError",
             "base64",
         ),
-        (
-            '{"method": "observe", "obs": {"obs": {"dtype": "f8", "shape": [-1], "base64": ""}}}',
-            "ProtocolError",
-            "shape",
+        *(
+            (
+                '{"method": "observe", "obs": {"obs": {"dtype": "f8", "shape": SHAPE, "base64": ""}}}'.replace(
+                    "SHAPE", shape
+                ),
+                "ProtocolError",
+                text,
+            )
+            for shape, text in (
+                ("[-1]", "with a shape that is one"),
+                ("[1.5]", "with a shape that is one"),
+                ("[1e999]", "with a shape that is one"),
+                ('"12"', "with a shape that is one"),
+                ("[1%s]" % (30 * "0"), "dtype, shape and base64"),
+            )
+        ),
+        *(
+            (
+                '{"method": "observe", "obs": {"obs": {"dtype": "DTYPE", "shape": [1], "base64": ""}}}'.replace(
+                    "DTYPE", dtype
+                ),
+                "ProtocolError",
+                "must be of integers or floats",
+            )
+            for dtype in (",", "2)", "O", "f8,f8", "(2,2)f8", "")  # numpy makes a SyntaxError of the first two
         ),
         (
             '{"method": "observe", "obs": {"obs": [1, 2, 3]}}',

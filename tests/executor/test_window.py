@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from ttscompile import ObservationSpec
 from ttscompile.errors import ObservationError
-from ttscompile.runtimes.executor.window import MOST_FRAMES, FrameSpec, ObservationWindow
+from ttscompile.runtimes.executor.window import FrameSpec, ObservationWindow
 
 SPECS = {
     "obs": ObservationSpec((2, 3)),
@@ -130,9 +130,10 @@ def test_the_tolerance(time: float, complete: bool) -> None:
     assert (window(times=[0.0, time]).complete is not None) is complete
 
 
-def test_old_frames_are_thrown_away() -> None:
-    made = window(times=[i * 1e-6 for i in range(3 * MOST_FRAMES)])
-    assert len(made._times) == len(made._frames) == MOST_FRAMES
+def test_old_frames_are_thrown_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(f"{ObservationWindow.__module__}.MOST_FRAMES", 30)
+    made = window(times=[i * 1e-6 for i in range(90)])
+    assert len(made._times) == len(made._frames) == 30
     made.add(10.0, frame(10), 10.0)
     assert made._times == [10.0]
     made.clear()

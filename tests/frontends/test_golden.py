@@ -16,6 +16,10 @@ from ttscompile.errors import ObservationError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.checkpoint import plain_config, read_checkpoint
 from ttscompile.frontends.eager import eager_policy
+from ttscompile.ir.evaluate import evaluate
+
+from ..golden import compiled_golden
+from ..once import Once
 
 GOLDEN = {
     "mlp_encoder_causal": "token-wise condition encoder",
@@ -29,11 +33,17 @@ Loaded = tuple[nn.Module, PolicySpec, dict[str, npt.NDArray[Any]]]
 
 
 @pytest.fixture(scope="module", params=GOLDEN)
-def golden(request: pytest.FixtureRequest, shared: Path) -> Loaded:
-    """Module, specification and the original's numbers, of one golden checkpoint."""
-    base = shared / "golden" / "diffusion_policy" / request.param
+def name(request: pytest.FixtureRequest) -> str:
+    """Of one golden checkpoint."""
+    return str(request.param)
+
+
+@pytest.fixture(scope="module")
+def golden(name: str, shared: Path) -> Loaded:
+    """Module, specification and the original's numbers."""
+    base = shared / "golden" / "diffusion_policy" / name
     module, spec = load_checkpoint_policy(base.with_suffix(".ckpt"))
-    assert spec.source["variant"] == GOLDEN[request.param]
+    assert spec.source["variant"] == GOLDEN[name]
     with np.load(base.with_suffix(".npz")) as numbers:
         return module, spec, dict(numbers)
 
@@ -89,26 +99,22 @@ def test_whole_call(golden: Loaded) -> None:
     assert np.abs(executed - numbers["action"]).max() < tolerance
 
 
-# torch's own deprecation, raised while it copies an exported program.
-@pytest.mark.filterwarnings("ignore:.*LeafSpec.*:FutureWarning")
-def test_exports_for_any_batch(golden: Loaded) -> None:
-    """torch.export captures the module once for every batch size, and decomposing it changes nothing."""
-    module, spec, numbers = golden
-    obs, x, t = normalized(spec, numbers["obs"]), torch.from_numpy(numbers["probe_x"]), torch.full((2,), 7)
-    batch = torch.export.Dim("B")
-    exported = torch.export.export(module, (x, t, obs), dynamic_shapes=({0: batch},) * 3, strict=False)
-    decomposed = exported.run_decompositions({})
+def test_captured_once_for_any_batch(golden: Loaded, name: str, once: Once, shared: Path) -> None:
+    """The graph that is compiled, after capture, decompositions and passes, is the module for every batch size."""
+    module, _, numbers = golden
+    program = compiled_golden(once, shared, name)[1]
+    weights = {key: torch.from_numpy(program.weights[key]) for key in program.denoiser.constants}
     for streams in (1, 5):
         generator = torch.Generator().manual_seed(streams)
         inputs = (
-            torch.randn(streams, *x.shape[1:], generator=generator),
+            torch.randn(streams, *numbers["probe_x"].shape[1:], generator=generator),
             torch.arange(streams),
-            torch.randn(streams, *obs.shape[1:], generator=generator),
+            torch.randn(streams, *numbers["obs"].shape[1:], generator=generator),
         )
+        values = dict(zip(("sample", "timestep", "obs"), inputs, strict=True))
+        (found,) = evaluate(program.denoiser, weights, values)
         with torch.no_grad():
-            expected = module(*inputs)
-            for program in (exported, decomposed):
-                torch.testing.assert_close(program.module()(*inputs), expected, rtol=1e-5, atol=1e-5)
+            torch.testing.assert_close(found, module(*inputs), rtol=1e-5, atol=1e-5)
 
 
 def test_eager_policy_needs_noise_for_a_stochastic_sampler(golden: Loaded) -> None:

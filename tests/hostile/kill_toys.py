@@ -27,16 +27,16 @@ def main() -> None:
 
     torch.set_num_threads(1)
     programs = [toy_program(2, 2, seed=seed) for seed in (0, 1)]
-    models = [lower_program(program) for program in programs]
+    models = lower_program(programs[0])  # which hold no weights
     with tempfile.TemporaryDirectory(prefix=PREFIX, dir=memory()) as name:
         folder = Path(name)
         old, new, updated = (folder / each for each in ("old", "new", "updated"))
-        for path, program, model in zip((old, new), programs, models, strict=True):
-            write_artifact(program, model, path)
+        for path, program in zip((old, new), programs, strict=True):
+            write_artifact(program, models, path)
         plan = np.array([[0, 0], [2, 2]], np.int8)
 
         def write(path: Path) -> None:
-            write_artifact(programs[1], models[1], path)
+            write_artifact(programs[1], models, path)
 
         pruner = {name: value + 1 for name, value in load_artifact(new).pruner.items()}
 

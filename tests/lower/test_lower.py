@@ -1,14 +1,9 @@
-"""``lower``: the same numbers in onnxruntime, at any batch size, from the same bytes."""
+"""``lower``: the same numbers in onnxruntime, at any batch size."""
 
 from __future__ import annotations
 
-import hashlib
-import os
 import re
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,7 +20,6 @@ from ttscompile.ir.graph import Batch, Graph, Node, Ref, TensorType
 from ttscompile.ir.program import Pieces, Program
 from ttscompile.lower.program import OPSET, lower_graph, lower_program, structural_key
 
-ROOT = Path(__file__).resolve().parents[2]
 B = Batch()
 
 
@@ -119,26 +113,6 @@ def test_expansion_over_streams() -> None:
     assert_parity(build.graph(build.op("y", "mul.Tensor", (2, B, 3), same, wide)), {"token": torch.randn(1, 3)})
 
 
-HASH = """
-import hashlib
-from tests.lower.modules import captured
-from ttscompile.lower.program import lower_graph
-for name in ("SelfAttention", "AdaptiveNorm"):
-    print(hashlib.sha256(lower_graph(captured(name)[1], "p").SerializeToString()).hexdigest())
-"""
-
-
-def test_bytes_do_not_depend_on_the_process() -> None:
-    here = [
-        hashlib.sha256(lower_graph(captured(name)[1], "p").SerializeToString()).hexdigest()
-        for name in ("SelfAttention", "AdaptiveNorm")
-    ]
-    command = [sys.executable, "-W", "ignore", "-c", HASH]
-    environment = {**os.environ, "PYTHONHASHSEED": "1", "PYTHONPATH": str(ROOT)}  # here it is random
-    result = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, check=True)
-    assert result.stdout.split() == here
-
-
 def feed_forward(index: int, hidden: int) -> Graph:
     build = Builder()
     x, shift = build.input(f"a{index}", B, TOKENS, WIDTH), build.input(f"table{index}", 1, WIDTH)
@@ -213,7 +187,8 @@ def test_what_cannot_be_lowered() -> None:
         lower_graph(Graph({"x": type_}, {}, nodes, ("z",)), "block_03")
     broken = program()
     assert broken.pieces is not None
-    broken = replace(broken, pieces=replace(broken.pieces, condition=Graph({"x": type_}, {}, nodes, ("z",))))
+    condition = Graph({"x": type_}, {}, nodes, ("z",))
+    broken = replace(broken, pieces=replace(broken.pieces, condition=condition, blocks=broken.pieces.blocks[:1]))
     with pytest.raises(LoweringError, match=r"piece 'condition' could not be exported"):  # named among all pieces
         lower_program(broken)
     with pytest.raises(LoweringError, match="twice"):

@@ -7,6 +7,7 @@ import sys
 import textwrap
 from collections.abc import Callable
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
+from torch import nn
 
 import ttscompile
 from tests.passes.test_pipeline import MODULES, spec
@@ -40,14 +42,20 @@ from ttscompile.runtimes.policy import CompiledPolicy
 Arrays = dict[str, np.ndarray]
 
 
+@lru_cache(maxsize=1)
+def opened(model: str | bytes) -> onnxruntime.InferenceSession:
+    """A session, which keeps nothing from call to call: the episodes of a test share it."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    options.log_severity_level = 3  # optional inputs have values in the model, which is worth a warning to it
+    return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+
+
 class Episode:
     """Calls of the single file that hand the rollout cache on, as its user would."""
 
     def __init__(self, model: str | bytes, streams: int) -> None:
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = 1
-        options.log_severity_level = 3  # optional inputs have values in the model, which is worth a warning to it
-        self.session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+        self.session = opened(model)
         shapes = {value.name: value.shape for value in self.session.get_inputs()}
         self.takes_noise = "step_noise" in shapes
         row = [streams if n == "B" else n for n in shapes["rollout_rows"][1:]]
@@ -266,16 +274,15 @@ def test_two_gigabytes_are_too_many(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("name", MODULES)
-def test_the_compiler_writes_it(name: str, tmp_path: Path) -> None:
+def test_the_compiler_writes_it(name: str, compiled_module: Callable[[str], tuple[nn.Module, Path]]) -> None:
     """Of modules that nobody prepared."""
-    path = tmp_path / "new" / "call.onnx"
-    compile_denoiser(MODULES[name]().eval(), spec(), tmp_path / "artifact", single_file=path)
-    policy = ttscompile.load(tmp_path / "artifact")
+    _, folder = compiled_module(name)
+    policy = ttscompile.load(folder / "artifact")
     rng = np.random.default_rng(0)
-    episode = Episode(str(path), 2)
+    episode = Episode(str(folder / "new" / "call.onnx"), 2)
     written = np.zeros(episode.index.shape, np.bool_)
     for _ in range(3):
-        plan = random_plan(rng, *written.shape[:1], policy_groups(tmp_path / "artifact"), written, 0.3)
+        plan = random_plan(rng, *written.shape[:1], policy_groups(folder / "artifact"), written, 0.3)
         obs, noise = inputs(policy, rng, 2)
         expected = policy.predict_action(obs, noise=noise, plan=plan)
         found = episode.call(obs, noise, plan)
@@ -286,7 +293,7 @@ def test_the_compiler_writes_it(name: str, tmp_path: Path) -> None:
 def test_a_place_where_nothing_can_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ArtifactError, match="single file cannot be written"):
-        compile_denoiser(next(iter(MODULES.values()))().eval(), spec(), single_file=tmp_path / "file" / "call.onnx")
+        compile_denoiser(MODULES["bare observation"]().eval(), spec(), single_file=tmp_path / "file" / "call.onnx")
 
 
 PLAIN = textwrap.dedent(
@@ -312,21 +319,13 @@ PLAIN = textwrap.dedent(
 )
 
 
-@pytest.fixture(scope="module")
-def pusht_single_file(pusht_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Artifact and single file of the Push-T policy."""
-    folder = tmp_path_factory.mktemp("pusht")
-    ttscompile.convert(pusht_checkpoint, folder / "compiled", single_file=folder / "pusht.onnx")
-    return folder / "compiled", folder / "pusht.onnx"
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("streams", [1, 2])
 def test_the_real_policy_in_a_process_that_never_heard_of_us(
-    pusht_single_file: tuple[Path, Path], tmp_path: Path, streams: int
+    compiled_pusht: Path, tmp_path: Path, streams: int
 ) -> None:
-    artifact, model = pusht_single_file
-    policy = ttscompile.load(artifact)
+    model = compiled_pusht.parent / "call.onnx"
+    policy = ttscompile.load(compiled_pusht)
     recorded, expected = recorded_episode(policy, streams)
     np.savez(tmp_path / "given.npz", **recorded)
     command = [sys.executable, "-c", PLAIN, str(model), str(tmp_path / "given.npz"), str(tmp_path / "actions.npy")]

@@ -165,11 +165,16 @@ def spec() -> PolicySpec:
 
 
 @functools.cache
-def compiled(name: str) -> tuple[nn.Module, Program]:
-    """Capture is the slow part; programs are immutable, so tests share them."""
+def explained(name: str) -> tuple[nn.Module, Program, dict[str, tuple[str, ...]]]:
+    """Capture is the slow part; programs are immutable, so tests share them, and what each stage told."""
     torch.manual_seed(0)
-    module = MODULES[name]().eval()
-    return module, transform(module, spec())
+    module, told = MODULES[name]().eval(), dict[str, tuple[str, ...]]()
+    return module, transform(module, spec(), explain=lambda stage, notes: told.update({stage: notes})), told
+
+
+def compiled(name: str) -> tuple[nn.Module, Program]:
+    """A module and its program."""
+    return explained(name)[:2]
 
 
 @pytest.mark.parametrize("name", MODULES)
@@ -217,8 +222,7 @@ def test_modulations_leave_the_loop() -> None:
 
 
 def test_stages_are_explained() -> None:
-    told: dict[str, tuple[str, ...]] = {}
-    transform(TokenDecoder().eval(), spec(), explain=lambda stage, notes: told.update({stage: notes}))
+    told = explained("tokens")[2]
     assert list(told) == [
         "capture", "CleanUp", "CutCopies", "WidenAttention", "RegroupSums", "find_residual_blocks", "Partition",
         "UnfoldBatch", "SplitTokens", "SplitFeatures", "Hoist", "InsertPruner", "InsertReuse",
@@ -262,9 +266,8 @@ def test_pruner_shrinks_until_it_costs_one_percent_and_says_when_it_cannot() -> 
     large = transform(TokenDecoder(width=64).eval(), spec())
     assert large.pieces is not None and large.pieces.pruner is not None
     assert graph_flops(large.pieces.pruner) <= 0.01 * large.dense_flops
-    notes: list[str] = []
-    transform(BareObservation().eval(), spec(), explain=lambda _, lines: notes.extend(lines))
-    assert any("more than 1% even at its smallest" in note for note in notes)
+    told = explained("bare observation")[2]
+    assert any("more than 1% even at its smallest" in note for note in told["InsertPruner"])
 
 
 class LongObservation(nn.Module):

@@ -184,7 +184,7 @@ def test_a_first_call_with_a_schedule_binds_nothing(
     schedule = uniform_plan(5, 5, 2)
     if not whole_steps:
         schedule[3, 1] = Source.COMPUTE
-    path = make_artifact(toy_program(normed=True)).path
+    path = make_artifact(toy_program(pruner=False, normed=True)).path
     update_calibration(path, None, {"mine": schedule}, "mine", {"strategy": "tts"})
     artifact = load_artifact(path)
     runtime = open_runtime(artifact)

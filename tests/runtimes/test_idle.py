@@ -60,7 +60,7 @@ def random_plans(rng: np.random.Generator, artifact: Artifact, streams: int, wri
 def test_idle_steps_agree_with_the_reference(
     make_artifact: MakeArtifact, streams: int, memories: int, clip: float | None, sequence_first: bool, steps: int
 ) -> None:
-    program = toy_program(steps=steps, blocks=BLOCKS, sequence_first=sequence_first, normed=True)
+    program = toy_program(steps, BLOCKS, pruner=False, sequence_first=sequence_first, normed=True)
     sampler = random_sampler(steps, memories, memories, clip)
     artifact = make_artifact(replace(program, spec=replace(program.spec, sampler=sampler)))
     assert IDLE in artifact.manifest.pieces
@@ -83,7 +83,7 @@ def test_runs_of_idle_steps_go_through_numpy_and_prepare_once(
     make_artifact: MakeArtifact, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Steps 1..4 and 7..11 of five that add the same, even with an anchor among them; a run of two does not."""
-    artifact = make_artifact(toy_program(steps=STEPS, blocks=BLOCKS, normed=True))
+    artifact = make_artifact(toy_program(STEPS, BLOCKS, pruner=False, normed=True))
     runtime = open_runtime(artifact)
     plan = np.full((STEPS, BLOCKS), Source.TIMESTEP, np.int8)
     plan[[0, 4, 7]] = Source.COMPUTE
@@ -114,7 +114,7 @@ def test_a_network_of_another_form_has_no_such_steps(toy_artifact: Artifact) -> 
 
 
 def test_a_call_does_not_see_the_history_of_the_one_before(make_artifact: MakeArtifact) -> None:
-    artifact = make_artifact(toy_program(steps=STEPS, blocks=BLOCKS, normed=True))
+    artifact = make_artifact(toy_program(STEPS, BLOCKS, pruner=False, normed=True))
     runtime = open_runtime(artifact)
     plan, rng = uniform_plan(STEPS, BLOCKS, 2), np.random.default_rng(0)
     obs, noise = random_inputs(artifact, rng, 1)

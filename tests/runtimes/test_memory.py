@@ -48,7 +48,7 @@ TABLES = {
 
 
 def program_of(table: SamplerTable) -> Program:
-    program = toy_program(table.steps)
+    program = toy_program(table.steps, pruner=False)
     return replace(program, spec=replace(program.spec, sampler=table))
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,8 @@ from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy, PolicyInfo
 
 from ..families.support import record
+from ..golden import compiled_golden
+from ..once import Once
 from .agreement import largest_difference, random_inputs
 from .plans import random_plan
 
@@ -35,20 +36,13 @@ RUNTIMES = ("onnxruntime", "reference")
 Compiled = Callable[[str], Path]
 
 
-@pytest.fixture(scope="module")
-def converted(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[Path, Program]]:
-    """Artifact and program of a golden checkpoint by name, or of the Push-T policy; each is compiled once."""
-
-    @cache
-    def compile_once(name: str) -> tuple[Path, Program]:
-        folder = "policies" if name == "pusht_dpt" else "golden/diffusion_policy"
-        directory = tmp_path_factory.mktemp("golden") / name
-        return directory, ttscompile.convert(shared / folder / f"{name}.ckpt", directory)
-
-    return compile_once
+@pytest.fixture
+def converted(shared: Path, once: Once) -> Callable[[str], tuple[Path, Program]]:
+    """Artifact and program of a golden checkpoint by name, or of the Push-T policy."""
+    return lambda name: compiled_golden(once, shared, name)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def compiled(converted: Callable[[str], tuple[Path, Program]]) -> Compiled:
     """The artifact alone."""
     return lambda name: converted(name)[0]
@@ -110,11 +104,10 @@ def test_an_episode_with_their_plans_is_what_the_authors_code_gives(
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CHECKPOINTS)
 def test_both_runtimes_agree_on_random_plans(compiled: Compiled, name: str) -> None:
-    """Over all checkpoints 5 x 4 episodes of 3 calls, of one to three streams: 60 calls, 112 random legal plans."""
+    """An episode of three calls of two streams. Toys go through many more, of one to four streams."""
     artifact = load_artifact(compiled(name))
     runtimes = open_runtime(artifact, "onnxruntime"), open_runtime(artifact, "reference")
-    for seed, streams in enumerate((1, 2, 3, 2)):
-        assert largest_difference(artifact, *runtimes, np.random.default_rng(seed), streams, calls=3) < 1e-5
+    assert largest_difference(artifact, *runtimes, np.random.default_rng(0), streams=2, calls=3) < 1e-5
 
 
 @pytest.mark.slow
@@ -122,11 +115,11 @@ def test_both_runtimes_agree_on_random_plans(compiled: Compiled, name: str) -> N
 def test_a_batch_of_streams_is_its_streams_one_by_one(compiled: Compiled, name: str) -> None:
     artifact = load_artifact(compiled(name))
     rng = np.random.default_rng(0)
-    together, alone = open_runtime(artifact), [open_runtime(artifact) for _ in range(3)]
-    written = np.zeros((3, artifact.manifest.steps, len(artifact.manifest.groups)), np.bool_)
-    for _ in range(3):
+    together, alone = open_runtime(artifact), [open_runtime(artifact) for _ in range(2)]
+    written = np.zeros((2, artifact.manifest.steps, len(artifact.manifest.groups)), np.bool_)
+    for _ in range(2):
         plans = np.stack([random_plan(rng, artifact.manifest.steps, artifact.manifest.groups, one) for one in written])
-        obs, noise = random_inputs(artifact, rng, 3)
+        obs, noise = random_inputs(artifact, rng, 2)
         assert noise.steps is not None
         batch, _ = together.predict(obs, noise, plans)
         for s, runtime in enumerate(alone):

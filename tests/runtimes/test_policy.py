@@ -239,7 +239,7 @@ def test_noise_that_does_not_fit_is_refused(quick: CompiledPolicy, case: int) ->
 
 
 def test_a_deterministic_sampler_needs_no_noise_of_steps(make_artifact: MakeArtifact) -> None:
-    policy = load(make_artifact(toy_program(noise=0.0)).path)
+    policy = load(make_artifact(toy_program(noise=0.0, pruner=False)).path)
     assert not policy.info.stochastic
     initial, steps = some_noise().initial, some_noise().steps
     out = [policy.predict_action({"obs": OBS}, noise=Noise(initial, draws))["action"] for draws in (None, steps)]

@@ -10,6 +10,7 @@ import pytest
 
 import ttscompile
 from tests.calibration import policies
+from tests.once import Once
 from ttscompile import Noise, TtscompileError
 from ttscompile.artifact import load_artifact
 from ttscompile.errors import ArtifactError, RuntimeUnavailableError
@@ -19,20 +20,16 @@ from ttscompile.runtimes.random_calls import random_calls
 from .agreement import largest_difference, random_inputs
 
 
-@pytest.fixture(scope="module")
-def int8(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture
+def int8(once: Once) -> Path:
     """A small nonlinear policy with a stochastic sampler."""
-    directory = tmp_path_factory.mktemp("int8") / "compiled"
-    ttscompile.compile_denoiser(policies.Mixer(0).eval(), policies.spec(), directory, precision="int8")
-    return directory
+    return policies.compiled(once, "int8")
 
 
-@pytest.fixture(scope="module")
-def fp32(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture
+def fp32(once: Once) -> Path:
     """The same in fp32."""
-    directory = tmp_path_factory.mktemp("fp32") / "compiled"
-    ttscompile.compile_denoiser(policies.Mixer(0).eval(), policies.spec(), directory)
-    return directory
+    return policies.compiled(once)
 
 
 def test_it_is_the_reference_within_its_own_tolerance_on_random_plans(int8: Path) -> None:

@@ -68,6 +68,15 @@ def sound(compiled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
+@pytest.fixture(scope="session")
+def quick(compiled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same with one plan, which saves so much that it is the faster one beside any other work."""
+    directory = Path(shutil.copytree(compiled, tmp_path_factory.mktemp("quick") / "compiled"))
+    plan = policy.sparsest()
+    update_calibration(directory, None, {"schedule": plan}, "schedule", {"strategy": "by hand"}, golden=record_plans)
+    return directory
+
+
 @pytest.fixture
 def artifact(sound: Path, tmp_path: Path) -> Path:
     """A copy of ``sound``."""

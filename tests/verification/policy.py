@@ -12,7 +12,7 @@ from ttscompile import PolicySpec
 from ttscompile.lattice import Source
 
 STEPS, HORIZON, CHANNELS = policies.STEPS, policies.HORIZON, policies.CHANNELS
-WIDTH, LAYERS, BLOCKS = 64, 3, 6
+WIDTH, LAYERS, BLOCKS = 128, 3, 6
 
 
 class Network(nn.Module):
@@ -57,6 +57,13 @@ def other() -> npt.NDArray[np.int8]:
     """The second half of the blocks at every other step."""
     plan = np.full((STEPS, BLOCKS), Source.TIMESTEP, np.int8)
     plan[0] = plan[1::2, 3:] = Source.COMPUTE
+    return plan
+
+
+def sparsest() -> npt.NDArray[np.int8]:
+    """Step 0 alone."""
+    plan = np.full((STEPS, BLOCKS), Source.TIMESTEP, np.int8)
+    plan[0] = Source.COMPUTE
     return plan
 
 

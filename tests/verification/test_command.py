@@ -22,15 +22,15 @@ def run(*arguments: object) -> Result:
     return CliRunner().invoke(main, [str(a) for a in arguments], catch_exceptions=False)
 
 
-def test_a_sound_artifact_gives_status_0_and_a_picture(sound: Path, recording: Path, tmp_path: Path) -> None:
+def test_a_sound_artifact_gives_status_0_and_a_picture(quick: Path, recording: Path, tmp_path: Path) -> None:
     picture = tmp_path / "errors.png"
     arguments = ("--trajectories", recording, "--calls", 5, "--plot", picture, "--json")
-    result = run("verify", sound, *arguments)
+    result = run("verify", quick, *arguments)
     assert result.exit_code == 0, result.stdout
     found = json.loads(result.stdout)
     assert found["passed"] is True
     assert found["first_failure"] is None
-    assert found["identity"] == read_manifest(sound).identity
+    assert found["identity"] == read_manifest(quick).identity
     assert {rung["status"] for rung in found["rungs"]} == {"passed"}
     assert found["machine"]["cores"] >= 1
     assert picture.read_bytes().startswith(b"\x89PNG")

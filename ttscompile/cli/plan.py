@@ -32,10 +32,19 @@ JITTER_HZ = 200
     help="Of frames and actions in training; the control rate if not given.",
 )
 @click.option(
-    "--horizon", type=click.IntRange(min=1), help="Actions of a chunk to play; those that the policy executes."
+    "--horizon",
+    type=click.IntRange(min=1),
+    help="Actions from one call to the next; as many as the policy executes, if not given.",
+)
+@click.option(
+    "--reserve",
+    type=click.IntRange(min=0),
+    help="Actions after these that may be played; all predicted, if not given.",
 )
 @click.option("--plan", "names", multiple=True, help="Which plan to measure; may be repeated. All, if not given.")
-@click.option("--margin-ticks", type=click.IntRange(min=0), default=1, show_default=True, help="To be early by.")
+@click.option(
+    "--margin-ticks", type=click.IntRange(min=0), default=1, show_default=True, help="That a chunk is to be early by."
+)
 @click.option("--threads", type=click.IntRange(min=1), default=1, show_default=True, help="Of the policy.")
 @click.option("--runs", type=click.IntRange(min=1), default=20, show_default=True, help="Counted calls of each plan.")
 @click.option(
@@ -52,6 +61,7 @@ def plan(
     control_hz: float,
     policy_hz: float | None,
     horizon: int | None,
+    reserve: int | None,
     names: tuple[str, ...],
     margin_ticks: int,
     threads: int,
@@ -68,6 +78,7 @@ def plan(
     settings = ExecutorSettings(
         policy_hz=policy_hz,
         horizon=horizon,
+        reserve=reserve,
         margin_ticks=margin_ticks,
         measured_calls=runs,
         tiers=names or policy.info.plans,

@@ -23,21 +23,46 @@ from ttscompile.runtimes.executor.server import ExecutorServer, ServerLimits
     type=click.FloatRange(min=0, min_open=True),
     help="Of frames and actions in training; the control rate if not given.",
 )
+@click.option(
+    "--horizon",
+    type=click.IntRange(min=1),
+    help="Actions from one call to the next; as many as the policy executes, if not given.",
+)
 @click.option("--host", default="127.0.0.1", show_default=True, help="To listen on. There is no authentication.")
 @click.option("--port", type=click.IntRange(0, 65535), default=8765, show_default=True, help="0: any that is free.")
-@click.option("--margin-ticks", type=click.IntRange(min=0), default=1, show_default=True, help="To be early by.")
+@click.option(
+    "--margin-ticks", type=click.IntRange(min=0), default=1, show_default=True, help="That a chunk is to be early by."
+)
 @click.option("--threads", type=click.IntRange(min=1), default=1, show_default=True, help="Of the policy.")
 @click.option(
     "--tier", "tiers", multiple=True, help="A plan, slowest first; may be repeated. The default plan, if none."
 )
-@click.option("--seam", type=click.Choice(["replace", "blend", "prefix"]), default="replace", show_default=True)
-@click.option("--interpolation", type=click.Choice(["hold", "linear"]), default="hold", show_default=True)
+@click.option(
+    "--seam",
+    type=click.Choice(["replace", "blend", "prefix"]),
+    default="replace",
+    show_default=True,
+    help="How a chunk joins the one before.",
+)
+@click.option(
+    "--interpolation",
+    type=click.Choice(["hold", "linear"]),
+    default="hold",
+    show_default=True,
+    help="Between actions, if the loop is faster than the policy.",
+)
 @click.option(
     "--reserve",
     type=click.IntRange(min=0),
-    help="Actions to go on with while a chunk is late; else all predicted.",
+    help="Actions after those that the policy executes that may be played; all predicted, if not given.",
 )
-@click.option("--max-hold", type=click.IntRange(min=0), default=3, show_default=True, help="Ticks to repeat an action.")
+@click.option(
+    "--max-hold",
+    type=click.IntRange(min=0),
+    default=3,
+    show_default=True,
+    help="Ticks to repeat the last action for, when there is no other.",
+)
 @click.option("--max-clients", type=click.IntRange(min=1), default=8, show_default=True)
 @click.option("--max-message-bytes", type=click.IntRange(min=128), default=1 << 20, show_default=True)
 @click.option("--seed", type=int, help="Of the policy's noise.")
@@ -45,6 +70,7 @@ def serve(
     directory: Path,
     control_hz: float,
     policy_hz: float | None,
+    horizon: int | None,
     host: str,
     port: int,
     margin_ticks: int,
@@ -66,6 +92,7 @@ def serve(
     console = progress()
     settings = ExecutorSettings(
         policy_hz=policy_hz,
+        horizon=horizon,
         tiers=tiers or None,
         seam=seam,
         interpolation=interpolation,
