@@ -139,6 +139,11 @@ def test_files_that_torch_did_not_write(tmp_path: Path) -> None:
             archive.writestr(name, "hello")
         with pytest.raises(CheckpointError, match=message):
             load_checkpoint_policy(path)
+    damaged = bytearray(path.read_bytes())
+    damaged[damaged.index(b"PK\x01\x02") + 6] = 128  # the version of zip that it needs: 12.8
+    path.write_bytes(damaged)
+    with pytest.raises(CheckpointError, match=r"zip file version 12\.8"):
+        load_checkpoint_policy(path)
 
 
 def test_every_row_is_reached(tmp_path: Path) -> None:

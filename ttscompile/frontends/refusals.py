@@ -178,7 +178,7 @@ def refuse_file(path: Path) -> None:
     try:
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()
-    except (zipfile.BadZipFile, OSError, ValueError):
+    except (zipfile.BadZipFile, NotImplementedError, OSError, ValueError):
         return  # a damaged archive, which the reader of checkpoints describes
     if "manifest.json" in names:
         raise _refused(path, "an artifact that is compiled already", "manifest.json", DIRECTORIES[0].remedy)
