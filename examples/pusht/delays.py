@@ -32,7 +32,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 from rollout import Rollout, run_episodes
-from variants import first_seed_option, open_variant, results_console, run, runtime_option
+from variants import cache_option, first_seed_option, open_variant, results_console, run, runtime_option
 
 from ttscompile.cli.output import identity_of, print_identity
 
@@ -148,16 +148,16 @@ def delays_table(found: dict[Setup, Figures], baseline: Evaluation) -> Table:
     return table
 
 
-def several(kind: Callable[[str], T], least: float = 0) -> Callable[[Any, Any, str], list[T]]:
-    """A callback for an option that takes several values, with commas between."""
+def several(kind: Callable[[str], T]) -> Callable[[Any, Any, str], list[T]]:
+    """A callback for an option that takes several values, with commas between; numbers from 0 on."""
 
     def parse(context: Any, parameter: Any, text: str) -> list[T]:
         try:
             values = [kind(each) for each in text.split(",")]
         except ValueError as error:
             raise click.BadParameter(str(error)) from error
-        if any(isinstance(value, int | float) and not least <= value < float("inf") for value in values):
-            raise click.BadParameter(f"{text!r} must be {least:g} or more.")
+        if any(isinstance(value, int | float) and not 0 <= value < float("inf") for value in values):
+            raise click.BadParameter(f"{text!r} must be 0 or more.")
         return list(dict.fromkeys(values))
 
     return parse
@@ -180,13 +180,7 @@ def several(kind: Callable[[str], T], least: float = 0) -> Callable[[Any, Any, s
 @first_seed_option
 @runtime_option
 @click.option("--jobs", default=1, show_default=True, type=click.IntRange(1), help="Processes, of one thread each.")
-@click.option(
-    "--cache",
-    type=click.Path(file_okay=False, path_type=Path),
-    default=Path("build/pusht/episodes"),
-    show_default=True,
-    help="Where the baseline's episodes are kept, as by evaluate.py.",
-)
+@cache_option
 @click.option("--plot", "picture", type=click.Path(dir_okay=False, path_type=Path), help="Draw score against latency.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON document instead of a table.")
 def main(

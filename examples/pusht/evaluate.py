@@ -26,7 +26,16 @@ from rich.progress import Progress
 from rich.table import Table
 from rollout import EpisodeCache, Rollout, run_episodes
 from score_plot import Timed, plot_scores, time_calls
-from variants import Variant, first_seed_option, open_variant, results_console, run, runtime_option, threads_option
+from variants import (
+    Variant,
+    cache_option,
+    first_seed_option,
+    open_variant,
+    results_console,
+    run,
+    runtime_option,
+    threads_option,
+)
 
 from ttscompile.artifact.manifest import abbreviated
 from ttscompile.cli.output import identity_of
@@ -159,13 +168,7 @@ def evaluation_table(evaluations: Sequence[Evaluation], seeds: Sequence[int], ti
 @click.option("--batch", default=16, show_default=True, type=click.IntRange(1), help="Episodes in lockstep.")
 @runtime_option
 @threads_option
-@click.option(
-    "--cache",
-    type=click.Path(file_okay=False, path_type=Path),
-    default=Path("build/pusht/episodes"),
-    show_default=True,
-    help="Where episodes are kept, by what was computed, and taken from.",
-)
+@cache_option
 @click.option("--no-cache", is_flag=True, help="Run all episodes, and keep none.")
 @click.option("--jobs", default=1, show_default=True, type=click.IntRange(1), help="Processes that run episodes.")
 @click.option(

@@ -57,3 +57,10 @@ threads_option = click.option("--threads", default=2, show_default=True, type=cl
 first_seed_option = click.option(
     "--first-seed", default=100_000, show_default=True, type=click.IntRange(0), help="Seeds count up from here."
 )
+cache_option = click.option(
+    "--cache",
+    type=click.Path(file_okay=False, path_type=Path),
+    default=Path("build/pusht/episodes"),
+    show_default=True,
+    help="Where episodes are kept, by what was computed, and taken from.",
+)

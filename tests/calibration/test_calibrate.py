@@ -176,10 +176,9 @@ def test_a_damaged_state_is_refused(artifact: Path, recording: Path) -> None:
         quick(artifact, recording, resume=True)
 
 
-@pytest.mark.parametrize("change", [{"seed": 1}, {"target_sparsity": 0.6}])
-def test_a_state_of_other_settings_is_refused(
-    artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch, change: dict[str, Any]
-) -> None:
+def begin(artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch, **settings: Any) -> None:
+    """A calibration that is killed once its state has been saved."""
+
     def dying(self: StateFile) -> None:
         save(self)
         raise _Killed
@@ -188,7 +187,14 @@ def test_a_state_of_other_settings_is_refused(
     with monkeypatch.context() as patch:
         patch.setattr(StateFile, "save", dying)
         with pytest.raises(_Killed):
-            quick(artifact, recording)
+            quick(artifact, recording, **settings)
+
+
+@pytest.mark.parametrize("change", [{"seed": 1}, {"target_sparsity": 0.6}])
+def test_a_state_of_other_settings_is_refused(
+    artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch, change: dict[str, Any]
+) -> None:
+    begin(artifact, recording, monkeypatch)
     with pytest.raises(CalibrationError, match=r"other settings: \w+ was .*, now"):
         quick(artifact, recording, resume=True, **change)
 
@@ -196,15 +202,7 @@ def test_a_state_of_other_settings_is_refused(
 def test_resuming_with_more_time_goes_on_with_the_same_calls(
     artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def dying(self: StateFile) -> None:
-        save(self)
-        raise _Killed
-
-    save = StateFile.save
-    with monkeypatch.context() as patch:
-        patch.setattr(StateFile, "save", dying)
-        with pytest.raises(_Killed):
-            quick(artifact, recording, strategy="interval", max_minutes=1)
+    begin(artifact, recording, monkeypatch, strategy="interval", max_minutes=1)
     result = quick(artifact, recording, strategy="interval", max_minutes=2, resume=True)
     assert result.calls["calibration"] == 64
 
