@@ -10,6 +10,7 @@ import click
 import numpy as np
 
 import ttscompile
+from ttscompile.cli.loop_options import loop_options
 from ttscompile.cli.output import artifact_argument, json_option, print_identity, print_json, progress, results, table
 from ttscompile.errors import DeadlineMissedError
 from ttscompile.machine import fingerprint, one_line
@@ -25,27 +26,8 @@ JITTER_HZ = 200
 
 @click.command()
 @artifact_argument
-@click.option("--control-hz", type=click.FloatRange(min=0, min_open=True), required=True, help="Of the control loop.")
-@click.option(
-    "--policy-hz",
-    type=click.FloatRange(min=0, min_open=True),
-    help="Of frames and actions in training; the control rate if not given.",
-)
-@click.option(
-    "--horizon",
-    type=click.IntRange(min=1),
-    help="Actions from one call to the next; as many as the policy executes, if not given.",
-)
-@click.option(
-    "--reserve",
-    type=click.IntRange(min=0),
-    help="Actions after these that may be played; all predicted, if not given.",
-)
+@loop_options
 @click.option("--plan", "names", multiple=True, help="Which plan to measure; may be repeated. All, if not given.")
-@click.option(
-    "--margin-ticks", type=click.IntRange(min=0), default=1, show_default=True, help="That a chunk is to be early by."
-)
-@click.option("--threads", type=click.IntRange(min=1), default=1, show_default=True, help="Of the policy.")
 @click.option("--runs", type=click.IntRange(min=1), default=20, show_default=True, help="Counted calls of each plan.")
 @click.option(
     "--jitter",

@@ -10,6 +10,7 @@ from pathlib import Path
 import click
 
 import ttscompile
+from ttscompile.cli.loop_options import loop_options
 from ttscompile.cli.output import artifact_argument, progress
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
 from ttscompile.runtimes.executor.server import ExecutorServer, ServerLimits
@@ -17,23 +18,9 @@ from ttscompile.runtimes.executor.server import ExecutorServer, ServerLimits
 
 @click.command()
 @artifact_argument
-@click.option("--control-hz", type=click.FloatRange(min=0, min_open=True), required=True, help="Of the control loop.")
-@click.option(
-    "--policy-hz",
-    type=click.FloatRange(min=0, min_open=True),
-    help="Of frames and actions in training; the control rate if not given.",
-)
-@click.option(
-    "--horizon",
-    type=click.IntRange(min=1),
-    help="Actions from one call to the next; as many as the policy executes, if not given.",
-)
+@loop_options
 @click.option("--host", default="127.0.0.1", show_default=True, help="To listen on. There is no authentication.")
 @click.option("--port", type=click.IntRange(0, 65535), default=8765, show_default=True, help="0: any that is free.")
-@click.option(
-    "--margin-ticks", type=click.IntRange(min=0), default=1, show_default=True, help="That a chunk is to be early by."
-)
-@click.option("--threads", type=click.IntRange(min=1), default=1, show_default=True, help="Of the policy.")
 @click.option(
     "--tier", "tiers", multiple=True, help="A plan, slowest first; may be repeated. The default plan, if none."
 )
@@ -50,11 +37,6 @@ from ttscompile.runtimes.executor.server import ExecutorServer, ServerLimits
     default="hold",
     show_default=True,
     help="Between actions, if the loop is faster than the policy.",
-)
-@click.option(
-    "--reserve",
-    type=click.IntRange(min=0),
-    help="Actions after those that the policy executes that may be played; all predicted, if not given.",
 )
 @click.option(
     "--max-hold",
