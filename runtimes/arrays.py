@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.config import FloatArray, Noise, ObservationSpec
+from ttscompile.config import FloatArray, Noise, ObservationSpec, PolicySpec
 from ttscompile.errors import ObservationError
 
 Array: TypeAlias = npt.NDArray[Any]
@@ -161,34 +161,37 @@ def check_finite(array: Array, what: str, remedy: str) -> None:
     )
 
 
-def check_noise(noise: Noise, streams: int, steps: int, sample: tuple[int, int], stochastic: bool) -> Noise:
+def check_noise(noise: Noise, streams: int, spec: PolicySpec) -> Noise:
     """The noise of a call as float32 arrays that fit it.
 
     Args:
-        noise: the caller's.
+        noise: the caller's; where the policy predicts fewer steps than the original, with as many as either. If the
+            sampler draws no noise in its steps, ``noise.steps`` is not looked at.
         streams: B of the observation.
-        steps: K.
-        sample: ``(T, D)``.
-        stochastic: whether the sampler draws noise in its steps; if not, ``noise.steps`` is not looked at.
+        spec: of the policy.
 
     Raises:
         ObservationError: missing, of the wrong shape or dtype, or not finite.
     """
     if not isinstance(noise, Noise):
         raise ObservationError(f"noise is a {type(noise).__name__}; expected ttscompile.Noise(initial, steps).")
-    initial = _noise(noise.initial, "noise.initial", "[B, T, D]", (streams, *sample))
-    if not stochastic:
+    one = (streams, *spec.sample)
+    initial = _noise(noise.initial, "noise.initial", "[B, T, D]", one, spec.left_out)
+    if not spec.sampler.stochastic:
         return Noise(initial)
+    shape = (spec.sampler.steps, *one)
     if noise.steps is None:
         raise ObservationError(
-            f"noise.steps is missing: the sampler of this policy draws noise in its steps. Give [K, B, T, D] ="
-            f" {(steps, streams, *sample)}, or noise=None to have all of it drawn."
+            f"noise.steps is missing: the sampler of this policy draws noise in its steps. Give [K, B, T, D] = {shape},"
+            " or noise=None to have all of it drawn."
         )
-    return Noise(initial, _noise(noise.steps, "noise.steps", "[K, B, T, D]", (steps, streams, *sample)))
+    return Noise(initial, _noise(noise.steps, "noise.steps", "[K, B, T, D]", shape, spec.left_out))
 
 
-def _noise(value: Any, what: str, axes: str, shape: tuple[int, ...]) -> FloatArray:
+def _noise(value: Any, what: str, axes: str, shape: tuple[int, ...], left_out: int) -> FloatArray:
     array = as_array(value, what)
+    if left_out and array.shape == (*shape[:-2], shape[-2] + left_out, shape[-1]):
+        array = array[..., : shape[-2], :]
     if array.shape != shape or array.dtype != np.float32:
         raise ObservationError(
             f"{what} must be float32 {axes} = {list(shape)}; found {array.dtype} {list(array.shape)}."

@@ -47,7 +47,8 @@ class PolicyInfo:
         dense_flops: of one call of the policy as it was before it was compiled, one stream.
         observation: specification of each key of the observation.
         action: which part of the denoised sample is action, and which of it is executed.
-        sample: ``(T, D)``, the shape of one stream's noise.
+        sample: ``(T, D)``, the shape of one stream's noise and of what is predicted.
+        original_sample: the same of the original, which may predict more steps; noise of this shape fits as well.
         stochastic: whether the sampler draws noise in its steps, so that ``Noise.steps`` is needed.
         identity: sha256 of what the artifact computes.
         model_identity: the same without plans, corrections and pruner: what calibration leaves as it is.
@@ -64,6 +65,7 @@ class PolicyInfo:
     observation: Mapping[str, ObservationSpec]
     action: ChunkSpec
     sample: tuple[int, int]
+    original_sample: tuple[int, int]
     stochastic: bool
     identity: str
     model_identity: str
@@ -158,6 +160,7 @@ class CompiledPolicy:
             observation=manifest.spec.observations,
             action=manifest.spec.chunk,
             sample=manifest.spec.sample,
+            original_sample=manifest.spec.original.sample,
             stochastic=manifest.spec.sampler.stochastic,
             identity=manifest.identity,
             model_identity=manifest.model_identity,
@@ -286,10 +289,7 @@ class CompiledPolicy:
         if prefix is not None:
             prefix = check_prefix(prefix, streams, spec, self._prefix_refusal)
             prefix = prefix if spec.chunk.normalizer is None else spec.chunk.normalizer.normalize(prefix)
-        if noise is None:
-            noise = self._draw(streams)
-        else:
-            noise = check_noise(noise, streams, self._manifest.steps, spec.sample, spec.sampler.stochastic)
+        noise = self._draw(streams) if noise is None else check_noise(noise, streams, spec)
         matrix, name, repair = self._plan(plan)
         correction = None if name is None else self._artifact.corrections.get(name)
         known = None if prefix is None else known_samples(spec, prefix, noise.initial)
@@ -301,11 +301,14 @@ class CompiledPolicy:
         return predicted if spec.chunk.normalizer is None else spec.chunk.normalizer.unnormalize(predicted)
 
     def _draw(self, streams: int) -> Noise:
-        shape = (streams, *self._manifest.spec.sample)
-        initial = self._rng.standard_normal(shape, dtype=np.float32)
-        if not self._manifest.spec.sampler.stochastic:
+        """Noise of all steps of the original's horizon: a seed means the same however many are predicted."""
+        spec = self._manifest.spec.original
+        shape, predicted = (streams, *spec.sample), self._manifest.spec.sample[0]
+        initial = self._rng.standard_normal(shape, dtype=np.float32)[:, :predicted]
+        if not spec.sampler.stochastic:
             return Noise(initial)
-        return Noise(initial, self._rng.standard_normal((self._manifest.steps, *shape), dtype=np.float32))
+        steps = self._rng.standard_normal((spec.sampler.steps, *shape), dtype=np.float32)
+        return Noise(initial, steps[:, :, :predicted])
 
     def _plan(self, plan: str | npt.ArrayLike | None) -> tuple[npt.NDArray[Any] | None, str | None, bool]:
         """Matrix (None: the pruner's), name (None: the caller's matrix), and whether illegal reads are repaired."""

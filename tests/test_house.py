@@ -46,7 +46,8 @@ MAY_IMPORT = {
     "record_golden": BELOW_ARTIFACT | {"frontends", "runtimes"},
     "verification": BELOW_ARTIFACT | {"runtimes", "trajectories"},
     "calibration": BELOW_ARTIFACT | {"points", "record_golden", "runtimes", "trajectories"},
-    "driver": BELOW_ARTIFACT | COMPILER | {"record_golden", "runtimes"},
+    "narrow": BASE | {"frontends"},
+    "driver": BELOW_ARTIFACT | COMPILER | {"narrow", "record_golden", "runtimes"},
     "cli": BELOW_ARTIFACT
     | COMPILER
     | {
@@ -73,6 +74,7 @@ COMPILES = (
     "ttscompile.frontends",
     "ttscompile.ir.evaluate",
     "ttscompile.lower",
+    "ttscompile.narrow",
     "ttscompile.passes",
     "ttscompile.record_golden",
     "ttscompile.runtimes.reference",

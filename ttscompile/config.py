@@ -6,7 +6,7 @@ Nothing here imports torch; the same records are written to the artifact and rea
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -238,6 +238,7 @@ class PolicySpec:
         sample_argument: name of the module's sample argument.
         timestep_argument: name of the module's timestep argument (a ``[B]`` tensor).
         source: what this was compiled from, for people: format and variant, no path.
+        left_out: steps that the original predicts after the last one of the sample (``ttscompile.narrow``).
     """
 
     sample: tuple[int, int]
@@ -247,6 +248,7 @@ class PolicySpec:
     sample_argument: str = "sample"
     timestep_argument: str = "timestep"
     source: Mapping[str, str] = field(default_factory=dict)
+    left_out: int = 0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "sample", tuple(int(n) for n in self.sample))
@@ -263,6 +265,8 @@ class PolicySpec:
                 )
             taken.add(argument)
         horizon, channels = self.sample
+        if self.left_out < 0:
+            raise SpecError(f"left_out is {self.left_out}; expected a number of steps, 0 for none.")
         if self.chunk.stop > horizon or self.chunk.action_dim > channels:
             raise SpecError(
                 f"chunk [{self.chunk.start}:{self.chunk.stop}] of {self.chunk.action_dim} channels does not fit a"
@@ -277,6 +281,11 @@ class PolicySpec:
     def arguments(self) -> Mapping[str, str]:
         """By observation key: the name of the module's argument that it is given as."""
         return {key: key.replace(".", "_") for key in self.observations}
+
+    @property
+    def original(self) -> PolicySpec:
+        """The same with all steps that the original predicts."""
+        return replace(self, sample=(self.sample[0] + self.left_out, self.sample[1]), left_out=0)
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ from .lower.joint import chain_blocks, join_blocks
 from .lower.precision import lower_precision, require_precision
 from .lower.program import lower_program
 from .lower.single_file import lower_single_file
+from .narrow import narrow
 from .passes.base import Pass
 from .passes.clean_up import CleanUp
 from .passes.cut_copies import CutCopies
@@ -67,6 +68,7 @@ def convert(
     spacing: str | None = None,
     task: str | None = None,
     encoders: str | os.PathLike[str] | None = None,
+    prediction_horizon: int | None = None,
     precision: str = FP32,
     single_file: str | os.PathLike[str] | None = None,
     explain: Explain = _silent,
@@ -88,6 +90,7 @@ def convert(
             makes its tokens an observation.
         encoders: of a LeRobot policy: folder with its CLIP encoders' configurations, where they are neither in nor
             beside the checkpoint. Nothing is ever downloaded.
+        prediction_horizon: predict only the first so many steps of the policy's horizon; see ``compile_denoiser``.
         precision: of the weights of residual blocks: ``fp32`` or ``int8``; see ``compile_denoiser``.
         single_file: where one ONNX file of the whole call goes too, for programs without ttscompile; None for none.
             ``ttscompile.lower.single_file`` describes its inputs and outputs.
@@ -102,7 +105,15 @@ def convert(
     module, spec = load_checkpoint_policy(
         checkpoint, format=format, sampler=sampler, steps=steps, spacing=spacing, task=task, encoders=encoders
     )
-    return compile_denoiser(module, spec, directory, precision=precision, single_file=single_file, explain=explain)
+    return compile_denoiser(
+        module,
+        spec,
+        directory,
+        prediction_horizon=prediction_horizon,
+        precision=precision,
+        single_file=single_file,
+        explain=explain,
+    )
 
 
 def compile_denoiser(
@@ -110,6 +121,7 @@ def compile_denoiser(
     spec: PolicySpec,
     directory: str | os.PathLike[str] | None = None,
     *,
+    prediction_horizon: int | None = None,
     precision: str = FP32,
     single_file: str | os.PathLike[str] | None = None,
     explain: Explain = _silent,
@@ -120,6 +132,8 @@ def compile_denoiser(
         module: ``eps(sample, timestep, **observations)``, see ``ttscompile.PolicySpec``; observations come normalised.
         spec: the policy beside its network.
         directory: where the artifact goes; None compiles without writing.
+        prediction_horizon: predict only the first so many steps of the sample: less to compute at every step, with the
+            same actions, where attention is causal. Refused where it is not. None predicts all.
         precision: of the weights of residual blocks: ``fp32``, or ``int8``, which is faster on processors with integer
             dot products. What it does to the actions is measured, and the artifact says it; fp32 stays in the artifact
             too, for the reference runtime and ``load(..., precision="fp32")``.
@@ -134,6 +148,10 @@ def compile_denoiser(
     """
     if precision != FP32:
         require_precision(precision)
+    if prediction_horizon is not None:
+        spec, changed = narrow(module, spec, prediction_horizon)
+        told = f"{prediction_horizon} of {spec.original.sample[0]} steps are predicted"
+        explain("narrow", (f"{told}; they differ from the original's by {changed:.1g} of their deviation",))
     program = transform(module, spec, explain=explain)
     if directory is None and single_file is None:
         return program
@@ -194,7 +212,8 @@ def transform(module: nn.Module, spec: PolicySpec, *, explain: Explain = _silent
     graph, weights = capture(module, spec)
     megabytes = sum(w.nbytes for w in weights.values()) / 1e6
     explain("capture", (f"{len(graph.nodes)} operations, {megabytes:.1f} MB of weights",))
-    program = Program(spec, graph, weights, dense_flops=_dense_flops(module, graph, spec))
+    whole = capture(module, spec.original)[0] if spec.left_out else graph
+    program = Program(spec, graph, weights, dense_flops=_dense_flops(module, whole, spec))
     verify(program)
     for first in (CleanUp(), CutCopies(), WidenAttention(), RegroupSums()):
         program = _run(first, program, explain)

@@ -74,15 +74,19 @@ def _record_original(module: nn.Module, program: Program) -> Golden:
         raw = np.stack([np.resize(each, one.shape) for each in pattern(raw, one.shape)])
         observations[key] = raw
         normalized[key] = raw if one.normalizer is None else one.normalizer.normalize(raw)
-    shape = (streams, *spec.sample)
+    original, kept = spec.original, spec.sample[0]
+    shape = (streams, *original.sample)
     initial = draw.standard_normal(shape, dtype=np.float32)
     draws = draw.standard_normal((steps, *shape), dtype=np.float32) if spec.sampler.stochastic else None
 
     copied = copy.deepcopy(module).cpu().float().eval()
-    watch = _Watch(copied, spec)
+    watch = _Watch(copied, original)
     tensors = {key: torch.from_numpy(value) for key, value in normalized.items()}
-    sample = eager_policy(copied, spec)(tensors, Noise(initial, draws)).numpy()
+    sample = eager_policy(copied, original)(tensors, Noise(initial, draws)).numpy()
     given, predicted = np.stack(watch.given), np.stack(watch.predicted)
+    # What the artifact predicts of it: the original has all steps, and says what those that are kept should be.
+    initial, sample, given, predicted = (each[..., :kept, :] for each in (initial, sample, given, predicted))
+    draws = None if draws is None else draws[..., :kept, :]
     if not (np.isfinite(predicted).all() and np.isfinite(sample).all()):
         raise CaptureError(
             "the module's prediction on a random observation within the range of its normaliser is not a number."

@@ -33,7 +33,7 @@ class Variant:
 
 def noise_shape(info: PolicyInfo) -> NoiseShape:
     """Sizes of the noise that a compiled policy takes."""
-    return NoiseShape(info.K, info.sample, info.stochastic)
+    return NoiseShape(info.K, info.original_sample, info.stochastic)
 
 
 def open_variant(text: str, runtime: str, threads: int) -> Variant:

@@ -38,6 +38,8 @@ def type_from_json(value: Value) -> TensorType:
 
 def spec_to_json(spec: PolicySpec) -> dict[str, Any]:
     """A ``PolicySpec`` as JSON; the order of the observations is kept."""
+    # Only where it says something, so that an artifact of the whole horizon is what it was before there was a choice.
+    narrowed = {"left_out": spec.left_out} if spec.left_out else {}
     return {
         "sample": list(spec.sample),
         "sample_argument": spec.sample_argument,
@@ -61,6 +63,7 @@ def spec_to_json(spec: PolicySpec) -> dict[str, Any]:
         },
         "sampler": _sampler_to_json(spec.sampler),
         "source": {key: spec.source[key] for key in sorted(spec.source)},
+        **narrowed,
     }
 
 
@@ -70,7 +73,8 @@ def spec_from_json(value: Value) -> PolicySpec:
     Raises:
         ArtifactError: not a specification, or one that contradicts itself.
     """
-    fields = value.keys("sample", "sample_argument", "timestep_argument", "observations", "chunk", "sampler", "source")
+    names = ("sample", "sample_argument", "timestep_argument", "observations", "chunk", "sampler", "source")
+    fields = value.keys(*names, optional=("left_out",))
     sample = [item.integer(1) for item in fields["sample"].items()]
     if len(sample) != 2:
         fields["sample"].fail("two sizes [T, D]")
@@ -90,6 +94,7 @@ def spec_from_json(value: Value) -> PolicySpec:
             sample_argument=fields["sample_argument"].text(),
             timestep_argument=fields["timestep_argument"].text(),
             source={key: item.text() for key, item in fields["source"].members().items()},
+            left_out=fields["left_out"].integer() if "left_out" in fields else 0,
         )
     except SpecError as error:
         raise ArtifactError(f"{value.path}: {error} {REMEDY}") from error

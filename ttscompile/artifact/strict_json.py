@@ -35,11 +35,11 @@ class Value:
         """
         raise ArtifactError(f"{self.path}: expected {expected}; found {_shorten(self.data)}. {REMEDY}")
 
-    def keys(self, *required: str) -> dict[str, Value]:
-        """The members of an object that has exactly these keys."""
+    def keys(self, *required: str, optional: Sequence[str] = ()) -> dict[str, Value]:
+        """The members of an object that has exactly these keys, or some of the optional ones too."""
         members = self.members()
         missing = [key for key in required if key not in members]
-        unknown = [key for key in members if key not in required]
+        unknown = [key for key in members if key not in (*required, *optional)]
         if missing or unknown:
             self.fail(f"an object with the keys {', '.join(required)} (missing: {missing}, unknown: {unknown})")
         return members

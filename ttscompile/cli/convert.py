@@ -50,6 +50,12 @@ from ttscompile.config import FP32, PRECISIONS
     help="LeRobot: folder with the CLIP encoders' config.json, if not in or beside CHECKPOINT. Nothing is downloaded.",
 )
 @click.option(
+    "--prediction-horizon",
+    type=click.IntRange(min=1),
+    help="Predict only the first so many steps of the policy's horizon, at least those that it executes: less to"
+    " compute, the same actions. Refused where attention is not causal.",
+)
+@click.option(
     "--precision",
     type=click.Choice(PRECISIONS),
     default=FP32,
@@ -73,6 +79,7 @@ def convert(
     spacing: str | None,
     task: str | None,
     encoders: Path | None,
+    prediction_horizon: int | None,
     precision: str,
     single_file: Path | None,
     explain: bool,
@@ -104,6 +111,7 @@ def convert(
             spacing=spacing,
             task=task,
             encoders=encoders,
+            prediction_horizon=prediction_horizon,
             precision=precision,
             single_file=single_file,
             explain=on_stage,

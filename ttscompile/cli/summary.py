@@ -45,6 +45,7 @@ def document(directory: Path, artifact: Artifact | None = None) -> dict[str, Any
             "clip": sampler.clip,
         },
         "sample": list(spec.sample),
+        "left_out": spec.left_out,
         "observations": {k: {"shape": list(o.shape), "dtype": o.dtype} for k, o in spec.observations.items()},
         "chunk": {"action_dim": spec.chunk.action_dim, "start": spec.chunk.start, "stop": spec.chunk.stop},
         "blocks": [
@@ -149,6 +150,7 @@ def print_summary(summary: dict[str, Any], console: Console) -> None:
     about.add_row(
         "action",
         f"{horizon} steps of {chunk['action_dim']}, of which {chunk['start']}..{chunk['stop'] - 1} are executed"
+        + (f"; {summary['left_out']} more are left out" if summary["left_out"] else "")
         + (f"; the sample has {channels} channels" if channels != chunk["action_dim"] else ""),
     )
     cache = summary["rollout_cache"]

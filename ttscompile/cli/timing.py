@@ -187,8 +187,8 @@ def _eager(checkpoint: Path, threads: int, manifest: Manifest, as_saved: bool) -
     module, original = original_policy(checkpoint, manifest.spec)
     torch.set_num_threads(threads)
     if not as_saved:
-        run = eager_policy(module, manifest.spec)
-        return network_contestant("eager PyTorch", run, manifest.spec, manifest.flops.dense)
+        whole = manifest.spec.original
+        return network_contestant("eager PyTorch", eager_policy(module, whole), whole, manifest.flops.dense)
     sampler, dense = original.sampler, manifest.flops.dense
     # An encoder runs once a call, whatever the sampler: what it takes is not known apart.
     flops = None if isinstance(module, EncodedDenoiser) else dense / manifest.steps * sampler.steps
@@ -241,7 +241,7 @@ def network_contestant(label: str, run: EagerPolicy, spec: PolicySpec, dense_flo
 
 def _interface(spec: PolicySpec) -> str:
     observations = ", ".join(f"{key} {observation.shape}" for key, observation in spec.observations.items())
-    return f"sample {spec.sample}, observations {observations}"
+    return f"sample {spec.original.sample}, observations {observations}"
 
 
 def _different_statistics(found: PolicySpec, expected: PolicySpec) -> list[str]:

@@ -36,7 +36,7 @@ def eager_policy(module: nn.Module, spec: PolicySpec) -> EagerPolicy:
                 f"noise.steps is None, but sampler {table.name} draws noise; expected [K, B, T, D], K = {table.steps}."
             )
         with torch.inference_mode():
-            evaluate = _evaluation(module, spec, observations)
+            evaluate = evaluation(module, spec, observations)
             x = torch.from_numpy(noise.initial)
             draws = None if noise.steps is None else torch.from_numpy(noise.steps)
             memory = [torch.zeros_like(x)] * table.memories
@@ -61,7 +61,7 @@ def eager_policy(module: nn.Module, spec: PolicySpec) -> EagerPolicy:
     return run
 
 
-def _evaluation(
+def evaluation(
     module: nn.Module, spec: PolicySpec, observations: Mapping[str, torch.Tensor]
 ) -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor]:
     """One evaluation of the denoiser, a function of sample and timesteps, for these observations."""

@@ -201,7 +201,7 @@ class TransformerForDiffusion(nn.Module):
         """Evaluate the denoiser once.
 
         Args:
-            sample: float32 ``[B, T, input_dim]``.
+            sample: float32 ``[B, T, input_dim]``, T at most the horizon.
             timestep: int64 ``[B]``.
             cond: float32 ``[B, To, cond_dim]``; None without observation tokens.
 
@@ -212,14 +212,18 @@ class TransformerForDiffusion(nn.Module):
         tokens = self.input_emb(sample)
         if self.decoder is None:
             tokens = torch.cat((time, tokens), dim=1)
-            x = self.encoder(tokens + self.pos_emb[:, : tokens.shape[1]], mask=self.mask)
+        count = tokens.shape[1]  # fewer than the horizon's, where only the first steps are predicted
+        mask = None if self.mask is None else self.mask[:count, :count]
+        if self.decoder is None:
+            x = self.encoder(tokens + self.pos_emb[:, :count], mask=mask)
             x = x[:, 1:]
         else:
             memory = time
             if self.cond_obs_emb is not None:
                 memory = torch.cat((time, self.cond_obs_emb(cond)), dim=1)
             memory = self.encoder(memory + self.cond_pos_emb[:, : memory.shape[1]])
-            x = self.decoder(tokens + self.pos_emb[:, : tokens.shape[1]], memory, self.mask, self.memory_mask)
+            memory_mask = None if self.memory_mask is None else self.memory_mask[:count]
+            x = self.decoder(tokens + self.pos_emb[:, :count], memory, mask, memory_mask)
         prediction: torch.Tensor = self.head(self.ln_f(x))
         return prediction
 
@@ -257,13 +261,14 @@ class InpaintingDenoiser(nn.Module):
         super().__init__()
         self.model = model
         self.action_dim = action_dim
-        self.hidden_steps = horizon - n_obs_steps
+        self.n_obs_steps = n_obs_steps
         observed = torch.zeros(horizon, model.config.input_dim, dtype=torch.bool)
         observed[:n_obs_steps, action_dim:] = True
         self.register_buffer("observed", observed, persistent=False)
 
     def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
         """``[B, T, Da + Do]``, ``[B]``, normalised ``[B, To, Do]`` -> ``[B, T, Da + Do]``."""
-        placed = nn.functional.pad(obs, (self.action_dim, 0, 0, self.hidden_steps))
-        prediction: torch.Tensor = self.model(torch.where(self.observed, placed, sample), timestep)
+        steps = sample.shape[1]
+        placed = nn.functional.pad(obs, (self.action_dim, 0, 0, steps - self.n_obs_steps))
+        prediction: torch.Tensor = self.model(torch.where(self.observed[:steps], placed, sample), timestep)
         return prediction

@@ -1,0 +1,121 @@
+"""``prediction_horizon``: fewer steps are predicted, and they are the original's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner
+
+import ttscompile
+from tests.families.test_vla import FAMILIES, loaded
+from tests.frontends.test_diffusion_policy import VARIANTS, Build, Save
+from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.spec_json import spec_to_json
+from ttscompile.cli import main
+from ttscompile.errors import ObservationError, SpecError
+from ttscompile.frontends import load_checkpoint_policy
+from ttscompile.frontends.eager import eager_policy
+from ttscompile.narrow import narrow
+from ttscompile.verification import verify
+
+KEPT, HORIZON, STREAMS = 4, 6, 2
+
+
+@pytest.mark.parametrize(("variant", "as_cond", "model"), VARIANTS)
+def test_steps_can_be_left_out_of_causal_networks_only(
+    payload: Build, save: Save, variant: str, as_cond: bool, model: dict[str, Any]
+) -> None:
+    module, spec = load_checkpoint_policy(save(payload(as_cond, **model)))
+    if model.get("causal_attn", True):
+        narrowed, difference = narrow(module, spec, KEPT)
+        assert difference < 1e-5
+        assert (narrowed.sample, narrowed.left_out) == ((KEPT, spec.sample[1]), HORIZON - KEPT)
+        assert narrowed.original == spec
+    else:
+        with pytest.raises(SpecError, match=r"is 4, but these steps depend on the 2 after them: .*predict all 6"):
+            narrow(module, spec, KEPT)
+
+
+@pytest.mark.parametrize("steps", [3, 7])
+def test_no_fewer_than_are_executed_and_no_more_than_there_are(payload: Build, save: Save, steps: int) -> None:
+    module, spec = load_checkpoint_policy(save(payload()))
+    with pytest.raises(SpecError, match=rf"is {steps}; expected at least 4, .* actions 1 to 3, and at most 6"):
+        narrow(module, spec, steps)
+
+
+def test_a_network_of_one_length(payload: Build, save: Save) -> None:
+    module, spec = load_checkpoint_policy(save(payload()))
+
+    class OneLength(torch.nn.Module):
+        def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
+            return module(sample.reshape(-1, HORIZON, 3), timestep, obs)
+
+    with pytest.raises(SpecError, match=r"does not take a sample of 4 steps: .*predict all 6 steps"):
+        narrow(OneLength(), spec, KEPT)
+
+
+def test_the_rest_of_the_prediction_is_the_original(payload: Build, save: Save, tmp_path: Path) -> None:
+    """With the original's noise, given or drawn, in both runtimes, dense; and in the record that travels with it."""
+    checkpoint = save(payload())
+    module, original = load_checkpoint_policy(checkpoint)
+    folder = tmp_path / "narrow"
+    program = ttscompile.convert(checkpoint, folder, prediction_horizon=KEPT)
+    artifact = load_artifact(folder)
+    assert spec_to_json(artifact.manifest.spec.original) == spec_to_json(original)
+    # Of the original's FLOPs two thirds are left, and less where more than tokens counts.
+    assert artifact.manifest.flops.call(artifact.schedule("dense"), pruned=False) < 0.7 * program.dense_flops
+
+    obs = np.random.default_rng(0).standard_normal((STREAMS, 2, 5), dtype=np.float32)
+    rng = np.random.default_rng(3)
+    initial = rng.standard_normal((STREAMS, HORIZON, 3), dtype=np.float32)
+    steps = rng.standard_normal((20, *initial.shape), dtype=np.float32)
+    normalizers = original.observations["obs"].normalizer, original.chunk.normalizer
+    assert normalizers[0] is not None
+    assert normalizers[1] is not None
+    given = {"obs": torch.from_numpy(normalizers[0].normalize(obs))}
+    sample = eager_policy(module, original)(given, ttscompile.Noise(initial, steps)).numpy()
+    expected = normalizers[1].unnormalize(sample)
+    cut = ttscompile.Noise(initial[:, :KEPT], steps[:, :, :KEPT])
+    for runtime in ("reference", "onnxruntime"):
+        policy = ttscompile.load(folder, runtime=runtime, seed=3)
+        assert (policy.info.sample, policy.info.original_sample) == ((KEPT, 3), (HORIZON, 3))
+        for noise in (None, ttscompile.Noise(initial, steps), cut):
+            found = policy.predict_action({"obs": obs}, noise=noise)
+            np.testing.assert_allclose(found["action_pred"], expected[:, :KEPT], rtol=1e-5, atol=1e-5)
+            np.testing.assert_allclose(found["action"], expected[:, 1:4], rtol=1e-5, atol=1e-5)
+    with pytest.raises(ObservationError, match=r"= \[2, 4, 3\]; found float32 \[2, 5, 3\]"):
+        policy.predict_action({"obs": obs}, noise=ttscompile.Noise(initial[:, :5], steps))
+    assert verify(folder).passed
+
+
+def test_the_command_refuses_in_one_message(payload: Build, save: Save, tmp_path: Path) -> None:
+    checkpoint = save(payload(causal_attn=False))
+    result = CliRunner().invoke(
+        main, ["convert", str(checkpoint), "-o", str(tmp_path / "a"), "--prediction-horizon", "4"]
+    )
+    assert result.exit_code == 2
+    assert "Only where attention is causal can steps be left out" in result.stderr
+    assert not (tmp_path / "a").exists()
+
+
+def test_steps_left_out_are_a_number(payload: Build, save: Save) -> None:
+    _, spec = load_checkpoint_policy(save(payload()))
+    with pytest.raises(SpecError, match="left_out is -1"):
+        replace(spec, left_out=-1)
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_of_the_action_heads_only_smolvla_is_causal(name: str) -> None:
+    """The rest attend to all steps; RDT-1B, CogACT and DiT-Policy also hold tables of one length."""
+    module, _, spec = loaded(FAMILIES[name](), name)
+    executed = replace(spec, chunk=replace(spec.chunk, stop=2))
+    if name == "smolvla":
+        assert narrow(module, executed, 2)[1] < 1e-5
+    else:
+        with pytest.raises(SpecError, match=r"depend on the 4 after them|does not take a sample of 2 steps"):
+            narrow(module, executed, 2)

@@ -1,0 +1,81 @@
+"""Predict fewer steps than the original: the first of its horizon, where they do not depend on the rest.
+
+A policy executes the first actions of what it predicts. In a network with causal attention a step sees only those
+before it, so those at the end can be left out of sample and graph; what is left stays as it was, but for rounding.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import nn
+
+from .config import PolicySpec
+from .errors import SpecError
+from .frontends.eager import evaluation
+
+TOLERANCE = 1e-4
+"""Of the prediction's deviation. Rounding is a hundredth of it; a network that attends to later steps is far above."""
+
+_STREAMS = 4
+
+
+def narrow(module: nn.Module, spec: PolicySpec, prediction_horizon: int) -> tuple[PolicySpec, float]:
+    """The specification of the policy that predicts only the first steps, and what that changes.
+
+    Args:
+        module: as ``compile_denoiser`` takes it; it has to accept a shorter sample.
+        spec: of the policy with all steps.
+        prediction_horizon: T, at least up to the last action that is executed.
+
+    Returns:
+        The specification; and the largest difference between predictions with and without the last steps, over the
+        standard deviation of the prediction, on random inputs at the first, the middle and the last timestep.
+
+    Raises:
+        SpecError: fewer steps than are executed or more than there are; the module takes no shorter sample; or what is
+            kept depends on what would be left out.
+    """
+    horizon, channels = spec.sample
+    if not spec.chunk.stop <= prediction_horizon <= horizon:
+        raise SpecError(
+            f"prediction_horizon is {prediction_horizon}; expected at least {spec.chunk.stop}, as the policy executes"
+            f" actions {spec.chunk.start} to {spec.chunk.stop - 1}, and at most {horizon}, which it predicts."
+        )
+    left_out = spec.left_out + horizon - prediction_horizon
+    found = _difference(module, spec, prediction_horizon)
+    if not found <= TOLERANCE:
+        raise SpecError(
+            f"prediction_horizon is {prediction_horizon}, but these steps depend on the {horizon - prediction_horizon}"
+            f" after them: without, the prediction differs by {found:.2g} of its deviation; expected at most"
+            f" {TOLERANCE:g}. Only where attention is causal can steps be left out: predict all {horizon}."
+        )
+    return replace(spec, sample=(prediction_horizon, channels), left_out=left_out), found
+
+
+def _difference(module: nn.Module, spec: PolicySpec, steps: int) -> float:
+    """Largest difference of the first steps' prediction with and without those after them, over its deviation."""
+    draw = np.random.default_rng(0)
+    observations = {}
+    for key, one in spec.observations.items():
+        raw = np.concatenate([one.draw(draw) for _ in range(_STREAMS)])
+        observations[key] = torch.from_numpy(raw if one.normalizer is None else one.normalizer.normalize(raw))
+    sample = torch.from_numpy(draw.standard_normal((_STREAMS, *spec.sample), dtype=np.float32))
+    timesteps, worst = torch.from_numpy(spec.sampler.timesteps), 0.0
+    with torch.inference_mode():
+        evaluate = evaluation(copy.deepcopy(module).cpu().float().eval(), spec, observations)
+        for k in (0, spec.sampler.steps // 2, spec.sampler.steps - 1):
+            timestep = timesteps[k].expand(_STREAMS)
+            whole = evaluate(sample, timestep)[:, :steps]
+            try:
+                first = evaluate(sample[:, :steps], timestep)
+            except (RuntimeError, ValueError, IndexError, AssertionError) as error:
+                raise SpecError(
+                    f"the network does not take a sample of {steps} steps: {error}. Slice its masks and position tables"
+                    f" to the sample's length, or predict all {spec.sample[0]} steps."
+                ) from error
+            worst = max(worst, float((first - whole).abs().max() / whole.std()))
+    return worst
