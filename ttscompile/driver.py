@@ -30,7 +30,7 @@ from .lower.joint import chain_blocks, join_blocks
 from .lower.precision import lower_precision, require_precision
 from .lower.program import lower_program
 from .lower.single_file import lower_single_file
-from .narrow import narrow
+from .narrow import narrow, unneeded
 from .passes.base import Pass
 from .passes.clean_up import CleanUp
 from .passes.cut_copies import CutCopies
@@ -153,6 +153,8 @@ def compile_denoiser(
         told = f"{prediction_horizon} of {spec.original.sample[0]} steps are predicted"
         explain("narrow", (f"{told}; they differ from the original's by {changed:.1g} of their deviation",))
     program = transform(module, spec, explain=explain)
+    if prediction_horizon is None and (hint := unneeded(module, spec)) is not None:
+        explain("narrow", (hint,))
     if directory is None and single_file is None:
         return program
     models = lower_program(program)

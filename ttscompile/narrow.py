@@ -56,6 +56,25 @@ def narrow(module: nn.Module, spec: PolicySpec, prediction_horizon: int) -> tupl
     return replace(spec, sample=(prediction_horizon, channels), left_out=left_out), found
 
 
+def unneeded(module: nn.Module, spec: PolicySpec) -> str | None:
+    """A hint where ``narrow`` could leave out steps; None where it could not.
+
+    Args:
+        module: see ``narrow``.
+        spec: see ``narrow``.
+    """
+    (horizon, _), chunk = spec.sample, spec.chunk
+    try:
+        if chunk.stop == horizon or not _difference(module, spec, chunk.stop) <= TOLERANCE:
+            return None
+    except SpecError:
+        return None
+    return (
+        f"of {horizon} predicted steps {chunk.start} to {chunk.stop - 1} are executed, and none depends on a later one."
+        f" A prediction horizon of {chunk.stop} or a few more gives the same actions for less (docs/howto/convert.md)."
+    )
+
+
 def _difference(module: nn.Module, spec: PolicySpec, steps: int) -> float:
     """Largest difference of the first steps' prediction with and without those after them, over its deviation."""
     draw = np.random.default_rng(0)

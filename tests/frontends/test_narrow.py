@@ -20,7 +20,7 @@ from ttscompile.cli import main
 from ttscompile.errors import ObservationError, SpecError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
-from ttscompile.narrow import narrow
+from ttscompile.narrow import narrow, unneeded
 from ttscompile.verification import verify
 
 KEPT, HORIZON, STREAMS = 4, 6, 2
@@ -36,9 +36,13 @@ def test_steps_can_be_left_out_of_causal_networks_only(
         assert difference < 1e-5
         assert (narrowed.sample, narrowed.left_out) == ((KEPT, spec.sample[1]), HORIZON - KEPT)
         assert narrowed.original == spec
+        assert "of 6 predicted steps 1 to 3 are executed" in (unneeded(module, spec) or "")
     else:
         with pytest.raises(SpecError, match=r"is 4, but these steps depend on the 2 after them: .*predict all 6"):
             narrow(module, spec, KEPT)
+        assert unneeded(module, spec) is None
+    executed = replace(spec, sample=(KEPT, spec.sample[1]))
+    assert unneeded(module, executed) is None
 
 
 @pytest.mark.parametrize("steps", [3, 7])

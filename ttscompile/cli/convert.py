@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -91,7 +92,7 @@ def convert(
 
     The artifact computes everything until 'ttscompile calibrate' gives it a plan.
     """
-    stages: list[dict[str, object]] = []
+    stages: list[dict[str, Any]] = []
     console = progress()
     with only_results_on_stdout(), console.status("compiling") as status:
 
@@ -120,6 +121,9 @@ def convert(
     summary = document(directory, artifact)
     if (warning := few_steps(artifact.manifest)) is not None:
         console.print(f"warning: {warning}", soft_wrap=True)
+    for stage in stages:
+        if stage["stage"] == "narrow" and prediction_horizon is None:
+            console.print("hint:", *stage["notes"], soft_wrap=True)
     if sampler is None and (hint := many_steps(artifact.manifest)) is not None:
         console.print(f"hint: {hint}", soft_wrap=True)
     if as_json:
