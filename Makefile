@@ -3,9 +3,11 @@
 #   make PYTHON=python3.12 test      another interpreter (3.11 or later)
 #   make PIP_FLAGS="--extra-index-url https://download.pytorch.org/whl/cpu" test
 #                                    PyTorch's small CPU build, where pip's own index has the CUDA build only
+#   make EXTRAS=dev,ray test         with Ray too, before there is a .venv: tests of examples/ray_serve skip without it
 
 PYTHON ?= python3.11
 PIP_FLAGS ?=
+EXTRAS ?= dev
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/installed.stamp
@@ -47,5 +49,5 @@ clean:
 
 $(READY): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) -c constraints.txt -e '.[$(EXTRAS)]'
 	touch $@
