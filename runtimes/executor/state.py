@@ -288,16 +288,19 @@ class ExecutorState:
             counts.chunks_discarded += 1
             return "discarded"
         outcome = self._schedule(job, actions, now)
-        if outcome == "refused":
-            counts.chunks_refused += 1
+        refused = outcome == "refused"
+        if refused:
             self.recorder.last_refusal = self._refusal
-            return outcome
-        self._refusal = None
+        else:
+            self._refusal = None
+        counts.chunks_refused += refused
         counts.chunks += outcome == "scheduled"
         counts.chunks_overdue += outcome == "overdue"
         if job.deadline is not None:
             self.recorder.slack_ms.add(1e3 * (job.deadline - now))
         late = job.deadline is not None and now > job.deadline
+        if refused and not late:  # a faster plan is no remedy for what was refused in time, nor has it kept up
+            return outcome
         switched = self._tiers.after_call(missed=late or self._runs_out(now) is None)
         counts.switches_down += switched == 1
         counts.switches_up += switched == -1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import random
 import threading
 import time
@@ -301,6 +302,22 @@ def test_pressure_leads_to_the_faster_plan_and_back() -> None:
     assert ran[3:7] == ["fast"] * 4
     assert ran[7] == "dense"
     assert (counted.switches_down, counted.switches_up) == (1, 1)
+
+
+def test_a_late_call_leads_to_the_faster_plan_though_its_chunk_is_refused() -> None:
+    settings = ExecutorSettings(tiers=("dense", "fast"))
+    with World(latency={"dense": 0.25, "fast": 0.05}, fault={2: 0.9}, settings=settings) as world:
+        world.policy.actions = lambda _: np.full((1 + 8, 3), np.nan if len(world.policy.calls) == 3 else 0)
+        world.executor.observe({"obs": np.zeros(2)})
+        while len(world.policy.calls) < 4:
+            world.clock.advance(0.1)
+            world.executor.observe({"obs": np.zeros(2)})
+            with contextlib.suppress(DeadlineMissedError):
+                world.executor.action()
+        counted = world.executor.statistics()
+        ran = [plan for _, plan, _ in world.policy.calls]
+    assert (counted.chunks_refused, counted.switches_down) == (1, 1)
+    assert ran == ["dense", "dense", "dense", "fast"]
 
 
 @pytest.mark.alone
