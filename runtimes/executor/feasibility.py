@@ -17,7 +17,13 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import asdict, dataclass
+from statistics import median
 from typing import Any
+
+
+def _ms(seconds: float) -> str:
+    """In milliseconds, to four digits at least, without an exponent."""
+    return f"{1e3 * seconds:.4g}" if seconds < 10 else f"{1e3 * seconds:.0f}"
 
 
 @dataclass(frozen=True)
@@ -86,13 +92,12 @@ class Feasibility:
         """The arithmetic on one line, in milliseconds."""
         covered = self.needed <= self.predicted + 1e-12
         if covered and not self.feasible:
-            lasts = f"{1e3 * self.play:.4g} ms = {self.horizon_steps} actions"
-            return f"latency {1e3 * self.latency:.4g} ms > {lasts} at {self.policy_hz:g} Hz, to the next call"
+            lasts = f"{_ms(self.play)} ms = {self.horizon_steps} actions"
+            return f"latency {_ms(self.latency)} ms > {lasts} at {self.policy_hz:g} Hz, to the next call"
         return (
-            f"frame period {1e3 * self.frame:.4g} + 2 x latency {1e3 * self.latency:.4g}"
-            f" + margin {1e3 * self.margin:.4g} = {1e3 * self.needed:.4g} ms {'<=' if covered else '>'}"
-            f" {1e3 * self.predicted:.4g} ms = {self.horizon_steps + self.reserve_steps} actions"
-            f" at {self.policy_hz:g} Hz"
+            f"frame period {_ms(self.frame)} + 2 x latency {_ms(self.latency)} + margin {_ms(self.margin)}"
+            f" = {_ms(self.needed)} ms {'<=' if covered else '>'} {_ms(self.predicted)} ms"
+            f" = {self.horizon_steps + self.reserve_steps} actions at {self.policy_hz:g} Hz"
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -108,17 +113,33 @@ class Feasibility:
 
 
 class LatencyWindow:
-    """The longest of the last calls. Warm-up calls are made, and left out, before there is one of these.
+    """What calls take, by the last ones. Warm-up calls are made, and left out, before there is one of these.
 
     Args:
         window: calls that count.
+
+    Attributes:
+        bound: the longest of them, in seconds.
     """
 
     def __init__(self, window: int) -> None:
         self._latencies: deque[float] = deque(maxlen=window)
-        self.bound = 0.0
+        self.bound = self._typical = 0.0
 
     def add(self, latency: float) -> None:
         """Take the latency of a call, in seconds."""
         self._latencies.append(latency)
-        self.bound = max(self._latencies)
+        self.bound, self._typical = max(self._latencies), median(self._latencies)
+
+    def reckoned(self, most: float) -> float:
+        """What the next call is reckoned to take, in seconds: as long as the longest that a schedule can cover.
+
+        An exception beyond that, because the host stood still, is no reason to give up the distance between calls until
+        it is forgotten. Where most calls are beyond it, the longest counts.
+
+        Args:
+            most: the longest call that can be covered.
+        """
+        if self.bound <= most or self._typical > most:
+            return self.bound
+        return max(each for each in self._latencies if each <= most)

@@ -75,6 +75,7 @@ class ExecutorState:
         self._settings, self._resolved = settings, resolved
         self._guard = Guard(settings.guard, normalizer, resolved.channels)
         self._tiers = Tiers(tiers, settings.down_after, settings.up_after)
+        self._coverable = feasibility(settings, resolved, 0.0).max_latency
         self._latencies = latencies
         period = 1 / resolved.policy_hz
         self._window = ObservationWindow(resolved.frames.steps, period, settings.rate_tolerance, resolved.max_age)
@@ -342,7 +343,12 @@ class ExecutorState:
     @property
     def _takes(self) -> float:
         """Seconds that the next call has to start before its chunk is needed."""
-        return self._latencies[self.plan].bound + self._settings.margin_ticks / self._resolved.control_hz
+        return self._latency + self._settings.margin_ticks / self._resolved.control_hz
+
+    @property
+    def _latency(self) -> float:
+        """Seconds that the next call is reckoned to take."""
+        return self._latencies[self.plan].reckoned(self._coverable)
 
     def _executed(self, timeline: Timeline) -> float:
         """When the policy would have executed the newest chunk, and so observes again."""
@@ -367,7 +373,7 @@ class ExecutorState:
     def _committed(self, observed: float, now: float) -> FloatArray:
         """Actions from the observation to when this call will be done, one a step of the policy, ``[N, Da]``."""
         tick, step = self._grid.tick(observed), self._resolved.ticks_per_step
-        until = self._grid.tick(now + self._latencies[self.plan].bound)
+        until = self._grid.tick(now + self._latency)
         played = dict(self._played)
         rows: list[FloatArray] = []
         while tick <= until and len(rows) < self._resolved.horizon:

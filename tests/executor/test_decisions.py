@@ -42,6 +42,7 @@ def test_what_is_predicted_beyond_what_is_executed_lets_calls_take_longer() -> N
     slow = Feasibility(0.161, 50, 50, 8, 1, reserve_steps=50)
     assert not slow.feasible
     assert slow.explain() == "latency 161 ms > 160 ms = 8 actions at 50 Hz, to the next call"
+    assert "latency 12345 + margin 20 = 24730 ms >" in Feasibility(12.345, 50, 50, 8, 1).explain()
 
 
 @given(st.floats(1e-4, 1), st.sampled_from([1, 2, 5]), st.integers(2, 32), st.integers(0, 3), st.integers(0, 40))

@@ -135,6 +135,31 @@ def test_another_tier_does_not_change_how_far_calls_are_apart() -> None:
     assert distances == pytest.approx([0.8] * len(distances))
 
 
+def test_an_exception_that_no_schedule_covers_changes_nothing_after_it() -> None:
+    """The fifth call takes 310 ms, where 130 can be covered: those after it are 8 actions apart, as before."""
+    calls, counts, _ = Loop(latency={"dense": 0.038}, took={4: 0.31}).run(30)
+    distances = apart(calls)
+    assert distances.pop(3) == pytest.approx(0.3)  # to the newest frame when it is done
+    assert distances == pytest.approx([0.16] * len(distances))
+    assert len(calls) > 50
+    assert counts.deadlines_missed == 1
+
+
+def test_where_calls_take_longer_than_can_be_covered_they_follow_each_other_at_once() -> None:
+    calls, _, _ = Loop(latency={"dense": 0.038}, took=dict.fromkeys(range(4, 100), 0.21)).run(30)
+    assert sum(apart(calls)[-8:]) == pytest.approx(8 * 0.21)
+
+
+@pytest.mark.parametrize(
+    ("latencies", "reckoned"), [([1, 2, 1], 2), ([1, 9, 2], 2), ([9, 1, 9], 9), ([5], 5), ([3], 3)]
+)
+def test_what_a_call_is_reckoned_to_take(latencies: list[float], reckoned: float) -> None:
+    window = LatencyWindow(3)
+    for each in latencies:
+        window.add(each)
+    assert window.reckoned(most=4) == reckoned
+
+
 def test_a_policy_that_executes_one_action_of_many_keeps_up() -> None:
     """A call a frame, each done before the next."""
     calls, counts, arithmetic = Loop(10.0, 1, 15, {"dense": 0.05}).run(4)
