@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ttscompile.config import FloatArray, Noise, ObservationSpec, PolicySpec
-from ttscompile.errors import ObservationError
+from ttscompile.errors import ObservationError, TtscompileError
 
 Array: TypeAlias = npt.NDArray[Any]
 
@@ -21,6 +21,17 @@ def is_tensor(value: object) -> bool:
     """Whether this is a torch tensor; if torch was never imported, nothing is."""
     torch = sys.modules.get("torch")
     return torch is not None and isinstance(value, torch.Tensor)
+
+
+def check_seed(seed: int | None) -> int | None:
+    """The seed, or None for none.
+
+    Raises:
+        TtscompileError: not a whole number of at least 0.
+    """
+    if seed is None or (isinstance(seed, int | np.integer) and not isinstance(seed, bool) and seed >= 0):
+        return seed
+    raise TtscompileError(f"seed: expected an integer of at least 0, or None for another sequence; found {seed!r}.")
 
 
 def as_array(value: Any, what: str) -> Array:

@@ -18,7 +18,7 @@ from ttscompile.config import FP32, ChunkSpec, FloatArray, Noise, ObservationSpe
 from ttscompile.errors import IllegalPlanError, ObservationError, RuntimeUnavailableError, TtscompileError
 from ttscompile.ir.graph import TensorType
 
-from .arrays import check_noise, check_observation, is_tensor, like
+from .arrays import check_noise, check_observation, check_seed, is_tensor, like
 from .base import CallReport, Runtime, open_runtime
 from .inpainting import check_prefix, known_samples, prefix_refusal
 from .liveness import RolloutNeeds, rollout_needs
@@ -103,7 +103,9 @@ def load(
         IllegalPlanError: the artifact has no plan of this name.
         ArtifactError: the artifact is missing, damaged, of another version, or without blocks of this precision.
         RuntimeUnavailableError: the runtime cannot be had on this machine.
+        TtscompileError: the seed is no whole number of at least 0.
     """
+    check_seed(seed)
     artifact = load_artifact(path)
     if runtime == "reference":
         if precision not in (None, FP32):
@@ -139,7 +141,7 @@ class CompiledPolicy:
         self._default = artifact.manifest.default_plan if plan is None else plan
         _require_plan(artifact, self._default)
         self._prefix_refusal = prefix_refusal(artifact.manifest.spec)
-        self._rng = np.random.default_rng(seed)
+        self._rng = np.random.default_rng(check_seed(seed))
         self._report: CallReport | None = None
         self._queues = Queues(artifact.manifest.spec.observations)
         self._lock = threading.Lock()
@@ -176,7 +178,11 @@ class CompiledPolicy:
 
         Args:
             seed: of the noise from here on; None goes on with the sequence under way.
+
+        Raises:
+            TtscompileError: the seed is no whole number of at least 0; nothing was done.
         """
+        check_seed(seed)
         with self._alone():
             self._runtime.reset()
             self._queues.reset()
@@ -349,6 +355,11 @@ class CompiledPolicy:
 def _require_plan(artifact: Artifact, name: str) -> None:
     """Raise unless the artifact has a plan of this name."""
     known = [DENSE, *artifact.manifest.plans]
+    if not isinstance(name, str):
+        raise IllegalPlanError(
+            f"expected the name of a plan, one of {known}; found a {type(name).__name__}. A matrix is for"
+            " predict_action(plan=...), call by call."
+        )
     if name not in known:
         raise IllegalPlanError(
             f"the artifact has no plan {name!r}; it has {known}. Use one of these, or give predict_action a matrix"

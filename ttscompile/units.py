@@ -20,9 +20,9 @@ def share(part: float | None) -> str:
     return f"{part:.1%}" if part == 0 or part >= 0.01 else f"{part:.3%}"
 
 
-def ms(milliseconds: float) -> str:
-    """A time to three digits at least, without an exponent."""
-    return f"{milliseconds:.3g}" if milliseconds < 1000 else f"{milliseconds:.0f}"
+def ms(milliseconds: float, digits: int = 3) -> str:
+    """A time to so many digits at least, without an exponent."""
+    return f"{milliseconds:.{digits}g}" if milliseconds < 10**digits else f"{milliseconds:.0f}"
 
 
 def plain(value: object) -> str:

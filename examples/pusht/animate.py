@@ -102,9 +102,9 @@ def _palette(frame: Image.Image) -> Image.Image:
 
 def _part(scene: Scene, episode: Episode, label: str, step: int, size: int) -> Image.Image:
     now = min(step, len(episode.targets))
-    coverage = 0.0 if now == 0 else episode.coverages[:now].max()
+    best = f"   best coverage {episode.coverages[:now].max():.2f}" if now else ""  # it is told after each step
     target = None if now == len(episode.targets) else episode.targets[now]
-    caption = f"{label}\n{now / 10:.1f} s   best coverage {coverage:.2f}"
+    caption = f"{label}\n{now / 10:.1f} s{best}"
     return scene.picture(episode.states[now], target, caption, size)
 
 

@@ -2,7 +2,7 @@
 
     python examples/pusht/demo.py
 
-Takes about a quarter of an hour on two cores, half of which is calibration; everything it makes is in ``build/pusht``.
+Takes about eleven minutes on 4 cores, half of which is calibration; everything it makes is in ``build/pusht``.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ def main(
     console = results_console()
     directory.mkdir(parents=True, exist_ok=True)
     artifact, calls = directory / "compiled", directory / "calls.npz"
-    console.print(one_line(fingerprint()), highlight=False)
+    console.print(one_line(fingerprint()), highlight=False, soft_wrap=True)
 
     console.rule("1 of 5: convert")
     program = ttscompile.convert(checkpoint, artifact)
@@ -150,6 +150,8 @@ def main(
     )
 
     console.print(calibration_table(result))
+    for name, reason in result.skipped.items():
+        console.print(f"{name}: none, {reason}")
 
     console.rule("4 of 5: drive the robot, dense and compiled")
     seeds = range(first_seed, first_seed + episodes)
@@ -171,6 +173,7 @@ def main(
     first = [evaluation.rollout.episodes[0] for evaluation in evaluations]
     save_animation(animation, first, ["dense", f"compiled, {speeds[-1].sparsity:.0%} of the cells reused"])
     console.print(f"episode of seed {first_seed}, dense and compiled: {animation}")
+    console.print(f"next: .venv/bin/ttscompile inspect {artifact}; docs/tutorial.md has the rest", soft_wrap=True)
 
 
 if __name__ == "__main__":

@@ -142,7 +142,7 @@ def _columns(rollout: Rollout) -> tuple[list[float], list[float], list[float]]:
 def evaluation_table(evaluations: Sequence[Evaluation], seeds: Sequence[int], timed: Sequence[Timed] = ()) -> Table:
     """The figures as a table, with 95 % intervals; and times, if any were taken."""
     table = Table(title=f"Push-T, {len(seeds)} episodes, seeds {seeds[0]}..{seeds[-1]}, mean and 95 % interval")
-    table.add_column("variant")
+    table.add_column("variant", overflow="fold")  # paths that differ at the end only
     for column in ("score", "best coverage", "success", "score, difference", "success, difference", "sparsity"):
         table.add_column(column, justify="right")
     if timed:

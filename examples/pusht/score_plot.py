@@ -13,6 +13,8 @@ from bootstrap import Estimate
 from rollout import seeded_noise
 from variants import Variant
 
+from ttscompile.units import ms
+
 WARM_UP = 2
 MARKERS = "osD^vP*"
 """Of the variants, from fast to slow; their number and that of the colours have no common divisor."""
@@ -76,7 +78,7 @@ def plot_scores(
     shown = sorted(zip(timed, scores, names, strict=True), key=lambda one: one[0].median)
     for number, (time, score, name) in enumerate(shown):  # names beside the points would lie on each other
         errors = [[score.mean - score.low], [score.high - score.mean]]
-        told = f"{name}: {score.mean:.3f}, {time.median:.3g} ms"
+        told = f"{name}: {score.mean:.3f}, {ms(time.median)} ms"
         marker = MARKERS[number % len(MARKERS)]
         axes.errorbar([time.median], [score.mean], yerr=errors, fmt=marker, capsize=3, label=told)
     axes.set_xscale("log")

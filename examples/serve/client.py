@@ -129,7 +129,10 @@ def main() -> None:
     parser.add_argument("url", nargs="?", default="ws://127.0.0.1:8765/")
     parser.add_argument("--seconds", type=float, default=5.0)
     arguments = parser.parse_args()
-    call = Client(arguments.url)
+    try:
+        call = Client(arguments.url)
+    except ConnectionRefusedError:
+        sys.exit(f"error: nobody listens at {arguments.url}: start 'ttscompile serve DIR --control-hz 10' first")
     info = call("info")
 
     def zeros(shape: list[int]) -> Any:

@@ -25,6 +25,7 @@ import numpy.typing as npt
 
 from ttscompile.config import FloatArray
 from ttscompile.errors import ExecutorClosedError, ExecutorError, InfeasibleError, WorkerDeadError
+from ttscompile.runtimes.arrays import check_seed
 
 from .clock import Clock, MonotonicClock
 from .feasibility import Feasibility, LatencyWindow
@@ -184,7 +185,9 @@ class AsyncExecutor:
         Raises:
             WorkerDeadError: the policy's thread has ended; ``__cause__`` says why.
             ExecutorClosedError: after ``close``.
+            TtscompileError: the seed is no whole number of at least 0; the episode goes on.
         """
+        check_seed(seed)
         with self._lock:
             state = self._checked()
             state.reset()

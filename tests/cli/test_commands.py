@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import runpy
 import shutil
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,20 @@ def pruned(compiled_layer: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     weights = {name: np.array(array) for name, array in load_artifact(directory).pruner.items()}
     update_calibration(directory, weights, {}, "tts", {"strategy": "tts"})
     return directory
+
+
+def test_help_has_a_whole_line_for_each_command_in_the_order_of_use(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["ttscompile", "--help"])
+    with pytest.raises(SystemExit, match="0"):
+        runpy.run_module("ttscompile", run_name="__main__")
+    told = capsys.readouterr().out
+    assert "Usage: python -m ttscompile" in told
+    listed = [line.split(maxsplit=1) for line in told.partition("Commands:\n")[2].splitlines()]
+    assert {name for name, _ in listed} == set(main.commands)
+    assert all(what.endswith((".", "?")) and not what.endswith("...") for _, what in listed), "cut off"
+    assert [name for name, _ in listed][:4] == ["doctor", "convert", "calibrate", "inspect"]
 
 
 def test_convert_says_what_it_made_and_explains_on_standard_error(one_layer_checkpoint: Path, tmp_path: Path) -> None:

@@ -63,6 +63,9 @@ def test_what_is_no_artifact(command: str, made: bool, tmp_path: Path) -> None:
         (["inspect", "out", "--plan", "dense"], "give --plot FILE too"),
         (["bench", "out", "--against", "eager"], "give --checkpoint FILE too"),
         (["bench", "out", "--against", "tensorrt"], "'tensorrt' is not one of original, eager, onnxruntime-dense"),
+        (["bench", "out", "--seed", "-1"], "not in the range x>=0"),
+        (["serve", "out", "--control-hz", "10", "--seed", "-1"], "not in the range x>=0"),
+        (["report", "out", "-o", "report.pdf"], "ends in .html"),
         (["deploy"], "No such command"),
     ],
 )

@@ -72,6 +72,15 @@ def test_figures_of_a_variant():
     assert other.legalised == 1
 
 
+def test_variants_whose_paths_differ_at_the_end_are_told_apart_in_a_narrow_table():
+    dense = rollout([0.97, 0.76])
+    names = ("build/pusht/compiled:dense", "build/pusht/compiled:safe")
+    console = Console(file=io.StringIO(), width=100)
+    console.print(evaluation_table([summarise(name, dense, dense) for name in names], range(100, 102)))
+    rows = "".join(line.split("│")[1].strip() for line in console.file.getvalue().splitlines() if line[:1] == "│")
+    assert rows == "".join(names)
+
+
 def test_other_seeds_are_not_paired():
     with pytest.raises(ValueError, match="other seeds"):
         summarise("sparse", rollout([0.5], first_seed=7), rollout([0.5]))

@@ -19,6 +19,7 @@ from ttscompile.errors import (
     ExecutorClosedError,
     ExecutorError,
     InfeasibleError,
+    TtscompileError,
     WorkerDeadError,
 )
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings, GuardLimits, settings
@@ -170,6 +171,16 @@ def test_reset_starts_an_episode_and_passes_the_seed_on() -> None:
         assert world.tick()[0] == 1
         assert world.policy.resets == [None, 7]
         assert world.executor.statistics().resets == 1
+
+
+def test_a_seed_that_is_none_is_told_to_who_gave_it_and_the_policy_lives() -> None:
+    with World() as world:
+        world.begin()
+        with pytest.raises(TtscompileError, match="seed: expected an integer of at least 0"):
+            world.executor.reset(seed=-1)
+        assert world.executor.statistics().resets == 0
+        world.tick()
+        assert world.policy.resets == [None]
 
 
 def test_the_prefix_seam_is_refused_for_a_policy_that_cannot_inpaint() -> None:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
 
+from ttscompile.artifact.write import update_calibration
 from ttscompile.cli import main
+from ttscompile.lattice import dense_plan, uniform_plan
 
 
 def run(*arguments: object) -> tuple[int, str, str]:
@@ -44,6 +47,15 @@ def test_jitter_is_measured_and_printed(toy_compiled: Path) -> None:
     assert "200 Hz loop" in out
     assert "alone" in out
     assert "beside plan 'dense'" in out
+
+
+def test_jitter_is_measured_beside_the_plan_that_a_robot_runs(toy_compiled: Path, tmp_path: Path) -> None:
+    calibrated = shutil.copytree(toy_compiled, tmp_path / "compiled")
+    plans = {"uniform": uniform_plan(5, 5, 1), "schedule": dense_plan(5, 5)}  # the baseline is the faster one
+    update_calibration(calibrated, None, plans, "schedule", {"strategy": "tts"})
+    loop = ("--control-hz", 10, "--margin-ticks", 0, "--runs", 3, "--jitter", 0.1)
+    assert "beside plan 'schedule'" in run(calibrated, *loop)[1]
+    assert "beside plan 'uniform'" in run(calibrated, *loop, "--plan", "uniform")[1]
 
 
 @pytest.mark.parametrize(

@@ -213,7 +213,7 @@ def test_other_samplers_are_refused_by_name(scheduler_class: type[Any], settings
 @pytest.mark.parametrize(
     ("steps", "arguments", "message"),
     [
-        (51, {}, "51 denoising steps are not possible"),
+        (51, {}, "51 denoising steps are not possible; the policy was trained with 50 timesteps"),
         (10, {"eta": 0.5}, r"unexpected keyword argument 'eta'.*\['eta'\]"),
     ],
 )

@@ -178,6 +178,23 @@ def test_a_seed_decides_the_noise(toy_artifact: Artifact) -> None:
     assert not np.array_equal(actions(load(toy_artifact.path)), actions(load(toy_artifact.path)))
 
 
+@pytest.mark.parametrize("seed", [-1, 0.5, "0", True])
+def test_a_seed_that_is_none_is_refused_before_anything_is_done(toy_artifact: Artifact, seed: Any) -> None:
+    with pytest.raises(TtscompileError, match=r"seed: expected an integer of at least 0"):
+        load(toy_artifact.path, seed=seed)
+    policy = load(toy_artifact.path, seed=5)
+    policy.predict_action({"obs": OBS})
+    with pytest.raises(TtscompileError, match=r"seed: expected an integer of at least 0"):
+        policy.reset(seed=seed)
+    with pytest.raises(ObservationError, match="Call reset"):  # the episode is still under way
+        policy.predict_action({"obs": OBS[:1]})
+
+
+def test_load_takes_a_name_of_a_plan_and_no_matrix(toy_artifact: Artifact) -> None:
+    with pytest.raises(IllegalPlanError, match=r"name of a plan, one of \['dense'.*found a ndarray.*predict_action"):
+        load(toy_artifact.path, plan=np.zeros((5, 5), np.int8))  # type: ignore[arg-type]
+
+
 def with_value(value: float) -> np.ndarray:
     obs = OBS.copy()
     obs[1, 0] = value

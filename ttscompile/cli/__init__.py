@@ -26,7 +26,10 @@ from ttscompile.errors import CalibrationFailedError, TtscompileError
 
 
 class _Commands(click.Group):
-    """Tells every error of ttscompile in one message, without a traceback."""
+    """Lists its commands as they follow each other; tells every error in one message, without a traceback."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(self.commands)
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
@@ -52,5 +55,18 @@ def main() -> None:
     """Compile diffusion-transformer robot policies into artifacts that run in real time without PyTorch."""
 
 
-for _command in (convert, calibrate, inspect, compare, bench, plan, serve, doctor, report, verify):
+# In the order in which they are used; a line each, short enough for a terminal of 80 columns.
+for _command, _what in (
+    (doctor, "What stands in the way on this machine."),
+    (convert, "Compile a checkpoint into an artifact."),
+    (calibrate, "Learn from recorded episodes what an artifact may leave out."),
+    (inspect, "What is in an artifact; a picture of a plan."),
+    (verify, "Does it do what the original did, and do its plans engage?"),
+    (report, "All about an artifact on one page."),
+    (bench, "Time calls, beside what they replace."),
+    (compare, "Action error against latency, of plans and strategies."),
+    (plan, "Which plans keep up with a control loop on this machine."),
+    (serve, "Drive a robot from another process, over a local WebSocket."),
+):
+    _command.short_help = _what
     main.add_command(_command)

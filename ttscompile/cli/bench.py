@@ -10,6 +10,7 @@ from ttscompile.cli.output import (
     artifact_argument,
     identity_of,
     json_option,
+    ms,
     print_identity,
     print_json,
     progress,
@@ -45,7 +46,7 @@ def _rivals(_: click.Context, __: click.Parameter, value: str) -> tuple[str, ...
     help=f"{', '.join(RIVALS)}; the first two are eager PyTorch.",
 )
 @click.option("--checkpoint", type=click.Path(path_type=Path), help="For 'original' and 'eager'.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Of observations and noise.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of observations and noise.")
 @json_option
 def bench(
     directory: Path,
@@ -102,8 +103,8 @@ def _row(m: Measurement, compiled: Measurement) -> tuple[str, ...]:
     low, high = m.quartiles_ms
     return (
         m.label,
-        f"{m.median_ms:.4g}",
-        f"{low:.4g}..{high:.4g}",
+        ms(m.median_ms, 4),
+        f"{ms(low, 4)}..{ms(high, 4)}",
         f"{1000 / m.median_ms:.1f}",
         "" if m is compiled else f"{m.median_ms / compiled.median_ms:.1f} x",
         "" if m.flops is None else f"{m.flops / 1e9:.3f}",

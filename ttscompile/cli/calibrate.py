@@ -60,7 +60,9 @@ STRATEGIES = (
     help="How the plan is found; tts is this project's own. The others are published methods: interval (FORA), bac,"
     " delta-dit, deepcache, sag, dip-go, l2c, evo, teacache, dbcache.",
 )
-@click.option("--seed", type=int, default=0, show_default=True, help="Of the split, the noise and the training.")
+@click.option(
+    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the split, the noise and the training."
+)
 @click.option(
     "--max-minutes",
     type=click.FloatRange(min=0, min_open=True),

@@ -14,6 +14,8 @@ from ttscompile.cli.output import (
     artifact_argument,
     identity_of,
     json_option,
+    manifest_of,
+    ms,
     only_results_on_stdout,
     print_json,
     progress,
@@ -40,7 +42,19 @@ def _strategies(_: click.Context, __: click.Parameter, value: str) -> tuple[str,
     return names
 
 
-def _sparsities(_: click.Context, __: click.Parameter, value: str) -> tuple[float, ...]:
+SPARSITIES = 0.9, 0.95, 0.98
+LEFT = 5, 3, 2
+"""Steps to compute in their place, where a call has so few that one of them is more than the last leaves."""
+
+
+def default_sparsities(steps: int) -> tuple[float, ...]:
+    """Shares of the cells that a policy of ``steps`` steps can reuse, from safe to daring."""
+    return SPARSITIES if steps >= 50 else tuple(1 - left / steps for left in LEFT if left < steps)
+
+
+def _sparsities(_: click.Context, __: click.Parameter, value: str | None) -> tuple[float, ...] | None:
+    if value is None:
+        return None
     try:
         found = tuple(dict.fromkeys(float(part) for part in value.split(",") if part.strip()))
     except ValueError as error:
@@ -61,7 +75,11 @@ def _sparsities(_: click.Context, __: click.Parameter, value: str) -> tuple[floa
     callback=_strategies,
     help="Each finds a plan for each sparsity; an empty list compares plans of artifacts alone.",
 )
-@click.option("--sparsities", default="0.9,0.95,0.98", show_default=True, callback=_sparsities, help="For strategies.")
+@click.option(
+    "--sparsities",
+    callback=_sparsities,
+    help="For strategies; 0.9,0.95,0.98 if not given, or, of less than 50 steps, what leaves five, three and two.",
+)
 @click.option(
     "--with",
     "others",
@@ -83,7 +101,9 @@ def _sparsities(_: click.Context, __: click.Parameter, value: str) -> tuple[floa
     help="Limit of each search, about; there is one for each strategy and sparsity.",
 )
 @click.option("--intervals", type=click.IntRange(min=1), help="Of each search, at most; for a quick look.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Of the split, the noise and the searches.")
+@click.option(
+    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the split, the noise and the searches."
+)
 @click.option("--plot", "picture", type=click.Path(path_type=Path), help="Draw into this file (.png, .svg, .pdf).")
 @json_option
 def compare(
@@ -91,7 +111,7 @@ def compare(
     trajectories: tuple[Path, ...],
     sources: Sources,
     strategies: tuple[str, ...],
-    sparsities: tuple[float, ...],
+    sparsities: tuple[float, ...] | None,
     others: tuple[Path, ...],
     calls: int,
     learned_calls: int,
@@ -114,6 +134,8 @@ def compare(
             f"compare needs {error.name}, which is not installed. Run: pip install 'ttscompile[compile]'."
         ) from error
     identities = {path: identity_of(path) for path in (directory, *others)}  # of what is measured now
+    if sparsities is None:
+        sparsities = default_sparsities(manifest_of(directory).steps)
     columns = (TextColumn("{task.description:<28}"), BarColumn(bar_width=24), MofNCompleteColumn(), TimeElapsedColumn())
     told = progress()
     with only_results_on_stdout(), Progress(*columns, console=told, disable=not told.is_terminal) as bar:
@@ -128,7 +150,7 @@ def compare(
             directory,
             trajectories,
             strategies,
-            sparsities,
+            sparsities if strategies else (),
             others,
             observation=sources,
             calls=calls,
@@ -167,8 +189,8 @@ def _print(found: Frontier, output: Console, machine: str) -> None:
             p.name + " *" * (p.noise != "all"),
             f"{p.error:.4g}",
             f"{p.error_p90:.4g}",
-            f"{p.latency_ms:.4g}",
-            f"{low:.4g}..{high:.4g}",
+            ms(p.latency_ms, 4),
+            f"{ms(low, 4)}..{ms(high, 4)}",
             f"{p.flops / 1e9:.3f}",
             share(p.sparsity),
             "yes" if p in efficient else "",
@@ -182,7 +204,7 @@ def _print(found: Frontier, output: Console, machine: str) -> None:
         soft_wrap=True,
     )
     told = {"steps": "the same initial sample and other draws", "all": "other noise altogether"}
-    apart = "; ".join(f"with {told[name]} {error:.4g}" for name, error in found.yardsticks.items())
+    apart = "; ".join(f"by {error:.4g} with {told[name]}" for name, error in found.yardsticks.items())
     if any(p.noise != "all" for p in found.points):
         output.print(
             "* Another sampler: it shares the initial sample with the dense policy and nothing else (and a stochastic"

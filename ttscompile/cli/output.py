@@ -16,9 +16,10 @@ from rich.console import Console
 from rich.table import Table
 
 from ttscompile.artifact.load import load_artifact, read_manifest
-from ttscompile.artifact.manifest import abbreviated
+from ttscompile.artifact.manifest import Manifest, abbreviated
 from ttscompile.errors import TtscompileError
 from ttscompile.units import flops as flops
+from ttscompile.units import ms as ms
 from ttscompile.units import share as share
 
 artifact_argument = click.argument("directory", type=click.Path(path_type=Path))
@@ -85,13 +86,22 @@ def table(*columns: str) -> Table:
     return made
 
 
-def identity_of(path: Path) -> str:
-    """Identity of an artifact, 64 digits; of a directory its manifest's, which is not checked again.
+def manifest_of(path: Path) -> Manifest:
+    """Manifest of an artifact; in a directory nothing else is read and checked.
 
     Raises:
         ArtifactError: there is no artifact.
     """
-    return (read_manifest(path) if path.is_dir() else load_artifact(path).manifest).identity
+    return read_manifest(path) if path.is_dir() else load_artifact(path).manifest
+
+
+def identity_of(path: Path) -> str:
+    """Identity of an artifact, 64 digits.
+
+    Raises:
+        ArtifactError: there is no artifact.
+    """
+    return manifest_of(path).identity
 
 
 def print_identity(identity: str, console: Console) -> None:

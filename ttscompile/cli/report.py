@@ -58,6 +58,8 @@ def report(
     """
     if not output.absolute().parent.is_dir():
         raise OutputError(f"{output}: the report cannot be written: no such folder. Give one that exists.")
+    if output.suffix not in (".html", ".htm"):
+        raise OutputError(f"{output}: a report is a page of HTML. Give a name that ends in .html.")
     require_packages()  # before minutes of work
     console = progress()
     artifact = load_artifact(directory)

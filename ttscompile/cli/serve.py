@@ -47,7 +47,7 @@ from ttscompile.runtimes.executor.server import ExecutorServer, ServerLimits
 )
 @click.option("--max-clients", type=click.IntRange(min=1), default=8, show_default=True)
 @click.option("--max-message-bytes", type=click.IntRange(min=128), default=1 << 20, show_default=True)
-@click.option("--seed", type=int, help="Of the policy's noise.")
+@click.option("--seed", type=click.IntRange(min=0), help="Of the policy's noise.")
 def serve(
     directory: Path,
     control_hz: float,

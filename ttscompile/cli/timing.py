@@ -182,7 +182,8 @@ def _eager(checkpoint: Path, threads: int, manifest: Manifest, as_saved: bool) -
         from ttscompile.frontends.encoded import EncodedDenoiser
     except ModuleNotFoundError as error:
         raise RuntimeUnavailableError(
-            f"--against eager needs {error.name}, which is not installed. Run: pip install 'ttscompile[compile]'."
+            f"the original network needs {error.name}, which is not installed. Run: pip install 'ttscompile[compile]',"
+            " or take 'original' and 'eager' out of --against."
         ) from error
     module, original = original_policy(checkpoint, manifest.spec)
     torch.set_num_threads(threads)

@@ -196,6 +196,12 @@ def sampler_table(
     """
     probe = _Probe(scheduler, step_arguments or {})
     _refuse_known(scheduler)
+    trained = scheduler.config.get("num_train_timesteps")
+    if isinstance(trained, int) and steps > trained:
+        raise SpecError(
+            f"sampler {probe.name}: {steps} denoising steps are not possible; the policy was trained with {trained}"
+            " timesteps, so expected as many at most."
+        )
     try:
         set_timesteps(scheduler, steps)
     except Exception as error:

@@ -1,0 +1,5 @@
+"""``python -m ttscompile``: the command line, where its script is not on the path."""
+
+from ttscompile.cli import main
+
+main(prog_name="python -m ttscompile")
