@@ -32,6 +32,9 @@ GIVEN = "given"
 
 RUNTIMES = ("onnxruntime", "reference")
 
+MOST_THREADS = 1024
+"""More than any machine has a use for: onnxruntime tries to make as many as it is told, for minutes."""
+
 
 @dataclass(frozen=True)
 class Timings:
@@ -131,8 +134,8 @@ def open_runtime(artifact: Artifact, runtime: str = "onnxruntime", threads: int 
         RuntimeUnavailableError: no runtime of this name, its packages are missing, or the threads cannot be had.
         ArtifactError: the parts of the artifact do not fit each other.
     """
-    if not isinstance(threads, int) or isinstance(threads, bool) or threads < 1:
-        raise RuntimeUnavailableError(f"threads must be an integer of at least 1; found {threads!r}.")
+    if not isinstance(threads, int) or isinstance(threads, bool) or not 1 <= threads <= MOST_THREADS:
+        raise RuntimeUnavailableError(f"threads must be an integer of at least 1 and at most {MOST_THREADS}; found {threads!r}.")
     if runtime == "onnxruntime":
         from .onnxruntime_cpu import OnnxRuntime
 

@@ -129,4 +129,8 @@ def convert(
     if as_json:
         print_json(summary | {"stages": stages})
     else:
-        print_summary(summary, results())
+        console = results()
+        print_summary(summary, console)
+        if single_file is not None:
+            megabytes = single_file.stat().st_size / 1e6
+            console.print(f"single file: {single_file}, {megabytes:.1f} MB", soft_wrap=True, highlight=False)

@@ -77,7 +77,10 @@ def configured_sampler(
     own = str(settings.get("_target_", "")).rpartition(".")[2]
     own_name = _NAMES.get(own)
     if sampler is not None and sampler not in SAMPLERS:
-        raise SpecError(f"sampler {sampler!r} is not known; expected one of {', '.join(SAMPLERS)}.")
+        raise SpecError(
+            f"sampler {sampler!r} is none of a policy that was trained with diffusion; expected one of"
+            f" {', '.join(SAMPLERS)}. Those of flow matching, euler and rk4, are for policies trained with that."
+        )
     if spacing is not None and spacing not in SPACINGS:
         raise SpecError(f"timestep spacing {spacing!r} is not known; expected one of {', '.join(SPACINGS)}.")
     if steps is not None and (type(steps) is not int or not 1 <= steps <= MOST_STEPS):
