@@ -24,10 +24,15 @@ def random_calls(spec: PolicySpec, count: int, seed: int) -> list[tuple[Observat
     for number in range(count):
         rng = np.random.default_rng((number, seed))
         obs: Observation = {key: observation.draw(rng) for key, observation in spec.observations.items()}
-        initial = rng.standard_normal((1, *spec.sample), dtype=np.float32)
-        draws = rng.standard_normal((spec.sampler.steps, *initial.shape), dtype=np.float32)
-        calls.append((obs, Noise(initial, draws if spec.sampler.stochastic else None)))
+        calls.append((obs, random_noise(spec, rng)))
     return calls
+
+
+def random_noise(spec: PolicySpec, rng: np.random.Generator) -> Noise:
+    """Noise of one stream; as many numbers are drawn whether or not the sampler is stochastic."""
+    initial = rng.standard_normal((1, *spec.sample), dtype=np.float32)
+    draws = rng.standard_normal((spec.sampler.steps, *initial.shape), dtype=np.float32)
+    return Noise(initial, draws if spec.sampler.stochastic else None)
 
 
 def normalized(spec: PolicySpec, obs: Observation) -> Observation:

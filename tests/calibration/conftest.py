@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 import ttscompile
 from tests.once import Once
+from ttscompile.calibration.strategies import tts
 
-from . import policies
+from . import policies, tasks
+
+
+@pytest.fixture(autouse=True, scope="package")
+def _short_search() -> Iterator[None]:
+    """Intervals of all phases, and few of them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tts, "DISTANCES", (1,))
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -36,3 +47,9 @@ def artifact(compiled: Path, tmp_path: Path) -> Path:
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Six episodes."""
     return policies.record(tmp_path_factory.mktemp("recording") / "calls.npz")
+
+
+@pytest.fixture(scope="session")
+def make_task(compiled: Path, recording: Path) -> tasks.MakeTask:
+    """Makes tasks on ``compiled``."""
+    return partial(tasks.make_task, compiled, recording)

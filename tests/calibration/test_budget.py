@@ -16,17 +16,13 @@ from ttscompile.calibration.families import Families, budget_of_error
 from ttscompile.calibration.latency import measure_budget
 from ttscompile.calibration.progress import Bar
 from ttscompile.calibration.state import FILE, StateFile
-from ttscompile.calibration.strategies import tts
 from ttscompile.calibration.whole_steps import Errors, WholeSteps
 from ttscompile.errors import CalibrationError, CalibrationFailedError
 from ttscompile.lattice import Source
 
+from .killed import killed
+
 STEPS, BLOCKS = 10, 6
-
-
-@pytest.fixture(autouse=True)
-def short_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tts, "DISTANCES", (1,))
 
 
 def quick(artifact: Path, recording: Path, **changes: Any) -> CalibrationResult:
@@ -153,22 +149,9 @@ def test_the_real_clock_finds_that_nothing_takes_no_time(artifact: Path, recordi
 
 def test_the_latency_is_measured_once(artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _timed(monkeypatch, 1.0)
-    save = StateFile.save
-
-    def dying(self: StateFile) -> None:
-        save(self)
-        if self.arrays:
-            raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(StateFile, "save", dying)
-        with pytest.raises(KeyboardInterrupt):
-            quick(artifact, recording, latency_ms=3.9)
-
-    def again(*_: Any) -> None:
-        raise AssertionError("measured again")
-
-    monkeypatch.setattr(pipeline, "measure_budget", again)
+    with killed(saves=2):  # of the latency, and of some targets
+        quick(artifact, recording, latency_ms=3.9)
+    monkeypatch.setattr(pipeline, "measure_budget", lambda *_: pytest.fail("measured again"))
     result = quick(artifact, recording, latency_ms=3.9, resume=True)
     assert result.budget["cells"] == 3 * BLOCKS
     assert result.budget["latency_ms"] == 3.9
@@ -197,7 +180,7 @@ class _Judged(WholeSteps):
 def test_an_error_is_as_few_steps_as_do(tmp_path: Path, limit: float, full: int) -> None:
     whole, state = _Judged(), StateFile(tmp_path, {})
     with Bar(shown=False) as bar:
-        families = Families(whole, state, Clock(0.0, 0.0, float("inf")), bar)
+        families = Families(whole, state, Clock(), bar)
         budget = budget_of_error(families, Goal("max_action_error", limit), 100, BLOCKS)
         assert budget.cells == full * BLOCKS
         asked = len(whole.asked)
@@ -207,10 +190,10 @@ def test_an_error_is_as_few_steps_as_do(tmp_path: Path, limit: float, full: int)
 
 def test_an_error_out_of_reach_and_one_out_of_time_are_failures(tmp_path: Path) -> None:
     with Bar(shown=False) as bar:
-        families = Families(_Judged(), StateFile(tmp_path, {}), Clock(0.0, 0.0, float("inf")), bar)
+        families = Families(_Judged(), StateFile(tmp_path, {}), Clock(), bar)
         with pytest.raises(CalibrationFailedError, match="at least half of the cells: 10 with 1 of .*, 0.2 with 50 of"):
             budget_of_error(families, Goal("max_action_error", 0.1), 100, BLOCKS)
-        late = Families(_Judged(), StateFile(tmp_path, {}), Clock(0.0, 0.0, 0.0), bar)
+        late = Families(_Judged(), StateFile(tmp_path, {}), Clock(0.0), bar)
         with pytest.raises(CalibrationFailedError, match="time limit ended the search .*: none tried"):
             budget_of_error(late, Goal("max_action_error", 0.1), 100, BLOCKS)
 

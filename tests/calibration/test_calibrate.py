@@ -15,12 +15,13 @@ import ttscompile
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration import CalibrationResult, calibrate, strategies
 from ttscompile.calibration.calls import split_episodes
-from ttscompile.calibration.state import FILE, StateFile
-from ttscompile.calibration.strategies import tts
+from ttscompile.calibration.execute import Executor
+from ttscompile.calibration.state import FILE
 from ttscompile.errors import ArtifactError, CalibrationError, CalibrationFailedError
 from ttscompile.lattice import Source, uniform_plan
 
 from . import policies
+from .killed import killed
 
 INTERVALS = 6
 TARGET = 0.7
@@ -31,22 +32,13 @@ def quick(artifact: Path, recording: Path, **changes: Any) -> CalibrationResult:
     return calibrate(artifact, [recording], **arguments)
 
 
-@pytest.fixture(autouse=True)
-def short_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    """So few intervals that all phases are gone through."""
-    monkeypatch.setattr(tts, "DISTANCES", (1,))
-
-
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def calibrated(
     compiled: Path, recording: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, CalibrationResult]:
     """A calibrated artifact and the result; not to be changed."""
-    directory = tmp_path_factory.mktemp("calibrated") / "compiled"
-    shutil.copytree(compiled, directory)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tts, "DISTANCES", (1,))
-        return directory, quick(directory, recording, max_intervals=None)
+    directory = Path(shutil.copytree(compiled, tmp_path_factory.mktemp("calibrated") / "compiled"))
+    return directory, quick(directory, recording, max_intervals=None)
 
 
 def contents(directory: Path) -> dict[str, bytes]:
@@ -113,10 +105,6 @@ def test_another_seed_gives_another_split(
     assert other.episodes != calibrated[1].episodes
 
 
-class _Killed(Exception):
-    """Stands for a kill: nothing of the package catches it."""
-
-
 @pytest.mark.parametrize("saves", [1, 5, 7])  # during targets, search and adaptation
 def test_resuming_after_a_kill_ends_where_it_would_have_ended(
     calibrated: tuple[Path, CalibrationResult],
@@ -125,21 +113,9 @@ def test_resuming_after_a_kill_ends_where_it_would_have_ended(
     monkeypatch: pytest.MonkeyPatch,
     saves: int,
 ) -> None:
-    save = StateFile.save
-    done = 0
-
-    def dying(self: StateFile) -> None:
-        nonlocal done
-        save(self)
-        done += 1
-        if done == saves:
-            raise _Killed
-
     before = load_artifact(artifact).manifest.identity
-    with monkeypatch.context() as patch:
-        patch.setattr(StateFile, "save", dying)
-        with pytest.raises(_Killed):
-            quick(artifact, recording, max_intervals=None)
+    with killed(saves):
+        quick(artifact, recording, max_intervals=None)
     assert load_artifact(artifact).manifest.identity == before  # the artifact works as it did
     counted = _count_targets(monkeypatch)
     result = quick(artifact, recording, max_intervals=None, resume=True)
@@ -148,8 +124,6 @@ def test_resuming_after_a_kill_ends_where_it_would_have_ended(
 
 
 def _count_targets(monkeypatch: pytest.MonkeyPatch) -> Callable[[], int]:
-    from ttscompile.calibration.execute import Executor
-
     count = 0
     run_dense = Executor.run_dense
 
@@ -176,33 +150,17 @@ def test_a_damaged_state_is_refused(artifact: Path, recording: Path) -> None:
         quick(artifact, recording, resume=True)
 
 
-def begin(artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch, **settings: Any) -> None:
-    """A calibration that is killed once its state has been saved."""
-
-    def dying(self: StateFile) -> None:
-        save(self)
-        raise _Killed
-
-    save = StateFile.save
-    with monkeypatch.context() as patch:
-        patch.setattr(StateFile, "save", dying)
-        with pytest.raises(_Killed):
-            quick(artifact, recording, **settings)
-
-
 @pytest.mark.parametrize("change", [{"seed": 1}, {"target_sparsity": 0.6}])
-def test_a_state_of_other_settings_is_refused(
-    artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch, change: dict[str, Any]
-) -> None:
-    begin(artifact, recording, monkeypatch)
+def test_a_state_of_other_settings_is_refused(artifact: Path, recording: Path, change: dict[str, Any]) -> None:
+    with killed():
+        quick(artifact, recording)
     with pytest.raises(CalibrationError, match=r"other settings: \w+ was .*, now"):
         quick(artifact, recording, resume=True, **change)
 
 
-def test_resuming_with_more_time_goes_on_with_the_same_calls(
-    artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    begin(artifact, recording, monkeypatch, strategy="interval", max_minutes=1)
+def test_resuming_with_more_time_goes_on_with_the_same_calls(artifact: Path, recording: Path) -> None:
+    with killed():
+        quick(artifact, recording, strategy="interval", max_minutes=1)
     result = quick(artifact, recording, strategy="interval", max_minutes=2, resume=True)
     assert result.calls["calibration"] == 64
 
@@ -227,13 +185,9 @@ def test_no_better_than_uniform_is_a_failure_that_changes_nothing(
 ) -> None:
     before = contents(artifact)
 
-    class Useless(strategies.Interval):
-        def found(self) -> strategies.Found:
-            return strategies.Found(self.plan, None, {})
-
-    monkeypatch.setattr(strategies, "Interval", Useless)
+    monkeypatch.setattr(strategies, "bac", strategies.interval)
     with pytest.raises(CalibrationFailedError, match="no better than the uniform schedule"):
-        quick(artifact, recording, strategy="interval")
+        quick(artifact, recording, strategy="bac")
     assert {n: c for n, c in contents(artifact).items() if n != FILE} == before
 
 

@@ -19,6 +19,7 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import update_calibration
 from ttscompile.calibration.frontier import compare
 from ttscompile.cli import main
+from ttscompile.cli.compare import default_sparsities
 from ttscompile.errors import CalibrationError, OutputError
 from ttscompile.lattice import uniform_plan
 from ttscompile.plots.frontier import plot_frontier
@@ -95,8 +96,9 @@ def test_nothing_is_written(planned: Path, recording: Path) -> None:
 
 
 def test_it_says_when_a_search_had_too_little_time_or_too_few_calls(planned: Path, recording: Path) -> None:
-    found = compare(planned, [recording], ["tts", "interval"], [0.8], calls=1, learned=8, max_minutes=0)
-    assert {(point.series, point.name) for point in found.points} >= {("tts", "0.8"), ("interval", "0.8")}
+    found = compare(planned, [recording], ["tts", "interval", "teacache"], [0.8], calls=1, learned=8, max_minutes=0)
+    assert [point.series for point in found.points] == ["this artifact"] * 2 + ["tts", "interval"]
+    assert found.skipped["teacache 0.8"].startswith("the time limit ended the search for a threshold of 'teacache'")
     assert found.warnings[1] == "the limit of 0 minutes cut the search short of tts 0.8: see --max-minutes."
     assert "tts fits corrections of 48 features from at most 8 calls" in found.warnings[2]
 
@@ -178,6 +180,19 @@ def test_the_command_prints_the_same_as_a_table_and_as_json(
     assert "Yardstick: two dense calls are apart" in shown.stdout
 
 
+def test_without_sparsities_those_are_taken_that_the_steps_allow(planned: Path, recording: Path) -> None:
+    assert default_sparsities(100) == (0.9, 0.95, 0.98)
+    assert default_sparsities(16) == (11 / 16, 13 / 16, 14 / 16)
+    arguments = ["compare", str(planned), "--trajectories", str(recording), "--calls", "2", "--json"]
+    told = CliRunner().invoke(main, [*arguments, "--strategies", "interval"])  # of ten steps: 95 % is none
+    assert told.exit_code == 0, told.stderr
+    made = [point["name"] for point in json.loads(told.stdout)["points"] if point["series"] == "interval"]
+    assert made == ["0.5", "0.7", "0.8"]
+    alone = CliRunner().invoke(main, [*arguments, "--strategies", ""])
+    assert alone.exit_code == 0, alone.stderr
+    assert {point["series"] for point in json.loads(alone.stdout)["points"]} == {"this artifact"}
+
+
 @pytest.mark.parametrize(
     ("option", "value", "message"),
     [
@@ -190,10 +205,3 @@ def test_bad_lists_are_refused(planned: Path, option: str, value: str, message: 
     result = CliRunner().invoke(main, ["compare", str(planned), "--trajectories", "a.npz", option, value])
     assert result.exit_code == 2
     assert message in result.stderr
-
-
-def test_the_fixture_is_the_same_network(planned: Path, other_sampler: Path) -> None:
-    ours, theirs = (load_artifact(path).manifest for path in (planned, other_sampler))
-    assert theirs.steps == 5
-    assert not theirs.spec.sampler.stochastic
-    assert ours.spec.sampler.stochastic

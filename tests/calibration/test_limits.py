@@ -26,15 +26,17 @@ from ttscompile.calibration.latency import _pruner_ms
 from ttscompile.calibration.progress import Bar
 from ttscompile.calibration.search import search_plan
 from ttscompile.calibration.state import FILE, StateFile
+from ttscompile.calibration.strategies import NAMES, open_strategy
 from ttscompile.calibration.strategies.tts import Tts
 from ttscompile.calibration.targets import draw_calls, with_targets
 from ttscompile.calibration.whole_steps import WholeSteps
-from ttscompile.errors import CalibrationError
-from ttscompile.lattice import uniform_plan
+from ttscompile.errors import CalibrationError, CalibrationFailedError
+from ttscompile.lattice import PlanArray, Source, uniform_plan
+from ttscompile.runtimes.reference.model import Contexts, ReferenceModel
 from ttscompile.trajectories import load_trajectories
 
 from . import policies
-from .strategies.tasks import make_task
+from .tasks import MakeTask
 
 
 class _Hand(Clock):
@@ -49,8 +51,7 @@ class _Hand(Clock):
 class _Slow:
     """A search whose intervals take 10 s, and whose plan takes 25 s more to be finished."""
 
-    intervals, closing, settling, done, loss = 50, 0, 25.0, False, 1.0
-    plan = uniform_plan(4, 2, 2)
+    intervals, closing, settling, done = 50, 0, 25.0, False
 
     def __init__(self, clock: _Hand) -> None:
         self._clock = clock
@@ -58,26 +59,44 @@ class _Slow:
     def advance(self, interval: int) -> None:
         self._clock.now += 10
 
-    def state(self) -> dict[str, Any]:
-        return {}
-
     def found(self) -> str:
         self._clock.now += self.settling
         return "found"
 
 
-def test_the_search_ends_in_time_for_what_its_plan_still_takes(tmp_path: Path) -> None:
-    clock = _Hand(0.0, 0.0, 100.0)
+def test_the_search_ends_in_time_for_what_its_plan_still_takes() -> None:
+    clock = _Hand(100.0)
     search: Any = _Slow(clock)
-    with Bar(shown=False) as bar:
-        found, intervals, stopped = search_plan(search, StateFile(tmp_path, {}), clock, bar, None)
-    assert (found, intervals, stopped) == ("found", 7, "time limit")
+    assert search_plan(search, clock) == ("found", 7, "time limit")
     assert clock.now == 95.0
 
 
-def test_a_family_is_not_begun_that_cannot_be_finished(compiled: Path, recording: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("name", "limit"), [*((name, 0) for name in NAMES), ("teacache", 1920), ("delta-dit", 960)])
+def test_a_limit_holds_within_an_interval(
+    make_task: MakeTask, name: str, limit: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A block takes a second for each call: a dense answer to all calls takes 480."""
+    task, clock, block = make_task(budget=34, calls=8), _Hand(limit), ReferenceModel.block
+
+    def slow(self: ReferenceModel, b: int, k: int, stream: Any, contexts: Contexts, *streams: Any) -> torch.Tensor:
+        clock.now += len(streams[0]) if streams else contexts.streams
+        return block(self, b, k, stream, contexts, *streams)
+
+    monkeypatch.setattr(ReferenceModel, "block", slow)
+    search = open_strategy(name, replace(task, clock=clock))
+    if name in ("teacache", "dbcache") and limit == 0:
+        with pytest.raises(CalibrationFailedError, match="time limit ended the search for a threshold of"):
+            search_plan(search, clock)
+    else:
+        found, _, stopped = search_plan(search, clock)
+        assert np.count_nonzero(found.schedule == Source.COMPUTE) <= 34
+        assert (stopped == "time limit") == (name not in ("interval", "deepcache"))  # which have one candidate
+    assert clock.now <= limit + 2 * 480
+
+
+def test_a_family_is_not_begun_that_cannot_be_finished(make_task: MakeTask, tmp_path: Path) -> None:
     """Compared, then fitted on all calls and judged."""
-    whole = WholeSteps(make_task(compiled, recording, 20, calls=24))
+    whole = WholeSteps(make_task(20, calls=24))
     assert whole.comparing(3) == whole.correcting(3) == 0.0  # nothing is known yet
     begun = time.monotonic()
     whole.errors((0, 4, 8))
@@ -87,7 +106,7 @@ def test_a_family_is_not_begun_that_cannot_be_finished(compiled: Path, recording
     needed = 2 * whole.comparing(4) + whole.correcting(4)
     with Bar(shown=False) as bar:
         for limit, made in ((0.9 * needed, False), (1.1 * needed, True)):
-            families = Families(whole, StateFile(tmp_path, {}), _Hand(0.0, 0.0, limit), bar)
+            families = Families(whole, StateFile(tmp_path, {}), _Hand(limit), bar)
             assert (families.best(4, "", (2.0,)) is not None) == made
 
 
@@ -99,7 +118,7 @@ def test_when_half_of_the_time_is_over_no_more_targets_are_made_than_needed(
     executor, spec = Executor(artifact), artifact.manifest.spec
     episodes = load_trajectories([recording], spec.observations, 4)
     calls = draw_calls(executor, spec, episodes, split_episodes(6, 0.25, 0), 16, 4, 0)["calibration"]
-    state, fresh, clock = StateFile(tmp_path, {}), StateFile(tmp_path, {}), _Hand(0.0, 0.0, 100.0)
+    state, fresh, clock = StateFile(tmp_path, {}), StateFile(tmp_path, {}), _Hand(100.0)
     clock.now = 51.0
     with Bar(shown=False) as bar:
         few = with_targets(executor, "calibration", calls, 3, state, clock, bar)
@@ -119,8 +138,8 @@ def test_only_corrections_need_many_calls(artifact: Path, recording: Path) -> No
     assert result.calls["calibration"] == 64
 
 
-def test_without_a_pruner_no_time_is_kept_for_it(compiled: Path, recording: Path) -> None:
-    task = make_task(compiled, recording, 20, calls=4)
+def test_without_a_pruner_no_time_is_kept_for_it(make_task: MakeTask) -> None:
+    task = make_task(20, calls=4)
     with_head, without = (Tts(one, WholeSteps(one)) for one in (task, replace(task, pruner={})))
     assert (with_head.closing, without.closing) == (5 if task.pruner else 0, 0)
 
@@ -142,10 +161,9 @@ def test_a_baseline_that_diverges_is_worse_than_any_plan(
 ) -> None:
     run = Executor.run
 
-    def diverging(self: Executor, plans: Any, calls: Any) -> torch.Tensor:
-        samples = run(self, plans, calls)
-        samples[torch.tensor([np.array_equal(plan, uniform_plan(*plan.shape, 5)) for plan in plans])] = float("nan")
-        return samples
+    def diverging(self: Executor, plan: PlanArray, calls: Any) -> torch.Tensor:
+        samples = run(self, plan, calls)
+        return samples * float("nan") if np.array_equal(plan, uniform_plan(10, 6, 5)) else samples
 
     monkeypatch.setattr(Executor, "run", diverging)
     result = calibrate(artifact, [recording], 0.55, "deepcache", progress=False, max_minutes=1e-6)

@@ -11,14 +11,8 @@ import pytest
 import ttscompile
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration import CalibrationResult, calibrate, families
-from ttscompile.calibration.strategies import tts
 from ttscompile.errors import IllegalPlanError
 from ttscompile.lattice import Source
-
-
-@pytest.fixture
-def short_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tts, "DISTANCES", (1,))
 
 
 @pytest.fixture(scope="module")
@@ -27,9 +21,7 @@ def calibrated(
 ) -> tuple[Path, CalibrationResult]:
     """Four of ten steps; not to be changed."""
     directory = Path(shutil.copytree(compiled, tmp_path_factory.mktemp("named") / "compiled"))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tts, "DISTANCES", (1,))
-        return directory, calibrate(directory, [recording], 0.6, progress=False, max_minutes=1)
+    return directory, calibrate(directory, [recording], 0.6, progress=False, max_minutes=1)
 
 
 def computed(artifact: Path, name: str) -> list[int]:
@@ -78,7 +70,7 @@ def test_a_plan_is_chosen_when_loading_or_calling(calibrated: tuple[Path, Calibr
         ttscompile.load(artifact, plan="swift")
 
 
-def test_what_cannot_be_made_is_said(artifact: Path, recording: Path, short_search: None) -> None:
+def test_what_cannot_be_made_is_said(artifact: Path, recording: Path) -> None:
     result = calibrate(artifact, [recording], 0.8, progress=False, max_minutes=1)
     assert result.skipped == {"fast": "the target computes 2 whole steps: half of that is too little"}
     assert len(computed(artifact, "safe")) == 4
@@ -95,7 +87,7 @@ def test_what_cannot_be_made_is_said(artifact: Path, recording: Path, short_sear
 
 
 def test_a_plan_that_is_no_safer_is_left_out_with_the_reason(
-    artifact: Path, recording: Path, short_search: None, monkeypatch: pytest.MonkeyPatch
+    artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The time limit ends the search for ``safe`` at its first candidate, which is bad."""
     monkeypatch.setattr(families.Families, "best", lambda *_: families.Best(tuple(range(8)), 1.0))

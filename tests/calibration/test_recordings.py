@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -19,6 +20,7 @@ import pytest
 import zarr
 from PIL import Image
 
+from tests.hostile.pickles import Runs
 from ttscompile.config import ObservationSpec
 from ttscompile.errors import TrajectoryError
 from ttscompile.trajectories import Episode, apart, load_trajectories
@@ -174,22 +176,12 @@ def test_an_array_for_no_key_is_refused(tmp_path: Path) -> None:
         load_trajectories([as_npz(tmp_path)], LOW, 3, {"observation": ("state",)})
 
 
-class Payload:
-    """Creates a file if it is ever unpickled."""
-
-    def __init__(self, target: Path) -> None:
-        self.target = target
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return Path.touch, (self.target,)
-
-
 @pytest.mark.parametrize("declared", ["|O", "<f4"])
 def test_a_zarr_codec_that_unpickles_is_never_run(declared: str, tmp_path: Path) -> None:
     target, store = tmp_path / "touched", as_zarr(tmp_path)
     array = store / "data" / "state"
     payload = np.empty(4, object)
-    payload[:] = Payload(target)
+    payload[:] = Runs(os.mkdir, str(target))
     (array / "0.0").write_bytes(numcodecs.Pickle().encode(payload))
     meta = json.loads((array / ".zarray").read_text())
     meta |= {"dtype": declared, "filters": [{"id": "pickle", "protocol": 5}], "compressor": None, "fill_value": 0}
@@ -257,8 +249,3 @@ def test_arrays_out_of_proportion_are_refused(format: str, tmp_path: Path, monke
     monkeypatch.setattr(trajectories_frames, "MAX_RATIO", 0)
     with pytest.raises(TrajectoryError, match="in proportion"):
         load_trajectories([WRITERS[format](tmp_path)], LOW, 3, SOURCES)
-
-
-def test_a_directory_that_is_no_data_set_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(TrajectoryError, match="found a directory that is none of these"):
-        load_trajectories([tmp_path], LOW, 3)

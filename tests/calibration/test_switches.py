@@ -9,13 +9,12 @@ import pytest
 import torch
 
 from ttscompile.artifact.load import load_artifact
-from ttscompile.calibration.calls import prepare_calls, sample_calls
-from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.head import capacity, has_head, head_features, head_weights
 from ttscompile.calibration.switches import Switch, fit_switches
-from ttscompile.lattice import PlanArray, Source
+from ttscompile.lattice import PlanArray, Source, whole_steps_plan
 from ttscompile.runtimes.base import pruner_plan
-from ttscompile.trajectories import load_trajectories
+
+from .tasks import MakeTask
 
 STEPS, BLOCKS, CALLS = 6, 4, 64
 
@@ -85,18 +84,14 @@ def switched(schedule: PlanArray, switches: list[Switch], on: np.ndarray) -> Pla
     return plan
 
 
-def test_the_head_predicts_the_schedule_with_the_switches_that_are_on(compiled: Path, recording: Path) -> None:
-    artifact = load_artifact(compiled)
-    executor, spec = Executor(artifact), artifact.manifest.spec
-    episodes = load_trajectories([recording], spec.observations, 4)
-    chosen = sample_calls(episodes, range(len(episodes)), 30, seed=0)
-    calls = prepare_calls(executor.model, spec, episodes, chosen, (0, 0))
-    assert has_head(artifact.pruner)
+def test_the_head_predicts_the_schedule_with_the_switches_that_are_on(make_task: MakeTask) -> None:
+    task = make_task(calls=30)
+    executor, calls, pruner = task.executor, task.calls, task.pruner
+    assert has_head(pruner)
     assert executor.pruner_graph is not None
     features = head_features(executor.pruner_graph, calls)
     assert features.shape == (30, 32)
-    schedule = np.full((executor.model.steps, executor.model.blocks), Source.TIMESTEP, np.int8)
-    schedule[[0, 5]] = Source.COMPUTE
+    schedule = whole_steps_plan(10, 6, [0, 5])
     schedule[7, 2] = Source.FORWARD
     draw = np.random.default_rng(0)
     directions = draw.standard_normal((3, features.shape[1]))
@@ -106,30 +101,26 @@ def test_the_head_predicts_the_schedule_with_the_switches_that_are_on(compiled: 
         Switch((5, 2), (5 + 3, 3), directions[1], float(biases[1])),
         Switch((5, 4), (9, 5), directions[2], float(biases[2])),
     ]
-    weights = head_weights(artifact.pruner, schedule, switches, features)
+    weights = head_weights(pruner, schedule, switches, features)
     found = pruner_plan(executor.logits(calls, weights))
     on = features @ directions.T + biases > 0
     assert on.any(0).all()
     assert not on.all(0).any()
     for plan, states in zip(found, on, strict=True):
         np.testing.assert_array_equal(plan, switched(schedule, switches, states))
-    assert {name: w.shape for name, w in weights.items()} == {name: w.shape for name, w in artifact.pruner.items()}
+    assert {name: w.shape for name, w in weights.items()} == {name: w.shape for name, w in pruner.items()}
 
 
-def test_a_switch_within_one_step(compiled: Path, recording: Path) -> None:
-    artifact = load_artifact(compiled)
-    executor, spec = Executor(artifact), artifact.manifest.spec
-    episodes = load_trajectories([recording], spec.observations, 4)
-    calls = prepare_calls(executor.model, spec, episodes, [(0, 0), (1, 0)], (0, 0))
-    assert executor.pruner_graph is not None
-    features = head_features(executor.pruner_graph, calls)
-    schedule = np.full((executor.model.steps, executor.model.blocks), Source.TIMESTEP, np.int8)
-    schedule[0] = Source.COMPUTE
+def test_a_switch_within_one_step(make_task: MakeTask) -> None:
+    task = make_task(calls=2)
+    assert task.executor.pruner_graph is not None
+    features = head_features(task.executor.pruner_graph, task.calls)
+    schedule = whole_steps_plan(10, 6, [0])
     schedule[3, 0] = Source.COMPUTE
     for bias, computed in ((1.0, 4), (-1.0, 0)):
         switch = Switch((3, 0), (3, 4), np.zeros(features.shape[1]), bias)
-        plans = pruner_plan(executor.logits(calls, head_weights(artifact.pruner, schedule, [switch], features)))
-        for plan in plans:
+        weights = head_weights(task.pruner, schedule, [switch], features)
+        for plan in pruner_plan(task.executor.logits(task.calls, weights)):
             assert np.flatnonzero(plan[3] == Source.COMPUTE).tolist() == [computed]
 
 

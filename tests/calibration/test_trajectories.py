@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import io
+import os
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.hostile.pickles import Runs
 from ttscompile import ObservationSpec
 from ttscompile.errors import TrajectoryError
 from ttscompile.trajectories import Episode, load_trajectories
@@ -147,19 +148,9 @@ def test_what_does_not_fit_is_refused(file: Path, content: dict[str, Any], messa
     assert str(file) in str(error.value)
 
 
-class Payload:
-    """Creates a file if it is ever unpickled."""
-
-    def __init__(self, target: Path) -> None:
-        self.target = target
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return Path.touch, (self.target,)
-
-
 def test_pickled_objects_are_never_loaded(file: Path, tmp_path: Path) -> None:
     target = tmp_path / "touched"
-    content = {**arrays(), "obs": np.array([Payload(target)] * 5, dtype=object)}
+    content = {**arrays(), "obs": np.array([Runs(os.mkdir, str(target))] * 5, dtype=object)}
     np.savez(file, allow_pickle=True, **content)
     with pytest.raises(TrajectoryError, match="Python objects"):
         load(file)
@@ -196,7 +187,7 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         load(text)
     archive = tmp_path / "archive.npz"
     with zipfile.ZipFile(archive, "w") as z:
-        z.writestr("obs.npy", io.BytesIO(b"no array").getvalue())
+        z.writestr("obs.npy", b"no array")
     with pytest.raises(TrajectoryError):
         load(archive)
     with pytest.raises(TrajectoryError, match="does not exist"):

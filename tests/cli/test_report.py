@@ -22,9 +22,7 @@ from ttscompile.artifact.write import update_calibration
 from ttscompile.cli import main
 from ttscompile.errors import ReportError
 from ttscompile.lattice import Source, uniform_plan
-from ttscompile.points import efficient
 from ttscompile.report import Given, build, facts, pictures, render, verified
-from ttscompile.report.frontier import from_comparison
 from ttscompile.report.measure import run_episode
 from ttscompile.report.page import Table
 from ttscompile.runtimes import open_runtime
@@ -292,16 +290,6 @@ def test_shares_of_an_episode_are_counted_by_hand(calibrated: Path) -> None:
     assert shares[Source.TIMESTEP, 1:].min() == shares[Source.TIMESTEP, 1:].max() == 0.25
     assert shares[Source.ROLLOUT, 1:].min() == shares[Source.ROLLOUT, 1:].max() == 0.75
     np.testing.assert_allclose(course.sparsity, 0.8)
-
-
-def test_the_frontier_leaves_out_what_is_beaten() -> None:
-    document = {
-        "points": [
-            {"series": "a", "name": str(i), "error": error, "latency_ms": ms}
-            for i, (error, ms) in enumerate([(3, 1), (2, 2), (2.5, 3), (1, 4)])
-        ]
-    }
-    assert [point.name for point in efficient(from_comparison(document)[0])] == ["0", "1", "3"]
 
 
 @pytest.mark.parametrize("package", ["jinja2", "matplotlib"])

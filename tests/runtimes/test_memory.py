@@ -183,11 +183,10 @@ def test_calibration_runs_the_same_loop_and_its_corrections_help(made: Made) -> 
     plan[[0, 3]] = C
     corrected = executor.corrected(fit_correction(executor, plan, calls))
     for each in (executor, corrected):
-        found = each.run([plan, 0 * plan], calls)
         with torch.no_grad():
             expected = executor.model.rollout(contexts, initial, steps, plan, correction=each.correction)
-        torch.testing.assert_close(found[0], expected.sample, rtol=0, atol=2e-5)
+        torch.testing.assert_close(each.run(plan, calls), expected.sample, rtol=0, atol=2e-5)
         if each.correction is None:
-            torch.testing.assert_close(found[1], calls.targets, rtol=0, atol=2e-5)
-    errors = [float((each.run([plan], calls)[0] - calls.targets).abs().mean()) for each in (executor, corrected)]
+            torch.testing.assert_close(each.run(0 * plan, calls), calls.targets, rtol=0, atol=2e-5)
+    errors = [float((each.run(plan, calls) - calls.targets).abs().mean()) for each in (executor, corrected)]
     assert errors[1] < 0.8 * errors[0]

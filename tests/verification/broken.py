@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,26 +17,25 @@ from ttscompile.artifact.codec import encode
 from ttscompile.artifact.files import describe
 from ttscompile.artifact.identity import identities
 from ttscompile.artifact.load import read_manifest
-from ttscompile.artifact.manifest import MANIFEST, Manifest
-
-Arrays = dict[str, npt.NDArray[Any]]
+from ttscompile.artifact.manifest import MANIFEST
 
 
-def edit_manifest(directory: Path, edit: Callable[[Manifest], Manifest] = lambda manifest: manifest) -> None:
-    """Change the manifest; hashes of files, identities and checksum are made anew."""
-    manifest = edit(read_manifest(directory))
+def edit_manifest(directory: Path, **changes: Any) -> None:
+    """Change fields of the manifest; hashes of files, identities and checksum are made anew."""
+    manifest = replace(read_manifest(directory), **changes)
     manifest = replace(manifest, files={name: describe(directory / name) for name in manifest.files})
     identity, model_identity = identities(manifest)
     manifest = replace(manifest, identity=identity, model_identity=model_identity)
     (directory / MANIFEST).write_bytes(encode(manifest))
 
 
-def edit_tensors(directory: Path, store: str, edit: Callable[[Arrays], None]) -> None:
-    """Change arrays of one of the artifact's stores in place; every tensor stays where it lies."""
+@contextmanager
+def edited(directory: Path, store: str) -> Iterator[dict[str, npt.NDArray[Any]]]:
+    """The arrays of one of the artifact's stores, to be changed in the block; every tensor stays where it lies."""
     path = directory / getattr(read_manifest(directory).stores, store)
     places = tensors.offsets(path)
     arrays = {name: np.array(array) for name, array in tensors.read(path).items()}
-    edit(arrays)
+    yield arrays
     path.write_bytes(tensors.serialize(arrays))
     assert tensors.offsets(path) == places, "the ONNX graphs would read other weights"
     edit_manifest(directory)

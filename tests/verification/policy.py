@@ -9,7 +9,7 @@ from torch import nn
 
 from tests.calibration import policies
 from ttscompile import PolicySpec
-from ttscompile.lattice import Source
+from ttscompile.lattice import Source, whole_steps_plan
 
 STEPS, HORIZON, CHANNELS = policies.STEPS, policies.HORIZON, policies.CHANNELS
 WIDTH, LAYERS, BLOCKS = 128, 3, 6
@@ -46,8 +46,7 @@ def spec() -> PolicySpec:
 
 def sparse() -> npt.NDArray[np.int8]:
     """Three full steps of ten, and one block of a fourth."""
-    plan = np.full((STEPS, BLOCKS), Source.TIMESTEP, np.int8)
-    plan[[0, 4, 8]] = Source.COMPUTE
+    plan = whole_steps_plan(STEPS, BLOCKS, [0, 4, 8])
     plan[6, 2] = Source.COMPUTE
     plan[6, 4] = Source.FORWARD
     return plan
@@ -55,16 +54,14 @@ def sparse() -> npt.NDArray[np.int8]:
 
 def other() -> npt.NDArray[np.int8]:
     """The second half of the blocks at every other step."""
-    plan = np.full((STEPS, BLOCKS), Source.TIMESTEP, np.int8)
-    plan[0] = plan[1::2, 3:] = Source.COMPUTE
+    plan = whole_steps_plan(STEPS, BLOCKS, [0])
+    plan[1::2, 3:] = Source.COMPUTE
     return plan
 
 
 def sparsest() -> npt.NDArray[np.int8]:
     """Step 0 alone."""
-    plan = np.full((STEPS, BLOCKS), Source.TIMESTEP, np.int8)
-    plan[0] = Source.COMPUTE
-    return plan
+    return whole_steps_plan(STEPS, BLOCKS, [0])
 
 
 def shifted(plan: npt.NDArray[np.int8]) -> npt.NDArray[np.int8]:

@@ -15,7 +15,7 @@ from ttscompile.artifact.load import read_manifest
 from ttscompile.cli import main
 
 from . import policy
-from .broken import Arrays, edit_tensors
+from .broken import edited
 
 
 def run(*arguments: object) -> Result:
@@ -37,14 +37,10 @@ def test_a_sound_artifact_gives_status_0_and_a_picture(quick: Path, recording: P
 
 
 def test_a_broken_one_gives_status_1_and_says_where_and_what_to_do(artifact: Path, tmp_path: Path) -> None:
-    def shift(arrays: Arrays) -> None:
+    with edited(artifact, "plans") as arrays:
         arrays["schedule"] = policy.shifted(arrays["schedule"])
-
-    def perturb(arrays: Arrays) -> None:
+    with edited(artifact, "weights") as arrays:
         arrays["narrow.1.weight"] *= 1.1
-
-    edit_tensors(artifact, "plans", shift)
-    edit_tensors(artifact, "weights", perturb)
     result = run("verify", artifact, "--plot", tmp_path / "errors.svg")
     assert result.exit_code == 1
     assert "FAILED at block (step 0, block 3)" in result.stdout

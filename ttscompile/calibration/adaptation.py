@@ -31,6 +31,7 @@ class Adaptation:
         schedule: ``[K, blocks]``, settled.
 
     Attributes:
+        done: whether nothing is left to do.
         pruner: constants of the pruner; None before the last interval, or if no switch helps.
         switches: how many it has.
     """
@@ -42,17 +43,12 @@ class Adaptation:
         self._task, self._schedule = task, schedule
         self._effects: list[Matrix] = []
         self._errors: list[Matrix] = []
-        self._finished = not has_head(task.pruner) or task.calls.count < 2
+        self.done = not has_head(task.pruner) or task.calls.count < 2
         self.pruner: dict[str, Array] | None = None
         self.switches = 0
         # Two thirds to learn from, at most what the intervals linearise; the rest decides whether it was worth it.
         self._order = task.draw(10**6).permutation(task.calls.count)
         self._learned = min(LINEARISED * (self.INTERVALS - 1), 2 * task.calls.count // 3)
-
-    @property
-    def done(self) -> bool:
-        """Whether nothing is left to do."""
-        return self._finished
 
     def advance(self) -> None:
         """Linearise some more calls; with all of them, fit."""
@@ -68,18 +64,18 @@ class Adaptation:
             self._errors.append(model.error.reshape(len(numbers), -1))
             return
         self._fit()
-        self._finished = True
+        self.done = True
 
     def state(self) -> dict[str, Array]:
         """What was learned."""
-        state: dict[str, Array] = {self.KEY: np.array(int(self._finished)), "switches": np.array(self.switches)}
+        state: dict[str, Array] = {self.KEY: np.array(int(self.done)), "switches": np.array(self.switches)}
         for i, (effects, error) in enumerate(zip(self._effects, self._errors, strict=True)):
             state[f"effects{i}"], state[f"error{i}"] = effects, error
         return {**state, **(self.pruner or {})}
 
     def restore(self, state: Mapping[str, Array]) -> None:
         """Go back to where ``state`` was taken."""
-        self._finished, self.switches = bool(state[self.KEY]), int(state["switches"])
+        self.done, self.switches = bool(state[self.KEY]), int(state["switches"])
         count = sum(name.startswith("effects") for name in state)
         self._effects = [state[f"effects{i}"] for i in range(count)]
         self._errors = [state[f"error{i}"] for i in range(count)]
@@ -102,10 +98,9 @@ class Adaptation:
             count=capacity(task.pruner),
         )
         calls = task.executor.selector.calls(task.calls, others)
-        base = task.actions.errors(task.executor.run([self._schedule], calls)[0], calls.targets, units=False).mean()
+        base = task.error(self._schedule, calls)
         for count in dict.fromkeys(min(n, len(switches)) for n in COUNTS):
             weights = head_weights(task.pruner, self._schedule, switches[:count], features)
-            plans = pruner_plan(task.executor.logits(calls, weights))
-            error = task.actions.errors(task.executor.run_each(plans, calls), calls.targets, units=False).mean()
+            error = task.error(pruner_plan(task.executor.logits(calls, weights)), calls)
             if count and error < base:
                 base, self.pruner, self.switches = error, weights, count

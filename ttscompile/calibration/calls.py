@@ -157,18 +157,12 @@ class Selector:
     def __init__(self, graphs: Iterable[Graph]) -> None:
         self._axes = {name: graph.types()[name].batch_axis for graph in graphs for name in graph.outputs}
 
-    def contexts(self, contexts: Contexts, streams: Sequence[int] | IntArray) -> Contexts:
-        """Contexts of these streams, in this order; a stream may be taken several times."""
-        index = torch.as_tensor(np.asarray(streams, dtype=np.int64))
-        first, *_ = contexts.steps
-        steps = tuple(self._take(row, index) for row in contexts.steps) if first else contexts.steps
-        return Contexts(len(index), self._take(contexts.condition, index), steps)
-
     def calls(self, calls: Calls, streams: Sequence[int] | IntArray) -> Calls:
         """These calls, in this order; a call may be taken several times."""
-        index = torch.as_tensor(np.asarray(streams, dtype=np.int64))
+        index, contexts = torch.as_tensor(np.asarray(streams, dtype=np.int64)), calls.contexts
+        steps = tuple(self._take(row, index) for row in contexts.steps) if contexts.steps[0] else contexts.steps
         return Calls(
-            contexts=self.contexts(calls.contexts, streams),
+            contexts=Contexts(len(index), self._take(contexts.condition, index), steps),
             initial=calls.initial[index],
             noise=None if calls.noise is None else calls.noise[:, index],
             targets=calls.targets[index] if len(calls.targets) else calls.targets,

@@ -1,25 +1,36 @@
-"""Seconds of work, those before an interruption included."""
+"""Seconds of work, those before an interruption included, and what there is still time for."""
 
 from __future__ import annotations
 
+import math
 import time
+from collections.abc import Iterable, Iterator
+from copy import copy
+from typing import TypeVar
+
+Part = TypeVar("Part")
 
 
 class Clock:
-    """Counts from ``begun``.
+    """Counts from when it is made.
 
     Args:
-        begun: reading of ``time.monotonic`` when this part of the work began.
-        before: seconds of the parts before it.
         limit: seconds after which nothing more is begun.
+        before: seconds of the parts of the work before this one.
+        begun: reading of ``time.monotonic`` when this part began; None for now.
+
+    Attributes:
+        limit: see above.
+        cut: whether anything was left out for want of time.
     """
 
-    def __init__(self, begun: float, before: float, limit: float) -> None:
-        self._begun, self._before, self.limit = begun, before, limit
+    def __init__(self, limit: float = math.inf, before: float = 0.0, begun: float | None = None) -> None:
+        self.limit, self.cut = limit, False
+        self._zero = (time.monotonic() if begun is None else begun) - before
 
     def elapsed(self) -> float:
         """Seconds so far."""
-        return time.monotonic() - self._begun + self._before
+        return time.monotonic() - self._zero
 
     def left(self) -> float:
         """Seconds until the limit; negative after it."""
@@ -27,4 +38,22 @@ class Clock:
 
     def until(self, share: float) -> Clock:
         """The same clock with a share of the limit."""
-        return Clock(self._begun, self._before, self.limit * share)
+        other = copy(self)
+        other.limit *= share
+        return other
+
+    def has(self, seconds: float) -> bool:
+        """Whether so much is left; where it is not, something is left out, and ``cut`` says so."""
+        enough = seconds <= self.left()
+        self.cut |= not enough
+        return enough
+
+    def in_time(self, parts: Iterable[Part]) -> Iterator[Part]:
+        """The first part of some work, and others as long as they end in time, taking no more than those before."""
+        longest = 0.0
+        for number, part in enumerate(parts):
+            begun = self.elapsed()
+            if number and not self.has(longest):
+                return
+            yield part
+            longest = max(longest, self.elapsed() - begun)

@@ -17,6 +17,7 @@ from ..lattice import Source
 from ..points import MeasuredPoint
 from ..runtimes.base import open_runtime
 from ..runtimes.policy import CompiledPolicy
+from ..runtimes.random_calls import random_noise
 from ..trajectories.episodes import Episode
 from .calls import LARGEST
 
@@ -79,7 +80,7 @@ def measure(
     apart: dict[str, list[float]] = {"all": [], **({"steps": []} if spec.sampler.stochastic else {})}
     for number, (episode, row) in enumerate(chosen):
         obs = {key: array[row : row + 1] for key, array in episodes[episode].observations.items()}
-        one, two = _noise(artifact, draw), _noise(artifact, draw)
+        one, two = random_noise(spec, draw), random_noise(spec, draw)
         dense = _call(truth, obs, one, DENSE)
         apart["all"].append(_error(_call(truth, obs, two, DENSE), dense))
         if "steps" in apart:
@@ -130,13 +131,6 @@ def _error(actions: Array, dense: Array) -> float:
     with np.errstate(invalid="ignore", over="ignore"):
         difference = np.abs(actions - dense).mean()
     return float(np.nan_to_num(difference, nan=LARGEST, posinf=LARGEST))
-
-
-def _noise(artifact: Artifact, draw: np.random.Generator) -> Noise:
-    spec = artifact.manifest.spec
-    initial = draw.standard_normal((1, *spec.sample), dtype=np.float32)
-    draws = draw.standard_normal((spec.sampler.steps, *initial.shape), dtype=np.float32)
-    return Noise(initial, draws if spec.sampler.stochastic else None)
 
 
 def _adapted(noise: Noise, policy: CompiledPolicy, draw: np.random.Generator) -> Noise:

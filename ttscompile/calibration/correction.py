@@ -19,7 +19,7 @@ from ..lattice import BoolArray, PlanArray, Source
 from ..runtimes.reference.correction import correct, features, remember
 from ..runtimes.reference.sampler import Carried
 from .calls import Calls
-from .execute import Executor
+from .execute import Executor, State
 from .workers import workers
 
 STREAMS = 64
@@ -37,14 +37,13 @@ def anchors_of(plan: PlanArray) -> BoolArray:
     return np.asarray((plan == Source.COMPUTE).mean(axis=1) >= ANCHOR_SHARE)
 
 
-def fit_correction(executor: Executor, plan: PlanArray, calls: Calls, ridge: float = RIDGE) -> Correction:
+def fit_correction(executor: Executor, plan: PlanArray, calls: Calls) -> Correction:
     """The correction of a schedule.
 
     Args:
         executor: of the policy; its own correction is not used.
         plan: int8 ``[K, blocks]``, legal without a rollout cache.
         calls: with the path of the dense policy.
-        ridge: see ``RIDGE``.
     """
     assert calls.path is not None
     steps, sample = executor.model.steps, (calls.initial.shape[1], calls.initial.shape[2])
@@ -56,7 +55,7 @@ def fit_correction(executor: Executor, plan: PlanArray, calls: Calls, ridge: flo
         for k in range(steps):
             pairs = some.map(partial(_Lane.predict, k=k), lanes)
             read, missing = torch.cat([a for a, _ in pairs], 1), torch.cat([b for _, b in pairs], 1)
-            weight, bias = _solve(read.double(), missing.double(), groups, ridge)
+            weight, bias = _solve(read.double(), missing.double(), groups)
             for lane in lanes:
                 lane.advance(weight, bias, bool(anchors[k]))
             weights.append(weight.numpy())
@@ -70,7 +69,7 @@ class _Lane:
     def __init__(self, executor: Executor, plan: PlanArray, calls: Calls) -> None:
         assert calls.path is not None
         self._executor, self._plan, self._calls, self._path = executor, plan, calls, calls.path
-        self._state = executor.begin(calls, 1)
+        self._state = State(len(executor.axes))
         self._carried = self._following = executor.model.begin(calls.initial)
         self._prediction = calls.initial
 
@@ -94,7 +93,7 @@ class _Lane:
         )
 
 
-def _solve(read: Tensor, missing: Tensor, groups: int, ridge: float) -> tuple[Tensor, Tensor]:
+def _solve(read: Tensor, missing: Tensor, groups: int) -> tuple[Tensor, Tensor]:
     """Ridge regression of each group with a bias: float32 ``[G, 6 T, T]`` and ``[G, 1, T]``."""
     if groups == 1:
         read, missing = read.flatten(0, 1)[None], missing.flatten(0, 1)[None]
@@ -102,6 +101,6 @@ def _solve(read: Tensor, missing: Tensor, groups: int, ridge: float) -> tuple[Te
     read, missing = read - mean, missing - offset
     gram = read.transpose(1, 2) @ read
     scale = gram.diagonal(dim1=1, dim2=2).mean(1)[:, None, None]
-    shift = (ridge * scale + 1e-9) * torch.eye(read.shape[-1], dtype=read.dtype)
+    shift = (RIDGE * scale + 1e-9) * torch.eye(read.shape[-1], dtype=read.dtype)
     weight = torch.linalg.solve(gram + shift, read.transpose(1, 2) @ missing)
     return weight.float(), (offset - mean @ weight).float()

@@ -2,32 +2,23 @@
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Sequence
 
-from ..lattice import PlanArray, whole_steps_plan
+import numpy as np
 
 CROWDING = (2.0, 3.0, 1.5, 4.0, 1.0, 2.5, 3.5, 5.0, 0.6, 0.4)
 """1 is even, above it the steps crowd towards the end, below it towards the start. In the order in which they are
 tried: late steps mattered most wherever it was measured, and time may end the search."""
 
 
-def crowded_plan(steps: int, blocks: int, full_steps: int, crowding: float) -> PlanArray:
-    """Every block computed at ``full_steps`` steps, TIMESTEP elsewhere.
+def crowded_steps(steps: int, full_steps: int, crowding: float) -> tuple[int, ...]:
+    """Which steps to compute, in order.
 
     Args:
         steps: K.
-        blocks: number of blocks.
         full_steps: how many steps are computed; step 0 is one of them.
         crowding: the i-th of m is at ``K * (1 - (1 - i/m) ** crowding)``.
-
-    Returns:
-        int8 ``[K, blocks]``.
     """
-    return whole_steps_plan(steps, blocks, crowded_steps(steps, full_steps, crowding))
-
-
-def crowded_steps(steps: int, full_steps: int, crowding: float) -> tuple[int, ...]:
-    """The steps that ``crowded_plan`` computes, in order."""
     wished = steps * (1 - (1 - np.arange(full_steps) / full_steps) ** crowding)
     chosen: list[int] = []
     for i, wish in enumerate(wished):  # distinct, in order, and leaving room for those that follow
@@ -36,7 +27,6 @@ def crowded_steps(steps: int, full_steps: int, crowding: float) -> tuple[int, ..
     return tuple(chosen)
 
 
-def crowded_plans(steps: int, blocks: int, full_steps: int) -> list[PlanArray]:
-    """The different plans of all ``CROWDING``."""
-    plans = [crowded_plan(steps, blocks, full_steps, crowding) for crowding in CROWDING]
-    return list({plan.tobytes(): plan for plan in plans}.values())
+def crowded_family(steps: int, full_steps: int, crowding: Sequence[float] = CROWDING) -> list[tuple[int, ...]]:
+    """The different schedules that compute ``full_steps`` of the steps."""
+    return list(dict.fromkeys(crowded_steps(steps, full_steps, one) for one in crowding))

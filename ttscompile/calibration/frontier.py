@@ -11,9 +11,8 @@ calls are apart that start alike and draw differently is the yardstick for its e
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +20,8 @@ import torch
 
 from ..artifact.load import Artifact, load_artifact
 from ..artifact.manifest import DENSE
-from ..correction import FEATURES, Correction
+from ..correction import FEATURES
 from ..errors import CalibrationError
-from ..lattice import PlanArray
 from ..points import Frontier
 from ..runtimes.base import open_runtime
 from ..runtimes.policy import CompiledPolicy
@@ -33,7 +31,7 @@ from .calls import Actions, Split, require_seed, sample_calls, split_episodes
 from .contest import Entrant, Progress, measure
 from .execute import Executor
 from .latency import with_plans
-from .strategies import Found, Task, plan_of, require_reach
+from .strategies import Found, Task, plan_of, require_reach, require_strategy
 from .targets import dense_rounds, draw_calls
 
 LEARNED = 256
@@ -73,7 +71,8 @@ def compare(
         threads: of onnxruntime.
         seed: of the split, the calls, the noise and the searches.
         intervals: of a search, at most; None for the strategy's own number.
-        max_minutes: of a search; what it has found by then takes part, and a warning says so.
+        max_minutes: of a search, about: what it has found by then takes part, and a warning says so. A strategy that
+            has no plan within the budget by then is left out.
         progress: told how far it is.
 
     Raises:
@@ -100,18 +99,31 @@ def compare(
     skipped: dict[str, str] = {}
     wished: list[tuple[str, float]] = []
     for strategy in strategies:
+        require_strategy(strategy)
         for sparsity, cells in budgets.items():
             try:
                 require_reach(strategy, steps, blocks, cells)
             except CalibrationError as error:
-                if not _known(strategy, steps, blocks):
-                    raise
                 skipped[f"{strategy} {sparsity:g}"] = str(error)
-                continue
-            wished.append((strategy, sparsity))
-    search = partial(plan_of, intervals=intervals, seconds=60 * max_minutes)
-    plans, corrections, cut = _find(artifact, episodes, split, wished, budgets, learned, seed, search, progress)
-    entrants = _enter(artifact, plans, corrections, compared, wished, threads)
+            else:
+                wished.append((strategy, sparsity))
+    found: dict[tuple[str, float], Found] = {}
+    cut: list[str] = []
+    if wished:
+        task = _task(artifact, episodes, split, learned, seed, progress)
+    for number, (strategy, sparsity) in enumerate(wished):
+        name = f"{strategy} {sparsity:g}"
+        progress(f"search: {name}", number, len(wished))
+        try:
+            one, short = plan_of(strategy, replace(task, budget=budgets[sparsity]), intervals, 60 * max_minutes)
+        except CalibrationError as error:
+            skipped[name] = str(error)
+        else:
+            found[strategy, sparsity] = one
+            cut += [name] * short
+    if wished:
+        progress("search", len(wished), len(wished))
+    entrants = _enter(artifact, found, compared, threads)
     chosen = sample_calls(episodes, split.validation, calls, seed)
     warnings = _warnings(artifact, split, compared)
     if cut:
@@ -127,77 +139,40 @@ def compare(
     return Frontier(points, len(chosen), split.validation, threads, yardsticks, skipped, warnings)
 
 
-def _find(
-    artifact: Artifact,
-    episodes: Sequence[Episode],
-    split: Split,
-    wished: Sequence[tuple[str, float]],
-    budgets: Mapping[float, int],
-    limit: int,
-    seed: int,
-    search: Callable[[str, Task], tuple[Found, bool]],
-    progress: Progress,
-) -> tuple[dict[str, PlanArray], dict[str, Correction], list[str]]:
-    """Plans of strategies, with their corrections, by ``strategy sparsity``; and which of these had too little time."""
-    plans: dict[str, PlanArray] = {}
-    corrections: dict[str, Correction] = {}
-    cut: list[str] = []
-    if not wished:
-        return plans, corrections, cut
+def _task(
+    artifact: Artifact, episodes: Sequence[Episode], split: Split, limit: int, seed: int, progress: Progress
+) -> Task:
+    """What strategies are given, but for the budget: calls with what the dense policy answers to them."""
     spec, executor = artifact.manifest.spec, Executor(artifact)
-    learned = draw_calls(executor, spec, episodes, split, limit, 1, seed)["calibration"]
-    progress("dense calls to learn from", 0, learned.count)
+    calls = draw_calls(executor, spec, episodes, split, limit, 1, seed)["calibration"]
+    progress("dense calls to learn from", 0, calls.count)
     paths: list[torch.Tensor] = []
-    for found in dense_rounds(executor, learned):
-        paths += found
-        progress("dense calls to learn from", sum(map(len, paths)), learned.count)
-    learned = learned.answered(torch.cat(paths))
+    for found in dense_rounds(executor, calls):
+        paths.append(found)
+        progress("dense calls to learn from", sum(map(len, paths)), calls.count)
     kinds = tuple(block.kind for block in artifact.manifest.blocks)
     # Without constants of a pruner nobody spends time on plans that depend on the observation: schedules are compared.
-    task = Task(executor, Actions(spec), learned, len(kinds), seed, {}, kinds)
-    for number, (strategy, sparsity) in enumerate(wished):
-        name = f"{strategy} {sparsity:g}"
-        progress(f"search: {name}", number, len(wished))
-        proposal, short = search(strategy, replace(task, budget=budgets[sparsity]))
-        plans[name] = proposal.schedule
-        cut += [name] * short
-        if proposal.correction is not None:
-            corrections[name] = proposal.correction
-    progress("search", len(wished), len(wished))
-    return plans, corrections, cut
+    return Task(executor, Actions(spec), calls.answered(torch.cat(paths)), len(kinds), seed, {}, kinds)
 
 
 def _enter(
-    artifact: Artifact,
-    plans: Mapping[str, PlanArray],
-    corrections: Mapping[str, Correction],
-    others: Mapping[str, Artifact],
-    wished: Sequence[tuple[str, float]],
-    threads: int,
+    artifact: Artifact, found: Mapping[tuple[str, float], Found], others: Mapping[str, Artifact], threads: int
 ) -> list[Entrant]:
     """Everything that takes part: the artifact's own plans, those of strategies, and those of other artifacts."""
-    whole = with_plans(artifact, plans, corrections)
+    named = {f"{strategy} {sparsity:g}": one for (strategy, sparsity), one in found.items()}
+    corrections = {name: one.correction for name, one in named.items() if one.correction is not None}
+    whole = with_plans(artifact, {name: one.schedule for name, one in named.items()}, corrections)
     policy = CompiledPolicy(whole, open_runtime(whole, "onnxruntime", threads))
     entrants = [Entrant("this artifact", name, policy, name, True) for name in (DENSE, *artifact.manifest.plans)]
-    for strategy, sparsity in wished:
+    for strategy, sparsity in found:
         entrants.append(Entrant(strategy, f"{sparsity:g}", policy, f"{strategy} {sparsity:g}", True))
     sampler = artifact.manifest.spec.sampler
     for name, other in others.items():
         theirs = other.manifest.spec.sampler
-        paired = theirs.stochastic == sampler.stochastic and theirs.name == sampler.name
-        paired &= bool(theirs.steps == sampler.steps)
+        paired = (theirs.stochastic, theirs.name, theirs.steps) == (sampler.stochastic, sampler.name, sampler.steps)
         opened = CompiledPolicy(other, open_runtime(other, "onnxruntime", threads))
         entrants += [Entrant(name, plan, opened, plan, paired) for plan in (DENSE, *other.manifest.plans)]
     return entrants
-
-
-def _known(strategy: str, steps: int, blocks: int) -> bool:
-    """Whether there is a strategy of this name: it can be dense, if nothing else."""
-    try:
-        require_reach(strategy, steps, blocks, steps * blocks)
-    except CalibrationError:
-        return False
-    return True
 
 
 def _unique(name: str, others: Sequence[Path]) -> str:

@@ -19,6 +19,9 @@ from .strategies import Found
 PRUNED, SCHEDULE, UNIFORM = "tts", "schedule", "uniform"
 """Names of plans in the artifact: the pruner's, the best that does not depend on the observation, and the baseline."""
 
+BASELINE = "interval"
+"""The strategy that is no better than the uniform schedule, and need not be."""
+
 BETTER = 0.9
 """A plan has to bring the error below this share of the uniform schedule's."""
 
@@ -50,13 +53,13 @@ def judge(
     scores = {}
     corrected, plain = executor.corrected(found.correction), executor.corrected(None)
     judged = [(SCHEDULE, found.schedule, corrected), (UNIFORM, uniform_of(artifact, budget), plain)]
-    judged += [(name, plan, executor.corrected(named.corrections.get(name))) for name, plan in named.plans.items()]
+    judged += [(name, one.plan, executor.corrected(one.correction)) for name, one in named.plans.items()]
     for name, plan, runs in judged:
-        errors = actions.errors(runs.run([plan], calls)[0], calls.targets, units=True)
+        errors = actions.errors(runs.run(plan, calls), calls.targets, units=True)
         scores[name] = PlanScore.of(errors, plan[None], manifest.flops, pruned=False)
     if found.pruner is not None:
         plans = pruner_plan(executor.logits(calls, found.pruner))
-        errors = actions.errors(corrected.run_each(plans, calls), calls.targets, units=True)
+        errors = actions.errors(corrected.run(plans, calls), calls.targets, units=True)
         scores[PRUNED] = PlanScore.of(errors, plans, manifest.flops, pruned=True)
     return scores
 
@@ -77,13 +80,12 @@ def default_of(scores: Mapping[str, PlanScore], goal: Goal, cells: int, manifest
     return PRUNED if saves and pruned.error <= scores[SCHEDULE].error else SCHEDULE
 
 
-def require_success(result: CalibrationResult, goal: Goal, is_baseline: bool) -> None:
+def require_success(result: CalibrationResult, goal: Goal) -> None:
     """Raise unless the default plan is what was asked for.
 
     Args:
         result: of the calibration.
         goal: what was asked for.
-        is_baseline: the strategy is the baseline, and need not be better than it.
 
     Raises:
         CalibrationFailedError: says which of its promises it breaks.
@@ -109,7 +111,7 @@ def require_success(result: CalibrationResult, goal: Goal, is_baseline: bool) ->
             f" validation calls; at most {goal.value:g} was asked for. The artifact is as it was. Allow a larger error,"
             " more time, or calibrate with more episodes."
         )
-    if not is_baseline and not chosen.error < BETTER * baseline.error:
+    if result.strategy != BASELINE and not chosen.error < BETTER * baseline.error:
         raise CalibrationFailedError(
             f"{what} is no better than the uniform schedule: on the validation calls its actions are {chosen.error:.4g}"
             f" off on average, the uniform schedule's {baseline.error:.4g} (expected below {BETTER:.0%} of that). The"

@@ -15,7 +15,6 @@ Push-T policy the predicted and the measured change of the error by a single cel
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,14 +25,12 @@ from torch import Tensor
 from ..lattice import BoolArray, PlanArray, Source
 from .calls import Actions, Calls
 from .execute import Executor
+from .sensitivity import chunks, sensitivity
 
 Matrix = npt.NDArray[np.float32]
 
 DIRECTIONS = 4
 """Random directions of the action space that are followed for each call, in place of all of its dimensions."""
-
-CANDIDATE_BYTES = 2**28
-"""Memory for candidates; the gradients and what they need take about three times as much."""
 
 SOFTEN = 0.5
 """Share of the median error that is added where errors are divided by their size."""
@@ -83,74 +80,33 @@ def linearise(executor: Executor, actions: Actions, plan: PlanArray, calls: Call
         seed: of the directions.
     """
     generator = torch.Generator().manual_seed(seed)
-    difference = actions.executed(executor.run(plan[None], calls)[0]) - actions.executed(calls.targets)
+    difference = actions.executed(executor.run(plan, calls)) - actions.executed(calls.targets)
     weights = 1 / (difference.abs() + SOFTEN * difference.abs().median() + 1e-9)
     rank = min(DIRECTIONS, actions.size)
     bases = torch.linalg.qr(torch.randn(calls.count, actions.size, rank, generator=generator))[0]
     probes = bases.transpose(1, 2) * (actions.size / rank) ** 0.5 * weights.sqrt()[:, None]
-    reaches = []
-    chunk = _chunk(executor)
-    for start in range(0, calls.count, chunk):
-        numbers = np.arange(start, min(start + chunk, calls.count))
-        reaches.append(
-            _reach(executor, actions, plan, executor.selector.calls(calls, numbers), probes[torch.as_tensor(numbers)])
-        )
+    reaches = [
+        _reach(executor, actions, plan, executor.selector.calls(calls, numbers), probes[torch.as_tensor(numbers)])
+        for numbers in chunks(executor, calls.count)
+    ]
     error = torch.einsum("nra,na->nr", probes, difference).flatten()
     return LinearModel(np.concatenate(reaches, -1), error.numpy(), plan == Source.COMPUTE)
 
 
-def _chunk(executor: Executor) -> int:
-    """How many calls are linearised at once: each holds the candidates of all cells in memory."""
-    each = 4 * executor.model.steps * sum(math.prod(type_.at(1)) for type_ in executor.types)
-    return int(np.clip(CANDIDATE_BYTES // each, 1, 32))
-
-
 def _reach(executor: Executor, actions: Actions, plan: PlanArray, calls: Calls, probes: Tensor) -> Matrix:
     """``LinearModel.reach`` of a few calls; ``probes`` is ``[N, R, size]``."""
-    rank, count = probes.shape[1], calls.count
-    streams = executor.selector.calls(calls, np.tile(np.arange(count), rank))
-    model, axes = executor.model, executor.axes
-    carried = model.begin(streams.initial.clone().requires_grad_())
-    shape = (len(axes), model.steps)
-    candidates: list[list[Tensor]] = [[] for _ in axes]
-    passed: list[
-        Tensor
-    ] = []  # the stream after additions, whose gradients are those of the residuals added just before
-    position = np.zeros(shape, np.int64)
-    cache: dict[int, Tensor] = {}
-    for k, row in enumerate(plan):
-        stream = model.stem(carried.sample, k, streams.contexts)
-        computes = bool((row == Source.COMPUTE).any()) or not executor.alike
-        for b, axis in enumerate(axes):
-            if row[b] == Source.COMPUTE:
-                cache[b] = model.block(b, k, stream, streams.contexts)
-                candidates[b].append(_rows(cache[b].detach(), axis)[:count])
-            else:
-                with torch.no_grad():
-                    first = stream.narrow(axis, 0, count)
-                    candidates[b].append(_rows(model.block(b, k, first, calls.contexts), axis))
-            stream = stream + cache[b]
-            if computes:
-                position[b, k] = len(passed)
-                passed.append(stream)
-        if not computes:  # nothing but additions: one gradient serves all blocks
-            position[:, k] = len(passed)
-            passed.append(stream)
-        prediction = model.tail(stream, k, streams.contexts)
-        carried = executor.advance(carried, prediction, streams, k)
-    executed = actions.executed(carried.sample).reshape(rank, count, -1)
-    gradients = torch.autograd.grad((executed * probes.transpose(0, 1)).sum(), passed)
-    reach = np.empty((*shape, model.steps, count * rank), np.float32)
-    for b, axis in enumerate(axes):
-        slopes = torch.stack([_rows(gradients[i], axis) for i in position[b]], 1)
+    rank, count, (steps, blocks) = probes.shape[1], calls.count, plan.shape
+
+    def projected(samples: Tensor) -> Tensor:
+        return (actions.executed(samples).reshape(rank, count, -1) * probes.transpose(0, 1)).sum()
+
+    found = sensitivity(executor, plan, Source.TIMESTEP, calls, rank, projected)
+    reach = np.empty((blocks, steps, steps, count * rank), np.float32)
+    for b in range(blocks):
+        slopes = torch.stack(found.gradients[b::blocks], 1)
         slopes = slopes.reshape(rank, count, *slopes.shape[1:])
-        products = slopes @ torch.stack(candidates[b], 1).transpose(1, 2)  # [R, N, K added, K computed]
+        products = slopes @ torch.stack(found.computed[b::blocks], 1).transpose(1, 2)  # [R, N, K added, K computed]
         reach[b] = products.permute(2, 3, 1, 0).flatten(2).numpy()
-    summed = np.zeros((shape[0], shape[1] + 1, *reach.shape[2:]), np.float32)
+    summed = np.zeros((blocks, steps + 1, *reach.shape[2:]), np.float32)
     np.cumsum(reach, axis=1, out=summed[:, 1:])
     return summed
-
-
-def _rows(values: Tensor, axis: int) -> Tensor:
-    """One row a stream."""
-    return values.movedim(axis, 0).flatten(1)

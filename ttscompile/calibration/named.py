@@ -7,15 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TypeVar
 
 from ..correction import Correction
 from ..lattice import PlanArray
 from .families import Families
-from .strategies import Found, Task
+from .strategies import Task
 from .whole_steps import WholeSteps
-
-Kept = TypeVar("Kept")
 
 SAFE, FAST = "safe", "fast"
 
@@ -24,28 +21,36 @@ SHARE = 0.2
 
 
 @dataclass(frozen=True)
+class NamedPlan:
+    """A plan beside the target.
+
+    Attributes:
+        steps: that it computes.
+        plan: int8 ``[K, blocks]``.
+        correction: None where it is better without.
+    """
+
+    steps: tuple[int, ...]
+    plan: PlanArray
+    correction: Correction | None
+
+
+@dataclass(frozen=True)
 class Named:
     """Plans beside the target.
 
     Attributes:
-        plans: int8 ``[K, blocks]`` by name.
-        corrections: of those that are better with one.
-        steps: that each computes, for the record.
+        plans: by name.
         skipped: why a name has no plan.
     """
 
-    plans: Mapping[str, PlanArray] = field(default_factory=dict)
-    corrections: Mapping[str, Correction] = field(default_factory=dict)
-    steps: Mapping[str, list[int]] = field(default_factory=dict)
+    plans: Mapping[str, NamedPlan] = field(default_factory=dict)
     skipped: Mapping[str, str] = field(default_factory=dict)
 
     def without(self, name: str, reason: str) -> Named:
         """The same without one of the plans, and why."""
-
-        def rest(of: Mapping[str, Kept]) -> dict[str, Kept]:
-            return {key: value for key, value in of.items() if key != name}
-
-        return Named(rest(self.plans), rest(self.corrections), rest(self.steps), {**self.skipped, name: reason})
+        kept = {other: plan for other, plan in self.plans.items() if other != name}
+        return Named(kept, {**self.skipped, name: reason})
 
 
 def named_plans(families: Families, whole: WholeSteps, task: Task, strategy: str, cells: int) -> Named:
@@ -73,35 +78,11 @@ def named_plans(families: Families, whole: WholeSteps, task: Task, strategy: str
         counts[FAST] = max(2, target // 2)
     else:
         skipped[FAST] = f"the target computes {target} whole step{'s' * (target > 1)}: half of that is too little"
-    plans, corrections, steps = {}, {}, {}
+    plans: dict[str, NamedPlan] = {}
     for name, count in counts.items():
         best = families.best(count, f"plan {name}")
         if best is None:
             skipped[name] = "the time limit left none for it"
-            continue
-        plans[name], steps[name] = whole.plan(best.steps), list(best.steps)
-        correction = whole.correction(best.steps)
-        if correction is not None:
-            corrections[name] = correction
-    return Named(plans, corrections, steps, skipped)
-
-
-def relaxed(found: Found, families: Families, whole: WholeSteps, task: Task, full_steps: int) -> Found | None:
-    """What to take instead where the target's plan misses an error on held-out calls: more steps.
-
-    Args:
-        found: what missed it.
-        families: compares schedules.
-        whole: makes them.
-        task: with the calls that corrections are fitted on.
-        full_steps: how many to compute.
-
-    Returns:
-        A schedule with its correction, and no pruner; None if there is no time for it.
-    """
-    best = families.best(full_steps, f"{full_steps} steps")
-    if best is None:
-        return None
-    plan = whole.plan(best.steps)
-    notes = {**found.notes, "steps": list(best.steps), "switches": 0}
-    return Found(plan, None, notes, correction=whole.correction(best.steps))
+        else:
+            plans[name] = NamedPlan(best.steps, whole.plan(best.steps), whole.correction(best.steps))
+    return Named(plans, skipped)

@@ -17,6 +17,7 @@ from ..artifact.manifest import PRUNER
 from ..artifact.write import update_calibration
 from ..correction import FEATURES
 from ..errors import CalibrationError
+from ..lattice import sparsity
 from ..record_golden import record_plans
 from ..trajectories.episodes import Episode, load_trajectories
 from .budget import ERROR, LATENCY, Budget, Goal, cells_of, goal_of
@@ -27,13 +28,13 @@ from .families import Families, budget_of_error
 from .head import has_head
 from .judge import PRUNED, SCHEDULE, UNIFORM, default_of, judge, require_success, uniform_of
 from .latency import measure_budget
-from .named import SAFE, SHARE, Named, named_plans, relaxed
+from .named import SAFE, SHARE, Named, named_plans
 from .precision import precision_record
 from .progress import Bar
 from .result import CalibrationResult
 from .search import search_plan
 from .state import StateFile
-from .strategies import Found, Task, open_strategy, require_reach, require_strategy
+from .strategies import Found, Strategy, Task, open_strategy, require_reach, require_strategy
 from .targets import draw_calls, with_targets
 from .whole_steps import WholeSteps
 
@@ -145,7 +146,7 @@ def calibrate(
     if not (resume and state.load()):
         state.remove()
     limit = state.progress.setdefault("calls", limit)  # whatever time there is to go on
-    clock = Clock(begun, float(state.progress.get("seconds", 0.0)), 60 * max_minutes)
+    clock = Clock(60 * max_minutes, float(state.progress.get("seconds", 0.0)), begun)
     if goal.kind == LATENCY:
         budget = _timed_budget(artifact, goal, strategy, state, clock)
     executor = Executor(artifact)
@@ -168,10 +169,8 @@ def calibrate(
         families = Families(whole, state, clock, bar)
         if budget is None:
             budget = budget_of_error(families, goal, artifact.manifest.steps, len(kinds))
-        task = replace(task, budget=budget.cells)
-        searching = clock.until(1 - SHARE) if strategy == "tts" else clock
-        search = open_strategy(strategy, task, whole)
-        found, intervals, stopped = search_plan(search, state, searching, bar, max_intervals)
+        task = replace(task, budget=budget.cells, clock=clock.until(1 - SHARE) if strategy == "tts" else clock)
+        found, intervals, stopped = _search(open_strategy(strategy, task, whole), state, task.clock, bar, max_intervals)
         if goal.kind == ERROR:
             found, budget = _relax(artifact, families, whole, task, found, budget, sets["validation"])
         named = named_plans(families, whole, task, strategy, budget.cells)
@@ -193,7 +192,7 @@ def calibrate(
         stopped=stopped,
         seconds=clock.elapsed(),
     )
-    require_success(result, goal, found.is_baseline)
+    require_success(result, goal)
     precision = precision_record(artifact, episodes, split.validation, SCHEDULE, found.schedule, found.correction, seed)
     _write(Path(path), artifact, result, found, named, {**found.notes, **precision})
     state.remove()
@@ -204,7 +203,7 @@ def _write(
     path: Path, artifact: Artifact, result: CalibrationResult, found: Found, named: Named, notes: dict[str, object]
 ) -> None:
     """Put the plans into the artifact."""
-    corrections = dict(named.corrections)
+    corrections = {name: one.correction for name, one in named.plans.items() if one.correction is not None}
     if found.correction is not None:
         corrections[SCHEDULE] = found.correction
         if found.pruner is not None:
@@ -213,9 +212,9 @@ def _write(
     update_calibration(
         path,
         found.pruner,
-        {SCHEDULE: found.schedule, UNIFORM: uniform, **named.plans},
+        {SCHEDULE: found.schedule, UNIFORM: uniform, **{name: one.plan for name, one in named.plans.items()}},
         result.default_plan,
-        {**result.record(), **notes, "named_steps": dict(named.steps)},
+        {**result.record(), **notes, "named_steps": {name: list(one.steps) for name, one in named.plans.items()}},
         corrections=corrections,
         model_identity=artifact.manifest.model_identity,
         golden=record_plans,
@@ -262,6 +261,25 @@ def _may_prune(artifact: Artifact, strategy: str) -> bool:
     return strategy == "tts" and has_head(artifact.pruner)
 
 
+def _search(search: Strategy, state: StateFile, clock: Clock, bar: Bar, most: int | None) -> tuple[Found, int, str]:
+    """``search_plan`` from where the state is; saved after every interval."""
+    first = int(state.progress.get("intervals", 0))
+    count = search.intervals if most is None else min(most, search.intervals)
+    if first:
+        with state.reading():
+            search.restore(state.get("strategy"))
+    bar.stage("search", count, first)
+
+    def save(done: int, longest: float) -> None:
+        state.put("strategy", search.state())
+        state.progress.update(intervals=done, seconds=clock.elapsed())
+        state.save()
+        left = min(clock.left(), (count - done) * longest)
+        bar.update(done, f"error {search.loss:.4f}, sparsity {sparsity(search.plan):.2%}", left)
+
+    return search_plan(search, clock, most, first, save)
+
+
 def _relax(
     artifact: Artifact, families: Families, whole: WholeSteps, task: Task, found: Found, budget: Budget, held_out: Calls
 ) -> tuple[Found, Budget]:
@@ -275,10 +293,12 @@ def _relax(
     while misses(found, budget.cells):
         full = budget.cells // blocks
         more = full + max(1, full // 4)
-        other = relaxed(found, families, whole, task, more) if more <= steps // 2 else None
-        if other is None:
+        best = families.best(more, f"{more} steps") if more <= steps // 2 else None
+        if best is None:
             break
-        found, budget = other, replace(budget, cells=more * blocks)
+        notes = {**found.notes, "steps": list(best.steps), "switches": 0}
+        found = Found(whole.plan(best.steps), None, notes, correction=whole.correction(best.steps))
+        budget = replace(budget, cells=more * blocks)
     return found, budget
 
 

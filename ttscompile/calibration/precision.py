@@ -9,10 +9,10 @@ import numpy as np
 
 from ..artifact.load import Artifact
 from ..artifact.manifest import DENSE
-from ..config import Noise
 from ..correction import Correction
 from ..lattice import PlanArray, Source
 from ..runtimes.precision import Call, action_errors, compare
+from ..runtimes.random_calls import normalized, random_noise
 from ..trajectories.episodes import Episode
 from .calls import sample_calls
 
@@ -67,10 +67,5 @@ def _calls(
     spec = artifact.manifest.spec
     draw = np.random.default_rng((seed, 3))
     for number, row in chosen:
-        obs = {}
-        for key, one in spec.observations.items():
-            array = episodes[number].observations[key][row : row + 1]
-            obs[key] = array if one.normalizer is None else one.normalizer.normalize(array)
-        initial = draw.standard_normal((1, *spec.sample), dtype=np.float32)
-        draws = draw.standard_normal((spec.sampler.steps, *initial.shape), dtype=np.float32)
-        yield obs, Noise(initial, draws if spec.sampler.stochastic else None)
+        obs = {key: episodes[number].observations[key][row : row + 1] for key in spec.observations}
+        yield normalized(spec, obs), random_noise(spec, draw)

@@ -47,7 +47,7 @@ class Bar:
             self._progress.console.print(f"{what}: {total - done} to do", markup=False, soft_wrap=True)
         self._progress.update(self._task, description=what, total=total, completed=done, note="", left="")
 
-    def update(self, done: int, note: str, seconds_left: float | None) -> None:
+    def update(self, done: int, note: str, seconds_left: float) -> None:
         """Say how far it is."""
-        left = "" if seconds_left is None else f"at most {max(seconds_left, 0) / 60:.1f} min left"
+        left = f"at most {max(seconds_left, 0) / 60:.1f} min left"
         self._progress.update(self._task, completed=done, note=note, left=left)

@@ -2,52 +2,52 @@
 
 from __future__ import annotations
 
-from ..lattice import sparsity
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
 from .clock import Clock
-from .progress import Bar
-from .state import StateFile
-from .strategies import Found, Strategy
+
+if TYPE_CHECKING:
+    from .strategies.base import Found, Strategy
 
 CLOSING_SHARE = 0.3
 """What a strategy does at the end is left out where it would take more than this share of the time: on Push-T an
 interval of search lowers the error by 3 to 30 %, the switches by a few."""
 
 
-def search_plan(search: Strategy, state: StateFile, clock: Clock, bar: Bar, most: int | None) -> tuple[Found, int, str]:
-    """Intervals until the strategy is done, or the time is up.
+def search_plan(
+    search: Strategy,
+    clock: Clock,
+    most: int | None = None,
+    first: int = 0,
+    after: Callable[[int, float], None] = lambda done, longest: None,
+) -> tuple[Found, int, str]:
+    """Intervals until the strategy is done, or the time is up; one at least.
 
     Args:
-        search: at its beginning.
-        state: to go on from, and to save to after every interval.
+        search: after its first ``first`` intervals.
         clock: with the limit of the search.
-        bar: shows the progress.
         most: intervals; None for the strategy's own number.
+        first: the interval to begin with.
+        after: told after each interval how many are done, and how many seconds the longest took.
 
     Returns:
-        What was found, after how many intervals, and why it stopped.
+        What was found, after how many intervals, and why it stopped: ``converged``, ``finished`` or ``time limit``.
+
+    Raises:
+        CalibrationFailedError: the time was up before there was a plan within the budget.
     """
     count = search.intervals if most is None else min(most, search.intervals)
-    first = int(state.progress.get("intervals", 0))
-    if first:
-        with state.reading():
-            search.restore(state.get("strategy"))
-    bar.stage("search", count, first)
-    number, longest, cut = first, 0.0, False
+    number, longest = first, 0.0
     while number < count and not search.done:
         start = clock.elapsed()
-        end = start + longest + search.settling
-        if number > 0 and end > clock.limit:
-            return search.found(), number, "time limit"
+        if number > 0 and not clock.has(longest + search.settling):
+            break
         closing = search.closing * longest
-        if number > 0 and closing <= CLOSING_SHARE * clock.limit and end + closing > clock.limit:
+        if 0 < closing <= CLOSING_SHARE * clock.limit and not clock.has(longest + search.settling + closing):
             search.close()
-            cut = True
         search.advance(number)
         number += 1
         longest = max(longest, clock.elapsed() - start)
-        state.put("strategy", search.state())
-        state.progress.update(intervals=number, seconds=clock.elapsed())
-        state.save()
-        left = min(clock.left(), (count - number) * longest)
-        bar.update(number, f"error {search.loss:.4f}, sparsity {sparsity(search.plan):.2%}", left)
-    return search.found(), number, "time limit" if cut else "converged" if search.done else "finished"
+        after(number, longest)
+    return search.found(), number, "time limit" if clock.cut else "converged" if search.done else "finished"

@@ -51,7 +51,7 @@ def with_targets(
     # A calibration that was interrupted later goes on with as many as it had then.
     count = min(calls.count, int(state.progress.get(key, calls.count)))
     while len(path) < count and (len(path) < least or clock.elapsed() < SHARE * clock.limit):
-        path = torch.cat([path, *next(rounds)])
+        path = torch.cat([path, next(rounds)])
         state.put("targets", {**state.get("targets"), name: path.numpy()})
         state.progress["seconds"] = clock.elapsed()
         state.save()
@@ -62,7 +62,7 @@ def with_targets(
     return calls.answered(path)
 
 
-def dense_rounds(executor: Executor, calls: Calls, begin: int = 0) -> Iterator[list[torch.Tensor]]:
+def dense_rounds(executor: Executor, calls: Calls, begin: int = 0) -> Iterator[torch.Tensor]:
     """What the dense policy answers to calls, from number ``begin`` on, a round of all workers at a time.
 
     Yields:
@@ -74,7 +74,7 @@ def dense_rounds(executor: Executor, calls: Calls, begin: int = 0) -> Iterator[l
             parts = [np.arange(i, min(i + TARGETS_AT_ONCE, end)) for i in range(begin, end, TARGETS_AT_ONCE)]
             found = some.map(lambda part: executor.run_dense(executor.selector.calls(calls, part)), parts)
         begin = end
-        yield found
+        yield torch.cat(found)
 
 
 def draw_calls(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from ..correction import Correction
 from ..lattice import PlanArray, whole_steps_plan
 from .correction import fit_correction
-from .crowded import CROWDING, crowded_steps
+from .crowded import CROWDING, crowded_family
 
 if TYPE_CHECKING:
     from .strategies.base import Task
@@ -88,11 +88,10 @@ class WholeSteps:
 
     def _errors(self, steps: Sequence[int], correction: Correction | None) -> Errors:
         task, calls = self._task, self._compared
-        samples = task.executor.corrected(correction).run([self.plan(steps)], calls)[0]
+        samples = task.executor.corrected(correction).run(self.plan(steps), calls)
         normalised, units = (task.actions.errors(samples, calls.targets, units=u).mean() for u in (False, True))
         return Errors(float(normalised), float(units))
 
     def crowded(self, full_steps: int, crowding: Sequence[float] = CROWDING) -> list[tuple[int, ...]]:
         """The family of schedules that a search starts with: the different ones of ``full_steps`` steps."""
-        steps = self._task.executor.model.steps
-        return list(dict.fromkeys(crowded_steps(steps, full_steps, c) for c in crowding))
+        return crowded_family(self._task.executor.model.steps, full_steps, crowding)

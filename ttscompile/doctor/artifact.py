@@ -56,23 +56,19 @@ def _needs(artifact: Artifact) -> list[Finding]:
         ),
     ]
     precision = manifest.precision_name
-    if precision == "int8" and has_integer_dot_product() is False:
-        remedy = "Its fast kernels saturate on this processor. Load it with precision='fp32', which it holds too."
-        found.append(Finding(PART, "precision", f"{precision}, without VNNI or AMX", Level.WARNING, remedy))
-    else:
-        found.append(Finding(PART, "precision", precision))
+    slow = precision == "int8" and has_integer_dot_product() is False
+    remedy = "Its fast kernels saturate on this processor. Load it with precision='fp32', which it holds too."
+    found.append(Finding.judged(PART, "precision", precision + ", without VNNI or AMX" * slow, slow, remedy))
     weights = sum(record.bytes for record in manifest.files.values())
     cache = rollout_needs(artifact)
     told = (
         f"{weights / 2**20:.1f} MiB of files, and {cache.bytes_read / 2**20:.1f} MiB of rollout cache a stream for its"
         f" plans ({cache.bytes_most / 2**20:.1f} for plans that you give)"
     )
-    available = available_bytes()
-    if available is not None and _COPIES * weights + cache.bytes_read > available:
-        remedy = f"{available / 2**20:.0f} MiB are available: free some, or raise the limit of the control group."
-        found.append(Finding(PART, "memory", told, Level.PROBLEM, remedy))
-    else:
-        found.append(Finding(PART, "memory", told))
+    available, needed = available_bytes(), _COPIES * weights + cache.bytes_read
+    remedy = f"{(available or 0) / 2**20:.0f} MiB are available: free some, or raise the limit of the control group."
+    short = available is not None and needed > available
+    found.append(Finding.judged(PART, "memory", told, short, remedy, Level.PROBLEM))
     if manifest.calibration is None or manifest.default_plan == "dense":
         remedy = "It computes everything, in many times the time. Run: ttscompile calibrate DIR --trajectories FILE."
         found.append(Finding(PART, "plan", "dense: not calibrated", Level.WARNING, remedy))

@@ -20,17 +20,16 @@ from .packages import package_findings
 MARKS = {Level.OK: "ok", Level.NOTE: "-", Level.WARNING: "!", Level.PROBLEM: "PROBLEM"}
 
 
-def examine(directory: Path | None = None, root: Path = Path("/")) -> list[Finding]:
+def examine(directory: Path | None = None) -> list[Finding]:
     """Everything that is found, in the order of the report.
 
     Args:
         directory: an artifact, or the same zipped; it is loaded and called. None looks at the machine alone.
-        root: of the system's own files ``/proc`` and ``/sys``.
 
     Returns:
         Findings; none raises. What stops an artifact from running has the level ``PROBLEM``.
     """
-    found = [*package_findings(), *machine_findings(root)]
+    found = [*package_findings(), *machine_findings()]
     if directory is not None:
         found += artifact_findings(directory)
     return found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 
 class Level(enum.Enum):
@@ -36,12 +36,13 @@ class Finding:
     def __post_init__(self) -> None:
         assert self.remedy or self.level in (Level.OK, Level.NOTE), f"{self.what}: no remedy"
 
+    @classmethod
+    def judged(
+        cls, part: str, what: str, found: str, wrong: bool, remedy: str, level: Level = Level.WARNING
+    ) -> Finding:
+        """Of this level and with this remedy if it is wrong, else ``OK`` and without."""
+        return cls(part, what, found, level, remedy) if wrong else cls(part, what, found)
+
     def to_json(self) -> dict[str, str]:
         """As plain JSON values."""
-        return {
-            "part": self.part,
-            "what": self.what,
-            "found": self.found,
-            "level": self.level.value,
-            "remedy": self.remedy,
-        }
+        return {**asdict(self), "level": self.level.value}

@@ -47,15 +47,8 @@ def machine_findings(root: Path = Path("/")) -> list[Finding]:
 
 def usable_cores(root: Path = Path("/")) -> float:
     """Cores that this process may keep busy: affinity, physical cores and the cgroup's limit, whichever is least."""
-    affinity = _affinity()
-    physical = _physical(root)
-    limits: list[float] = [len(affinity)]
-    if physical is not None:
-        limits.append(physical)
-    quota = cgroup_cores(root)
-    if quota is not None:
-        limits.append(quota)
-    return min(limits)
+    limits = len(_affinity()), _physical(root), cgroup_cores(root)
+    return min(limit for limit in limits if limit is not None)
 
 
 def cgroup_cores(root: Path) -> float | None:
@@ -95,10 +88,8 @@ def _processor(root: Path) -> list[Finding]:
     has = [told for name, told in known.items() if name in flags]
     lacks = [told for name, told in known.items() if name not in flags and not flags & _AS_GOOD.get(name, set())]
     told = f"{', '.join(has) or 'none that matter'}" + (f"; not {', '.join(lacks)}" if lacks else "")
-    if x86 and "avx2" not in flags:
-        remedy = "onnxruntime falls back to kernels that are several times slower; use a processor of 2015 or later."
-        return [*found, Finding(part, "instructions", told, Level.WARNING, remedy)]
-    return [*found, Finding(part, "instructions", told)]
+    remedy = "onnxruntime falls back to kernels that are several times slower; use a processor of 2015 or later."
+    return [*found, Finding.judged(part, "instructions", told, x86 and "avx2" not in flags, remedy)]
 
 
 def _cores(root: Path) -> list[Finding]:
@@ -118,18 +109,12 @@ def _cores(root: Path) -> list[Finding]:
     )
     found.append(Finding(part, "threads", advice))
     governor = _text(root / "sys/devices/system/cpu/cpu0/cpufreq/scaling_governor").strip()
-    if governor and governor != "performance":
+    if governor:
         remedy = "The first calls after a pause are slow. Run: sudo cpupower frequency-set -g performance."
-        found.append(Finding(part, "frequency governor", governor, Level.WARNING, remedy))
-    elif governor:
-        found.append(Finding(part, "frequency governor", governor))
+        found.append(Finding.judged(part, "frequency governor", governor, governor != "performance", remedy))
     load = os.getloadavg()[0]
-    if load > _BUSY * usable:
-        remedy = "Timings taken now say little: stop what else runs, or reserve cores (taskset)."
-        found.append(Finding(part, "load", f"{load:.1f} over the last minute", Level.WARNING, remedy))
-    else:
-        found.append(Finding(part, "load", f"{load:.1f} over the last minute"))
-    return found
+    remedy = "Timings taken now say little: stop what else runs, or reserve cores (taskset)."
+    return [*found, Finding.judged(part, "load", f"{load:.1f} over the last minute", load > _BUSY * usable, remedy)]
 
 
 def _memory(root: Path) -> list[Finding]:
@@ -143,19 +128,13 @@ def _clock(root: Path) -> list[Finding]:
     part, info = "clock", time.get_clock_info("monotonic")
     found = [Finding(part, "resolution", f"{1e9 * info.resolution:g} ns, {1e9 * _tick():.0f} ns between two readings")]
     source = _text(root / "sys/devices/system/clocksource/clocksource0/current_clocksource").strip()
-    if source and source not in _FAST_CLOCKS:
+    if source:
         remedy = "Reading the time costs a system call of microseconds; see the kernel's parameter clocksource=tsc."
-        found.append(Finding(part, "source", source, Level.WARNING, remedy))
-    elif source:
-        found.append(Finding(part, "source", source))
+        found.append(Finding.judged(part, "source", source, source not in _FAST_CLOCKS, remedy))
     late = _lateness_ms()
     told = f"{late:.2f} ms late in the median, of 20 sleeps of 1 ms"
-    if late > _LATE_MS:
-        remedy = "A control loop will jitter: look with ttscompile plan DIR --control-hz HZ --jitter 10."
-        found.append(Finding(part, "sleep", told, Level.WARNING, remedy))
-    else:
-        found.append(Finding(part, "sleep", told))
-    return found
+    remedy = "A control loop will jitter: look with ttscompile plan DIR --control-hz HZ --jitter 10."
+    return [*found, Finding.judged(part, "sleep", told, late > _LATE_MS, remedy)]
 
 
 def _tick() -> float:

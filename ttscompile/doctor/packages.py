@@ -66,9 +66,8 @@ def _python() -> list[Finding]:
     else:
         found = [Finding(part, "version", told)]
     system = f"{platform.system()} {platform.release()} {platform.machine()}"
-    if platform.system() == "Linux":
-        return [*found, Finding(part, "system", system)]
-    return [*found, Finding(part, "system", system, Level.WARNING, "ttscompile is tested on Linux only; use that.")]
+    remedy = "ttscompile is tested on Linux only; use that."
+    return [*found, Finding.judged(part, "system", system, platform.system() != "Linux", remedy)]
 
 
 def _packages(wanted: list[Requirement]) -> list[Finding]:
@@ -104,16 +103,15 @@ def _installed(wanted: Requirement) -> tuple[str, bool]:
 
 def _extra(name: str, wanted: list[Requirement]) -> Finding:
     """One extra: complete, or what it lacks; its absence is no problem on a robot."""
-    found = {each.name: _installed(each) for each in wanted}
+    found = [_installed(each) for each in wanted]
     what = f"extra {name!r}"
     lacking = [
         f"{each.name} {'' if told == 'not installed' else told + ' '}(needs {each.least})"
-        for each in wanted
-        for told, fits in [found[each.name]]
+        for each, (told, fits) in zip(wanted, found, strict=True)
         if not fits
     ]
     if not lacking:
-        versions = ", ".join(f"{package} {told}" for package, (told, _) in found.items())
+        versions = ", ".join(f"{each.name} {told}" for each, (told, _) in zip(wanted, found, strict=True))
         return Finding("packages", what, f"for {ENABLES[name]}: {versions}")
     remedy = f"Where you want {ENABLES[name]}: pip install 'ttscompile[{name}]'."
     return Finding("packages", what, f"lacks {', '.join(lacking)}", Level.NOTE, remedy)

@@ -8,9 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import OutputError, RuntimeUnavailableError
-
-_ABBREVIATIONS = {"self_attention": "SA", "cross_attention": "CA", "feed_forward": "FF"}
+from .figure import STEPS_AXIS, block_names, new_figure, write_picture
 
 _LEAST, _MOST = -8.0, 0.0
 """Powers of ten at the ends of the colours: rounding, and another residual altogether."""
@@ -33,7 +31,7 @@ def plot_errors(
         steps: number of each of the A steps.
         kinds: kind of each block, in order of execution.
         tolerance: errors above it are framed.
-        path: of the picture; its suffix (``.png``, ``.svg``, ``.pdf``) is the format.
+        path: see ``write_picture``.
         title: over the picture.
         cells: bool ``[K, blocks]``, cells of a plan that are marked; None for none.
         plan: its name.
@@ -42,17 +40,9 @@ def plot_errors(
         RuntimeUnavailableError: matplotlib is not installed.
         OutputError: the picture cannot be written.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ModuleNotFoundError as error:
-        raise RuntimeUnavailableError(
-            f"a picture of the errors needs matplotlib, and {error.name!r} is not installed."
-            " Install 'ttscompile[compile]', or read the errors with --json."
-        ) from error
     count, blocks = errors.shape
-    figure = Figure(figsize=(min(6.5 + 0.03 * count, 12.0), min(2.2 + 0.17 * blocks, 14.0)), layout="constrained")
-    FigureCanvasAgg(figure)
+    size = min(6.5 + 0.03 * count, 12.0), min(2.2 + 0.17 * blocks, 14.0)
+    figure = new_figure(*size, "a picture of the errors", "the errors")
     axes = figure.add_subplot()
     shown = np.log10(np.clip(np.nan_to_num(errors, nan=1.0, posinf=1.0), 10**_LEAST, 10**_MOST)).T
     image = axes.imshow(shown, cmap="viridis", vmin=_LEAST, vmax=_MOST, aspect="auto", interpolation="none")
@@ -69,8 +59,8 @@ def plot_errors(
             axes.scatter(across, down, s=12, marker="x", color="#f0e442", linewidths=0.9)
     ticks = np.unique(np.linspace(0, count - 1, min(count, 11)).round().astype(int))
     axes.set_xticks(ticks, [str(steps[i]) for i in ticks])
-    axes.set_yticks(range(blocks), [f"{_ABBREVIATIONS.get(k, k[:12])} {b}" for b, k in enumerate(kinds)], fontsize=7)
-    axes.set_xlabel("denoising step k, in order of execution (0 is the noisiest)")
+    axes.set_yticks(range(blocks), block_names(kinds), fontsize=7)
+    axes.set_xlabel(STEPS_AXIS)
     axes.set_ylabel("residual block")
     told = f"{len(above)} of {errors.size} residuals differ by more than {tolerance:g} (framed)"
     if plan is not None:
@@ -78,10 +68,4 @@ def plot_errors(
     axes.set_title(f"{title}\n{told}" if title else told, fontsize=9, loc="left")
     bar = figure.colorbar(image, ax=axes)
     bar.set_label("relative error of the residual, power of ten")
-    metadata = {".png": {"Software": None}, ".svg": {"Date": None}}.get(Path(path).suffix)
-    try:
-        figure.savefig(path, dpi=150, metadata=metadata)
-    except (OSError, ValueError) as error:
-        raise OutputError(
-            f"{path}: the picture cannot be written: {error}. Give a .png, .svg or .pdf in a folder that exists."
-        ) from error
+    write_picture(figure, path)

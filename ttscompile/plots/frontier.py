@@ -7,8 +7,8 @@ from math import log
 from pathlib import Path
 from textwrap import wrap
 
-from ..errors import OutputError, RuntimeUnavailableError
 from ..points import Point
+from .figure import new_figure, plain_powers, write_picture
 
 COLOURS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 """Okabe and Ito's palette, without the yellow that white paper swallows."""
@@ -33,24 +33,14 @@ def plot_frontier(
         points: of all series; those without an error (the dense policy itself) are left out: the axis is logarithmic.
         efficient: points that no other beats, fastest first.
         yardsticks: errors that are drawn as level lines, by their key in ``Frontier.yardsticks``.
-        path: of the picture; its suffix (``.png``, ``.svg``, ``.pdf``) is the format.
+        path: see ``write_picture``.
         title: over the picture.
 
     Raises:
         OutputError: the picture cannot be written.
         RuntimeUnavailableError: matplotlib is not installed.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-        from matplotlib.ticker import LogFormatter
-    except ModuleNotFoundError as error:
-        raise RuntimeUnavailableError(
-            f"a picture needs matplotlib, and {error.name!r} is not installed. Install 'ttscompile[compile]', or read"
-            " the figures with --json."
-        ) from error
-    figure = Figure(figsize=(7.5, 5.5), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(7.5, 5.5)
     axes = figure.add_subplot()
     shown = [point for point in points if point.error > 0]
     for i, series in enumerate(dict.fromkeys(point.series for point in shown)):
@@ -85,23 +75,15 @@ def plot_frontier(
     axes.set_yscale("log")
     axes.set_xlabel("latency of a call, ms (median)")
     axes.set_ylabel("error of the executed actions on held-out calls, in their units")
-    for axis in (axes.xaxis, axes.yaxis):  # 40 rather than 4 x 10^1
-        axis.set_major_formatter(LogFormatter())
-        axis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
+    plain_powers(axes.xaxis)
+    plain_powers(axes.yaxis)
     axes.margins(x=0.08, y=0.1)
     lines = [line for part in title.splitlines() for line in wrap(part, _TITLE_WIDTH)]
     axes.set_title("\n".join(lines), fontsize=8, loc="left")
     axes.grid(which="both", color="#dddddd", linewidth=0.5)
     axes.set_axisbelow(True)
     figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
-    # A picture of the same figures is the same file: matplotlib would put its version or the date into it.
-    metadata = {"Software": None} if path.suffix == ".png" else {"Date": None} if path.suffix == ".svg" else None
-    try:
-        figure.savefig(path, dpi=150, metadata=metadata)
-    except (OSError, ValueError) as error:  # no such folder; no such format
-        raise OutputError(
-            f"{path}: the picture cannot be written: {error}. Give a .png, .svg or .pdf in a folder that exists."
-        ) from error
+    write_picture(figure, path)
 
 
 def _near(p: Point, other: Point) -> bool:

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import IllegalPlanError, OutputError, RuntimeUnavailableError
+from ..errors import IllegalPlanError
 from ..lattice import PlanArray, Source, sparsity
+from .figure import STEPS_AXIS, block_names, new_figure, write_picture
 
 COLOURS = {
     Source.COMPUTE: "#d55e00",
@@ -18,8 +19,6 @@ COLOURS = {
 }
 """From Okabe and Ito's palette, which colour-blind readers can tell apart; what is computed is the darkest."""
 
-_ABBREVIATIONS = {"self_attention": "SA", "cross_attention": "CA", "feed_forward": "FF"}
-
 
 def plot_plan(plan: PlanArray, kinds: Sequence[str], path: str | Path, title: str = "") -> None:
     """Draw one plan and write the picture.
@@ -27,32 +26,25 @@ def plot_plan(plan: PlanArray, kinds: Sequence[str], path: str | Path, title: st
     Args:
         plan: int8 ``[K, blocks]`` of ``Source``.
         kinds: kind of each block, in order of execution.
-        path: of the picture; its suffix (``.png``, ``.svg``, ``.pdf``) is the format.
+        path: see ``write_picture``.
         title: over the picture; the sparsity is added to it.
 
     Raises:
         IllegalPlanError: the plan is not a matrix of sources, or does not have a column for each kind.
         RuntimeUnavailableError: matplotlib is not installed.
+        OutputError: the picture cannot be written.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.colors import ListedColormap
-        from matplotlib.figure import Figure
-        from matplotlib.patches import Patch
-    except ModuleNotFoundError as error:
-        raise RuntimeUnavailableError(
-            f"a picture of a plan needs matplotlib, and {error.name!r} is not installed."
-            " Install 'ttscompile[compile]', or read the plan with --json."
-        ) from error
     if plan.ndim != 2 or plan.shape[1] != len(kinds) or not np.isin(plan, list(Source)).all():
         raise IllegalPlanError(
             f"cannot draw a plan of shape {plan.shape} with values {np.unique(plan).tolist()}; expected"
             f" [K, {len(kinds)}] of ttscompile.Source, 0..3."
         )
     steps, blocks = plan.shape
-    # No pyplot: it keeps every figure in a global list, and would choose a window system.
-    figure = Figure(figsize=(min(6.0 + 0.03 * steps, 12.0), min(1.9 + 0.17 * blocks, 14.0)), layout="constrained")
-    FigureCanvasAgg(figure)
+    size = min(6.0 + 0.03 * steps, 12.0), min(1.9 + 0.17 * blocks, 14.0)
+    figure = new_figure(*size, "a picture of a plan", "the plan")
+    from matplotlib.colors import ListedColormap
+    from matplotlib.patches import Patch
+
     axes = figure.add_subplot()
     axes.imshow(
         plan.T, cmap=ListedColormap([COLOURS[s] for s in Source]), vmin=0, vmax=3, aspect="auto", interpolation="none"
@@ -61,8 +53,8 @@ def plot_plan(plan: PlanArray, kinds: Sequence[str], path: str | Path, title: st
     axes.set_yticks(np.arange(-0.5, blocks), minor=True)
     axes.grid(which="minor", color="white", linewidth=0.4)
     axes.tick_params(which="minor", length=0)
-    axes.set_yticks(range(blocks), [f"{_ABBREVIATIONS.get(k, k[:12])} {b}" for b, k in enumerate(kinds)], fontsize=7)
-    axes.set_xlabel("denoising step k, in order of execution (0 is the noisiest)")
+    axes.set_yticks(range(blocks), block_names(kinds), fontsize=7)
+    axes.set_xlabel(STEPS_AXIS)
     axes.set_ylabel("residual block")
     heading = f"{sparsity(plan):.1%} of {plan.size} cells reused"
     axes.set_title(f"{title}: {heading}" if title else heading, fontsize=10, loc="left")
@@ -77,13 +69,4 @@ def plot_plan(plan: PlanArray, kinds: Sequence[str], path: str | Path, title: st
         frameon=False,
         fontsize=9,
     )
-    # A picture of the same plan is the same file: matplotlib would put its version or the date into it.
-    metadata = (
-        {"Software": None} if Path(path).suffix == ".png" else {"Date": None} if Path(path).suffix == ".svg" else None
-    )
-    try:
-        figure.savefig(path, dpi=150, metadata=metadata)
-    except (OSError, ValueError) as error:  # no such folder; no such format
-        raise OutputError(
-            f"{path}: the picture cannot be written: {error}. Give a .png, .svg or .pdf in a folder that exists."
-        ) from error
+    write_picture(figure, path)

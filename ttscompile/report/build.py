@@ -209,12 +209,12 @@ def _frontier(artifact: Artifact, latencies: Sequence[Latency], compared: Compar
         text = "Errors from the calibration record, latencies measured now. ttscompile compare measures more of it."
     if not any(point.error > 0 for point in points):
         return Section("Frontier", ("There is no error to hold against a latency: calibrate the artifact first.",))
+    best = efficient(points)
     drawn = Picture(
-        pictures.frontier_picture(points, efficient(points), yardsticks, f"artifact {manifest.short_identity}"),
+        pictures.frontier_picture(points, best, yardsticks, f"artifact {manifest.short_identity}"),
         alt="Points: action error against latency of each plan. The table has the figures.",
         caption="Action error against latency: down and left is better.",
     )
-    best = efficient(points)
     rows = tuple((p.series, p.name, f"{p.error:.4g}", ms(p.latency_ms), "yes" if p in best else "") for p in points)
     head = ("", "plan", "action error", "ms a call", "on the frontier")
     return Section("Frontier", (text,), (Table(head, rows),), (drawn,))

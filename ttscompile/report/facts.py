@@ -162,7 +162,7 @@ def score_table(record: Mapping[str, Any]) -> Table:
             share(score["sparsity"]),
             share(score["flops_saved"]),
         )
-        for name, score in _scores(record).items()
+        for name, score in scores(record).items()
     ]
     head = ("plan", "mean action error", "90th percentile", "cells reused", "FLOPs saved")
     return Table(head, tuple(rows))
@@ -185,14 +185,9 @@ def record_table(record: Mapping[str, Any]) -> Table:
 
 
 def scores(record: Mapping[str, Any] | None) -> Mapping[str, Mapping[str, Any]]:
-    """Of each plan that calibration judged; empty without a record."""
-    return {} if record is None else _scores(record)
-
-
-def _scores(record: Mapping[str, Any]) -> Mapping[str, Mapping[str, Any]]:
-    """Those with figures: the record is free JSON, written by whoever made the artifact."""
+    """Of each plan that calibration judged, if its figures are there: a record is free JSON of whoever made it."""
     wanted = ("error", "error_p90", "sparsity", "flops_saved")
-    found = _mapping(record.get("plans"))
+    found = _mapping((record or {}).get("plans"))
     return {
         str(name): score
         for name, score in found.items()

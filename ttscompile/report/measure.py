@@ -52,13 +52,11 @@ class Course:
         name: of the episode.
         plans: int8 ``[R, K, blocks]``, as executed.
         legalised: cells of each call that were replaced because they were never computed.
-        total_ms: of each call.
     """
 
     name: str
     plans: PlanArray
     legalised: tuple[int, ...]
-    total_ms: tuple[float, ...]
 
     @property
     def sparsity(self) -> npt.NDArray[np.float64]:
@@ -125,7 +123,6 @@ def run_episode(policy: CompiledPolicy, episode: Episode) -> Course:
         name=episode.name,
         plans=np.stack([report.plan[0] for report in made]),
         legalised=tuple(report.legalised[0] for report in made),
-        total_ms=tuple(report.timings.total for report in made),
     )
 
 

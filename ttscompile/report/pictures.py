@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..lattice import PlanArray, Source, sparsity
+from ..plots.figure import STEPS_AXIS, new_figure, plain_powers
 from ..plots.frontier import plot_frontier
 from ..plots.plan import COLOURS, plot_plan
 from ..points import Point
@@ -58,18 +59,17 @@ def frontier_picture(
 
 def shares_picture(course: Course) -> bytes:
     """For each source that occurs, in how many of the episode's calls each cell had it."""
-    figure = _figure()
     shares = course.shares()
     used = [source for source in Source if shares[source].any()]
     steps, blocks = shares.shape[1:]
-    figure.set_size_inches(min(6.0 + 0.03 * steps, 12.0), len(used) * min(1.0 + 0.09 * blocks, 6.0) + 0.6)
+    figure = new_figure(min(6.0 + 0.03 * steps, 12.0), len(used) * min(1.0 + 0.09 * blocks, 6.0) + 0.6)
     panels = figure.subplots(len(used), 1, sharex=True, squeeze=False)[:, 0]
     for axes, source in zip(panels, used, strict=True):
         drawn = axes.imshow(shares[source].T, cmap="cividis", vmin=0, vmax=1, aspect="auto", interpolation="none")
         mean = float(shares[source].mean())
         axes.set_title(f"{source.name}: {mean:.1%} of the cells", fontsize=10, loc="left")
         axes.set_ylabel("block")
-    panels[-1].set_xlabel("denoising step k, in order of execution (0 is the noisiest)")
+    panels[-1].set_xlabel(STEPS_AXIS)
     figure.colorbar(drawn, ax=list(panels), label="share of the calls", pad=0.01)
     return _png(figure)
 
@@ -78,8 +78,7 @@ def sparsity_picture(course: Course) -> bytes:
     """Reused cells, call by call; and those that had to be replaced."""
     from matplotlib.ticker import MaxNLocator
 
-    figure = _figure()
-    figure.set_size_inches(6.0, 3.2)
+    figure = new_figure(6.0, 3.2)
     axes = figure.add_subplot()
     calls = np.arange(len(course.sparsity))
     axes.plot(calls, 100 * course.sparsity, color=COLOURS[Source.COMPUTE], marker="o", markersize=3, linewidth=1.2)
@@ -98,8 +97,7 @@ def sparsity_picture(course: Course) -> bytes:
 
 def latency_picture(latencies: Sequence[Latency]) -> bytes:
     """A bar a plan, cut into what its calls spend their time on; a bar that would dwarf the others is cut off."""
-    figure = _figure()
-    figure.set_size_inches(6.0, 1.5 + 0.45 * len(latencies))
+    figure = new_figure(6.0, 1.5 + 0.45 * len(latencies))
     axes = figure.add_subplot()
     rows = np.arange(len(latencies))[::-1]
     left = np.zeros(len(latencies))
@@ -132,10 +130,7 @@ def latency_picture(latencies: Sequence[Latency]) -> bytes:
 
 def plans_picture(scores: Mapping[str, Mapping[str, Any]]) -> bytes:
     """Held-out action error of each plan of a calibration against the share of cells that it computes."""
-    from matplotlib.ticker import LogFormatter
-
-    figure = _figure()
-    figure.set_size_inches(6.0, 4.0)
+    figure = new_figure(6.0, 4.0)
     axes = figure.add_subplot()
     for name, score in scores.items():
         x, middle, high = 100 * (1 - score["sparsity"]), score["error"], score["error_p90"]
@@ -144,8 +139,7 @@ def plans_picture(scores: Mapping[str, Mapping[str, Any]]) -> bytes:
         axes.plot(x, high, "_", color="#999999", markersize=10, zorder=1)
         axes.annotate(plain(name, 24), (x, middle), xytext=(7, -3), textcoords="offset points", fontsize=9)
     axes.set_yscale("log")
-    axes.yaxis.set_major_formatter(LogFormatter())  # 40 rather than 4 x 10^1
-    axes.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
+    plain_powers(axes.yaxis)
     axes.set_xlabel("cells computed, %")
     axes.set_ylabel("error of the actions, in their units")
     axes.margins(x=0.2, y=0.1)
@@ -158,16 +152,6 @@ def caption_of(plan: PlanArray) -> str:
     """Counts of a plan, for who cannot see it."""
     counts = ", ".join(f"{source.name.lower()} {int(np.count_nonzero(plan == source))}" for source in Source)
     return f"{sparsity(plan):.1%} of {plan.size} cells are reused: {counts}."
-
-
-def _figure() -> Figure:
-    """A figure without pyplot, which keeps every figure in a global list, and would choose a window system."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
 
 
 def _png(figure: Figure) -> bytes:

@@ -23,7 +23,7 @@ from typing import IO, Any, BinaryIO
 import numpy as np
 
 from ..errors import TrajectoryError
-from .frames import Array, Frames, Recording, bytes_of, require_proportion
+from .frames import Array, Frames, Recording, bytes_of, one_error, require_proportion
 from .hdf5_file import hdf5_recording
 from .lerobot_dataset import lerobot_recording
 from .zarr_buffer import zarr_recording
@@ -176,20 +176,18 @@ def serve(request: Mapping[str, Any], out: BinaryIO) -> None:
     """Answer a request on a stream."""
     path = Path(request["path"])
     try:
-        recording: Recording = FORMATS[request["kind"]](path)
-        _send(out, names=list(recording.names))
-        for name, own in {"ends": recording.ends, "order": recording.order}.items():
-            if own is not None:
-                _send_array(path, out, {"own": name}, len(own), iter([own]))
-        for name in request["wanted"]:
-            if name in recording.names:
-                _send_array(path, out, {"array": name}, *recording.read(name))
-        _send(out, end=True)
+        with one_error(f"{path}: is damaged, or no recording of its format", ". Copy it again"):
+            recording: Recording = FORMATS[request["kind"]](path)
+            _send(out, names=list(recording.names))
+            for name, own in {"ends": recording.ends, "order": recording.order}.items():
+                if own is not None:
+                    _send_array(path, out, {"own": name}, len(own), iter([own]))
+            for name in request["wanted"]:
+                if name in recording.names:
+                    _send_array(path, out, {"array": name}, *recording.read(name))
+            _send(out, end=True)
     except TrajectoryError as error:
         _send(out, error=str(error))
-    except Exception as error:  # the libraries raise whatever their parts raise
-        what = f"{type(error).__name__}: {str(error)[:160]}"
-        _send(out, error=f"{path}: is damaged, or no recording of its format ({what}). Copy it again.")
 
 
 def _send_array(path: Path, out: BinaryIO, head: Mapping[str, str], rows: int, blocks: Iterator[Array]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -189,7 +190,23 @@ def require_files(path: Path) -> None:
             )
 
 
-def require_package(path: Path, package: str) -> TrajectoryError:
+@contextmanager
+def one_error(what: str, hint: str = "") -> Iterator[None]:
+    """Within the block every error is a ``TrajectoryError``: libraries that decode raise whatever their parts raise.
+
+    Args:
+        what: went wrong; the error's own words follow it in brackets.
+        hint: what comes after these.
+    """
+    try:
+        yield
+    except TrajectoryError:
+        raise
+    except Exception as error:
+        raise TrajectoryError(f"{what} ({type(error).__name__}: {str(error)[:160]}){hint}.") from error
+
+
+def missing_package(path: Path, package: str) -> TrajectoryError:
     """The error of a package that is not installed."""
     return TrajectoryError(
         f"{path}: reading this takes the package {package!r}, which is not installed. Install 'ttscompile[recordings]',"

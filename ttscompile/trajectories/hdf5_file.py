@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import TrajectoryError
-from .frames import Array, Recording, block_rows, require_files, require_package, require_proportion
+from .frames import Array, Recording, block_rows, missing_package, one_error, require_files, require_proportion
 
 FILTERS = frozenset({"gzip", "lzf", "shuffle", "fletcher32"})
 """Compression that h5py has itself; others are libraries of their own."""
@@ -26,21 +26,14 @@ def hdf5_recording(path: Path) -> Recording:
     try:
         import h5py
     except ModuleNotFoundError as error:
-        raise require_package(path, "h5py") from error
+        raise missing_package(path, "h5py") from error
     require_files(path)
-    try:
-        with h5py.File(path, "r") as file:
-            demos = sorted(_group(path, file, "data"), key=_number)
-            groups = [_group(path, file, f"data/{demo}/obs") for demo in demos]
-            lengths = [_length(path, group) for group in groups]
-            names = sorted(set.intersection(*(set(group) for group in groups)))
-    except TrajectoryError:
-        raise
-    except Exception as error:  # h5py raises KeyError, OSError, ValueError and RuntimeError
-        raise TrajectoryError(
-            f"{path}: cannot be read as a data set of robomimic ({type(error).__name__}: {str(error)[:160]});"
-            " expected an HDF5 file with data/DEMO/obs/NAME [F, ...]."
-        ) from error
+    hint = "; expected an HDF5 file with data/DEMO/obs/NAME [F, ...]"
+    with one_error(f"{path}: cannot be read as a data set of robomimic", hint), h5py.File(path, "r") as file:
+        demos = sorted(_group(path, file, "data"), key=_number)
+        groups = [_group(path, file, f"data/{demo}/obs") for demo in demos]
+        lengths = [_length(path, group) for group in groups]
+        names = sorted(set.intersection(*(set(group) for group in groups)))
     total = sum(lengths)
     ends = np.cumsum(lengths) if total < 2**62 else np.zeros(0, np.int64)
     return Recording(names, lambda name: (total, _blocks(path, demos, name)), ends)
@@ -50,21 +43,16 @@ def _blocks(path: Path, demos: list[str], name: str) -> Iterator[Array]:
     """Rows of all demonstrations; sizes are compared with the file's before the first is read."""
     import h5py
 
-    try:
-        with h5py.File(path, "r") as file:
-            arrays = [_inside(path, file, f"data/{demo}/obs/{name}") for demo in demos]
-            for array in arrays:
-                _require_plain(path, array)
-            total = sum(math.prod(array.shape) * array.dtype.itemsize for array in arrays)
-            require_proportion(path, total, path.stat().st_size)
-            for array in arrays:
-                step = block_rows(array.shape, array.dtype.itemsize, array.chunks[0] if array.chunks else 1)
-                for start in range(0, max(1, len(array)), step):
-                    yield array[start : start + step]
-    except TrajectoryError:
-        raise
-    except Exception as error:
-        raise TrajectoryError(f"{path}: {name!r} is damaged ({type(error).__name__}: {str(error)[:160]}).") from error
+    with one_error(f"{path}: {name!r} is damaged"), h5py.File(path, "r") as file:
+        arrays = [_inside(path, file, f"data/{demo}/obs/{name}") for demo in demos]
+        for array in arrays:
+            _require_plain(path, array)
+        total = sum(math.prod(array.shape) * array.dtype.itemsize for array in arrays)
+        require_proportion(path, total, path.stat().st_size)
+        for array in arrays:
+            step = block_rows(array.shape, array.dtype.itemsize, array.chunks[0] if array.chunks else 1)
+            for start in range(0, max(1, len(array)), step):
+                yield array[start : start + step]
 
 
 def _inside(path: Path, file: Any, name: str) -> Any:

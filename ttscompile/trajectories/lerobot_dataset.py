@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import TrajectoryError
-from .frames import Array, Recording, require_files, require_package, require_proportion
+from .frames import Array, Recording, missing_package, one_error, require_files, require_proportion
 
 EPISODE, FRAME = "episode_index", "frame_index"
 ROWS, IMAGES = 4096, 8
@@ -27,25 +27,19 @@ def lerobot_recording(path: Path) -> Recording:
     try:
         import pyarrow.parquet as parquet
     except ModuleNotFoundError as error:
-        raise require_package(path, "pyarrow") from error
+        raise missing_package(path, "pyarrow") from error
     require_files(path / "data")
     require_files(path / "meta")
     files = sorted((path / "data").rglob("*.parquet"))
     if not files:
         raise TrajectoryError(f"{path}: has meta/info.json and no data/**/*.parquet; expected a LeRobot data set.")
     size = sum(file.stat().st_size for file in files)
-    try:
+    hint = f"; expected tables with the columns {EPISODE} and {FRAME}"
+    with one_error(f"{path}: cannot be read as a LeRobot data set", hint):
         videos = _videos(path)
         tables = [parquet.ParquetFile(file) for file in files]
         names = [name for name in tables[0].schema_arrow.names if name not in (EPISODE, FRAME)]
         episodes, numbers = (_index(path, tables, name, size) for name in (EPISODE, FRAME))
-    except TrajectoryError:
-        raise
-    except Exception as error:  # pyarrow has its own errors, of several kinds
-        raise TrajectoryError(
-            f"{path}: cannot be read as a LeRobot data set ({type(error).__name__}: {str(error)[:160]}); expected"
-            f" tables with the columns {EPISODE} and {FRAME}."
-        ) from error
     if len(episodes) != len(numbers):
         raise TrajectoryError(f"{path}: {EPISODE} has {len(episodes)} rows, and {FRAME} {len(numbers)}.")
     order = np.lexsort((numbers, episodes))
@@ -74,7 +68,7 @@ def _index(path: Path, tables: list[Any], name: str, size: int) -> Array:
 def _column(path: Path, tables: list[Any], name: str, size: int) -> Iterator[Array]:
     """The rows of a column, a few at a time; ends where they are more than the files can hold."""
     total = 0
-    try:
+    with one_error(f"{path}: column {name!r} is damaged"):
         for table in tables:
             images = _images_or_numbers(path, name, table.schema_arrow.field(name).type)
             for batch in table.iter_batches(IMAGES if images else ROWS, columns=[name], use_threads=False):
@@ -84,12 +78,6 @@ def _column(path: Path, tables: list[Any], name: str, size: int) -> Iterator[Arr
                     total += block.nbytes
                     require_proportion(path, total, size)
                     yield block
-    except TrajectoryError:
-        raise
-    except Exception as error:
-        raise TrajectoryError(
-            f"{path}: column {name!r} is damaged ({type(error).__name__}: {str(error)[:160]})."
-        ) from error
 
 
 def _images_or_numbers(path: Path, name: str, kind: Any) -> bool:
@@ -137,11 +125,7 @@ def _image(path: Path, name: str, value: Any) -> Array:
 
 def _videos(path: Path) -> list[str]:
     """Names of the features that are videos; they are not read, and the error says so."""
-    try:
+    hint = "; expected a LeRobot data set, whose features it names"
+    with one_error(f"{path}: meta/info.json cannot be read", hint):
         features = json.loads((path / "meta" / "info.json").read_text("utf-8"))["features"]
         return [name for name, feature in features.items() if feature.get("dtype") == "video"]
-    except (OSError, ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
-        raise TrajectoryError(
-            f"{path}: meta/info.json cannot be read ({type(error).__name__}: {str(error)[:160]}); expected a LeRobot"
-            " data set, whose features it names."
-        ) from error

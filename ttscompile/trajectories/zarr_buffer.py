@@ -10,7 +10,16 @@ from typing import Any
 import numpy as np
 
 from ..errors import TrajectoryError
-from .frames import Array, Recording, block_rows, bytes_of, require_files, require_package, require_proportion
+from .frames import (
+    Array,
+    Recording,
+    block_rows,
+    bytes_of,
+    missing_package,
+    one_error,
+    require_files,
+    require_proportion,
+)
 
 CODECS = frozenset({"blosc", "bz2", "delta", "gzip", "lz4", "lzma", "shuffle", "zlib", "zstd", "bytes", "crc32c"})
 """Compression that only computes. zarr also knows codecs that unpickle what they read."""
@@ -25,19 +34,15 @@ def zarr_recording(path: Path) -> Recording:
     try:
         import zarr
     except ModuleNotFoundError as error:
-        raise require_package(path, "zarr") from error
+        raise missing_package(path, "zarr") from error
     require_files(path)
-    try:
+    hint = "; expected a zarr group with data/NAME [F, ...] and meta/episode_ends [E]"
+    with one_error(f"{path}: cannot be read as a replay buffer of Diffusion Policy", hint):
         store: Any = zarr.storage.ZipStore(path, mode="r") if path.is_file() else str(path)
         group = zarr.open_group(store, mode="r")
         data: Any = group["data"]
         ends = group["meta/episode_ends"]
         names = tuple(sorted(name for name, _ in data.arrays()))
-    except Exception as error:  # zarr raises whatever its stores and parsers raise
-        raise TrajectoryError(
-            f"{path}: cannot be read as a replay buffer of Diffusion Policy ({_short(error)}); expected a zarr group"
-            " with data/NAME [F, ...] and meta/episode_ends [E]."
-        ) from error
     size = bytes_of(path)
 
     def read(name: str) -> tuple[int, Iterator[Array]]:
@@ -65,11 +70,9 @@ def _require_plain(path: Path, array: Any, size: int) -> None:
 
 def _blocks(path: Path, array: Any) -> Iterator[Array]:
     step = block_rows(array.shape, array.dtype.itemsize, max(1, array.chunks[0]))
-    try:
+    with one_error(f"{path}: {array.path!r} is damaged", ". Copy it again"):  # truncated chunks and the like
         for start in range(0, max(1, array.shape[0]), step):
             yield np.asarray(array[start : start + step])
-    except Exception as error:  # truncated chunks and the like
-        raise TrajectoryError(f"{path}: {array.path!r} is damaged ({_short(error)}). Copy it again.") from error
 
 
 def _codecs(metadata: Any) -> set[str]:
@@ -77,7 +80,3 @@ def _codecs(metadata: Any) -> set[str]:
     if metadata.zarr_format == 2:
         return {str(one.codec_id) for one in (*(metadata.filters or ()), metadata.compressor) if one is not None}
     return {str(one.to_dict()["name"]).removeprefix("numcodecs.") for one in metadata.codecs}
-
-
-def _short(error: Exception) -> str:
-    return f"{type(error).__name__}: {str(error)[:160]}"

@@ -128,18 +128,14 @@ def check_plans(
     failures: list[tuple[str, int | None, tuple[int, ...]]] = []
     cells, worst = {}, 0.0
     for name, record in recorded.items():
-        made, samples = _episode(artifact, golden, runtime, name)
-        differ = (made != record.plan).any((0, 1))
-        if np.count_nonzero(differ) > _differing_cells(artifact, name, differ):
+        made, differ, few, error = _replay(artifact, golden, runtime, name, record)
+        if not few:
             cells[name] = differ
             step, block = np.argwhere(differ)[0].tolist()
             told = f"plan {name!r} is not what calibration stored in {int(differ.sum())} of {differ.size} cells"
             told += f", first at step {step}, block {block}{_shifted(made[0, 0], record.plan[0, 0])}"
             failures.append((told, step, tuple(np.flatnonzero(differ[step]).tolist())))
             continue
-        if differ.any():  # a near tie: hold what the stored plan gives against the record
-            samples = _given(artifact, golden, runtime, name, record.plan)
-        error = largest(samples, record.sample)
         worst = max(worst, error)
         if not error <= SAMPLE:
             correction = artifact.corrections.get(name)
@@ -173,12 +169,8 @@ def check_plans_precision(
     tolerance = CARRIED * (SAMPLE if precision.error is None else precision.error.tolerance)
     errors, wrong = dict[str, float](), dict[str, str]()
     for name, record in recorded.items():
-        made, samples = _episode(artifact, golden, runtime, name)
-        differ = (made != record.plan).any((0, 1))
-        if differ.any():
-            samples = _given(artifact, golden, runtime, name, record.plan)
-        errors[name] = largest(samples, record.sample)
-        if np.count_nonzero(differ) > _differing_cells(artifact, name, differ):
+        _, differ, few, errors[name] = _replay(artifact, golden, runtime, name, record)
+        if not few:
             wrong[name] = f"{name!r} in {np.count_nonzero(differ)} of {differ.size} cells"
         elif not errors[name] <= tolerance:
             wrong[name] = f"the samples of {name!r} by {errors[name]:.2g}"
@@ -200,27 +192,29 @@ def dense_of(artifact: Artifact, streams: int) -> PlanArray:
     return np.broadcast_to(artifact.schedule(DENSE), (streams, *artifact.schedule(DENSE).shape))
 
 
-def _differing_cells(artifact: Artifact, name: str, cells: npt.NDArray[np.bool_]) -> float:
-    """How many of these cells may differ from the record."""
-    return CELLS * cells.size if artifact.manifest.plans[name].kind == "pruner" else 0
+def _replay(
+    artifact: Artifact, golden: Golden, runtime: Runtime, name: str, record: GoldenPlan
+) -> tuple[PlanArray, npt.NDArray[np.bool_], bool, float]:
+    """The episode that ``GoldenPlan`` describes.
 
-
-def _episode(artifact: Artifact, golden: Golden, runtime: Runtime, name: str) -> tuple[PlanArray, npt.NDArray[Any]]:
-    """Executed plans and samples of the episode that ``GoldenPlan`` describes."""
-    schedule = None if artifact.manifest.plans[name].kind == "pruner" else artifact.schedule(name)
-    return _two_calls(artifact, golden, runtime, name, (schedule, schedule), True)
-
-
-def _given(
-    artifact: Artifact, golden: Golden, runtime: Runtime, name: str, plans: npt.NDArray[np.int8]
-) -> npt.NDArray[Any]:
-    """Samples of the same episode with these plans ``[2, B, K, blocks]`` and the correction of a named plan."""
-    return _two_calls(artifact, golden, runtime, name, (plans[0], plans[1]), False)[1]
+    Returns:
+        Executed plans ``[2, B, K, blocks]``; the cells ``[K, blocks]`` that are not those of the record; whether these
+        may differ; and the error of the samples, with the stored plan where cells differ.
+    """
+    pruned = artifact.manifest.plans[name].kind == "pruner"
+    schedule = None if pruned else artifact.schedule(name)
+    made, samples = _two_calls(artifact, golden, runtime, name, (schedule, schedule), True)
+    differ = (made != record.plan).any((0, 1))
+    if differ.any():  # a near tie, maybe: hold what the stored plan gives against the record
+        _, samples = _two_calls(artifact, golden, runtime, name, (record.plan[0], record.plan[1]), False)
+    few = bool(np.count_nonzero(differ) <= (CELLS * differ.size if pruned else 0))
+    return made, differ, few, largest(samples, record.sample)
 
 
 def _two_calls(
     artifact: Artifact, golden: Golden, runtime: Runtime, name: str, plans: tuple[Any, Any], named: bool
 ) -> tuple[PlanArray, npt.NDArray[Any]]:
+    """Executed plans and samples of an episode of two calls; ``named`` where the plans are those of the artifact."""
     obs, made, samples = golden.network_observations(artifact.manifest.spec), [], []
     runtime.reset()
     for order, plan in zip((1, -1), plans, strict=True):

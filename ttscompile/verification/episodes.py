@@ -14,6 +14,7 @@ from ..artifact.load import Artifact
 from ..artifact.manifest import DENSE
 from ..config import Noise, PolicySpec
 from ..runtimes.policy import CompiledPolicy
+from ..runtimes.random_calls import random_noise
 from ..trajectories.episodes import Episode
 from .rung import FAILED, PASSED, SKIPPED, Rung, finite
 
@@ -75,15 +76,11 @@ def check_episodes(
         return Rung(SPARSITY, SKIPPED, "the artifact is not calibrated: every call is dense")
     spec, draw = manifest.spec, np.random.default_rng(0)
     total = _Errors({name: [] for name in manifest.plans}, [])
-    if episodes:
-        for i, episode in enumerate(episodes):
-            told(f"episode {i + 1} of {len(episodes)}, {episode.calls} calls")
-            rows = [{k: a[r : r + 1] for k, a in episode.observations.items()} for r in range(episode.calls)]
-            _run(policy, rows, [_noise(spec, draw) for _ in rows], [_noise(spec, draw) for _ in rows], total)
-    else:
-        obs = golden.raw_observations(spec)
-        rows = [{key: value[s : s + 1] for key, value in obs.items()} for s in range(golden.streams)]
-        _run(policy, rows, [_noise(spec, draw) for _ in rows], [_noise(spec, draw) for _ in rows], total)
+    for i, obs in enumerate([one.observations for one in episodes] or [golden.raw_observations(spec)]):
+        rows = [{k: a[r : r + 1] for k, a in obs.items()} for r in range(len(next(iter(obs.values()))))]
+        if episodes:
+            told(f"episode {i + 1} of {len(episodes)}, {len(rows)} calls")
+        _run(policy, spec, rows, draw, total)
     figures = {
         name: {"error": finite(float(np.mean(e))), "error_p90": finite(float(np.quantile(e, 0.9)))}
         for name, e in total.plans.items()
@@ -128,12 +125,13 @@ def check_episodes(
 
 def _run(
     policy: CompiledPolicy,
+    spec: PolicySpec,
     rows: Sequence[Mapping[str, npt.NDArray[Any]]],
-    noises: Sequence[Noise],
-    others: Sequence[Noise],
+    draw: np.random.Generator,
     total: _Errors,
 ) -> None:
     """One episode with every plan, and twice dense; each begins with a reset."""
+    noises, others = ([random_noise(spec, draw) for _ in rows] for _ in range(2))
 
     def actions(plan: str, with_noise: Sequence[Noise]) -> list[npt.NDArray[np.float64]]:
         policy.reset()
@@ -145,13 +143,6 @@ def _run(
     pairs.append((total.other_noise, actions(DENSE, others)))
     for errors, made in pairs:
         errors += [float(np.abs(one - other).mean()) for one, other in zip(made, dense, strict=True)]
-
-
-def _noise(spec: PolicySpec, draw: np.random.Generator) -> Noise:
-    initial = draw.standard_normal((1, *spec.sample), dtype=np.float32)
-    if not spec.sampler.stochastic:
-        return Noise(initial)
-    return Noise(initial, draw.standard_normal((spec.sampler.steps, *initial.shape), dtype=np.float32))
 
 
 def _promised(calibration: Mapping[str, Any] | None, name: str, key: str) -> float | None:

@@ -39,10 +39,6 @@ from .probe import Probe
 from .rung import FAILED, ErrorMap, Rung, Verification
 
 
-def _silent(what: str) -> None:
-    """Tell nobody."""
-
-
 def verify(
     path: str | os.PathLike[str],
     trajectories: Sequence[str | os.PathLike[str]] = (),
@@ -50,7 +46,7 @@ def verify(
     sources: Mapping[str, Sequence[str]] | None = None,
     calls: int = 24,
     threads: int = 1,
-    progress: Progress = _silent,
+    progress: Progress = lambda what: None,
 ) -> Verification:
     """Check an artifact, without the checkpoint that it was made from, and without torch.
 

@@ -139,11 +139,11 @@ class Probe:
         piece = self._manifest.pieces.get("step")
         if piece is None:
             return {}
-        feed = {n: self._tables[n][k] if n in self._tables else self._condition[n] for n in piece.inputs}
+        feed = {n: self._tables[n][k, ...] if n in self._tables else self._condition[n] for n in piece.inputs}
         return run_named(self._sessions["step"], piece.outputs, feed)
 
     def _value(self, name: str, k: int) -> Array:
         if name in self._tables:
-            row: Array = self._tables[name][k]
+            row: Array = self._tables[name][k, ...]
             return row
         return self._steps[k][name] if name in self._steps[k] else self._condition[name]

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,10 +18,9 @@ from ttscompile.calibration.strategies.bac import (
     spend,
     union,
 )
-from ttscompile.errors import CalibrationError
 from ttscompile.lattice import Source
 
-from .tasks import make_task
+from ..tasks import MakeTask
 
 
 def score(similarity: np.ndarray, steps: tuple[int, ...]) -> float:
@@ -83,8 +80,8 @@ def test_the_budget_goes_to_all_blocks_alike_and_then_to_those_that_gain_most() 
     assert spend([first, second], {0: [1]}, 7) == [3, 3]  # {0, 2, 4, 5} and {0, 2, 5}
 
 
-def test_statistics_of_a_dense_call(compiled: Path, recording: Path) -> None:
-    task = make_task(compiled, recording, 20)
+def test_statistics_of_a_dense_call(make_task: MakeTask) -> None:
+    task = make_task(20)
     calls = task.executor.selector.calls(task.calls, [0, 1])
     residuals = dense_residuals(task.executor, calls)
     similarity, change = dense_statistics(task.executor, calls)
@@ -97,8 +94,8 @@ def test_statistics_of_a_dense_call(compiled: Path, recording: Path) -> None:
     assert change[4] == pytest.approx(np.mean(pairs), rel=1e-4)
 
 
-def test_the_residuals_are_those_of_the_reference(compiled: Path, recording: Path) -> None:
-    task = make_task(compiled, recording, 20)
+def test_the_residuals_are_those_of_the_reference(make_task: MakeTask) -> None:
+    task = make_task(20)
     calls = task.executor.selector.calls(task.calls, [3])
     dense = np.zeros((10, 6), np.int8)
     rollout = task.executor.model.rollout(calls.contexts, calls.initial, calls.noise, dense)
@@ -107,12 +104,6 @@ def test_the_residuals_are_those_of_the_reference(compiled: Path, recording: Pat
         torch.testing.assert_close(residuals[b][0, k], expected.flatten())
 
 
-def test_the_plan_reads_timestep_only(compiled: Path, recording: Path) -> None:
-    found, _ = plan_of("bac", make_task(compiled, recording, 20))
+def test_the_plan_reads_timestep_only(make_task: MakeTask) -> None:
+    found, _ = plan_of("bac", make_task(20))
     assert set(np.unique(found.schedule)) == {Source.COMPUTE, Source.TIMESTEP}
-
-
-def test_kinds_that_nobody_told_are_asked_for(compiled: Path, recording: Path) -> None:
-    task = replace(make_task(compiled, recording, 20), kinds=())
-    with pytest.raises(CalibrationError, match="kind of each of the 6 blocks"):
-        plan_of("bac", task)

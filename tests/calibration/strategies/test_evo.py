@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ttscompile.calibration.crowded import crowded_plans
+from ttscompile.calibration.crowded import crowded_family
 from ttscompile.calibration.strategies.evo import POPULATION, Evo, mutate, repair
 
-from .tasks import make_task
+from ..tasks import MakeTask
 
 
 @given(st.data())
@@ -48,12 +46,11 @@ def test_a_mutation_moves_cells_within_their_blocks() -> None:
     np.testing.assert_array_equal(mutate(first, np.random.default_rng(0)), first)
 
 
-def test_generations_get_better_and_begin_with_whole_steps(compiled: Path, recording: Path) -> None:
-    task = make_task(compiled, recording, 20)
+def test_generations_get_better_and_begin_with_whole_steps(make_task: MakeTask) -> None:
+    task = make_task(20)
     search = Evo(task)
     assert search._population.shape == (POPULATION, 10, 6)
-    whole = crowded_plans(10, 6, 3)
-    np.testing.assert_array_equal(search._population[0][whole[0] == 0], True)
+    assert search._population[0][list(crowded_family(10, 3)[0])].all()
     losses = []
     for generation in range(6):
         search.advance(generation)
@@ -61,6 +58,4 @@ def test_generations_get_better_and_begin_with_whole_steps(compiled: Path, recor
         assert (search._population.sum((1, 2)) == 20).all()
     assert losses == sorted(losses, reverse=True)
     assert losses[-1] < losses[0]
-    samples = task.executor.run([search.plan], task.calls)
-    error = task.actions.errors(samples, task.calls.targets, units=False).mean()
-    np.testing.assert_allclose(error, losses[-1], rtol=1e-4)
+    np.testing.assert_allclose(task.error(search.plan, task.calls), losses[-1], rtol=1e-4)

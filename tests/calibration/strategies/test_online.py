@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 
 from ttscompile.calibration.strategies import plan_of
-from ttscompile.calibration.strategies.dbcache import dbcache
+from ttscompile.calibration.strategies.dbcache import dbcache, proposals
 from ttscompile.calibration.strategies.online import decide, within
-from ttscompile.calibration.strategies.teacache import dense_changes, teacache
+from ttscompile.calibration.strategies.teacache import dense_changes, proposal
 from ttscompile.errors import CalibrationError
 from ttscompile.lattice import Source
 from ttscompile.runtimes.criterion import Criterion
 
-from .tasks import make_task
+from ..tasks import MakeTask
 
 RULES = [
     Criterion("teacache", 0, 0.5, (1.0, 0.0), accumulates=True, warmup=1, closes=True),
@@ -25,10 +23,10 @@ RULES = [
 
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
-def test_the_decided_plans_do_what_the_call_did(compiled: Path, recording: Path, rule: Criterion) -> None:
-    task = make_task(compiled, recording, 30)
+def test_the_decided_plans_do_what_the_call_did(make_task: MakeTask, rule: Criterion) -> None:
+    task = make_task(30)
     decided = decide(task.executor, rule, task.calls)
-    again = task.executor.run_each(decided.plans, task.calls)
+    again = task.executor.run(decided.plans, task.calls)
     torch.testing.assert_close(decided.samples, again, rtol=0, atol=2e-6)
     assert len({plan.tobytes() for plan in decided.plans}) > 1  # calls differ
     assert set(np.unique(decided.plans)) == {Source.COMPUTE, Source.TIMESTEP}
@@ -36,8 +34,8 @@ def test_the_decided_plans_do_what_the_call_did(compiled: Path, recording: Path,
 
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
-def test_the_reference_decides_the_same(compiled: Path, recording: Path, rule: Criterion) -> None:
-    task = make_task(compiled, recording, 30)
+def test_the_reference_decides_the_same(make_task: MakeTask, rule: Criterion) -> None:
+    task = make_task(30)
     decided = decide(task.executor, rule, task.calls)
     model, calls = task.executor.model, task.calls
     result, plans = model.decided_rollout(calls.contexts, calls.initial, calls.noise, rule)
@@ -50,8 +48,8 @@ def test_the_reference_decides_the_same(compiled: Path, recording: Path, rule: C
 
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
-def test_a_call_does_not_depend_on_the_others(compiled: Path, recording: Path, rule: Criterion) -> None:
-    task = make_task(compiled, recording, 30)
+def test_a_call_does_not_depend_on_the_others(make_task: MakeTask, rule: Criterion) -> None:
+    task = make_task(30)
     together = decide(task.executor, rule, task.calls)
     for i in (0, 5):
         alone = decide(task.executor, rule, task.executor.selector.calls(task.calls, [i]))
@@ -60,8 +58,8 @@ def test_a_call_does_not_depend_on_the_others(compiled: Path, recording: Path, r
 
 @pytest.mark.parametrize("name", ["teacache", "dbcache"])
 @pytest.mark.parametrize("budget", [20, 40])
-def test_the_threshold_uses_the_budget(compiled: Path, recording: Path, name: str, budget: int) -> None:
-    task = make_task(compiled, recording, budget, calls=24)
+def test_the_threshold_uses_the_budget(make_task: MakeTask, name: str, budget: int) -> None:
+    task = make_task(budget, calls=24)
     found, _ = plan_of(name, task)
     assert found.criterion is not None
     assert found.criterion.name == name
@@ -74,13 +72,12 @@ def test_the_threshold_uses_the_budget(compiled: Path, recording: Path, name: st
 
 
 @pytest.mark.parametrize("name", ["teacache", "dbcache"])
-def test_the_schedule_is_the_best_decision(compiled: Path, recording: Path, name: str) -> None:
-    task = make_task(compiled, recording, 30, calls=12)
+def test_the_schedule_is_the_best_decision(make_task: MakeTask, name: str) -> None:
+    task = make_task(30, calls=12)
     found, _ = plan_of(name, task)
     assert found.criterion is not None
     plans = within(decide(task.executor, found.criterion, task.calls).plans, 30)
-    samples = task.executor.run(plans, task.calls)
-    errors = task.actions.errors(samples, task.calls.targets, units=False).mean(1)
+    errors = [task.error(plan, task.calls) for plan in plans]
     assert len(plans) > 1
     np.testing.assert_array_equal(found.schedule, plans[int(np.argmin(errors))])
 
@@ -93,22 +90,22 @@ def test_decisions_within_the_budget_once_each() -> None:
     assert [np.flatnonzero(plan[:, 0] == Source.COMPUTE).tolist() for plan in found] == [[0], [0, 1], [0, 3]]
 
 
-def test_dbcache_proposes_what_the_budget_has_room_for(compiled: Path, recording: Path) -> None:
-    assert [(c.always, c.warmup) for c, _ in dbcache(make_task(compiled, recording, 15))] == [(1, 1)]
-    proposed = [(c.always, c.warmup) for c, _ in dbcache(make_task(compiled, recording, 54))]
+def test_dbcache_proposes_what_the_budget_has_room_for(make_task: MakeTask) -> None:
+    assert [(c.always, c.warmup) for c, _ in proposals(make_task(15))] == [(1, 1)]
+    proposed = [(c.always, c.warmup) for c, _ in proposals(make_task(54))]
     assert proposed == [(1, 8), (1, 1), (2, 8), (2, 1), (3, 8), (3, 1)]
 
 
-def test_dbcache_of_one_block_is_refused(compiled: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    task = make_task(compiled, recording, 60)
+def test_dbcache_of_one_block_is_refused(make_task: MakeTask, monkeypatch: pytest.MonkeyPatch) -> None:
+    task = make_task(60)
     monkeypatch.setattr(task.executor.model, "blocks", 1)
     with pytest.raises(CalibrationError, match="the policy has one block"):
         dbcache(task)
 
 
-def test_teacache_fits_its_polynomial_to_dense_calls(compiled: Path, recording: Path) -> None:
-    task = make_task(compiled, recording, 30, calls=8)
-    ((criterion, start),) = teacache(task)
+def test_teacache_fits_its_polynomial_to_dense_calls(make_task: MakeTask) -> None:
+    task = make_task(30, calls=8)
+    ((criterion, start),) = proposal(task)
     before, after = dense_changes(task.executor, task.calls)
     assert len(criterion.polynomial) == 5
     left = after - np.polyval(criterion.polynomial, before)
@@ -116,8 +113,8 @@ def test_teacache_fits_its_polynomial_to_dense_calls(compiled: Path, recording: 
     assert start > 0
 
 
-def test_changes_of_dense_calls(compiled: Path, recording: Path) -> None:
-    task = make_task(compiled, recording, 30)
+def test_changes_of_dense_calls(make_task: MakeTask) -> None:
+    task = make_task(30)
     calls = task.executor.selector.calls(task.calls, [0, 4])
     before, after = dense_changes(task.executor, calls)
     assert before.shape == after.shape == (9 * 2,)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 
-from ttscompile.calibration.strategies import slopes as module
+from ttscompile.calibration import sensitivity
 from ttscompile.calibration.strategies.base import Task
 from ttscompile.calibration.strategies.slopes import chains, slopes
 from ttscompile.lattice import PlanArray, Source
 
-from .tasks import make_task
+from ..tasks import MakeTask
 
 
 def random_plan(reuse: Source, computed: float) -> PlanArray:
@@ -40,10 +38,10 @@ def gradients(task: Task, plan: PlanArray, reuse: Source) -> np.ndarray:
 @pytest.mark.parametrize("computed", [0.0, 0.3, 0.8])
 @pytest.mark.parametrize("size", [1, 2**28])
 def test_slopes_are_the_gradients_of_the_reference(
-    compiled: Path, recording: Path, monkeypatch: pytest.MonkeyPatch, reuse: Source, computed: float, size: int
+    make_task: MakeTask, monkeypatch: pytest.MonkeyPatch, reuse: Source, computed: float, size: int
 ) -> None:
-    monkeypatch.setattr(module, "BYTES", size)  # one call at a time, or all
-    task = make_task(compiled, recording, 20, calls=5)
+    monkeypatch.setattr(sensitivity, "BYTES", size)  # one call at a time, or all
+    task = make_task(20, calls=5)
     plan = random_plan(reuse, computed)
     found = slopes(task.executor, task.actions, plan, reuse, task.calls)
     expected = gradients(task, plan, reuse)

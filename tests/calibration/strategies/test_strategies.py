@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -18,12 +16,11 @@ from ttscompile.calibration.strategies import (
     open_strategy,
     plan_of,
     require_reach,
-    tts,
 )
 from ttscompile.errors import CalibrationError
 from ttscompile.lattice import Source, illegal_cells
 
-from .tasks import make_task
+from ..tasks import MakeTask
 
 BUDGET = 34
 """Of 10 x 6 cells: enough for all strategies."""
@@ -31,7 +28,6 @@ BUDGET = 34
 
 @pytest.fixture(autouse=True)
 def short_searches(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tts, "DISTANCES", (1,))
     monkeypatch.setattr(gates.Gates, "intervals", 4)
     monkeypatch.setattr(evo.Evo, "intervals", 4)
     monkeypatch.setattr(evo, "POPULATION", 16)
@@ -50,8 +46,8 @@ def run(strategy: Strategy, first: int = 0) -> Found:
     ("name", "budget"),
     [*((name, BUDGET) for name in NAMES), ("bac", 59), ("delta-dit", 59), ("deepcache", 59), ("sag", 7)],
 )
-def test_a_plan_is_legal_and_within_the_budget(compiled: Path, recording: Path, name: str, budget: int) -> None:
-    task = make_task(compiled, recording, budget, calls=8)
+def test_a_plan_is_legal_and_within_the_budget(make_task: MakeTask, name: str, budget: int) -> None:
+    task = make_task(budget, calls=8)
     found, _ = plan_of(name, task)
     model = task.executor.model
     assert found.schedule.shape == (model.steps, model.blocks)
@@ -62,9 +58,9 @@ def test_a_plan_is_legal_and_within_the_budget(compiled: Path, recording: Path, 
 
 
 @pytest.mark.parametrize("name", sorted(set(NAMES) - {"interval"}))
-def test_going_on_from_a_state_ends_where_another_run_ends(compiled: Path, recording: Path, name: str) -> None:
-    whole = run(open_strategy(name, make_task(compiled, recording, BUDGET, calls=8)))
-    task = make_task(compiled, recording, BUDGET, calls=8)
+def test_going_on_from_a_state_ends_where_another_run_ends(make_task: MakeTask, name: str) -> None:
+    whole = run(open_strategy(name, make_task(BUDGET, calls=8)))
+    task = make_task(BUDGET, calls=8)
     stopped = open_strategy(name, task)
     stopped.advance(0)
     if not stopped.done:
@@ -81,11 +77,9 @@ def test_going_on_from_a_state_ends_where_another_run_ends(compiled: Path, recor
 
 
 @pytest.mark.parametrize("name", ["evo", "dip-go", "tts"])
-def test_a_search_beats_even_steps(compiled: Path, recording: Path, name: str) -> None:
-    task = make_task(compiled, recording, 20, calls=24)
-    plans = [plan_of("interval", task)[0].schedule, plan_of(name, task)[0].schedule]
-    samples = task.executor.run(plans, task.calls)
-    even, searched = task.actions.errors(samples, task.calls.targets, units=False).mean(1)
+def test_a_search_beats_even_steps(make_task: MakeTask, name: str) -> None:
+    task = make_task(20, calls=24)
+    even, searched = (task.error(plan_of(one, task)[0].schedule, task.calls) for one in ("interval", name))
     assert searched < even
 
 
@@ -94,21 +88,19 @@ LEAST = {"deepcache": 24, "delta-dit": 15, "l2c": 30, "teacache": 12, "dbcache":
 
 
 @pytest.mark.parametrize(("name", "least"), [(name, LEAST.get(name, 6)) for name in NAMES])
-def test_a_budget_out_of_reach_is_refused_and_the_next_cell_is_not(
-    compiled: Path, recording: Path, name: str, least: int
-) -> None:
+def test_a_budget_out_of_reach_is_refused_and_the_next_cell_is_not(make_task: MakeTask, name: str, least: int) -> None:
     sparsity = f"{1 - least / 60:.4g}"
     with pytest.raises(CalibrationError, match=rf"'{name}' computes at least {least} of the 10 x 6 .* of {sparsity};"):
-        open_strategy(name, make_task(compiled, recording, least - 1))
+        open_strategy(name, make_task(least - 1))
     with pytest.raises(CalibrationError, match=f"leaves {least - 1}"):
         require_reach(name, 10, 6, least - 1)
-    found, _ = plan_of(name, make_task(compiled, recording, least))
+    found, _ = plan_of(name, make_task(least))
     assert int((found.schedule == Source.COMPUTE).sum()) == least
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_one_call_is_enough(compiled: Path, recording: Path, name: str) -> None:
-    found, _ = plan_of(name, make_task(compiled, recording, BUDGET, calls=1))
+def test_one_call_is_enough(make_task: MakeTask, name: str) -> None:
+    found, _ = plan_of(name, make_task(BUDGET, calls=1))
     assert int((found.schedule == Source.COMPUTE).sum()) <= BUDGET
 
 
@@ -117,8 +109,8 @@ def test_an_unknown_name_is_refused() -> None:
         require_reach("magic", 10, 6, 60)
 
 
-def test_fewer_intervals_than_a_strategy_has(compiled: Path, recording: Path) -> None:
-    task = make_task(compiled, recording, BUDGET)
+def test_fewer_intervals_than_a_strategy_has(make_task: MakeTask) -> None:
+    task = make_task(BUDGET)
     assert plan_of("evo", task, 2)[0].notes == {"generations": 2}
     assert plan_of("evo", task, 1000)[0].notes == {"generations": 4}
 

@@ -24,19 +24,20 @@ plan, nor an artifact, nor the runtimes' sums of reused residuals could say or h
 from __future__ import annotations
 
 import math
-import time
+from dataclasses import replace
 
 from ...errors import CalibrationError
 from ...lattice import Source
+from ..clock import Clock
+from ..search import search_plan
 from ..whole_steps import WholeSteps
 from . import dbcache, deepcache, delta_dit, gates, teacache
 from .bac import bac
 from .base import Found, Strategy, Task
 from .evo import Evo
-from .fixed import Fixed, require_cells
+from .fixed import Fixed
 from .gates import Gates
-from .interval import Interval
-from .online import Online
+from .interval import interval
 from .tts import Tts
 
 NAMES = (
@@ -89,7 +90,13 @@ def require_reach(name: str, steps: int, blocks: int, budget: int) -> None:
     """
     require_strategy(name)
     least = _LEAST[name](steps, blocks) if name in _LEAST else blocks
-    require_cells(name, least, steps, blocks, budget)
+    if budget < least:
+        cells = steps * blocks
+        raise CalibrationError(
+            f"strategy {name!r} computes at least {least} of the {steps} x {blocks} cells, a sparsity of"
+            f" {1 - least / cells:.4g}; the target of {1 - budget / cells:.4g} leaves {budget}. Lower the target, or"
+            " take another strategy."
+        )
 
 
 def open_strategy(name: str, task: Task, whole: WholeSteps | None = None) -> Strategy:
@@ -109,7 +116,7 @@ def open_strategy(name: str, task: Task, whole: WholeSteps | None = None) -> Str
         case "tts":
             return Tts(task, whole or WholeSteps(task))
         case "interval":
-            return Interval(task)
+            return Fixed(task, interval)
         case "bac":
             return Fixed(task, bac)
         case "delta-dit":
@@ -125,9 +132,9 @@ def open_strategy(name: str, task: Task, whole: WholeSteps | None = None) -> Str
         case "evo":
             return Evo(task)
         case "teacache":
-            return Online(task, teacache.teacache)
+            return Fixed(task, teacache.teacache)
         case _:
-            return Online(task, dbcache.dbcache)
+            return Fixed(task, dbcache.dbcache)
 
 
 def plan_of(name: str, task: Task, intervals: int | None = None, seconds: float = math.inf) -> tuple[Found, bool]:
@@ -135,29 +142,17 @@ def plan_of(name: str, task: Task, intervals: int | None = None, seconds: float 
 
     Args:
         name: of the strategy.
-        task: see ``Task``.
+        task: see ``Task``; its clock is not used.
         intervals: how many at most; None for the strategy's own number.
-        seconds: after which nothing more is begun but the first interval.
+        seconds: after which nothing more is begun that can be left out.
 
     Returns:
         What was found, and whether the time cut the search short.
 
     Raises:
         CalibrationError: there is no such strategy, or it cannot keep the budget.
+        CalibrationFailedError: the time was up before there was a plan within the budget.
     """
-    begun = time.monotonic()
-    strategy = open_strategy(name, task)
-    count = strategy.intervals if intervals is None else min(intervals, strategy.intervals)
-    closing = min(strategy.closing, count - 1)
-    longest = 0.0
-    for interval in range(count):
-        if strategy.done:
-            break
-        start = time.monotonic() - begun
-        if interval and start + longest + strategy.settling > seconds:
-            return strategy.found(), True
-        if closing and interval == count - closing:
-            strategy.close()
-        strategy.advance(interval)
-        longest = max(longest, time.monotonic() - begun - start)
-    return strategy.found(), False
+    clock = Clock(seconds)
+    found, _, stopped = search_plan(open_strategy(name, replace(task, clock=clock)), clock, intervals)
+    return found, stopped == "time limit"

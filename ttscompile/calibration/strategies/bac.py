@@ -22,17 +22,16 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from ...errors import CalibrationError
 from ...lattice import BoolArray, PlanArray, Source
 from ..calls import Calls
 from ..execute import Executor
 from .base import Task
-from .fixed import Chosen, best_of, some_calls
+from .fixed import Chosen, best_of
 
 Scores = npt.NDArray[np.float64]
 
 DENSE_CALLS = 4
-"""Dense calls whose similarities are averaged; the paper takes one."""
+"""Dense calls whose similarities are averaged, if there is time; the paper takes one."""
 
 BUBBLING = 5
 """Blocks that take over the updates of those after them."""
@@ -41,19 +40,11 @@ FEED_FORWARD = "feed_forward"
 
 
 def bac(task: Task) -> Chosen:
-    """The schedule of the scheduler and the union.
-
-    Raises:
-        CalibrationError: what kind the blocks are was not told.
-    """
+    """The schedule of the scheduler and the union."""
     model = task.executor.model
-    if len(task.kinds) != model.blocks:
-        raise CalibrationError(
-            f"strategy 'bac' has to know the kind of each of the {model.blocks} blocks; Task.kinds holds"
-            f" {len(task.kinds)}. Pass kinds=tuple(block.kind for block in artifact.manifest.blocks)."
-        )
-    calls = task.executor.selector.calls(task.calls, some_calls(task, DENSE_CALLS))
-    similarity, change = dense_statistics(task.executor, calls)
+    calls, select = task.some_calls(DENSE_CALLS), task.executor.selector.calls
+    found = [dense_statistics(task.executor, select(calls, [i])) for i in task.clock.in_time(range(calls.count))]
+    similarity, change = (np.mean([one[part] for one in found], axis=0) for part in range(2))
     most = min(model.steps, task.budget // model.blocks + 1)
     schedules = [best_schedules(one, most) for one in similarity]
     followed = bubbling(change, task.kinds)
@@ -175,16 +166,8 @@ def dense_statistics(executor: Executor, calls: Calls) -> tuple[Scores, Scores]:
 
 def dense_residuals(executor: Executor, calls: Calls) -> list[Tensor]:
     """Of each block, what it adds at every step of dense calls: ``[N, K, size]``."""
-    model = executor.model
     kept: list[list[Tensor]] = [[] for _ in executor.axes]
-    carried = model.begin(calls.initial)
-    with torch.no_grad():
-        for k in range(model.steps):
-            stream = model.stem(carried.sample, k, calls.contexts)
-            for b, axis in enumerate(executor.axes):
-                residual = model.block(b, k, stream, calls.contexts)
-                kept[b].append(residual.movedim(axis, 0).flatten(1))
-                stream = stream + residual
-            prediction = model.tail(stream, k, calls.contexts)
-            carried = model.advance(carried, prediction, None if calls.noise is None else calls.noise[k], k)
+    for _, residuals in executor.dense_steps(calls):
+        for rows, residual, axis in zip(kept, residuals, executor.axes, strict=True):
+            rows.append(residual.movedim(axis, 0).flatten(1))
     return [torch.stack(rows, 1) for rows in kept]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,6 +13,7 @@ from ...correction import Correction
 from ...lattice import PlanArray
 from ...runtimes.criterion import Criterion
 from ..calls import Actions, Calls
+from ..clock import Clock
 from ..execute import Executor
 
 Array = npt.NDArray[Any]
@@ -29,7 +30,8 @@ class Task:
         budget: cells that a plan may compute, step 0 included.
         seed: of all that is random.
         pruner: constants of the pruner by name; empty if the artifact has none.
-        kinds: what each block is; empty if nobody asked.
+        kinds: what each block is.
+        clock: what can be left out is not begun if it would end after its limit.
     """
 
     executor: Executor
@@ -38,11 +40,20 @@ class Task:
     budget: int
     seed: int
     pruner: Mapping[str, Array]
-    kinds: tuple[str, ...] = ()
+    kinds: tuple[str, ...]
+    clock: Clock = field(default_factory=Clock)
 
     def draw(self, *stage: int) -> np.random.Generator:
         """Random numbers that belong to a stage, whatever was drawn before: so that going on equals not stopping."""
         return np.random.default_rng((self.seed, 3, *stage))
+
+    def some_calls(self, count: int) -> Calls:
+        """Some of the calls to learn from, always the same ones; all if there are fewer."""
+        return self.executor.selector.calls(self.calls, self.draw(0).permutation(self.calls.count)[:count])
+
+    def error(self, plan: PlanArray, calls: Calls) -> float:
+        """Mean error of the executed actions of a plan on some calls, normalised; see ``Executor.run``."""
+        return float(self.actions.errors(self.executor.run(plan, calls), calls.targets, units=False).mean())
 
 
 @dataclass(frozen=True)
@@ -53,7 +64,6 @@ class Found:
         schedule: int8 ``[K, blocks]``, within the budget.
         pruner: all constants of the pruner, by name, for plans that depend on the observation; None for none.
         notes: what is worth keeping about how it was found; JSON.
-        is_baseline: it is no better than the uniform schedule, and need not be.
         correction: of the sampler's steps, for the schedule and the pruner's plans; None for none.
         criterion: decides the plan during the call; ``schedule`` is then one of its decisions. None for none.
     """
@@ -61,7 +71,6 @@ class Found:
     schedule: PlanArray
     pruner: Mapping[str, Array] | None
     notes: Mapping[str, Any]
-    is_baseline: bool = False
     correction: Correction | None = None
     criterion: Criterion | None = None
 

@@ -13,6 +13,8 @@ from collections.abc import Sequence
 from ...errors import CalibrationError
 from ...runtimes.criterion import Criterion
 from .base import Task
+from .fixed import Chosen
+from .online import online
 
 FIRST = (1, 2, 3)
 """Blocks, not layers: a layer of a transformer decoder is three."""
@@ -28,7 +30,12 @@ def least_cells(steps: int, blocks: int) -> int:
     return blocks + steps - 1
 
 
-def dbcache(task: Task) -> Sequence[tuple[Criterion, float]]:
+def dbcache(task: Task) -> Chosen:
+    """The best of ``proposals``, with the threshold for the budget."""
+    return online(task, proposals(task))
+
+
+def proposals(task: Task) -> Sequence[tuple[Criterion, float]]:
     """For each number of first blocks and of warm-up steps that the budget has room for, a criterion.
 
     Raises:

@@ -12,10 +12,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ...lattice import BoolArray, PlanArray, Source
-from ..crowded import crowded_plans
+from ...lattice import BoolArray, PlanArray, Source, whole_steps_plan
+from ..crowded import crowded_family
 from .base import Array, Found, Task
-from .fixed import some_calls
 
 POPULATION, GENERATIONS = 30, 100
 
@@ -46,7 +45,7 @@ class Evo:
     @property
     def plan(self) -> PlanArray:
         """The best schedule so far."""
-        return _plans(self._population[int(np.argmin(self._errors))])
+        return _plan(self._population[int(np.argmin(self._errors))])
 
     @property
     def loss(self) -> float:
@@ -93,10 +92,10 @@ class Evo:
         """Whole-step plans, and random ones."""
         task, model = self._task, self._task.executor.model
         draw = task.draw(10**6)
-        whole = crowded_plans(model.steps, model.blocks, max(1, task.budget // model.blocks))
-        random = draw.random((POPULATION - len(whole), model.steps, model.blocks)) < task.budget / whole[0].size
-        computed = np.concatenate([np.stack(whole) == Source.COMPUTE, random])
-        return np.stack([repair(one, task.budget, self._least, draw) for one in computed])
+        family = crowded_family(model.steps, max(1, task.budget // model.blocks))
+        whole = [whole_steps_plan(model.steps, model.blocks, steps) == Source.COMPUTE for steps in family]
+        random = draw.random((POPULATION - len(whole), *whole[0].shape)) < task.budget / whole[0].size
+        return np.stack([repair(one, task.budget, self._least, draw) for one in (*whole, *random)])
 
     def _children(self, draw: np.random.Generator) -> BoolArray:
         """All of the next generation but the best of this one."""
@@ -117,11 +116,11 @@ class Evo:
         return int(chosen[np.argmin(self._errors[chosen])])
 
     def _measure(self, computed: BoolArray) -> Array:
-        """Mean error of each plan."""
-        task = self._task
-        calls = task.executor.selector.calls(task.calls, some_calls(task, MEASURED))
-        samples = task.executor.run(list(_plans(computed)), calls)
-        return np.asarray(task.actions.errors(samples, calls.targets, units=False).mean(1), np.float64)
+        """Mean error of each plan; infinite where there was no time for it."""
+        calls, errors = self._task.some_calls(MEASURED), np.full(len(computed), np.inf)
+        for i in self._task.clock.in_time(range(len(computed))):
+            errors[i] = self._task.error(_plan(computed[i]), calls)
+        return errors
 
 
 def mutate(computed: BoolArray, draw: np.random.Generator) -> BoolArray:
@@ -162,5 +161,5 @@ def repair(computed: BoolArray, budget: int, least: int, draw: np.random.Generat
     return fixed
 
 
-def _plans(computed: BoolArray) -> PlanArray:
+def _plan(computed: BoolArray) -> PlanArray:
     return np.where(computed, Source.COMPUTE, Source.TIMESTEP).astype(np.int8)

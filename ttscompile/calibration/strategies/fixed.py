@@ -1,4 +1,4 @@
-"""Plans that are made at once, from a rule or from statistics of a few dense calls, without a search."""
+"""Strategies of one interval: a plan from a rule, or from statistics of a few calls."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import CalibrationError
-from ...lattice import PlanArray
+from ...lattice import PlanArray, dense_plan
+from ...runtimes.criterion import Criterion
 from .base import Array, Found, Task
 
 COMPARED = 16
@@ -25,11 +25,13 @@ class Chosen:
         plan: ``[K, blocks]``.
         error: of the calls that it was compared on, normalised.
         notes: its parameters; JSON.
+        criterion: see ``Found``; its record is in the notes.
     """
 
     plan: PlanArray
     error: float
     notes: Mapping[str, Any]
+    criterion: Criterion | None = None
 
 
 class Fixed:
@@ -38,6 +40,9 @@ class Fixed:
     Args:
         task: see ``Task``.
         choose: makes the plan.
+
+    Attributes:
+        done: whether it was made.
     """
 
     intervals = 1
@@ -47,13 +52,8 @@ class Fixed:
     def __init__(self, task: Task, choose: Callable[[Task], Chosen]) -> None:
         self._task, self._choose = task, choose
         model = task.executor.model
-        self._chosen = Chosen(np.zeros((model.steps, model.blocks), np.int8), float("nan"), {})
-        self._finished = False
-
-    @property
-    def done(self) -> bool:
-        """Whether the plan was made."""
-        return self._finished
+        self._chosen = Chosen(dense_plan(model.steps, model.blocks), float("nan"), {})
+        self.done = False
 
     @property
     def loss(self) -> float:
@@ -67,7 +67,7 @@ class Fixed:
 
     def advance(self, interval: int) -> None:
         """Make the plan."""
-        self._chosen, self._finished = self._choose(self._task), True
+        self._chosen, self.done = self._choose(self._task), True
 
     def close(self) -> None:
         """Nothing is left out: it is one interval."""
@@ -80,12 +80,13 @@ class Fixed:
     def restore(self, state: Mapping[str, Array]) -> None:
         """Go back to where ``state`` was taken."""
         notes = json.loads(state["notes"].tobytes())
-        self._chosen = Chosen(np.array(state["plan"], np.int8), float(state["error"]), notes)
-        self._finished = True
+        criterion = Criterion.from_record(notes["criterion"]) if "criterion" in notes else None
+        self._chosen = Chosen(np.array(state["plan"], np.int8), float(state["error"]), notes, criterion)
+        self.done = True
 
     def found(self) -> Found:
-        """The schedule, and no pruner."""
-        return Found(self._chosen.plan, None, self._chosen.notes)
+        """The schedule, and the criterion if there is one; no pruner."""
+        return Found(self._chosen.plan, None, self._chosen.notes, criterion=self._chosen.criterion)
 
 
 def best_of(task: Task, candidates: Sequence[tuple[PlanArray, Mapping[str, Any]]]) -> Chosen:
@@ -93,37 +94,9 @@ def best_of(task: Task, candidates: Sequence[tuple[PlanArray, Mapping[str, Any]]
 
     Args:
         task: see ``Task``.
-        candidates: plans within the budget, each with its parameters.
+        candidates: plans within the budget, each with its parameters; as many are compared as there is time for.
     """
-    calls = task.executor.selector.calls(task.calls, some_calls(task, COMPARED))
-    samples = task.executor.run([plan for plan, _ in candidates], calls)
-    errors = task.actions.errors(samples, calls.targets, units=False).mean(1)
+    calls = task.some_calls(COMPARED)
+    errors = [task.error(plan, calls) for plan, _ in task.clock.in_time(candidates)]
     best = int(np.argmin(errors))
-    return Chosen(candidates[best][0], float(errors[best]), candidates[best][1])
-
-
-def some_calls(task: Task, count: int) -> Array:
-    """Numbers of ``count`` of the calls to learn from, always the same ones; of all if there are fewer."""
-    return task.draw(0).permutation(task.calls.count)[:count]
-
-
-def require_cells(name: str, least: int, steps: int, blocks: int, budget: int) -> None:
-    """Refuse a budget that a strategy cannot keep whatever its parameters.
-
-    Args:
-        name: of the strategy.
-        least: cells that it computes at least.
-        steps: K.
-        blocks: number of residual blocks.
-        budget: cells that may be computed.
-
-    Raises:
-        CalibrationError: says how much sparsity it can reach.
-    """
-    if budget < least:
-        cells = steps * blocks
-        raise CalibrationError(
-            f"strategy {name!r} computes at least {least} of the {steps} x {blocks} cells, a sparsity of"
-            f" {1 - least / cells:.4g}; the target of {1 - budget / cells:.4g} leaves {budget}. Lower the target, or"
-            " take another strategy."
-        )
+    return Chosen(candidates[best][0], errors[best], candidates[best][1])

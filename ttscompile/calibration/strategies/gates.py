@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from ...lattice import BoolArray, PlanArray, Source, uniform_plan
 from .base import Array, Found, Task
-from .fixed import COMPARED, some_calls
+from .fixed import COMPARED
 from .slopes import slopes
 
 INTERVALS = 120
@@ -51,6 +51,10 @@ class Gates:
         task: see ``Task``.
         reuse: what cells that are not computed read.
         whole: every how many steps all cells are computed; 0 for step 0 only.
+
+    Attributes:
+        plan: the best schedule within the budget so far.
+        loss: its error on some of the calls.
     """
 
     intervals = INTERVALS
@@ -66,18 +70,8 @@ class Gates:
         begin = self._fixed | (uniform_plan(*shape, max(1, round(START * model.steps))) == Source.COMPUTE)
         self._scores = begin.astype(np.float64)
         self._mean, self._size = np.zeros(shape), np.zeros(shape)
-        self._plan = self._cells(task.budget)
-        self._loss, self._interval = float("nan"), 0
-
-    @property
-    def plan(self) -> PlanArray:
-        """The best schedule within the budget so far."""
-        return self._plan
-
-    @property
-    def loss(self) -> float:
-        """Error of the plan on some of the calls."""
-        return self._loss
+        self.plan = self._cells(task.budget)
+        self.loss, self._interval = float("nan"), 0
 
     @property
     def done(self) -> bool:
@@ -95,33 +89,31 @@ class Gates:
         gradient = slopes(task.executor, task.actions, self._cells(self._room(interval)), self._reuse, calls)
         self._step(gradient.astype(np.float64), interval)
         plan = self._cells(task.budget)
-        compared = task.executor.selector.calls(task.calls, some_calls(task, COMPARED))
-        samples = task.executor.run([plan], compared)
-        error = float(task.actions.errors(samples, compared.targets, units=False).mean())
-        if not error >= self._loss:  # also if nothing was measured before
-            self._plan, self._loss = plan, error
+        error = task.error(plan, task.some_calls(COMPARED))
+        if not error >= self.loss:  # also if nothing was measured before
+            self.plan, self.loss = plan, error
         self._interval = interval + 1
 
     def state(self) -> dict[str, Array]:
         """Scores, what the optimiser remembers, and the best plan."""
         return {
-            "plan": self._plan,
+            "plan": self.plan,
             "scores": self._scores,
             "mean": self._mean,
             "size": self._size,
-            "loss": np.array(self._loss),
+            "loss": np.array(self.loss),
             "interval": np.array(self._interval),
         }
 
     def restore(self, state: Mapping[str, Array]) -> None:
         """Go back to where ``state`` was taken."""
-        self._plan = np.array(state["plan"], np.int8)
+        self.plan = np.array(state["plan"], np.int8)
         self._scores, self._mean, self._size = (np.array(state[name]) for name in ("scores", "mean", "size"))
-        self._loss, self._interval = float(state["loss"]), int(state["interval"])
+        self.loss, self._interval = float(state["loss"]), int(state["interval"])
 
     def found(self) -> Found:
         """The schedule, and no pruner."""
-        return Found(self._plan, None, {"gradient_steps": self._interval})
+        return Found(self.plan, None, {"gradient_steps": self._interval})
 
     def _step(self, gradient: npt.NDArray[np.float64], interval: int) -> None:
         """Adam, with one size for all cells: a cell that hardly matters must not move as far as one that does."""

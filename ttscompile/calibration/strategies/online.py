@@ -1,4 +1,4 @@
-"""Strategies that find a criterion: its threshold for the budget, and what it decides on recorded calls.
+"""Strategies that choose a criterion: its threshold for the budget, and what it decides on recorded calls.
 
 Source of the criteria: ``teacache`` and ``dbcache``. The number of computed cells differs from call to call, so the
 budget is kept on average: the threshold is the lowest, found by bisection, with which the mean over some of the calls
@@ -10,21 +10,21 @@ learn from, the one with the lowest error on all of them.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from itertools import islice, repeat
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ...errors import CalibrationFailedError
 from ...lattice import PlanArray, Source
 from ...runtimes.criterion import Criterion
 from ..calls import Calls
 from ..execute import Executor
-from .base import Array, Found, Task
-from .fixed import COMPARED, best_of, some_calls
+from .base import Array, Task
+from .fixed import COMPARED, Chosen, best_of
 
 HALVINGS, DOUBLINGS = 9, 20
 """Of the interval that the threshold is in."""
@@ -85,12 +85,13 @@ def decide(executor: Executor, criterion: Criterion, calls: Calls) -> Decided:
                     part = model.block(b, k, stream, calls.contexts, streams.tolist())
                     cache[b] = cache[b].index_copy(axes[b], streams, part)
                 stream = stream + cache[b]
-            prediction = model.tail(stream, k, calls.contexts)
-            carried = model.advance(carried, prediction, None if calls.noise is None else calls.noise[k], k)
+            carried = executor.advance(carried, model.tail(stream, k, calls.contexts), calls, k)
     return Decided(np.stack(rows, 1), carried.sample)
 
 
-def fit_threshold(task: Task, criterion: Criterion, calls: Calls, low: float, high: float) -> Criterion:
+def fit_threshold(
+    task: Task, criterion: Criterion, calls: Calls, low: float, high: float, probes: Iterator[object]
+) -> tuple[Criterion, Decided] | None:
     """The criterion with the lowest threshold that keeps the budget, as far as bisection finds it.
 
     Args:
@@ -99,98 +100,64 @@ def fit_threshold(task: Task, criterion: Criterion, calls: Calls, low: float, hi
         calls: whose computed cells are counted.
         low: a threshold that is probably too low.
         high: one that probably is not; doubled until it is not.
+        probes: as many as there is time for.
+
+    Returns:
+        The criterion, and what it decides on the calls; None if the time was up before one kept the budget.
     """
+    found: tuple[Criterion, Decided] | None = None
 
     def fits(threshold: float) -> bool:
-        cells = decide(task.executor, replace(criterion, threshold=threshold), calls).cells
-        return bool(cells.mean() + 2 * cells.std() / len(cells) ** 0.5 <= task.budget)
+        nonlocal found
+        tried = replace(criterion, threshold=threshold)
+        decided = decide(task.executor, tried, calls)
+        kept = bool(decided.cells.mean() + 2 * decided.cells.std() / len(decided.cells) ** 0.5 <= task.budget)
+        found = (tried, decided) if kept else found
+        return kept
 
-    for _ in range(DOUBLINGS):
+    for _ in islice(probes, DOUBLINGS):
         if fits(high):
             break
         low, high = high, 2 * high
-    for _ in range(HALVINGS):
+    for _ in islice(probes, HALVINGS):
         middle = (low + high) / 2
         low, high = (low, middle) if fits(middle) else (middle, high)
-    return replace(criterion, threshold=high)
+    return found
 
 
-class Online:
-    """A strategy of one interval that finds a criterion.
+def online(task: Task, proposed: Sequence[tuple[Criterion, float]]) -> Chosen:
+    """Fit every criterion that is proposed, take the best, and fit it again on more calls.
 
     Args:
         task: see ``Task``.
-        propose: the criteria to choose from, each with a threshold to begin with.
+        proposed: criteria, each with a threshold to begin with.
+
+    Raises:
+        CalibrationFailedError: the time was up before one kept the budget.
     """
-
-    intervals = 1
-    closing = 0
-    settling = 0.0
-
-    def __init__(self, task: Task, propose: Callable[[Task], Sequence[tuple[Criterion, float]]]) -> None:
-        self._task, self._propose = task, propose
-        model = task.executor.model
-        self._plan: PlanArray = np.zeros((model.steps, model.blocks), np.int8)
-        self._criterion: Criterion | None = None
-        self._notes: dict[str, Any] = {}
-        self._loss = float("nan")
-
-    @property
-    def done(self) -> bool:
-        """Whether there is a criterion."""
-        return self._criterion is not None
-
-    @property
-    def loss(self) -> float:
-        """Error of the plans that the criterion decides."""
-        return self._loss
-
-    @property
-    def plan(self) -> PlanArray:
-        """The best that it decided; dense before there is one."""
-        return self._plan
-
-    def advance(self, interval: int) -> None:
-        """Fit every criterion that is proposed, take the best, and fit it again on more calls."""
-        task = self._task
-        some, more = (
-            task.executor.selector.calls(task.calls, some_calls(task, count)) for count in (COMPARED, COUNTED)
+    probes, some, more = task.clock.in_time(repeat(None)), task.some_calls(COMPARED), task.some_calls(COUNTED)
+    fitted = [fit_threshold(task, criterion, some, 0.0, start, probes) for criterion, start in proposed]
+    kept = [one for one in fitted if one is not None]
+    if not kept:
+        raise CalibrationFailedError(
+            f"the time limit ended the search for a threshold of {proposed[0][0].name!r} before one kept the budget of"
+            f" {task.budget} computed cells. The artifact is as it was. Allow more time, or lower the target."
         )
-        fitted = [fit_threshold(task, criterion, some, 0.0, start) for criterion, start in self._propose(task)]
-        errors = [self._error(criterion, some) for criterion in fitted]
-        best = fitted[int(np.argmin(errors))]
-        near = max(best.threshold, 1e-6)
-        self._criterion = fit_threshold(task, best, more, near / 2, near)
-        decided = decide(task.executor, self._criterion, more)
-        self._loss = float(task.actions.errors(decided.samples, more.targets, units=False).mean())
-        self._plan = best_of(task, [(plan, {}) for plan in within(decided.plans, task.budget)[:FROZEN]]).plan
-        self._notes = {
-            "criterion": self._criterion.record(),
-            "computed_cells": {"mean": float(decided.cells.mean()), "most": int(decided.cells.max())},
-        }
+    errors = [_error(task, decided, some) for _, decided in kept]
+    best, decided = kept[int(np.argmin(errors))]
+    calls, near = some, max(best.threshold, 1e-6)
+    again = fit_threshold(task, best, more, near / 2, near, probes)
+    if again is not None:
+        (best, decided), calls = again, more
+    chosen = best_of(task, [(plan, {}) for plan in within(decided.plans, task.budget)[:FROZEN]])
+    cells = {"mean": float(decided.cells.mean()), "most": int(decided.cells.max())}
+    notes = {"criterion": best.record(), "computed_cells": cells}
+    return Chosen(chosen.plan, _error(task, decided, calls), notes, best)
 
-    def _error(self, criterion: Criterion, calls: Calls) -> float:
-        """Of the plans that it decides."""
-        samples = decide(self._task.executor, criterion, calls).samples
-        return float(self._task.actions.errors(samples, calls.targets, units=False).mean())
 
-    def close(self) -> None:
-        """Nothing is left out: it is one interval."""
-
-    def state(self) -> dict[str, Array]:
-        """The criterion, and the best that it decided."""
-        notes = np.frombuffer(json.dumps(self._notes, sort_keys=True).encode(), np.uint8)
-        return {"plan": self._plan, "loss": np.array(self._loss), "notes": notes}
-
-    def restore(self, state: Mapping[str, Array]) -> None:
-        """Go back to where ``state`` was taken."""
-        self._plan, self._loss = np.array(state["plan"], np.int8), float(state["loss"])
-        self._notes = json.loads(state["notes"].tobytes())
-        self._criterion = Criterion.from_record(self._notes["criterion"])
-
-    def found(self) -> Found:
-        """The criterion, and the schedule of the best that it decided."""
-        return Found(self._plan, None, self._notes, criterion=self._criterion)
+def _error(task: Task, decided: Decided, calls: Calls) -> float:
+    """Of the plans that were decided."""
+    return float(task.actions.errors(decided.samples, calls.targets, units=False).mean())
 
 
 def within(plans: PlanArray, budget: int) -> list[PlanArray]:

@@ -13,8 +13,6 @@ whether i itself is computed or not. That is the gradient of the gate of cell i 
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -23,11 +21,9 @@ from torch import Tensor
 from ...lattice import PlanArray, Source
 from ..calls import Actions, Calls
 from ..execute import Executor
+from ..sensitivity import chunks, sensitivity
 
 Matrix = npt.NDArray[np.float32]
-
-BYTES = 2**28
-"""Memory for what the blocks compute; gradients and what they need take about four times as much."""
 
 
 def slopes(executor: Executor, actions: Actions, plan: PlanArray, reuse: Source, calls: Calls) -> Matrix:
@@ -44,12 +40,9 @@ def slopes(executor: Executor, actions: Actions, plan: PlanArray, reuse: Source,
         ``[K, blocks]``: by how much computing the cell, rather than reusing, changes the mean absolute error of the
         executed actions, normalised. 0 in step 0, which is always computed.
     """
-    size = 4 * executor.model.steps * sum(math.prod(type_.at(1)) for type_ in executor.types)
-    chunk = int(np.clip(BYTES // size, 1, 32))
     total = np.zeros(plan.shape, np.float64)
-    for start in range(0, calls.count, chunk):
-        some = executor.selector.calls(calls, np.arange(start, min(start + chunk, calls.count)))
-        total += _summed(executor, actions, plan, reuse, some)
+    for numbers in chunks(executor, calls.count):
+        total += _summed(executor, actions, plan, reuse, executor.selector.calls(calls, numbers))
     return (total / calls.count).astype(np.float32)
 
 
@@ -64,11 +57,15 @@ def _summed(
     executor: Executor, actions: Actions, plan: PlanArray, reuse: Source, calls: Calls
 ) -> npt.NDArray[np.float64]:
     """The slopes of a few calls, added up: ``[K, blocks]``."""
-    computed_rows, gradient_rows = _rollout(executor, actions, plan, reuse, calls)
+
+    def error(samples: Tensor) -> Tensor:
+        return (actions.executed(samples) - actions.executed(calls.targets)).abs().mean(-1).sum()
+
+    found = sensitivity(executor, plan, reuse, calls, 1, error)
     computed, values = (plan == Source.COMPUTE).reshape(-1), np.zeros(plan.size, np.float64)
     for chain in chains(plan, reuse, executor.model.groups):
-        f = torch.stack([computed_rows[i] for i in chain])  # [cells, N, size]
-        until = torch.cumsum(torch.stack([gradient_rows[i] for i in chain]), 0)
+        f = torch.stack([found.computed[i] for i in chain])  # [cells, N, size]
+        until = torch.cumsum(torch.stack([found.gradients[i] for i in chain]), 0)
         until = torch.cat([torch.zeros_like(until[:1]), until])
         places = np.flatnonzero(computed[chain])
         number = np.searchsorted(places, np.arange(len(chain)))  # of the first computed cell not before
@@ -76,47 +73,6 @@ def _summed(
         after = torch.from_numpy(np.append(places, len(chain))[np.searchsorted(places, np.arange(len(chain)), "right")])
         value = ((until[after] - until[:-1]) * (f - f[before])).sum((1, 2))
         values[chain] = value.double().numpy()
-    found = values.reshape(plan.shape)
-    found[0] = 0
-    return found
-
-
-def _rollout(
-    executor: Executor, actions: Actions, plan: PlanArray, reuse: Source, calls: Calls
-) -> tuple[list[Tensor], list[Tensor]]:
-    """Of each cell, what its block computes, and the gradient of the summed error in what it adds: ``[N, size]``."""
-    model = executor.model
-    carried = model.begin(calls.initial.clone().requires_grad_())
-    cache: dict[int, Tensor] = {}
-    computed: list[Tensor] = []
-    passed: list[Tensor] = []  # the stream after additions: its gradient is that of what was added just before
-    position: list[int] = []
-    for k, row in enumerate(plan):
-        stream = model.stem(carried.sample, k, calls.contexts)
-        computes = bool((row == Source.COMPUTE).any()) or not executor.alike
-        for b, axis in enumerate(executor.axes):
-            key = model.groups[b] if reuse == Source.FORWARD else b
-            if row[b] == Source.COMPUTE:
-                cache[key] = model.block(b, k, stream, calls.contexts)
-                computed.append(_rows(cache[key].detach(), axis))
-            else:
-                with torch.no_grad():
-                    computed.append(_rows(model.block(b, k, stream, calls.contexts), axis))
-            stream = stream + cache[key]
-            if computes:
-                position.append(len(passed))
-                passed.append(stream)
-        if not computes:  # nothing but additions: one gradient serves all blocks
-            position += [len(passed)] * len(row)
-            passed.append(stream)
-        prediction = model.tail(stream, k, calls.contexts)
-        carried = model.advance(carried, prediction, None if calls.noise is None else calls.noise[k], k)
-    error = (actions.executed(carried.sample) - actions.executed(calls.targets)).abs().mean(-1).sum()
-    gradients = torch.autograd.grad(error, passed)
-    axes = executor.axes * model.steps
-    return computed, [_rows(gradients[i], axis) for i, axis in zip(position, axes, strict=True)]
-
-
-def _rows(values: Tensor, axis: int) -> Tensor:
-    """One row a stream."""
-    return values.movedim(axis, 0).flatten(1)
+    summed = values.reshape(plan.shape)
+    summed[0] = 0
+    return summed

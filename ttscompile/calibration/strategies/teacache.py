@@ -12,13 +12,13 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
-import torch
 
 from ...runtimes.criterion import Criterion, relative_change
 from ..calls import Calls
 from ..execute import Executor
 from .base import Array, Task
-from .fixed import some_calls
+from .fixed import Chosen
+from .online import online
 
 DEGREE = 4
 
@@ -31,9 +31,14 @@ def least_cells(steps: int, blocks: int) -> int:
     return blocks * min(2, steps)
 
 
-def teacache(task: Task) -> Sequence[tuple[Criterion, float]]:
-    """The one criterion, with the polynomial of this policy."""
-    calls = task.executor.selector.calls(task.calls, some_calls(task, DENSE_CALLS))
+def teacache(task: Task) -> Chosen:
+    """The criterion with the polynomial of this policy, and the threshold for the budget."""
+    return online(task, proposal(task))
+
+
+def proposal(task: Task) -> Sequence[tuple[Criterion, float]]:
+    """The criterion, and a threshold to begin with."""
+    calls = task.some_calls(DENSE_CALLS)
     before, after = dense_changes(task.executor, calls)
     # A policy of fewer steps than coefficients has fewer pairs to fit.
     degree = max(0, min(DEGREE, len(np.unique(before)) - 1))
@@ -49,16 +54,9 @@ def dense_changes(executor: Executor, calls: Calls) -> tuple[Array, Array]:
     Returns:
         Two arrays ``[(K - 1) * N]``.
     """
-    model, axis = executor.model, executor.axes[0]
-    carried, seen = model.begin(calls.initial), []
-    with torch.no_grad():
-        for k in range(model.steps):
-            stem = stream = model.stem(carried.sample, k, calls.contexts)
-            for b in range(model.blocks):
-                stream = stream + model.block(b, k, stream, calls.contexts)
-            seen.append([value.movedim(axis, 0).numpy() for value in (stem, stream)])
-            prediction = model.tail(stream, k, calls.contexts)
-            carried = model.advance(carried, prediction, None if calls.noise is None else calls.noise[k], k)
+    seen = []
+    for stem, residuals in executor.dense_steps(calls):
+        seen.append([value.movedim(executor.axes[0], 0).numpy() for value in (stem, sum(residuals, stem))])
     changes = [[relative_change(b, a) for a, b in zip(*pair, strict=True)] for pair in pairwise(seen)]
     before, after = (np.concatenate([pair[i] for pair in changes]) for i in range(2))
     return before, after

@@ -31,6 +31,9 @@ class Tts:
     Args:
         task: see ``Task``.
         whole: compares schedules on the calls of ``task``.
+
+    Attributes:
+        loss: error of the plan on calls that its correction was not fitted on.
     """
 
     def __init__(self, task: Task, whole: WholeSteps) -> None:
@@ -38,7 +41,7 @@ class Tts:
         model = task.executor.model
         self._full = min(max(1, task.budget // model.blocks), model.steps)
         self._steps: tuple[int, ...] = tuple(range(self._full))
-        self._loss = float("nan")
+        self.loss = float("nan")
         self._crowded = self._whole.crowded(self._full)
         self._moves = [(distance, i) for distance in DISTANCES for i in range(1, self._full)]
         self.closing = Adaptation.INTERVALS if has_head(task.pruner) else 0
@@ -50,11 +53,6 @@ class Tts:
     def plan(self) -> PlanArray:
         """The best schedule so far."""
         return self._whole.plan(self._steps)
-
-    @property
-    def loss(self) -> float:
-        """Error of the plan on calls that its correction was not fitted on."""
-        return self._loss
 
     @property
     def done(self) -> bool:
@@ -89,12 +87,12 @@ class Tts:
 
     def state(self) -> dict[str, Array]:
         """Computed steps and their error; corrections are fitted again."""
-        state: dict[str, Array] = {"steps": np.array(self._steps, np.int64), "loss": np.array(self._loss)}
+        state: dict[str, Array] = {"steps": np.array(self._steps, np.int64), "loss": np.array(self.loss)}
         return state if self._adaptation is None else {**state, **self._adaptation.state()}
 
     def restore(self, state: Mapping[str, Array]) -> None:
         """Go back to where ``state`` was taken."""
-        self._steps, self._loss = tuple(int(k) for k in state["steps"]), float(state["loss"])
+        self._steps, self.loss = tuple(int(k) for k in state["steps"]), float(state["loss"])
         if Adaptation.KEY in state:
             self.close()
             assert self._adaptation is not None
@@ -113,8 +111,8 @@ class Tts:
             if steps is None:
                 continue
             error = self._whole.errors(steps).normalised
-            if not error >= self._loss:  # the first one beats NaN
-                self._steps, self._loss = steps, error
+            if not error >= self.loss:  # the first one beats NaN
+                self._steps, self.loss = steps, error
 
     def _moved(self, i: int, offset: int) -> tuple[int, ...] | None:
         """The schedule with its i-th step moved; None if it would meet another, or leave the loop."""

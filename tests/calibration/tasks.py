@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from ttscompile.artifact.load import load_artifact
@@ -10,14 +11,19 @@ from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.strategies import Task
 from ttscompile.trajectories import load_trajectories
 
+MakeTask = Callable[..., Task]
+"""``make_task`` on the nonlinear policy."""
 
-def make_task(directory: Path, recording: Path, budget: int, calls: int = 12, seed: int = 0) -> Task:
+
+def make_task(
+    directory: Path, recording: Path, budget: int = 20, calls: int = 12, seed: int = 0, episodes: range = range(6)
+) -> Task:
     """A task with all that a strategy may ask for."""
     artifact = load_artifact(directory)
     spec, executor = artifact.manifest.spec, Executor(artifact)
-    episodes = load_trajectories([recording], spec.observations, 4)
-    chosen = sample_calls(episodes, range(len(episodes)), calls, seed=0)
-    prepared = prepare_calls(executor.model, spec, episodes, chosen, (0, 0))
+    recorded = load_trajectories([recording], spec.observations, 4)
+    chosen = sample_calls(recorded, episodes, calls, seed=0, repeats=100)
+    prepared = prepare_calls(executor.model, spec, recorded, chosen, (0, episodes.start))
     prepared = prepared.answered(executor.run_dense(prepared))
     kinds = tuple(block.kind for block in artifact.manifest.blocks)
     return Task(executor, Actions(spec), prepared, budget, seed, artifact.pruner, kinds)
