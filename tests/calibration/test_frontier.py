@@ -15,9 +15,9 @@ from PIL import Image
 
 import ttscompile
 from ttscompile import SamplerTable
-from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.write import update_calibration
-from ttscompile.calibration.frontier import compare
+from ttscompile.calibration.frontier import _require_same_policy, compare
 from ttscompile.cli import main
 from ttscompile.cli.compare import default_sparsities
 from ttscompile.errors import CalibrationError, OutputError
@@ -122,6 +122,23 @@ def test_what_cannot_be_compared_is_refused(
         compare(planned, [recording], ["tts"], [0.95])
     with pytest.raises(CalibrationError, match="one episode; expected at least two"):
         compare(planned, [policies.record(tmp_path / "one.npz", episodes=1)], [], [])
+
+
+def test_an_artifact_that_predicts_fewer_steps_is_of_the_same_policy(planned: Path) -> None:
+    artifact = load_artifact(planned)
+    manifest, (steps, channels) = artifact.manifest, artifact.manifest.spec.sample
+
+    def predicting(count: int, weight: float = 0.0, left_out: int = 0) -> Artifact:
+        spec = replace(manifest.spec, sample=(count, channels), left_out=left_out)
+        weights = {**artifact.weights, "mask": np.zeros(count), "weight": np.full(3, weight)}
+        return replace(artifact, manifest=replace(manifest, spec=spec), weights=weights)
+
+    narrow = predicting(steps, left_out=2)
+    _require_same_policy(narrow, predicting(steps + 2), "other")
+    with pytest.raises(CalibrationError, match="found other weights"):
+        _require_same_policy(narrow, predicting(steps + 2, weight=1.0), "other")
+    with pytest.raises(CalibrationError, match="same checkpoint; found .* instead of"):
+        _require_same_policy(narrow, predicting(steps), "other")
 
 
 def _point(name: str, latency: float, error: float) -> MeasuredPoint:

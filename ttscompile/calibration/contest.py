@@ -71,7 +71,8 @@ def measure(
     Returns:
         A point for each entrant, and ``Frontier.yardsticks``.
     """
-    spec, draw = artifact.manifest.spec, np.random.default_rng((seed, 4))
+    # Noise of the original's shape fits every artifact of the policy, however many steps it predicts.
+    spec, draw = artifact.manifest.spec.original, np.random.default_rng((seed, 4))
     exact = artifact.at_precision(FP32)
     truth = CompiledPolicy(exact, open_runtime(exact, "onnxruntime", threads))
     errors: list[list[float]] = [[] for _ in entrants]
