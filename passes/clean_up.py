@@ -1,4 +1,4 @@
-"""Remove what does nothing: identities, dead code, repeated expressions, work on constants."""
+"""Remove what does nothing: identities, examples of a type, dead code, repeated expressions, work on constants."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 
 from ttscompile.ir.dataflow import reaching
 from ttscompile.ir.evaluate import Evaluator
-from ttscompile.ir.graph import Graph, Node, Ref, TensorType
+from ttscompile.ir.graph import Argument, Enum, Graph, Node, Ref, TensorType
 from ttscompile.ir.program import Pieces, Program
 
 from .base import Pass, PassResult
@@ -20,6 +20,8 @@ Weights = dict[str, npt.NDArray[Any]]
 
 _SAME = frozenset("aten.clone aten.alias aten.detach aten.contiguous aten.lift_fresh_copy".split())
 _SAME_IF_OFF = frozenset("aten.dropout aten.feature_dropout aten.alpha_dropout".split())
+_CONSTANT = {"zeros_like": 0, "ones_like": 1, "new_zeros": 0, "new_ones": 1}
+_VALUE = {"full_like": 1, "fill": 1, "new_full": 2}  # its place among the arguments
 _SAME_IF_TYPE_KEPT = frozenset(
     "aten.reshape aten.flatten aten.expand aten.slice aten._to_copy aten.to aten.squeeze".split()
 )
@@ -59,7 +61,26 @@ class CleanUp(Pass):
 
 def clean_graph(graph: Graph, weights: Weights) -> Graph:
     """One graph, simplified; constants that it folds are added to ``weights``."""
-    return drop_dead(merge_repeated(fold_constants(drop_identities(graph), weights)))
+    return drop_dead(merge_repeated(fold_constants(drop_identities(forget_examples(graph)), weights)))
+
+
+def forget_examples(graph: Graph) -> Graph:
+    """Write what reads a value for its type only without that value: ``time.type_as(sample)``, ``ones_like(sample)``.
+
+    Else all that follows would count as depending on the sample.
+    """
+    nodes = []
+    for node in graph.nodes:
+        base, dtype = node.op.split(".")[1] if node.op.startswith("aten.") else "", node.type.dtype
+        kwargs: tuple[tuple[str, Argument], ...] = (("dtype", Enum("dtype", dtype)),)
+        if base == "type_as":
+            node = replace(node, op="aten._to_copy.default", args=node.args[:1], kwargs=kwargs)
+        elif base in _CONSTANT or base in _VALUE:
+            value = _CONSTANT[base] if base in _CONSTANT else node.args[_VALUE[base]]
+            if not isinstance(value, Ref):
+                node = replace(node, op="aten.full.default", args=(node.type.shape, value), kwargs=kwargs)
+        nodes.append(node)
+    return replace(graph, nodes=tuple(nodes))
 
 
 def drop_identities(graph: Graph) -> Graph:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 import torch
 
 from ttscompile.config import SamplerTable
-from ttscompile.ir.binding import bindings, input_bindings
+from ttscompile.ir.binding import bindings, input_bindings, numbering
 from ttscompile.ir.evaluate import Evaluator
 from ttscompile.ir.flops import graph_flops
 from ttscompile.ir.graph import Graph, Node, Ref, TensorType, backward_slice
@@ -150,13 +150,13 @@ def _step_graph(
     """
     if not outputs:
         return None, [], prologue
-    types = prologue.types()
+    types, own = prologue.types(), numbering(prologue)
     early = {
         name: types[name]
         for node in prologue.nodes
-        if known[node.name] is Binding.STEP
+        if known[node.name] is Binding.STEP or node.name in own
         for name in node.refs()
-        if known[name] in (Binding.TABLE, Binding.CONDITION)
+        if known[name] in (Binding.TABLE, Binding.CONDITION) and name not in own
     }
     step = backward_slice(prologue, tuple(outputs), early)
     rows = unfold(prologue, step.inputs)
@@ -172,11 +172,12 @@ def _evaluate_tables(
     if not names:
         return {}
     graph = backward_slice(prologue, tuple(names), {})
+    graph = replace(graph, inputs={timestep: prologue.inputs[timestep]})  # which says that the batch is one
     run = Evaluator(graph, {n: torch.from_numpy(np.asarray(weights[n])) for n in graph.constants})
     rows: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in names}
     with torch.no_grad():
         for t in torch.from_numpy(sampler.timesteps):
-            values = run({timestep: t[None]} if timestep in graph.inputs else {})
+            values = run({timestep: t[None]})
             for name, value in zip(names, values, strict=True):
                 rows[name].append(value.contiguous().numpy().copy())
     return {name: np.stack(values) for name, values in rows.items()}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
+from ttscompile.ir.binding import numbering, one_step_at_a_time
 from ttscompile.ir.dataflow import reachable_from
 from ttscompile.ir.graph import Graph, Node, Ref, TensorType, backward_slice
 from ttscompile.ir.program import Pieces, Program
@@ -40,12 +41,13 @@ class Partition(Pass):
         types = graph.types()
         loop = reachable_from(graph, [spec.sample_argument])
         # What a loop node reads from outside the loop; constants belong to the pieces themselves.
+        own = loop | numbering(graph) | one_step_at_a_time(graph, spec)
         outside = {
             name: types[name]
             for node in graph.nodes
-            if node.name in loop
+            if node.name in own
             for name in node.refs()
-            if name not in loop and name not in graph.constants
+            if name not in own and name not in graph.constants
         }
 
         def outline(start: str, result: str) -> Graph:

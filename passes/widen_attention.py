@@ -1,4 +1,4 @@
-"""Give every attention an axis of heads: ONNX has none without."""
+"""Give every attention an axis of heads, and every mask a row for each query: ONNX has none without."""
 
 from __future__ import annotations
 
@@ -10,20 +10,24 @@ from ttscompile.ir.program import Program
 from .base import Pass, PassResult
 
 _ATTENTION = "aten.scaled_dot_product_attention.default"
+_MASK = 3
 
 
 class WidenAttention(Pass):
-    """Write attention of ``[B, T, C]`` as attention of one head.
+    """Write attention of ``[B, T, C]`` as attention of one head, and masks without rows with the same row repeated.
 
     Before::
 
         %y = aten.scaled_dot_product_attention.default(%q, %k, %v)          # [B, T, C]
+        %z = aten.scaled_dot_product_attention.default(%r, %l, %w, %pad)    # %pad : [B, 1, 1, S]
 
     After::
 
         %q.head = aten.unsqueeze.default(%q, 1)                             # [B, 1, T, C], %k and %v alike
         %y.head = aten.scaled_dot_product_attention.default(%q.head, %k.head, %v.head)
         %y      = aten.squeeze.dim(%y.head, 1)
+        %z.mask = aten.expand.default(%pad, [B, 1, T, S])
+        %z      = aten.scaled_dot_product_attention.default(%r, %l, %w, %z.mask)
     """
 
     def requires(self, program: Program) -> None:
@@ -35,13 +39,20 @@ class WidenAttention(Pass):
         """Rewrite in the denoiser."""
         graph = program.denoiser
         types = graph.types()
-        flat = [n for n in graph.nodes if n.op == _ATTENTION and len(n.type.shape) == 3]
-        if not flat:
+        nodes: list[Node] = []
+        masks: dict[object, Argument] = {}
+        widened = 0
+        for node in graph.nodes:
+            parts = [node]
+            if node.op == _ATTENTION and len(node.type.shape) == 3:
+                parts, widened = _widened(node, types), widened + 1
+                types |= {part.name: part.type for part in parts}
+            for part in parts:
+                nodes += _with_rows(part, types, masks) if part.op == _ATTENTION else [part]
+        if not widened and not masks:
             return PassResult(program, False)
-        rewritten = {node.name: _widened(node, types) for node in flat}
-        nodes = tuple(n for node in graph.nodes for n in rewritten.get(node.name, [node]))
-        notes = (f"{len(flat)} attentions got an axis for their one head",)
-        return PassResult(replace(program, denoiser=replace(graph, nodes=nodes)), True, notes)
+        notes = (f"{widened} attentions got an axis for their one head, {len(masks)} masks a row for each query",)
+        return PassResult(replace(program, denoiser=replace(graph, nodes=tuple(nodes))), True, notes)
 
 
 def _widened(node: Node, types: dict[str, TensorType]) -> list[Node]:
@@ -63,3 +74,28 @@ def _widened(node: Node, types: dict[str, TensorType]) -> list[Node]:
 
 def _with_head(type_: TensorType) -> TensorType:
     return replace(type_, shape=(type_.shape[0], 1, *type_.shape[1:]))
+
+
+def _with_rows(node: Node, types: dict[str, TensorType], made: dict[object, Argument]) -> list[Node]:
+    """The attention on a mask of ``[.., T, S]``, and the nodes that make that; ``made`` has those of others."""
+    mask = node.args[_MASK] if len(node.args) > _MASK else dict(node.kwargs).get("attn_mask")
+    if not isinstance(mask, Ref):
+        return [node]
+    query, key = node.args[:2]
+    assert isinstance(query, Ref) and isinstance(key, Ref)
+    tokens, type_ = (types[query.name].shape[-2], types[key.name].shape[-2]), types[mask.name]
+    if type_.shape[-2:] == tokens and len(type_.shape) != 3:
+        return [node]
+    nodes: list[Node] = []
+    same = (mask, tokens, len(node.type.shape))
+    if same not in made:
+        while len(type_.shape) < len(node.type.shape):  # torch aligns to the right, ONNX takes the first of three for B
+            type_ = replace(type_, shape=(1, *type_.shape))
+            nodes.append(Node(f"{node.name}.mask{len(nodes)}", "aten.unsqueeze.default", (mask, 0), (), (type_,)))
+            mask = Ref(nodes[-1].name)
+        type_ = replace(type_, shape=(*type_.shape[:-2], *tokens))
+        nodes.append(Node(f"{node.name}.mask", "aten.expand.default", (mask, type_.shape), (), (type_,), node.source))
+        made[same] = Ref(nodes[-1].name)
+    args = tuple(made[same] if i == _MASK else a for i, a in enumerate(node.args))
+    kwargs = tuple((name, made[same] if name == "attn_mask" else a) for name, a in node.kwargs)
+    return [*nodes, replace(node, args=args, kwargs=kwargs)]

@@ -299,7 +299,7 @@ class Workspace:
         value = self._values[name]
         if self._manifest.contexts[name].binding is Binding.CONDITION:
             return value
-        row: Array = value[k]
+        row: Array = value[k, ...]  # an array still where it is one number
         return row
 
     def _run_step(self, piece: PieceRecord) -> None:

@@ -86,6 +86,8 @@ def _traced(
         with warnings.catch_warnings(), _masks_as_given():
             # torch.export warns about its own use of a deprecated class
             warnings.filterwarnings("ignore", message=".*LeafSpec.*", category=FutureWarning)
+            # and about recurrent layers, which list their weights anew when they are copied
+            warnings.filterwarnings("ignore", message=".*_flat_weights.*", category=UserWarning)
             exported = _export(module, given, symbolic)
             with without_stack_traces():  # each operation keeps the one that it was captured with
                 return exported.run_decompositions({}), examples

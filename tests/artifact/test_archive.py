@@ -111,13 +111,19 @@ def test_a_missing_file(written: Path) -> None:
         load_artifact(packed(written, skip="stem.onnx"))
 
 
-def test_an_archive_that_is_a_checkpoint(written: Path) -> None:
-    path = written.parent / "policy.ckpt"
-    with zipfile.ZipFile(path, "w") as file:
+def test_a_checkpoint_in_place_of_an_artifact(written: Path) -> None:
+    (written.parent / "lerobot").mkdir()
+    (written.parent / "lerobot" / "config.json").touch()
+    (written.parent / "legacy.ckpt").write_bytes(b"no zip")
+    with zipfile.ZipFile(written.parent / "policy.bin", "w") as file:
         file.writestr("archive/data.pkl", b"x")
         file.writestr("archive/data/0", b"x")
-    with pytest.raises(ArtifactError, match="convert it first with 'ttscompile convert'"):
-        load_artifact(path)
+    for name in ("lerobot", "legacy.ckpt", "policy.bin"):
+        with pytest.raises(ArtifactError, match=f"{name}: a checkpoint, not an artifact. Convert it first: ttscompile"):
+            load_artifact(written.parent / name)
+
+
+def test_an_archive_without_a_manifest(written: Path) -> None:
     path = packed(written, skip="manifest.json")
     with pytest.raises(ArtifactError, match="expected manifest.json in the archive"):
         load_artifact(path)

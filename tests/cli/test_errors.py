@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+import ttscompile
 from ttscompile.cli import main
 from ttscompile.cli.output import print_json
 from ttscompile.errors import TrajectoryError
@@ -59,7 +60,6 @@ def test_what_is_no_artifact(command: str, made: bool, tmp_path: Path) -> None:
         (["convert", "policy.ckpt", "-o", "out", "--steps", "0"], "not in the range"),
         (["calibrate", "out"], "Missing option '--trajectories'"),
         (["calibrate", "out", "--trajectories"], "Missing option '--trajectories'"),
-        (["calibrate", "out", "--trajectories", "a.npz", "--target-sparsity", "1"], "above 0 and below 1"),
         (["inspect", "out", "--plan", "dense"], "give --plot FILE too"),
         (["bench", "out", "--against", "eager"], "give --checkpoint FILE too"),
         (["bench", "out", "--against", "tensorrt"], "'tensorrt' is not one of original, eager, onnxruntime-dense"),
@@ -75,6 +75,39 @@ def test_bad_usage(arguments: list[str], reason: str) -> None:
     assert result.stdout == ""
     assert reason in result.stderr
     assert "Traceback" not in result.stderr
+
+
+def test_a_target_that_cannot_be(toy_compiled: Path) -> None:
+    arguments = [str(toy_compiled), "--trajectories", str(toy_compiled), "--target-sparsity", "1"]
+    result = CliRunner().invoke(main, ["calibrate", *arguments])
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert "above 0 and below 1" in result.stderr and "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["convert", "-o", "out", "no.ckpt"],
+        ["convert", "here.ckpt", "-o", "."],
+        ["calibrate", "--trajectories", "here.ckpt", "--seed", "1", "nowhere"],
+        ["calibrate", "compiled", "--trajectories", "no.npz"],
+        ["compare", "compiled", "--trajectories", "no.npz"],
+    ],
+)
+def test_what_is_not_there_is_said_before_the_compiler_is_imported(
+    arguments: list[str], toy_compiled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "compiled").symlink_to(toy_compiled)
+    (tmp_path / "here.ckpt").touch()
+    monkeypatch.chdir(tmp_path)
+    for module in ("driver", "calibration", "calibration.frontier"):
+        monkeypatch.setitem(sys.modules, f"ttscompile.{module}", None)
+    for name in ("convert", "calibrate"):
+        monkeypatch.delitem(vars(ttscompile), name, raising=False)
+    result = CliRunner().invoke(main, arguments)
+    wrong = str(tmp_path) if arguments[-1] == "." else arguments[-1]
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr.startswith(f"error: {wrong}: ")
 
 
 def test_pictures_that_cannot_be_drawn(toy_compiled: Path, tmp_path: Path) -> None:
@@ -107,7 +140,7 @@ def test_an_interruption_is_no_failed_check(command: str, hint: str, monkeypatch
         raise KeyboardInterrupt
 
     monkeypatch.setattr(sys.modules["ttscompile.cli.inspect"], "load_artifact", interrupted)
-    monkeypatch.setattr("ttscompile.calibrate", interrupted, raising=False)
+    monkeypatch.setattr(sys.modules["ttscompile.cli.calibrate"], "manifest_of", interrupted)
     arguments = ["--trajectories", "calls.npz"] if command == "calibrate" else []
     result = CliRunner().invoke(main, [command, "out", *arguments])
     assert result.exit_code == 130

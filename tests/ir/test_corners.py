@@ -46,6 +46,13 @@ def test_flops_of_an_einsum(equation: str, flops: int) -> None:
     assert graph_flops(b.graph(y)) == flops
 
 
+def test_flops_of_a_recurrent_layer() -> None:
+    b = Builder()
+    weights = (b.constant("in", 48, 7), b.constant("back", 48, 16), b.constant("bias", 48))
+    arguments = (b.input("x", B, 5, 7), b.input("h", 1, B, 16), weights, True, 1, 0.0, False, False, True)
+    assert graph_flops(b.graph(b.op("y", "gru.input", (B, 5, 16), *arguments))) == 2 * 5 * 48 * (7 + 16)
+
+
 def test_a_context_that_nothing_gives_is_found_before_hoist() -> None:
     graph = replace(
         chain(1),

@@ -130,6 +130,18 @@ class TwoBranches(nn.Module):
         return torch.where(both[0] > both[1], both[0], both[1] + timestep[:, None, None])
 
 
+class Recurrent(nn.Module):
+    """Recurrent layers over the observation; dropout between them is off."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.past = nn.GRU(WIDTH, WIDTH, 2, dropout=0.1, batch_first=True)
+
+    def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
+        _, last = self.past(obs)
+        return sample + last[-1][:, None] * sample
+
+
 ALL: Mapping[str, type[nn.Module]] = {
     cls.__name__: cls
     for cls in (
@@ -140,6 +152,7 @@ ALL: Mapping[str, type[nn.Module]] = {
         ChannelsFirst,
         SequenceFirst,
         TwoBranches,
+        Recurrent,
     )
 }
 

@@ -119,6 +119,31 @@ def test_heads_in_a_doubled_batch_lie_behind_the_streams() -> None:
         unfold(b.graph(more), ["more"])
 
 
+def test_rows_that_are_all_alike_fit_any_layout() -> None:
+    b = Builder()
+    keys = b.op("keys", "repeat_interleave.self_int", TWICE, b.input("x", B, 4, 2), 2, 0)
+    none = b.op("none", "zeros.default", (Batch(2), 1, 2), (Batch(2), 1, 2))
+    row = b.op("row", "expand.default", TWICE, b.constant("bias", 1, 4, 2), TWICE)
+    more = b.op("more", "cat.default", (Batch(2), 5, 2), (b.op("sum", "add.Tensor", TWICE, keys, row), none), 1)
+    found = unfold(b.graph(more), ["more", "row", "none"])
+    assert [rows.unfolded.shape for rows in found.values()] == [(B, 2, 5, 2), (2, B, 4, 2), (2, B, 1, 2)]
+
+
+@pytest.mark.parametrize(
+    ("op", "axes", "found"), [("roll", ((1,), (1,)), True), ("flip", ((0,),), False), ("roll", ((1,), (0,)), False)]
+)
+def test_rows_that_change_places_are_refused(op: str, axes: tuple[object, ...], found: bool) -> None:
+    b = Builder()
+    x = b.input("x", B, 4, 2)
+    both = b.op("both", "cat.default", TWICE, (x, x), 0)
+    moved = b.op("moved", f"{op}.default", TWICE, both, *axes)  # type: ignore[arg-type]
+    if found:
+        assert unfold(b.graph(moved), ["moved"])["moved"].unfolded.shape == (2, B, 4, 2)
+    else:
+        with pytest.raises(PassError, match="several rows a stream"):
+            unfold(b.graph(moved), ["moved"])
+
+
 def test_values_with_an_axis_of_streams_are_left_alone() -> None:
     b = Builder()
     assert unfold(b.graph(b.op("y", "neg.default", (2, B), b.input("x", 2, B))), ["x", "y"]) == {}
@@ -168,6 +193,22 @@ def test_attention_without_heads_gets_one(mask: tuple[object, ...] | None) -> No
     if mask is not None:
         values["mask"] = torch.randn(4, 4) if len(mask) == 2 else torch.randn(3, 4, 4)
     torch.testing.assert_close(evaluate(wide, {}, values), evaluate(b.graph(y), {}, values))
+
+
+@pytest.mark.parametrize("shape", [(B, 1, 1, 5), (3, 4, 5), (1, 5)])
+def test_masks_get_a_row_for_each_query(shape: tuple[object, ...]) -> None:
+    b = Builder()
+    x, memory = b.input("sample", B, 3, 4, 2), b.input("memory", B, 3, 5, 2)
+    mask = b.input("mask", *shape)  # type: ignore[arg-type]
+    z = b.op("y", "scaled_dot_product_attention.default", (B, 3, 4, 2), x, memory, memory, mask)
+    y = b.op("z", "scaled_dot_product_attention.default", (B, 3, 4, 2), z, memory, memory, mask)
+    result = WidenAttention()(Program(toy_spec(), b.graph(y), {}))
+    wide = result.program.denoiser
+    assert [n.type.shape[-2:] for n in wide.nodes if n.op == "aten.expand.default"] == [(4, 5)]  # one for both
+    assert len(wide.types()["y.mask"].shape) == 4
+    values = {name: torch.randn(type_.at(2)) for name, type_ in wide.inputs.items()}
+    torch.testing.assert_close(evaluate(wide, {}, values), evaluate(b.graph(y), {}, values))
+    assert not WidenAttention()(result.program).modified
 
 
 def test_attention_with_heads_is_left_alone() -> None:

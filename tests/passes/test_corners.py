@@ -6,10 +6,13 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch import nn
 
 from tests.passes.graphs import B, Builder
 from tests.passes.specs import toy_spec
+from tests.passes.test_pipeline import STREAMS, evaluate_pieces
 from ttscompile import ObservationSpec
+from ttscompile.driver import transform
 from ttscompile.errors import PassError
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Ref
@@ -72,3 +75,39 @@ def test_a_weight_with_a_name_of_the_plan_head_is_refused() -> None:
     named = replace(program, weights={**program.weights, "pruner.hidden.bias": program.weights["v"]})
     with pytest.raises(PassError, match=r"weights of its own called pruner\.hidden\.bias"):
         InsertPruner()(named)
+
+
+class Picks(nn.Module):
+    """A row of each stream, by number, of what the step knows and of what the loop knows."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.ff = nn.Linear(2, 2)
+
+    def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
+        streams, last = torch.arange(len(obs)), obs[:, :, 0].argmax(1)
+        known = (obs[..., :2] * timestep[:, None, None]).flatten(0, 1)[last + 3 * streams]
+        x = sample + torch.tanh(self.ff(sample)) * known[:, None]
+        return x + self.ff(x) * x[streams, last][:, None]
+
+
+class Examples(Picks):
+    """One timestep for all streams; the sample gives a dtype and a shape to what does not depend on it."""
+
+    def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
+        time = timestep[0].float().type_as(sample) * (obs[:, :1, :2] + torch.full_like(sample, 0.5))
+        x = sample + self.ff(sample) * time
+        return x + self.ff(x) * time * sample.new_ones(len(sample), 1, 1)
+
+
+@pytest.mark.parametrize("module", [Picks, Examples])
+def test_what_is_no_function_of_one_stream_and_one_step(module: type[nn.Module]) -> None:
+    torch.manual_seed(0)
+    original = module().eval()
+    program = transform(original, toy_spec(obs=(3, 7)))
+    assert len(program.blocks) == 2
+    sample, obs = torch.randn(STREAMS, 4, 2), torch.randn(STREAMS, 3, 7)
+    for k, t in enumerate(program.spec.sampler.timesteps):
+        with torch.no_grad():
+            expected = original(sample, torch.full((STREAMS,), int(t)), obs)
+        torch.testing.assert_close(evaluate_pieces(program, sample, obs, k), expected, rtol=1e-5, atol=1e-5)

@@ -135,7 +135,7 @@ def contexts_at(program: Program, pieces: Pieces, obs: Mapping[str, torch.Tensor
     types = {n: t for g in (pieces.stem, *pieces.blocks, pieces.tail) for n, t in g.inputs.items()}
 
     def row(name: str, step: int, axis: int | None) -> torch.Tensor:
-        table = torch.from_numpy(pieces.tables[name][step])
+        table = torch.from_numpy(np.asarray(pieces.tables[name][step]))
         return table if axis is None else table.repeat_interleave(STREAMS, axis)
 
     if pieces.step is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 from ttscompile import Noise, Source
 from ttscompile.artifact import Artifact
 from ttscompile.errors import ArtifactError, IllegalPlanError, ObservationError, RuntimeUnavailableError
+from ttscompile.ir.program import Binding
 from ttscompile.lattice import dense_plan, legalize, uniform_plan
 from ttscompile.runtimes import Runtime, open_runtime
 from ttscompile.runtimes.reference.runtime import ReferenceRuntime
@@ -20,7 +22,7 @@ from ttscompile.runtimes.workspace import Workspace
 from .agreement import largest_difference, random_inputs
 from .conftest import MakeArtifact
 from .plans import random_plan
-from .toys import toy_program
+from .toys import f32, pencil_program, toy_program
 
 C, T, R = Source.COMPUTE, Source.TIMESTEP, Source.ROLLOUT
 
@@ -47,6 +49,26 @@ def test_reuse_gives_41_and_compute_gives_44(pencil_artifact: Artifact, name: st
     with pytest.raises(IllegalPlanError, match="never computed"):
         call(33, [C, R])
     assert call(35, [C, C]) == 44
+
+
+def test_a_value_of_the_step_may_be_one_number(make_artifact: MakeArtifact) -> None:
+    program = pencil_program()
+    pieces = program.pieces
+    assert pieces is not None
+    (block,) = pieces.blocks
+    nodes = tuple(node.renamed(lambda name: "time" if name == "offset" else name) for node in block.nodes)
+    pieces = replace(
+        pieces,
+        blocks=(replace(block, inputs={"h0": block.inputs["h0"], "time": f32()}, nodes=nodes),),
+        tables={"time": np.array([-32, -31], np.float32)},  # as timestep[0] gives it
+        bindings={**pieces.bindings, "time": Binding.TABLE},
+    )
+    artifact = make_artifact(replace(program, pieces=pieces))
+    for name in ("onnxruntime", "reference"):
+        noise = Noise(np.array([[[35]], [[33]]], np.float32))
+        obs = {"obs": np.zeros((2, 1), np.float32)}
+        sample, _ = open_runtime(artifact, name).predict(obs, noise, np.array([[C], [C]]))
+        assert sample.ravel().tolist() == [35 + 3 + 7, 33 + 1 + 3]
 
 
 @pytest.mark.parametrize(
@@ -230,7 +252,10 @@ def test_a_pruner_that_gives_nan_is_refused(make_artifact: MakeArtifact) -> None
             open_runtime(artifact, name).predict(*random_inputs(artifact, np.random.default_rng(0), 1))
 
 
-@pytest.mark.parametrize(("runtime_name", "threads"), [("tensorrt", 1), ("onnxruntime", 0), ("onnxruntime", True)])
+@pytest.mark.parametrize(
+    ("runtime_name", "threads"),
+    [("tensorrt", 1), ("onnxruntime", 0), ("onnxruntime", True), ("onnxruntime", 100_000)],
+)
 def test_what_cannot_be_had_is_refused(toy_artifact: Artifact, runtime_name: str, threads: int) -> None:
     with pytest.raises(RuntimeUnavailableError, match="expected one of|at least 1"):
         open_runtime(toy_artifact, runtime_name, threads)

@@ -70,12 +70,22 @@ def unpack(path: Path) -> Unpacked:
     return unpacked
 
 
+def is_checkpoint(path: Path) -> bool:
+    """Whether something that is no artifact is what ``convert`` takes: told by names, for the error to say so."""
+    if path.is_dir():
+        return (path / "config.json").is_file() and not (path / MANIFEST).exists()
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return any(PurePosixPath(name).name == "data.pkl" for name in archive.namelist())  # of torch.save
+    except (zipfile.BadZipFile, OSError):
+        return path.suffix in (".ckpt", ".pt", ".pth", ".safetensors")
+
+
 def _extract(archive: zipfile.ZipFile, path: Path, folder: Path) -> None:
     entries = _entries(archive, path)
     if MANIFEST not in entries:
         raise ArtifactError(
-            f"{path}: expected {MANIFEST} in the archive; found {sorted(entries)[:5]}. This is no artifact: if it is a"
-            " checkpoint, convert it first with 'ttscompile convert'."
+            f"{path}: not an artifact: expected {MANIFEST} in the archive; found {sorted(entries)[:5]}. {_AGAIN}"
         )
     allowed = max(FREE_BYTES, MAX_RATIO * path.stat().st_size)
     _copy(archive, entries[MANIFEST], min(entries[MANIFEST].file_size, MAX_MANIFEST_BYTES), path, folder / MANIFEST)
@@ -114,8 +124,8 @@ def _entries(archive: zipfile.ZipFile, path: Path) -> dict[str, zipfile.ZipInfo]
     folders = {name.parent for name, _ in files}
     if len(folders) > 1 or any(len(folder.parts) > 1 for folder in folders):
         raise ArtifactError(
-            f"{path}: expected files in one folder at most; found {sorted(map(str, folders))[:5]}. This is no artifact:"
-            " if it is a checkpoint, convert it first with 'ttscompile convert'."
+            f"{path}: not an artifact: expected files in one folder at most; found {sorted(map(str, folders))[:5]}."
+            f" {_AGAIN}"
         )
     entries = {name.name: info for name, info in files}
     if len(entries) != len(files):

@@ -22,7 +22,7 @@ from ..ir.program import Binding, Block, Pieces, Program
 from ..ir.serialize import graph_from_json
 from ..lattice import PlanArray, Source, check_plan, dense_plan
 from ..versions import release
-from .archive import Unpacked, unpack
+from .archive import Unpacked, is_checkpoint, unpack
 from .codec import decode
 from .files import verify
 from .identity import identities
@@ -192,10 +192,14 @@ def load_artifact(path: str | Path) -> Artifact:
         ArtifactError: says what is wrong, where, and what to do.
     """
     place = Path(path)
-    if place.is_dir():
-        return _load_directory(place)
     if not place.exists():
         raise ArtifactError(f"{place}: does not exist. Give the directory that 'ttscompile convert' wrote.")
+    if is_checkpoint(place):
+        raise ArtifactError(
+            f"{place}: a checkpoint, not an artifact. Convert it first: ttscompile convert {place} -o DIR."
+        )
+    if place.is_dir():
+        return _load_directory(place)
     unpacked = unpack(place)
     try:
         return replace(_load_directory(unpacked.path), _unpacked=unpacked)

@@ -7,8 +7,15 @@ from pathlib import Path
 import click
 
 import ttscompile
-from ttscompile.cli.output import artifact_argument, json_option, only_results_on_stdout, print_json, results
-from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
+from ttscompile.cli.output import (
+    artifact_argument,
+    json_option,
+    manifest_of,
+    only_results_on_stdout,
+    print_json,
+    results,
+)
+from ttscompile.cli.recordings import FilesCommand, Sources, require_recordings, trajectories_options
 from ttscompile.cli.summary import document, print_summary
 
 STRATEGIES = (
@@ -93,6 +100,8 @@ def calibrate(
     artifact gets 'safe', which computes twice as much, and 'fast', which computes half. Exit status 1: the budget was
     not kept.
     """
+    manifest_of(directory)
+    require_recordings(trajectories)
     with only_results_on_stdout():
         ttscompile.calibrate(
             directory,

@@ -23,7 +23,7 @@ from ttscompile.cli.output import (
     share,
     table,
 )
-from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
+from ttscompile.cli.recordings import FilesCommand, Sources, require_recordings, trajectories_options
 from ttscompile.errors import RuntimeUnavailableError
 from ttscompile.machine import fingerprint, one_line
 from ttscompile.plots.frontier import plot_frontier
@@ -127,13 +127,14 @@ def compare(
     Strategies find plans now, from the episodes that are not held out; nothing is written to the artifact. Every plan
     runs on the same calls, in turn, and its actions are held against those of the dense policy with the same noise.
     """
+    identities = {path: identity_of(path) for path in (directory, *others)}  # of what is measured now
+    require_recordings(trajectories)
     try:
         from ttscompile.calibration.frontier import compare as measure
     except ModuleNotFoundError as error:
         raise RuntimeUnavailableError(
             f"compare needs {error.name}, which is not installed. Run: pip install 'ttscompile[compile]'."
         ) from error
-    identities = {path: identity_of(path) for path in (directory, *others)}  # of what is measured now
     if sparsities is None:
         sparsities = default_sparsities(manifest_of(directory).steps)
     columns = (TextColumn("{task.description:<28}"), BarColumn(bar_width=24), MofNCompleteColumn(), TimeElapsedColumn())

@@ -10,9 +10,11 @@ import click
 import ttscompile
 from ttscompile.artifact.ceiling import few_steps, many_steps
 from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.write import require_replaceable
 from ttscompile.cli.output import json_option, only_results_on_stdout, print_json, progress, results
 from ttscompile.cli.summary import document, print_summary
 from ttscompile.config import FP32, PRECISIONS
+from ttscompile.errors import CheckpointError
 
 
 @click.command()
@@ -92,6 +94,9 @@ def convert(
 
     The artifact computes everything until 'ttscompile calibrate' gives it a plan.
     """
+    if not checkpoint.exists():  # told now: importing the compiler, and with it torch, takes seconds
+        raise CheckpointError(f"{checkpoint}: does not exist. Give a .ckpt file, or the directory of a LeRobot policy.")
+    require_replaceable(directory)
     stages: list[dict[str, Any]] = []
     console = progress()
     with only_results_on_stdout(), console.status("compiling") as status:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import click
+
+from ttscompile.errors import TrajectoryError
 
 Sources = dict[str, tuple[str, ...]]
 """By key of the observation, the arrays of a recording that it is made of; see ``ttscompile.trajectories``."""
@@ -40,6 +42,17 @@ def _sources(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> 
             raise click.BadParameter(f"{key!r} is given twice.")
         found[key] = parts
     return found
+
+
+def require_recordings(paths: Iterable[Path]) -> None:
+    """Raise unless all of these exist: to be told before torch is imported, which takes seconds.
+
+    Raises:
+        TrajectoryError: names the first that does not.
+    """
+    for path in paths:
+        if not path.exists():
+            raise TrajectoryError(f"{path}: does not exist. Give the file or the directory of a recording.")
 
 
 def trajectories_options(required: bool = True) -> Callable[[Callable[..., Any]], Callable[..., Any]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ..config import PolicySpec
-from .graph import Graph
+from .graph import Batch, Graph
 from .program import Binding
 
 _RANK = {Binding.CONSTANT: 0, Binding.TABLE: 1, Binding.CONDITION: 1, Binding.STEP: 2, Binding.LOOP: 3}
@@ -50,3 +50,38 @@ def bindings(graph: Graph, inputs: Mapping[str, Binding]) -> dict[str, Binding]:
                 binding = join(binding, found[name])
         found[node.name] = binding
     return found
+
+
+def numbering(graph: Graph) -> set[str]:
+    """Values that number the streams: ``arange(B)`` in ``tokens[arange(B), last]``, and indices that are made of it.
+
+    They mean something only for the streams that are computed together: all, those of one plan, or all steps of all
+    streams. So they do not cross from piece to piece; each piece makes its own.
+    """
+    found: set[str] = set()
+    for node in graph.nodes:
+        read = set(node.refs())
+        alone = read <= found | graph.constants.keys()
+        if found & read:
+            numbers = alone or not node.type.dtype.startswith("float")  # a float is what they were used for
+        else:  # a batch size that is no size of a shape is a number
+            numbers = alone and any(isinstance(a, Batch) for a in (*node.args, *(value for _, value in node.kwargs)))
+        if numbers:
+            found.add(node.name)
+    return found
+
+
+def one_step_at_a_time(graph: Graph, spec: PolicySpec) -> set[str]:
+    """Step values of ``timestep[0]`` and an observation: of all steps in one batch, no row could have its own."""
+    types = graph.types()
+    known = bindings(graph, {**input_bindings(spec), spec.sample_argument: Binding.LOOP})
+    found = {
+        name
+        for name, binding in known.items()
+        if binding is Binding.TABLE and not any(isinstance(size, Batch) for size in types[name].shape)
+    }
+    tables = set(found)
+    for node in graph.nodes:
+        if known[node.name] is Binding.STEP and not found.isdisjoint(node.refs()):
+            found.add(node.name)
+    return found - tables

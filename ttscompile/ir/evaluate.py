@@ -28,6 +28,8 @@ _REFUSED = frozenset({"aten.from_file.default"})
 _RANDOM_ONLY_WITH_DROPOUT = {
     "aten.scaled_dot_product_attention.default": (4, "dropout_p"),
     "aten.dropout.default": (2, "train"),
+    "aten.gru.input": (6, "train"),
+    "aten.lstm.input": (6, "train"),
 }
 
 _ENUM_TYPES = {"dtype": torch.dtype, "memory_format": torch.memory_format, "layout": torch.layout}

@@ -31,6 +31,11 @@ def node_flops(node: Node, types: Mapping[str, TensorType]) -> int:
         return 2 * math.prod(each) * math.prod(weight[1:])
     if base == "einsum":
         return _einsum_flops(node, types)
+    if base in ("gru", "lstm"):  # every matrix of every layer meets each frame
+        (parameters,) = node.args[2:3]
+        assert isinstance(parameters, tuple)
+        sizes = [math.prod(shape) for shape in (_shape(types, p) for p in parameters) if len(shape) == 2]
+        return 2 * math.prod(_shape(types, node.args[0])[:-1]) * sum(sizes)
     return 0
 
 

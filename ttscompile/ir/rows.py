@@ -16,6 +16,8 @@ from ..errors import PassError
 from .graph import GETITEM, Batch, Graph, Node, Ref, Size, TensorType
 
 _RESHAPE = "aten.reshape.default"
+_ALIKE = frozenset(f"aten.{op}.default" for op in ("zeros", "ones", "full", "expand"))
+_MOVING = {"flip": 1, "roll": 2}  # the place of the axes among the arguments
 
 
 class _Layout(NamedTuple):
@@ -84,15 +86,25 @@ def _rows(name: str, type_: TensorType, layout: _Layout | None) -> Rows:
 def _layouts(graph: Graph, types: Mapping[str, TensorType]) -> dict[str, _Layout]:
     """The layout of every value with an axis of streams of which it is known."""
     known = {name: _Layout(1, 1) for name, type_ in types.items() if type_.batch_axis is not None}
+    alike: set[str] = set()  # all rows of one number, so that every layout fits
     for node in graph.nodes:
         axis = _axis(node.type)
-        read = [name for name in node.refs() if _axis(types[name]) is not None]
-        if axis is None or node.name in known or not read or not all(name in known for name in read):
+        read = [name for name in node.refs() if _axis(types[name]) is not None and name not in alike]
+        if axis is None or node.name in known or not all(name in known for name in read):
+            continue
+        if not read:
+            if node.op in _ALIKE:
+                alike.add(node.name)
             continue
         layout = _made(node, axis, [types[name] for name in read], [known[name] for name in read])
         if layout is not None:
             known[node.name] = layout
-    return known
+    return {**known, **{name: _Layout(_multiple(types[name]), 1) for name in alike}}
+
+
+def _multiple(type_: TensorType) -> int:
+    """Rows a stream."""
+    return next(size.multiple for size in type_.shape if isinstance(size, Batch))
 
 
 def _made(node: Node, axis: int, read: Sequence[TensorType], layouts: Sequence[_Layout]) -> _Layout | None:
@@ -114,9 +126,16 @@ def _made(node: Node, axis: int, read: Sequence[TensorType], layouts: Sequence[_
         copies = size.multiple // rows
     elif base == "cat" and _joined(node) == axis and len({layout.rows for layout in layouts}) == 1:
         copies = sum(layout.copies for layout in layouts)
-    elif len(set(layouts)) > 1:
+    elif len(set(layouts)) > 1 or _moves_rows(node, base, axis):
         return None
     return _Layout(copies, rows) if copies * rows == size.multiple else None
+
+
+def _moves_rows(node: Node, base: str, axis: int) -> bool:
+    """Whether rows come to lie in another order; without axes ``roll`` moves all there are."""
+    axes = node.args[_MOVING[base]] if base in _MOVING and len(node.args) > _MOVING[base] else None
+    found = axes if isinstance(axes, tuple) else ()
+    return base in _MOVING and (not found or axis in [a % len(node.type.shape) for a in found if isinstance(a, int)])
 
 
 def _joined(node: Node) -> int:
