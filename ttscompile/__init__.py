@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from .runtimes.base import CallReport
     from .runtimes.executor import AsyncExecutor, ExecutorSettings, GuardLimits
     from .runtimes.policy import CompiledPolicy, PolicyInfo, load
+    from .samplers.edm import EDMDenoiser, edm_table
     from .samplers.flow import flow_matching_table
     from .verification import Verification, verify
 
@@ -30,6 +31,7 @@ __all__ = [
     "CallReport",
     "ChunkSpec",
     "CompiledPolicy",
+    "EDMDenoiser",
     "ExecutorSettings",
     "GuardLimits",
     "Noise",
@@ -44,6 +46,7 @@ __all__ = [
     "calibrate",
     "compile_denoiser",
     "convert",
+    "edm_table",
     "flow_matching_table",
     "legalize",
     "load",
@@ -56,6 +59,7 @@ _HOMES = {
     "CallReport": "runtimes.base",
     "ChunkSpec": "config",
     "CompiledPolicy": "runtimes.policy",
+    "EDMDenoiser": "samplers.edm",
     "ExecutorSettings": "runtimes.executor",
     "GuardLimits": "runtimes.executor",
     "Noise": "config",
@@ -69,6 +73,7 @@ _HOMES = {
     "calibrate": "calibration",
     "compile_denoiser": "driver",
     "convert": "driver",
+    "edm_table": "samplers.edm",
     "flow_matching_table": "samplers.flow",
     "legalize": "lattice",
     "load": "runtimes.policy",
