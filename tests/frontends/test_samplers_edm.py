@@ -30,10 +30,10 @@ class Network(nn.Module):
         self.stem, self.tail, self.condition = nn.Linear(2, 16), nn.Linear(16, 2), nn.Linear(3, 16)
         self.blocks = nn.ModuleList(nn.Sequential(nn.Linear(16, 32), nn.GELU(), nn.Linear(32, 16)) for _ in range(2))
 
-    def forward(self, sample: torch.Tensor, noise: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
+    def forward(self, sample: torch.Tensor, sigma: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
         stream = self.stem(sample)
         for block in self.blocks:
-            stream = stream + block(stream + (self.condition(state) + noise[:, None])[:, None])
+            stream = stream + block(stream + (self.condition(state) + sigma.log()[:, None] / 4)[:, None])
         prediction: torch.Tensor = self.tail(stream)
         return prediction
 
@@ -48,7 +48,7 @@ class Preconditioned(nn.Module):
     def forward(self, sample: torch.Tensor, timestep: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
         sigma = timestep[:, None, None]
         total = sigma**2 + DATA**2
-        prediction = self.network(sample / total.sqrt(), timestep.log() / 4, state)
+        prediction = self.network(sample / total.sqrt(), timestep, state)
         return sample * DATA**2 / total + prediction * sigma * DATA / total.sqrt()
 
 

@@ -1,7 +1,7 @@
 """Policies with the preconditioning of EDM, as k-diffusion trains them (BESO, MDT): a module and its table of numbers.
 
-Their denoised sample is ``c_skip(sigma) x + c_out(sigma) F(c_in(sigma) x, ln(sigma) / 4)``. The path past F would hide
-its residual stream; but all of it is linear, so that F alone is the denoiser, and the table does the rest, exactly.
+Their denoised sample is ``c_skip(sigma) x + c_out(sigma) F(c_in(sigma) x, sigma)``. The path past F would hide its
+residual stream; but all of it is linear, so that F alone is the denoiser, and the table does the rest, exactly.
 
 Source: Karras et al., arXiv 2206.00364, table 1, and Euler's method, which is DDIM in these variables.
 """
@@ -24,8 +24,8 @@ class EDMDenoiser(nn.Module):
     The sample of the table is the noise at the first step, and ``c_in x`` at the others.
 
     Args:
-        network: F: ``network(scaled, noise, **observations)`` with ``scaled [B, T, D]`` = ``c_in x`` and ``noise [B]``
-            = ``ln(sigma) / 4``.
+        network: F as k-diffusion's ``Denoiser`` calls it: ``network(scaled, sigma, **observations)`` with ``scaled
+            [B, T, D]`` = ``c_in x`` and ``sigma [B]``.
         sigmas: as ``edm_table`` is given them.
         sigma_data: likewise.
     """
@@ -39,7 +39,7 @@ class EDMDenoiser(nn.Module):
     def forward(self, sample: torch.Tensor, timestep: torch.Tensor, **observations: torch.Tensor) -> torch.Tensor:
         """``[B, T, D]``, ``[B]`` -> ``[B, T, D]``."""
         scale = torch.where(timestep == self.first, self.first_scale, 1.0)
-        prediction: torch.Tensor = self.network(scale[:, None, None] * sample, timestep.log() / 4, **observations)
+        prediction: torch.Tensor = self.network(scale[:, None, None] * sample, timestep, **observations)
         return prediction
 
 
