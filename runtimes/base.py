@@ -135,7 +135,9 @@ def open_runtime(artifact: Artifact, runtime: str = "onnxruntime", threads: int 
         ArtifactError: the parts of the artifact do not fit each other.
     """
     if not isinstance(threads, int) or isinstance(threads, bool) or not 1 <= threads <= MOST_THREADS:
-        raise RuntimeUnavailableError(f"threads must be an integer of at least 1 and at most {MOST_THREADS}; found {threads!r}.")
+        raise RuntimeUnavailableError(
+            f"threads must be an integer of at least 1 and at most {MOST_THREADS}; found {threads!r}."
+        )
     if runtime == "onnxruntime":
         from .onnxruntime_cpu import OnnxRuntime
 
