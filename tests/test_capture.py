@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 
 import pytest
@@ -56,11 +57,35 @@ def test_the_users_module_is_not_touched() -> None:
         (lambda y, t, o: y.double(), "returns float64"),
         (lambda y, t, o: (y.bfloat16() + 1).float(), r"_to_copy \(test_capture.py:\d+ in \S+\) computes in bfloat16"),
         (lambda y, t, o: torch.cat([y, y, y[:1]])[: y.shape[0]], "not a multiple of the batch size"),
+        (lambda y, t, o: y[o[:, 0] > 0], "size u0 at %index .* is not a multiple of the batch size"),
     ],
 )
 def test_what_cannot_be_compiled_is_refused(then: Callable[..., object], message: str) -> None:
     with pytest.raises(CaptureError, match=message):
         capture(Denoiser(then), toy_spec())
+
+
+@pytest.mark.parametrize(
+    "then",
+    [
+        lambda y, t, o: y if o.sum() > 0 else -y,  # torch.export prints its graph
+        lambda y, t, o: y @ torch.zeros(5, 5),  # torch logs the traceback
+    ],
+)
+def test_the_error_is_all_that_is_said(
+    then: Callable[..., object], capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    loggers = [logging.getLogger(name) for name in ("torch._subclasses.fake_tensor", "torch.fx")]
+    for logger in loggers:
+        logger.addHandler(caplog.handler)
+    try:
+        with pytest.raises(CaptureError, match=r" at test_capture.py:\d+ in <lambda>: ") as caught:
+            capture(Denoiser(then), toy_spec())
+    finally:
+        for logger in loggers:
+            logger.removeHandler(caplog.handler)
+    assert (*capsys.readouterr(), caplog.text) == ("", "", "")
+    assert "TORCH" not in str(caught.value)
 
 
 def test_a_constant_made_of_the_number_of_streams_is_refused() -> None:

@@ -7,11 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 from PIL import Image
 
 from ttscompile.errors import IllegalPlanError
 from ttscompile.lattice import Source
+from ttscompile.plots import frontier
 from ttscompile.plots.plan import COLOURS, plot_plan
+from ttscompile.points import Point
 
 
 def pixels_of(source: Source, picture: Path) -> int:
@@ -46,3 +49,31 @@ def test_what_is_no_plan_of_these_blocks_is_refused(plan: np.ndarray, tmp_path: 
     with pytest.raises(IllegalPlanError, match=r"expected \[K, 2\]"):
         plot_plan(plan, ["self_attention", "feed_forward"], tmp_path / "plan.png")
     assert list(tmp_path.iterdir()) == []
+
+
+def frontier_of(points: list[Point], monkeypatch: pytest.MonkeyPatch) -> Figure:
+    """The figure of a frontier, laid out."""
+    drawn: list[Figure] = []
+    monkeypatch.setattr(frontier, "write_picture", lambda figure, path: drawn.append(figure))
+    frontier.plot_frontier(points, sorted(points, key=lambda p: p.latency_ms), {}, Path(), "title")
+    drawn[0].canvas.draw()
+    return drawn[0]
+
+
+def test_logarithmic_axes_have_plain_numbers_and_names_stay_inside(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = [Point("s", "quick", 2.0, 0.5), Point("s", "a long name of a plan", 0.03, 130.0)]
+    figure = frontier_of(points, monkeypatch)
+    (axes,) = figure.axes
+    labels = [t for axis in (axes.xaxis, axes.yaxis) for t in axis.get_ticklabels(which="both") if t.get_text()]
+    assert {"0.1", "1", "100"} <= {t.get_text() for t in labels}
+    assert not [t.get_text() for t in labels if set(t.get_text()) - set("0123456789.")]
+    across = [t.get_window_extent().y1 for t in axes.get_xticklabels(which="both") if t.get_text()]
+    assert np.ptp(across) < 0.5, "labels of major and minor ticks stand at different heights"
+    frame = axes.get_window_extent()
+    assert all(frame.x0 < t.get_window_extent().x0 and t.get_window_extent().x1 < frame.x1 for t in axes.texts)
+
+
+def test_the_frontier_of_one_point_is_no_line_and_the_dense_plan_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    figure = frontier_of([Point("s", "quick", 2.0, 5.0), Point("s", "dense", 0.0, 99.0)], monkeypatch)
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["s"]
+    assert "dense of s, 99 ms" in figure.axes[0].get_title(loc="left")

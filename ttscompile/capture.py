@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import copy
 import inspect
+import logging
 import operator
 import re
+import traceback
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -15,6 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
+import torch.export._trace
 from torch import nn
 from torch.export.graph_signature import InputKind, OutputKind
 
@@ -28,6 +31,8 @@ EXAMPLE_STREAMS = 3
 """Batch size of the example inputs; neither 0 nor 1, which torch.export would specialise on."""
 
 _TORCH = PurePath(torch.__file__).parent
+_ADVICE = re.compile(r"\s*\n(?:Caused by: \(|For more information, run with|The error above occurred when calling)")
+"""Where torch.export's messages turn to its own debugging."""
 _RESHAPE = "aten.reshape.default"
 _VIEWS = (torch.ops.aten.view.default, torch.ops.aten._unsafe_view.default)
 
@@ -83,7 +88,7 @@ def _traced(
     fastpath = torch.backends.mha.get_fastpath_enabled()
     torch.backends.mha.set_fastpath_enabled(False)  # the fused encoder layer is opaque to every pass
     try:
-        with warnings.catch_warnings(), _masks_as_given():
+        with warnings.catch_warnings(), _masks_as_given(), _one_message():
             # torch.export warns about its own use of a deprecated class
             warnings.filterwarnings("ignore", message=".*LeafSpec.*", category=FutureWarning)
             # and about recurrent layers, which list their weights anew when they are copied
@@ -93,12 +98,27 @@ def _traced(
                 return exported.run_decompositions({}), examples
     except Exception as error:  # torch.export raises whatever the user's code or its own machinery raises
         raise CaptureError(
-            f"torch.export could not capture {type(module).__name__}: {type(error).__name__}: {error}\n"
+            f"torch.export could not capture {type(module).__name__}: {type(error).__name__} at {_place(error)}:"
+            f" {_ADVICE.split(str(error))[0].strip()}\n"
             f"It was called with {', '.join(f'{n} {tuple(t.shape)} {t.dtype}' for n, t in examples.items())}."
             " A denoiser must be one step (no sampling loop), without data-dependent control flow, for any batch size."
         ) from error
     finally:
         torch.backends.mha.set_fastpath_enabled(fastpath)
+
+
+@contextmanager
+def _one_message() -> Iterator[None]:
+    """What fails is told by the error: torch.export logs its traceback too, and prints the graph as far as it came."""
+    logger, names = logging.getLogger("torch"), vars(torch.export._trace)
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)  # what TORCH_LOGS asks for has a level of its own
+    names["print"] = lambda *_, **__: None
+    try:
+        yield
+    finally:
+        del names["print"]
+        logger.setLevel(level)
 
 
 @contextmanager
@@ -207,7 +227,7 @@ class _Converter:
         expression = size.node.expr
         if expression.is_Integer:
             return int(expression)
-        multiple = expression / self.symbol
+        multiple = expression / (self.symbol or 1)  # a number of streams has none; then this size depends on values
         if not multiple.is_Integer:
             raise CaptureError(
                 f"size {expression} at %{fx_node.name} ({_source(fx_node)}) is not a multiple of the batch size."
@@ -295,9 +315,19 @@ class _Converter:
 
 
 def _source(fx_node: torch.fx.Node) -> str:
+    """Where the module's code makes this node."""
+    return _innermost(fx_node.meta.get("stack_trace") or "")
+
+
+def _place(error: Exception) -> str:
+    """Where the module's code raises this."""
+    return _innermost("".join(traceback.format_tb(error.__traceback__)))
+
+
+def _innermost(trace: str) -> str:
     """``file:line in function`` of the innermost frame outside torch; the file's name only, no path of this machine."""
-    frames = re.findall(r'File "([^"]+)", line (\d+), in (\S+)', fx_node.meta.get("stack_trace") or "")
-    own = [frame for frame in frames if not PurePath(frame[0]).is_relative_to(_TORCH)]
+    frames = re.findall(r'File "([^"]+)", line (\d+), in (\S+)', trace)
+    own = [frame for frame in frames if frame[0] != __file__ and not PurePath(frame[0]).is_relative_to(_TORCH)]
     if not frames:
         return "source unknown"
     path, line, function = (own or frames)[-1]

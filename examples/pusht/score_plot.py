@@ -13,6 +13,7 @@ from bootstrap import Estimate
 from rollout import seeded_noise
 from variants import Variant
 
+from ttscompile.plots.figure import plain_powers
 from ttscompile.units import ms
 
 WARM_UP = 2
@@ -68,7 +69,6 @@ def plot_scores(
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
-    from matplotlib.ticker import LogFormatter
 
     figure = Figure(figsize=(9.0, 4.6), layout="constrained")
     FigureCanvasAgg(figure)
@@ -82,8 +82,7 @@ def plot_scores(
         marker = MARKERS[number % len(MARKERS)]
         axes.errorbar([time.median], [score.mean], yerr=errors, fmt=marker, capsize=3, label=told)
     axes.set_xscale("log")
-    axes.xaxis.set_major_formatter(LogFormatter())
-    axes.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
+    plain_powers(axes.xaxis)
     axes.set_xlabel("latency of a call, ms (median)")
     axes.set_ylabel("score, mean and 95 % interval")
     axes.margins(x=0.08)

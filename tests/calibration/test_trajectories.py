@@ -125,6 +125,7 @@ NAN = np.where(np.arange(30).reshape(5, 2, 3) == 13, np.nan, 0).astype(np.float3
         (changed(obs=NAN), "'obs' holds NaN or infinity in 1 rows, the first of them row 2"),
         (changed(obs=np.full((5, 2, 3), 1e300)), "'obs' holds NaN or infinity in 5 rows"),
         (changed(episode_ends=None), "has no array 'episode_ends'"),
+        ({f"data/{i:03}": np.zeros(1) for i in range(200)}, r"it has data/000, .*, data/007, .. \(200 in all\). Add"),
         (changed(episode_ends=np.array([], np.int64)), "episode_ends is empty: no episode is complete"),
         (
             changed(episode_ends=np.array([2, 6])),

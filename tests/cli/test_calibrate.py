@@ -14,6 +14,15 @@ from ttscompile.cli.calibrate import STRATEGIES
 from ttscompile.errors import CalibrationError, CalibrationFailedError
 
 
+@pytest.fixture(autouse=True)
+def there(toy_compiled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the command lines name exists."""
+    (tmp_path / "out").symlink_to(toy_compiled)
+    for name in ("a.npz", "b.npz"):
+        (tmp_path / name).touch()
+    monkeypatch.chdir(tmp_path)
+
+
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """What ``ttscompile.calibrate`` was called with; the call itself ends in an error."""

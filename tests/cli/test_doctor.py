@@ -50,7 +50,7 @@ def test_an_artifact_that_runs_here_has_no_problem(calibrated: Path) -> None:
     told = json.loads(result.stdout)
     assert (result.exit_code, told["ok"], told["problems"]) == (0, True, 0)
     by_name = {finding["what"]: finding for finding in told["findings"]}
-    assert by_name["plan"]["found"].startswith("schedule, of ")
+    assert by_name["plan"]["found"].startswith("default 'schedule'; it has ")
     assert "calls a second" in by_name["call"]["found"]
     assert "CPUExecutionProvider" in by_name["providers"]["found"]
     assert all(f["remedy"] for f in told["findings"] if f["level"] in ("warning", "problem"))

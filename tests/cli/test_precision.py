@@ -67,7 +67,8 @@ def test_fp32_is_the_default_and_inspect_says_so(toy_compiled: Path) -> None:
 
 
 def test_bf16_is_refused_with_the_reason_before_the_checkpoint_is_read(tmp_path: Path) -> None:
-    result = run("convert", tmp_path / "missing.ckpt", "-o", tmp_path / "compiled", "--precision", "bf16")
+    (tmp_path / "empty.ckpt").touch()
+    result = run("convert", tmp_path / "empty.ckpt", "-o", tmp_path / "compiled", "--precision", "bf16")
     assert result.exit_code == 2
     message = " ".join(result.stderr.split())
     assert "precision 'bf16': expected an onnxruntime whose CPU provider" in message

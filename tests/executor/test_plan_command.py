@@ -55,7 +55,9 @@ def test_jitter_is_measured_beside_the_plan_that_a_robot_runs(toy_compiled: Path
     update_calibration(calibrated, None, plans, "schedule", {"strategy": "tts"})
     loop = ("--control-hz", 10, "--margin-ticks", 0, "--runs", 3, "--jitter", 0.1)
     assert "beside plan 'schedule'" in run(calibrated, *loop)[1]
-    assert "beside plan 'uniform'" in run(calibrated, *loop, "--plan", "uniform")[1]
+    told = run(calibrated, *loop, "--plan", "uniform")[1]
+    assert "beside plan 'uniform'" in told
+    assert "uniform (baseline) " in told and "Not for a robot." in told
 
 
 @pytest.mark.parametrize(

@@ -68,3 +68,6 @@ def test_what_is_no_artifact_is_an_error(tmp_path: Path) -> None:
         check_integrity(tmp_path / "nowhere")
     with pytest.raises(ArtifactError, match="not an artifact"):
         check_integrity(tmp_path)
+    (tmp_path / "policy.ckpt").write_bytes(b"no zip")
+    with pytest.raises(ArtifactError, match="a checkpoint, not an artifact. Convert it first"):
+        check_integrity(tmp_path / "policy.ckpt")

@@ -315,7 +315,7 @@ assert found.passed, [rung.told for rung in found.rungs]
 heavy = {"onnx", "safetensors", "matplotlib", "diffusers"} & set(sys.modules)
 assert not heavy, heavy
 rung = found.rung("runtimes")
-print(rung.status, rung.told)
+print(rung.status, rung.told, rung.remedy)
 """
 
 
@@ -323,7 +323,7 @@ def test_it_needs_no_torch_and_says_what_it_could_not_do(quick: Path) -> None:
     command = [sys.executable, "-W", "error", "-c", WITHOUT_TORCH, str(quick)]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
-    assert result.stdout.startswith("skipped the reference runtime was not run: ")
+    assert result.stdout.startswith("skipped the reference runtime was not run: it needs torch Install 'ttscompile[c")
 
 
 def test_a_zipped_artifact(quick: Path, tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """What ``zip`` writes. The others that Python reads cost much more memory or time for a byte of the archive."""
 
 _ENCRYPTED = 0x1
+_UNREADABLE = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError, OSError)
 _AGAIN = "Zip the artifact's directory again, or give the directory itself."
 
 
@@ -61,7 +62,7 @@ def unpack(path: Path) -> Unpacked:
     try:
         with zipfile.ZipFile(path) as archive:
             _extract(archive, path, unpacked.path)
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError, OSError) as error:
+    except _UNREADABLE as error:
         unpacked.remove()
         raise ArtifactError(f"{path}: not a zip file that can be read: {error}. {_AGAIN}") from error
     except BaseException:
@@ -77,7 +78,7 @@ def is_checkpoint(path: Path) -> bool:
     try:
         with zipfile.ZipFile(path) as archive:
             return any(PurePosixPath(name).name == "data.pkl" for name in archive.namelist())  # of torch.save
-    except (zipfile.BadZipFile, OSError):
+    except _UNREADABLE:
         return path.suffix in (".ckpt", ".pt", ".pth", ".safetensors")
 
 

@@ -192,14 +192,11 @@ def load_artifact(path: str | Path) -> Artifact:
         ArtifactError: says what is wrong, where, and what to do.
     """
     place = Path(path)
-    if not place.exists():
-        raise ArtifactError(f"{place}: does not exist. Give the directory that 'ttscompile convert' wrote.")
-    if is_checkpoint(place):
-        raise ArtifactError(
-            f"{place}: a checkpoint, not an artifact. Convert it first: ttscompile convert {place} -o DIR."
-        )
     if place.is_dir():
         return _load_directory(place)
+    if not place.exists():
+        raise ArtifactError(f"{place}: does not exist. Give the directory that 'ttscompile convert' wrote.")
+    _refuse_checkpoint(place)
     unpacked = unpack(place)
     try:
         return replace(_load_directory(unpacked.path), _unpacked=unpacked)
@@ -218,12 +215,20 @@ def read_manifest(directory: Path) -> Manifest:
     try:
         content = path.read_bytes()
     except FileNotFoundError:
+        _refuse_checkpoint(directory)
         raise ArtifactError(
             f"{directory}: not an artifact: it has no {MANIFEST}. Give the directory that 'ttscompile convert' wrote."
         ) from None
     except OSError as error:
         raise ArtifactError(f"{path}: cannot be read: {error}. {REMEDY}") from error
     return decode(content, str(path))
+
+
+def _refuse_checkpoint(path: Path) -> None:
+    if is_checkpoint(path):
+        raise ArtifactError(
+            f"{path}: a checkpoint, not an artifact. Convert it first: ttscompile convert {path} -o DIR."
+        )
 
 
 def _load_directory(directory: Path) -> Artifact:

@@ -21,6 +21,8 @@ DENSE = "dense"
 """The plan that computes every cell; every artifact has it without listing it."""
 PRUNER = "pruner"
 """The pruner's piece, and the plan that it makes where that is not called otherwise."""
+UNIFORM = "uniform"
+"""The plan that calibration adds for comparisons alone: as many steps computed, evenly spaced. Not for a robot."""
 
 _SHOWN = 12
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ..artifact.load import Artifact
-from ..artifact.manifest import Manifest
+from ..artifact.manifest import UNIFORM, Manifest
 from ..errors import CalibrationFailedError
 from ..lattice import PlanArray, uniform_plan
 from ..runtimes.base import pruner_plan
@@ -16,8 +16,8 @@ from .named import Named
 from .result import CalibrationResult, PlanScore
 from .strategies import Found
 
-PRUNED, SCHEDULE, UNIFORM = "tts", "schedule", "uniform"
-"""Names of plans in the artifact: the pruner's, the best that does not depend on the observation, and the baseline."""
+PRUNED, SCHEDULE = "tts", "schedule"
+"""Names of plans in the artifact: the pruner's, and the best that does not depend on the observation."""
 
 BASELINE = "interval"
 """The strategy that is no better than the uniform schedule, and need not be."""

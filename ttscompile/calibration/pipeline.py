@@ -13,7 +13,7 @@ import numpy as np
 
 from ..artifact.ceiling import few_steps, usual_sparsity
 from ..artifact.load import Artifact, load_artifact
-from ..artifact.manifest import PRUNER
+from ..artifact.manifest import PRUNER, UNIFORM
 from ..artifact.write import update_calibration
 from ..correction import FEATURES
 from ..errors import CalibrationError
@@ -26,7 +26,7 @@ from .clock import Clock
 from .execute import Executor
 from .families import Families, budget_of_error
 from .head import has_head
-from .judge import PRUNED, SCHEDULE, UNIFORM, default_of, judge, require_success, uniform_of
+from .judge import PRUNED, SCHEDULE, default_of, judge, require_success, uniform_of
 from .latency import measure_budget
 from .named import SAFE, SHARE, Named, named_plans
 from .precision import precision_record

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ttscompile.artifact.load import load_artifact, read_manifest
-from ttscompile.artifact.manifest import Manifest, abbreviated
+from ttscompile.artifact.manifest import UNIFORM, Manifest, abbreviated
 from ttscompile.errors import TtscompileError
 from ttscompile.units import flops as flops
 from ttscompile.units import ms as ms
@@ -84,6 +84,11 @@ def table(*columns: str) -> Table:
     for i, column in enumerate(columns):
         made.add_column(column, justify="right" if i else "left", no_wrap=i == 0, overflow="fold")
     return made
+
+
+def marked(plan: str) -> str:
+    """The name of a plan in a table: the baseline, which no robot should run, is called so."""
+    return plan + " (baseline)" * (plan == UNIFORM)
 
 
 def manifest_of(path: Path) -> Manifest:

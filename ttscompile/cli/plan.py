@@ -10,10 +10,12 @@ import click
 import numpy as np
 
 import ttscompile
+from ttscompile.artifact.manifest import UNIFORM
 from ttscompile.cli.loop_options import loop_options
 from ttscompile.cli.output import (
     artifact_argument,
     json_option,
+    marked,
     ms,
     print_identity,
     print_json,
@@ -117,7 +119,7 @@ def _print(
     made = table("plan", "median ms", "longest ms", "may take ms", "up to Hz", "verdict")
     for name, each in judged.items():
         made.add_row(
-            name,
+            marked(name),
             ms(1e3 * float(np.median(measured[name])), 4),
             ms(1e3 * each.latency, 4),
             ms(max(1e3 * each.max_latency, 0), 4),
@@ -126,7 +128,11 @@ def _print(
         )
     output.print(made)
     for name, each in judged.items():
-        output.print(f"{name}: {each.explain()}", soft_wrap=True)
+        output.print(f"{marked(name)}: {each.explain()}", soft_wrap=True)
+    if UNIFORM in judged:
+        output.print(
+            f"{UNIFORM} is for comparisons: evenly spaced steps, not calibrated. Not for a robot.", soft_wrap=True
+        )
     output.print(
         f"Of {runs} calls with {threads} thread{'s' * (threads > 1)}; the longest has to fit. Hz: of the policy, with"
         " as many control ticks an action as here.",

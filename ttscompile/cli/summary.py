@@ -11,7 +11,7 @@ from rich.console import Console
 
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import DENSE, Manifest, abbreviated
-from ttscompile.cli.output import flops, share, table
+from ttscompile.cli.output import flops, marked, share, table
 from ttscompile.ir.joint import OF_ALL_BLOCKS
 from ttscompile.runtimes.liveness import rollout_needs
 from ttscompile.units import plain
@@ -169,7 +169,7 @@ def print_summary(summary: dict[str, Any], console: Console) -> None:
     plans = table("plan", "kind", "cells reused", "FLOPs reused", "FLOPs a call", "of the captured policy")
     for name, plan in summary["plans"].items():
         plans.add_row(
-            name + " (default)" * (name == summary["default_plan"]),
+            f"{name} (default)" if name == summary["default_plan"] else marked(name),
             plan["kind"],
             share(plan["sparsity"]),
             share(plan["flops_sparsity"]),
@@ -201,7 +201,7 @@ def _print_calibration(record: dict[str, Any] | None, console: Console) -> None:
     scores = table("held-out episodes", "mean action error", "90th percentile", "cells reused", "FLOPs saved")
     for name, score in record.get("plans", {}).items():
         errors = (f"{score[key]:.4g}" for key in ("error", "error_p90"))
-        scores.add_row(name, *errors, *(share(score[key]) for key in ("sparsity", "flops_saved")))
+        scores.add_row(marked(name), *errors, *(share(score[key]) for key in ("sparsity", "flops_saved")))
     precision = record.get("precision", {"plans": {}})
     for name, score in precision["plans"].items():
         errors = (f"{score[key]:.4g}" for key in ("error", "error_p90"))

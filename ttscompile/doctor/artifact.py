@@ -74,7 +74,7 @@ def _needs(artifact: Artifact) -> list[Finding]:
         found.append(Finding(PART, "plan", "dense: not calibrated", Level.WARNING, remedy))
     else:
         others = ", ".join(manifest.plans)
-        found.append(Finding(PART, "plan", f"{manifest.default_plan}, of {others}"))
+        found.append(Finding(PART, "plan", f"default {manifest.default_plan!r}; it has {others}"))
     return found
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from ..errors import OutputError, RuntimeUnavailableError
 
@@ -13,6 +15,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 STEPS_AXIS = "denoising step k, in order of execution (0 is the noisiest)"
+
+_CHARACTER = 0.012
+"""Share of the axes' width, about, that a character of a point's name takes."""
 
 _ABBREVIATIONS = {"self_attention": "SA", "cross_attention": "CA", "feed_forward": "FF"}
 
@@ -48,11 +53,34 @@ def block_names(kinds: Sequence[str]) -> list[str]:
 
 
 def plain_powers(axis: Axis) -> None:
-    """Write 40 rather than 4 x 10^1 on a logarithmic axis."""
+    """Write 40 and 0.6 rather than 4 x 10^1 and 6e-01 on a logarithmic axis."""
     from matplotlib.ticker import LogFormatter
 
-    axis.set_major_formatter(LogFormatter())
-    axis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
+    class Plain(LogFormatter):
+        """Labels the same ticks as its base, which writes every number below 1 as a power."""
+
+        def __call__(self, x: float, pos: int | None = None) -> str:
+            return np.format_float_positional(x, 3, fractional=False, trim="-") if super().__call__(x, pos) else ""
+
+    axis.set_major_formatter(Plain())
+    axis.set_minor_formatter(Plain(minor_thresholds=(2, 0.5)))
+    axis.set_tick_params(which="minor", length=2, pad=5)
+    axis.set_tick_params(which="major", length=3.5, pad=3.5)  # labels of both at one distance from the axis
+
+
+def beside(place: float, name: str, shift: float = 0.0) -> dict[str, Any]:
+    """How to write a name beside its point: to its right, or where that would leave the frame, to its left.
+
+    Args:
+        place: of the point between the first and the last, 0..1.
+        name: to write.
+        shift: upwards, in points.
+
+    Returns:
+        Arguments for ``Axes.annotate``.
+    """
+    left = place + _CHARACTER * len(name) > 1
+    return {"xytext": (-5 if left else 5, shift), "textcoords": "offset points", "ha": "right" if left else "left"}
 
 
 def write_picture(figure: Figure, path: str | Path) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from textwrap import wrap
 
 from ..points import Point
-from .figure import new_figure, plain_powers, write_picture
+from .figure import beside, new_figure, plain_powers, write_picture
 
 COLOURS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 """Okabe and Ito's palette, without the yellow that white paper swallows."""
@@ -30,7 +30,7 @@ def plot_frontier(
     """Draw the points and write the picture.
 
     Args:
-        points: of all series; those without an error (the dense policy itself) are left out: the axis is logarithmic.
+        points: of all series; those without an error (the dense policy) are told in the title: the axis is logarithmic.
         efficient: points that no other beats, fastest first.
         yardsticks: errors that are drawn as level lines, by their key in ``Frontier.yardsticks``.
         path: see ``write_picture``.
@@ -54,20 +54,23 @@ def plot_frontier(
             color=COLOURS[i % len(COLOURS)],
             label=series,
         )
+    first, last = (log(end([p.latency_ms for p in shown], default=1.0)) for end in (min, max))
     for i, p in enumerate(shown):
         above = 4 + 8 * sum(_near(p, other) for other in shown[:i])
-        axes.annotate(p.name, (p.latency_ms, p.error), xytext=(5, above), textcoords="offset points", fontsize=8)
+        place = (log(p.latency_ms) - first) / ((last - first) or 1.0)
+        axes.annotate(p.name, (p.latency_ms, p.error), fontsize=8, **beside(place, p.name, above))
     best = [point for point in efficient if point.error > 0]
-    axes.step(
-        [p.latency_ms for p in best],
-        [p.error for p in best],
-        where="post",
-        color="#999999",
-        linewidth=4,
-        alpha=0.35,
-        zorder=0,
-        label="frontier",
-    )
+    if len(best) > 1:  # of one point there is no line
+        axes.step(
+            [p.latency_ms for p in best],
+            [p.error for p in best],
+            where="post",
+            color="#999999",
+            linewidth=4,
+            alpha=0.35,
+            zorder=0,
+            label="frontier",
+        )
     for (name, height), style in zip(yardsticks.items(), ("--", ":"), strict=False):
         if height > 0:
             axes.axhline(height, color="#555555", linestyle=style, linewidth=1, label=_TOLD[name])
@@ -78,7 +81,9 @@ def plot_frontier(
     plain_powers(axes.xaxis)
     plain_powers(axes.yaxis)
     axes.margins(x=0.08, y=0.1)
-    lines = [line for part in title.splitlines() for line in wrap(part, _TITLE_WIDTH)]
+    exact = ", ".join(f"{p.name} of {p.series}, {p.latency_ms:.3g} ms" for p in points if p.error == 0)
+    parts = [*title.splitlines(), *([f"not drawn, with no error: {exact}"] if exact else [])]
+    lines = [line for part in parts for line in wrap(part, _TITLE_WIDTH)]
     axes.set_title("\n".join(lines), fontsize=8, loc="left")
     axes.grid(which="both", color="#dddddd", linewidth=0.5)
     axes.set_axisbelow(True)

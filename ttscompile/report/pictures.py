@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..lattice import PlanArray, Source, sparsity
-from ..plots.figure import STEPS_AXIS, new_figure, plain_powers
+from ..plots.figure import STEPS_AXIS, beside, new_figure, plain_powers
 from ..plots.frontier import plot_frontier
 from ..plots.plan import COLOURS, plot_plan
 from ..points import Point
@@ -132,12 +132,15 @@ def plans_picture(scores: Mapping[str, Mapping[str, Any]]) -> bytes:
     """Held-out action error of each plan of a calibration against the share of cells that it computes."""
     figure = new_figure(6.0, 4.0)
     axes = figure.add_subplot()
-    for name, score in scores.items():
-        x, middle, high = 100 * (1 - score["sparsity"]), score["error"], score["error_p90"]
+    computed = [100 * (1 - score["sparsity"]) for score in scores.values()]
+    span = (max(computed) - min(computed)) or 1.0
+    for x, (name, score) in zip(computed, scores.items(), strict=True):
+        middle, high = score["error"], score["error_p90"]
         axes.plot([x, x], [middle, high], color="#999999", linewidth=1, zorder=1)
         axes.plot(x, middle, "o", color=COLOURS[Source.COMPUTE], zorder=2)
         axes.plot(x, high, "_", color="#999999", markersize=10, zorder=1)
-        axes.annotate(plain(name, 24), (x, middle), xytext=(7, -3), textcoords="offset points", fontsize=9)
+        told = plain(name, 24)
+        axes.annotate(told, (x, middle), fontsize=9, **beside((x - min(computed)) / span, told, -3))
     axes.set_yscale("log")
     plain_powers(axes.yaxis)
     axes.set_xlabel("cells computed, %")

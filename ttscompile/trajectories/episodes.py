@@ -22,7 +22,7 @@ import numpy.typing as npt
 from ..config import ObservationSpec
 from ..errors import TrajectoryError
 from .apart import frames_apart
-from .frames import Frames, observation_frames, require_proportion
+from .frames import Frames, few, observation_frames, require_proportion
 
 Array = npt.NDArray[Any]
 
@@ -138,7 +138,9 @@ def _npz(path: Path) -> tuple[Frames, bool]:
     arrays = read_npz(path)
     frames = _meta(path, arrays.pop(META, None))
     if ENDS not in arrays:
-        raise TrajectoryError(f"{path}: has no array {ENDS!r}; it has {sorted(arrays)}. Add {ENDS} [E]: {_ENDS_ARE}.")
+        raise TrajectoryError(
+            f"{path}: has no array {ENDS!r}; it has {few(sorted(arrays))}. Add {ENDS} [E]: {_ENDS_ARE}."
+        )
     ends = arrays.pop(ENDS)
     return Frames(sorted(arrays), arrays.__getitem__, ends), frames
 

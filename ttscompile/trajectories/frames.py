@@ -24,6 +24,8 @@ on zeros; recorded images 10."""
 BLOCK_BYTES = 32 * 2**20
 """Rows are read so many bytes at a time, or one chunk."""
 
+_SHOWN = 8
+
 
 @dataclass(frozen=True)
 class Frames:
@@ -97,7 +99,7 @@ def _part(path: Path, frames: Frames, key: str, part: str) -> Array:
     name, colon, count = part.partition(":")
     if name not in frames.names:
         raise TrajectoryError(
-            f"{path}: has no array {name!r} for the observation {key!r}; it has {', '.join(frames.names)}. Say what the"
+            f"{path}: has no array {name!r} for the observation {key!r}; it has {few(frames.names)}. Say what the"
             f" observation is made of, in order: --observation {key}=NAME,NAME:N (NAME:N are its first N numbers), or"
             f' observation={{"{key}": ["NAME", "NAME:N"]}}.'
         )
@@ -111,6 +113,11 @@ def _part(path: Path, frames: Frames, key: str, part: str) -> Array:
             f" {flat.shape[1]} numbers of {name!r} are taken."
         )
     return flat[:, : int(count)]
+
+
+def few(names: Sequence[str]) -> str:
+    """The first names, and how many there are: an archive of something else may have thousands."""
+    return ", ".join(names[:_SHOWN]) + f", .. ({len(names)} in all)" * (len(names) > _SHOWN)
 
 
 def _flat(path: Path, name: str, array: Array) -> Array:

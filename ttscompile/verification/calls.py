@@ -75,8 +75,9 @@ def check_runtimes(artifact: Artifact, golden: Golden, runtime: Runtime) -> Rung
     """A dense call, and single blocks, in the reference runtime; skipped where there is no torch."""
     try:
         reference = open_runtime(artifact, "reference")
-    except RuntimeUnavailableError as missing:
-        return Rung(RUNTIMES, SKIPPED, f"the reference runtime was not run: {missing}")
+    except RuntimeUnavailableError:
+        remedy = "Install 'ttscompile[compile]' to have the runtimes compared."
+        return Rung(RUNTIMES, SKIPPED, "the reference runtime was not run: it needs torch", remedy=remedy)
     manifest, obs = artifact.manifest, golden.network_observations(artifact.manifest.spec)
     samples = []
     for one in (runtime, reference):

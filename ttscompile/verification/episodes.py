@@ -79,7 +79,7 @@ def check_episodes(
     for i, obs in enumerate([one.observations for one in episodes] or [golden.raw_observations(spec)]):
         rows = [{k: a[r : r + 1] for k, a in obs.items()} for r in range(len(next(iter(obs.values()))))]
         if episodes:
-            told(f"episode {i + 1} of {len(episodes)}, {len(rows)} calls")
+            told(f"episode {i + 1} of {len(episodes)}, {len(rows)} call{'s' * (len(rows) != 1)}")
         _run(policy, spec, rows, draw, total)
     figures = {
         name: {"error": finite(float(np.mean(e))), "error_p90": finite(float(np.quantile(e, 0.9)))}
@@ -112,7 +112,8 @@ def check_episodes(
         reasons.append(f"worse than calibrated, {told_before}")
     tolerance = min(beyond, worse)
     details |= {"promised": promised, "promised_p90": promised_p90, "reasons": reasons}
-    where = f"{calls} calls of {len(episodes)} episodes: {found}"
+    made = f"{calls} call{'s' * (calls != 1)} of {len(episodes)} episode{'s' * (len(episodes) != 1)}"
+    where = f"{made}: {found}"
     if not reasons:
         return Rung(SPARSITY, PASSED, where, error, tolerance, "action units", details=details)
     where += f". This is {'; and '.join(reasons)}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ..artifact.archive import is_checkpoint
 from ..artifact.codec import encode
 from ..artifact.files import verify as verify_file
 from ..artifact.load import Artifact, load_artifact, read_manifest
@@ -26,7 +27,7 @@ def check_integrity(path: Path) -> tuple[Rung, Artifact | None]:
     Raises:
         ArtifactError: there is nothing at this path that could be an artifact.
     """
-    if not path.exists() or (path.is_dir() and not (path / MANIFEST).is_file()):
+    if not path.exists() or (path.is_dir() and not (path / MANIFEST).is_file()) or is_checkpoint(path):
         load_artifact(path)  # says what is wrong
     wrong = _wrong_files(path) if path.is_dir() else []
     artifact = None
@@ -42,7 +43,8 @@ def check_integrity(path: Path) -> tuple[Rung, Artifact | None]:
     files = artifact.manifest.files
     size = sum(record.bytes for record in files.values()) / 1e6
     other = sorted({p.name for p in path.iterdir()} - {MANIFEST, *files}) if path.is_dir() else []
-    more = f"; {len(other)} other files lie beside them, which nothing reads: {', '.join(other[:3])}" if other else ""
+    lie = f"{len(other)} other file{'s lie' if len(other) > 1 else ' lies'} beside them"
+    more = f"; {lie}, which nothing reads: {', '.join(other[:3])}" if other else ""
     told = f"manifest and {len(files)} files, {size:.1f} MB, have the hashes that they were written with{more}"
     return Rung(NAME, PASSED, told, 0, 0, "files", details={"unlisted": other}), artifact
 

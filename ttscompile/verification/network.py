@@ -70,7 +70,9 @@ def check_preprocessing(artifact: Artifact, golden: Golden) -> Rung:
             " normaliser or the chunk was changed or exchanged since the artifact was made."
         )
     else:
-        told = f"normalisers of {len(errors) - 2} observations and of the action, and the chunk, are the original's"
+        count = len(spec.observations)
+        observed = f"{count} observation{'s' * (count != 1)}"
+        told = f"normalisers of {observed} and of the action, and the chunk, are the original's"
     remedy = _CONVERT if wrong else ""
     details = {"wrong": wrong, "errors": {name: finite(error) for name, error in errors.items()}}
     return Rung(
