@@ -93,6 +93,12 @@ def test_a_constant_made_of_the_number_of_streams_is_refused() -> None:
         capture(Denoiser(lambda y, t, o: y * torch.tensor(float(y.shape[0]))), toy_spec())
 
 
+@pytest.mark.parametrize("small", [1, 2])
+def test_a_branch_at_a_small_batch_is_refused(small: int) -> None:
+    with pytest.raises(CaptureError, match=f"computes for a batch of {small} something else than for 5"):
+        capture(Denoiser(lambda y, t, o: -y if small <= y.shape[0] < 4 else y), toy_spec())
+
+
 def test_a_buffer_may_have_the_name_of_an_operation() -> None:
     class Rotates(nn.Module):
         def __init__(self) -> None:

@@ -24,7 +24,7 @@ from torch.export.graph_signature import InputKind, OutputKind
 from .capture_batch import BATCHES, REMEDY, unify_batch
 from .config import PolicySpec
 from .errors import CaptureError
-from .ir.evaluate import without_stack_traces
+from .ir.evaluate import Evaluator, without_stack_traces
 from .ir.graph import GETITEM, Argument, Batch, Enum, Graph, Node, Ref, Size, TensorType
 
 EXAMPLE_STREAMS = 3
@@ -76,7 +76,29 @@ def capture(module: nn.Module, spec: PolicySpec) -> tuple[Graph, Weights]:
     unified = unify_batch(left, right)
     if differ := [name for name, value in weights.items() if not np.array_equal(value, others[name], equal_nan=True)]:
         raise CaptureError(f"the module makes constants of the batch size: {', '.join(differ)}.{REMEDY}")
+    _require_small_batches(module, spec, unified, weights)
     return unified, weights
+
+
+def _require_small_batches(module: nn.Module, spec: PolicySpec, graph: Graph, weights: Weights) -> None:
+    """Refuse a module that branches below the batches of both captures: it is run with one stream and with two."""
+    run = Evaluator(graph, {name: torch.from_numpy(np.asarray(value)) for name, value in weights.items()})
+    rng = np.random.default_rng(0)
+    for streams in (1, 2):
+        inputs = _examples(spec, streams)
+        for key, one in spec.observations.items():
+            raw = np.concatenate([one.draw(rng) for _ in range(streams)])
+            drawn = raw if one.normalizer is None else one.normalizer.normalize(raw)
+            inputs[key] = torch.from_numpy(drawn)
+        try:
+            with torch.no_grad():
+                (found,), expected = run(inputs), module(**_as_arguments(inputs, spec))
+        except Exception as error:  # whatever the user's code raises
+            raise CaptureError(f"the module fails for a batch of {streams}: {error}{REMEDY}") from error
+        if not torch.allclose(found, expected, rtol=1e-3, atol=1e-3 * float(expected.abs().max()), equal_nan=True):
+            raise CaptureError(
+                f"the module computes for a batch of {streams} something else than for {BATCHES[0]}.{REMEDY}"
+            )
 
 
 def _traced(
@@ -84,7 +106,7 @@ def _traced(
 ) -> tuple[torch.export.ExportedProgram, dict[str, torch.Tensor]]:
     """What torch.export makes of the module, and the example inputs."""
     examples = _examples(spec, streams)
-    given = {spec.arguments.get(name, name): value for name, value in examples.items()}
+    given = _as_arguments(examples, spec)
     fastpath = torch.backends.mha.get_fastpath_enabled()
     torch.backends.mha.set_fastpath_enabled(False)  # the fused encoder layer is opaque to every pass
     try:
@@ -153,6 +175,11 @@ def _export(module: nn.Module, examples: Mapping[str, torch.Tensor], symbolic: b
         inputs, shapes = tuple(examples.values()), (tuple(each.values()),)
         return torch.export.export(_ByPosition(module, list(examples)), inputs, dynamic_shapes=shapes, strict=False)
     return torch.export.export(module, (), kwargs=dict(examples), dynamic_shapes=each, strict=False)
+
+
+def _as_arguments(inputs: Mapping[str, torch.Tensor], spec: PolicySpec) -> dict[str, torch.Tensor]:
+    """By the names of the module's arguments."""
+    return {spec.arguments.get(name, name): value for name, value in inputs.items()}
 
 
 def _examples(spec: PolicySpec, streams: int) -> dict[str, torch.Tensor]:
