@@ -121,9 +121,10 @@ def test_a_graph_that_does_not_do_what_the_manifest_says(written: Path) -> None:
         ttscompile.load(written)
 
 
-def test_a_policy_out_of_proportion_to_its_files(written: Path) -> None:
+@pytest.mark.parametrize(("key", "value"), [("sample", [2**20, 2**20]), ("left_out", 10**12)])
+def test_a_policy_out_of_proportion_to_its_files(written: Path, key: str, value: object) -> None:
     def huge(document: dict[str, Any]) -> None:
-        document["spec"]["sample"] = [2**20, 2**20]
+        document["spec"][key] = value
 
     forge(written, huge)
     with pytest.raises(ArtifactError, match="its manifest declares"):

@@ -41,7 +41,8 @@ def check_size(manifest: Manifest, directory: Path) -> None:
 def _bytes(manifest: Manifest) -> Iterator[int]:
     """Sizes of what a runtime allocates for one stream, about; Python's integers do not overflow."""
     steps, (horizon, channels) = manifest.steps, manifest.spec.sample
-    yield 4 * horizon * channels * (steps + _HISTORY)
+    drawn = horizon + manifest.spec.left_out  # noise is drawn for the original's steps, too
+    yield 4 * drawn * channels * (steps + _HISTORY)
     yield 4 * steps * channels * (_HISTORY * horizon) * horizon  # the sampler's update, a matrix a step and channel
     for spec in manifest.spec.observations.values():
         yield math.prod(spec.shape) * np.dtype(spec.dtype).itemsize
