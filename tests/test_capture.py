@@ -95,8 +95,21 @@ def test_a_constant_made_of_the_number_of_streams_is_refused() -> None:
 
 @pytest.mark.parametrize("small", [1, 2])
 def test_a_branch_at_a_small_batch_is_refused(small: int) -> None:
-    with pytest.raises(CaptureError, match=f"computes for a batch of {small} something else than for 5"):
+    with pytest.raises(CaptureError, match=f"computes for a batch of {small} something else than for more"):
         capture(Denoiser(lambda y, t, o: -y if small <= y.shape[0] < 4 else y), toy_spec())
+
+
+@pytest.mark.parametrize(
+    "then",
+    [
+        lambda y, t, o: y - y.mean(0),
+        lambda y, t, o: y / y.shape[0],
+        lambda y, t, o: y * torch.arange(y.shape[0])[:, None, None],
+    ],
+)
+def test_streams_that_depend_on_each_other_are_refused(then: Callable[..., object]) -> None:
+    with pytest.raises(CaptureError, match="for a stream beside another something else than alone"):
+        capture(Denoiser(then), toy_spec())
 
 
 def test_a_buffer_may_have_the_name_of_an_operation() -> None:

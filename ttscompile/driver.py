@@ -148,9 +148,10 @@ def compile_denoiser(
     """
     if precision != FP32:
         require_precision(precision)
-    if prediction_horizon is not None:
-        spec, changed = narrow(module, spec, prediction_horizon)
-        told = f"{prediction_horizon} of {spec.original.sample[0]} steps are predicted"
+    if prediction_horizon is not None or spec.left_out:
+        kept = spec.sample[0] if prediction_horizon is None else prediction_horizon
+        spec, changed = narrow(module, spec.original, kept)
+        told = f"{kept} of {spec.original.sample[0]} steps are predicted"
         explain("narrow", (f"{told}; they differ from the original's by {changed:.1g} of their deviation",))
     program = transform(module, spec, explain=explain)
     if prediction_horizon is None and (hint := unneeded(module, spec)) is not None:

@@ -272,7 +272,8 @@ def _opened(graph: Graph, blocks: tuple[Block, ...]) -> Graph:
 def _split(graph: Graph, varying: list[str]) -> tuple[Graph, Graph]:
     """What depends on observations alone, once, and what depends on these inputs or on a probe, for every step."""
     types = graph.types()
-    loop = reachable_from(graph, [*varying, *(name for name in graph.inputs if name.startswith(_PROBE))])
+    starts = [*varying, *(name for name in graph.inputs if name.startswith(_PROBE))]
+    loop = reachable_from(graph, starts)
     before = {
         name: types[name]
         for node in graph.nodes
@@ -280,4 +281,7 @@ def _split(graph: Graph, varying: list[str]) -> tuple[Graph, Graph]:
         for name in node.refs()
         if name not in loop and name not in graph.constants and name not in graph.inputs
     }
-    return backward_slice(graph, tuple(before), {}), backward_slice(graph, graph.outputs, before)
+    once = backward_slice(graph, tuple(before), {})
+    # All observations, read or not: they say how many streams there are.
+    once = replace(once, inputs={name: type_ for name, type_ in graph.inputs.items() if name not in starts})
+    return once, backward_slice(graph, graph.outputs, before)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -61,6 +62,40 @@ def test_a_network_of_one_length(payload: Build, save: Save) -> None:
 
     with pytest.raises(SpecError, match=r"does not take a sample of 4 steps: .*predict all 6 steps"):
         narrow(OneLength(), spec, KEPT)
+
+
+def _pads(y: torch.Tensor) -> torch.Tensor:
+    return torch.nn.functional.pad(y, (0, 0, 0, HORIZON - y.shape[1]))
+
+
+@pytest.mark.parametrize(
+    ("then", "message"),
+    [
+        (lambda y: y * (float("nan") if y.shape[1] < HORIZON else 1), "differs by nan"),
+        (_pads, "does not take a sample of 4 steps"),
+        (lambda y: y[{HORIZON: slice(None)}[y.shape[1]]], "does not take a sample of 4 steps"),
+    ],
+)
+def test_no_number_another_shape_or_any_error_of_the_module_is_refused(
+    payload: Build, save: Save, then: Callable[[torch.Tensor], torch.Tensor], message: str
+) -> None:
+    _, spec = load_checkpoint_policy(save(payload()))
+
+    class Odd(torch.nn.Module):
+        def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
+            return then(sample)
+
+    with pytest.raises(SpecError, match=message):
+        narrow(Odd(), spec, KEPT)
+    assert unneeded(Odd(), spec) is None
+
+
+def test_what_a_specification_leaves_out_is_checked_too(payload: Build, save: Save) -> None:
+    module, spec = load_checkpoint_policy(save(payload(causal_attn=False)))
+    with pytest.raises(SpecError, match=r"is 4, but these steps depend on the 2 after them"):
+        ttscompile.compile_denoiser(module, replace(spec, sample=(KEPT, spec.sample[1]), left_out=HORIZON - KEPT))
+    with pytest.raises(SpecError, match=r"prediction_horizon is 0"):
+        ttscompile.compile_denoiser(module, spec, prediction_horizon=0)
 
 
 def test_the_rest_of_the_prediction_is_the_original(payload: Build, save: Save, tmp_path: Path) -> None:

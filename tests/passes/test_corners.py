@@ -21,6 +21,7 @@ from ttscompile.passes.find_residual_blocks import find_residual_blocks
 from ttscompile.passes.hoist import Hoist
 from ttscompile.passes.insert_pruner import InsertPruner
 from ttscompile.passes.partition import Partition
+from ttscompile.record_golden import record_original
 
 SHAPE = (B, 4, 2)
 
@@ -111,3 +112,17 @@ def test_what_is_no_function_of_one_stream_and_one_step(module: type[nn.Module])
         with torch.no_grad():
             expected = original(sample, torch.full((STREAMS,), int(t)), obs)
         torch.testing.assert_close(evaluate_pieces(program, sample, obs, k), expected, rtol=1e-5, atol=1e-5)
+
+
+class Shaped(Picks):
+    """Of the observation it takes only the shape."""
+
+    def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
+        time = torch.full_like(obs[:, :1, :2], 0.3) * timestep[:, None, None]
+        x = sample + self.ff(sample) * time
+        return x + self.ff(x) * time
+
+
+def test_the_record_of_a_network_that_reads_no_observation() -> None:
+    program = transform(Shaped(), toy_spec(obs=(3, 7)))
+    assert record_original(Shaped(), program).residuals.any(axis=(1, 2, 3))[0]

@@ -308,7 +308,7 @@ class NoResidual(nn.Module):
         self.net = nn.Sequential(nn.Linear(2, 8), nn.GELU(), nn.Linear(8, 2))
 
     def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
-        return self.net(sample) * obs.mean() * timestep[:, None, None]
+        return self.net(sample) * obs.flatten(1).mean(1)[:, None, None] * timestep[:, None, None]
 
 
 def test_a_network_without_residuals_is_refused_with_its_source_line() -> None:
