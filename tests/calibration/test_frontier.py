@@ -137,6 +137,8 @@ def test_an_artifact_that_predicts_fewer_steps_is_of_the_same_policy(planned: Pa
     _require_same_policy(narrow, predicting(steps + 2), "other")
     with pytest.raises(CalibrationError, match="found other weights"):
         _require_same_policy(narrow, predicting(steps + 2, weight=1.0), "other")
+    with pytest.raises(CalibrationError, match="found other weights"):
+        _require_same_policy(narrow, replace(predicting(steps + 2), weights={"mask": np.zeros(steps + 2)}), "other")
     with pytest.raises(CalibrationError, match="same checkpoint; found .* instead of"):
         _require_same_policy(narrow, predicting(steps), "other")
 

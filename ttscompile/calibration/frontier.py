@@ -200,9 +200,9 @@ def _require_same_policy(artifact: Artifact, other: Artifact, name: str) -> None
     # Masks and position tables are shorter where fewer steps are predicted; the weights proper are not.
     narrower = ours.sample != theirs.sample
     pairs = [(value, other.weights[key]) for key, value in artifact.weights.items() if key in other.weights]
-    equal = bool(pairs) and all(
-        np.array_equal(left, right) or (narrower and left.shape != right.shape) for left, right in pairs
-    )
+    same = [np.array_equal(left, right) for left, right in pairs]
+    excused = [narrower and left.shape != right.shape for left, right in pairs]
+    equal = any(same) and all(a or b for a, b in zip(same, excused, strict=True))
     if shapes[0] != shapes[1] or not equal:
         what = f"{shapes[1]} instead of {shapes[0]}" if shapes[0] != shapes[1] else "other weights"
         raise CalibrationError(
