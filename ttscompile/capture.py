@@ -90,8 +90,7 @@ def _require_streams_alike(module: nn.Module, spec: PolicySpec, graph: Graph, we
     run = Evaluator(graph, {name: torch.from_numpy(np.asarray(value)) for name, value in weights.items()})
     rng, both, made = np.random.default_rng(0), _examples(spec, 2), list[torch.Tensor]()
     for key, one in spec.observations.items():
-        raw = np.concatenate([one.draw(rng) for _ in range(2)])
-        both[key] = torch.from_numpy(raw if one.normalizer is None else one.normalizer.normalize(raw))
+        both[key] = torch.from_numpy(one.draw_normalized(rng, 2))
     for streams in (1, 2):
         inputs = {name: value[2 - streams :] for name, value in both.items()}
         try:

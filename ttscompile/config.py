@@ -200,6 +200,11 @@ class ObservationSpec:
             drawn = self.normalizer.unnormalize(drawn)
         return drawn.astype(self.dtype)
 
+    def draw_normalized(self, rng: np.random.Generator, streams: int) -> npt.NDArray[np.generic]:
+        """Random observations ``[streams, *shape]`` as the network is given them."""
+        raw = np.concatenate([self.draw(rng) for _ in range(streams)])
+        return raw if self.normalizer is None else self.normalizer.normalize(raw.astype(np.float32))
+
 
 @dataclass(frozen=True)
 class ChunkSpec:

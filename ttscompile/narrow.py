@@ -78,10 +78,9 @@ def unneeded(module: nn.Module, spec: PolicySpec) -> str | None:
 def _difference(module: nn.Module, spec: PolicySpec, steps: int) -> float:
     """Largest difference of the first steps' prediction with and without those after them, over its deviation."""
     draw = np.random.default_rng(0)
-    observations = {}
-    for key, one in spec.observations.items():
-        raw = np.concatenate([one.draw(draw) for _ in range(_STREAMS)])
-        observations[key] = torch.from_numpy(raw if one.normalizer is None else one.normalizer.normalize(raw))
+    observations = {
+        key: torch.from_numpy(one.draw_normalized(draw, _STREAMS)) for key, one in spec.observations.items()
+    }
     sample = torch.from_numpy(draw.standard_normal((_STREAMS, *spec.sample), dtype=np.float32))
     timesteps, found = torch.from_numpy(spec.sampler.timesteps), list[float]()
     with torch.inference_mode():
