@@ -2,4 +2,5 @@
 
 from ttscompile.cli import main
 
-main(prog_name="python -m ttscompile")
+if __name__ == "__main__":
+    main(prog_name="python -m ttscompile")

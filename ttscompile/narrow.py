@@ -45,7 +45,6 @@ def narrow(module: nn.Module, spec: PolicySpec, prediction_horizon: int) -> tupl
             f"prediction_horizon is {prediction_horizon}; expected at least {spec.chunk.stop}, as the policy executes"
             f" actions {spec.chunk.start} to {spec.chunk.stop - 1}, and at most {horizon}, which it predicts."
         )
-    left_out = spec.left_out + horizon - prediction_horizon
     found = _difference(module, spec, prediction_horizon)
     if not found <= TOLERANCE:
         raise SpecError(
@@ -53,7 +52,7 @@ def narrow(module: nn.Module, spec: PolicySpec, prediction_horizon: int) -> tupl
             f" after them: without, the prediction differs by {found:.2g} of its deviation; expected at most"
             f" {TOLERANCE:g}. Only where attention is causal can steps be left out: predict all {horizon}."
         )
-    return replace(spec, sample=(prediction_horizon, channels), left_out=left_out), found
+    return replace(spec, sample=(prediction_horizon, channels), left_out=horizon - prediction_horizon), found
 
 
 def unneeded(module: nn.Module, spec: PolicySpec) -> str | None:

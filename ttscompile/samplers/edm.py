@@ -16,6 +16,7 @@ from torch import nn
 
 from ..config import SamplerTable
 from ..errors import SpecError
+from .flow import deterministic_table
 
 
 class EDMDenoiser(nn.Module):
@@ -69,13 +70,12 @@ def edm_table(sigmas: Sequence[float], sigma_data: float, *, clip: float | None 
     unit = np.concatenate([sigma[:1], deviation[1:]])
     next_unit = np.append(unit[1:], 1.0)
     ratio = following / sigma
-    columns = {
-        "sample_to_x0": sigma_data**2 / deviation**2 * unit,
-        "out_to_x0": sigma * sigma_data / deviation,
-        "x0_to_next": (1 - ratio) / next_unit,
-        "sample_to_next": ratio * unit / next_unit,
-        "out_to_next": np.zeros_like(sigma),
-        "noise_to_next": np.zeros_like(sigma),
-    }
-    narrow = {name: np.asarray(values, np.float32) for name, values in columns.items()}
-    return SamplerTable(name="edm", timesteps=np.asarray(sigma, np.float32), clip=clip, **narrow)
+    return deterministic_table(
+        "edm",
+        sigma,
+        clip,
+        sample_to_x0=sigma_data**2 / deviation**2 * unit,
+        out_to_x0=sigma * sigma_data / deviation,
+        x0_to_next=(1 - ratio) / next_unit,
+        sample_to_next=ratio * unit / next_unit,
+    )

@@ -87,7 +87,7 @@ def _euler(times: npt.NDArray[np.float64], scale: float, clip: float | None) -> 
     left = times[-1] - times[:-1]
     # x + h v = x0 h / left + x (1 - h / left) where x0 = x + left v; unclipped it is added directly.
     share = zero if clip is None else lengths / left
-    return _table(
+    return deterministic_table(
         "euler",
         times[:-1] * scale,
         clip,
@@ -112,7 +112,7 @@ def _rk4(times: npt.NDArray[np.float64], scale: float) -> SamplerTable:
     to_memory[own[:, 0], :, x] = 1
     to_memory[own[:, 1:3], 0, base] = to_memory[own[:, 1:3], 1, result] = 1
     to_memory[own[:, :3], 1, out] = h[:, None] * np.array([1 / 6, 1 / 3, 1 / 3])
-    return _table(
+    return deterministic_table(
         "rk4",
         at.ravel() * scale,
         None,
@@ -123,10 +123,17 @@ def _rk4(times: npt.NDArray[np.float64], scale: float) -> SamplerTable:
     )
 
 
-def _table(
+def deterministic_table(
     name: str, timesteps: npt.NDArray[np.float64], clip: float | None, **columns: npt.NDArray[np.float64]
 ) -> SamplerTable:
-    """With zeros for columns that are not given."""
+    """A table in float32, with zeros ``[K]`` for columns that are not given: no noise, for one.
+
+    Args:
+        name: of the method.
+        timesteps: ``[K]``, as the network is given them.
+        clip: bound on the predicted sample; None for none.
+        columns: of ``SamplerTable``, and its memories.
+    """
     zeros = {column: np.zeros(len(timesteps)) for column in SamplerTable.COLUMNS}
     narrow = {column: np.asarray(values, np.float32) for column, values in (zeros | columns).items()}
     return SamplerTable(name=name, timesteps=np.asarray(timesteps, np.float32), clip=clip, **narrow)
