@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from ttscompile.config import SamplerTable
+from ttscompile.core.spec import SamplerTable
 from ttscompile.ir.binding import bindings, input_bindings, numbering
 from ttscompile.ir.evaluate import Evaluator
 from ttscompile.ir.flops import graph_flops

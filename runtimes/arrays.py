@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.config import FloatArray, Noise, ObservationSpec, PolicySpec
+from ttscompile.core.spec import FloatArray, Noise, ObservationSpec, PolicySpec
 from ttscompile.errors import ObservationError, TtscompileError
 
 Array: TypeAlias = npt.NDArray[Any]

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.config import FloatArray, Noise, SamplerTable
-from ttscompile.correction import Correction
+from ttscompile.core.correction import Correction
+from ttscompile.core.lattice import BoolArray, PlanArray, Source, check_plan, legalize, require_legal
+from ttscompile.core.spec import FloatArray, Noise, SamplerTable
 from ttscompile.errors import (
     ArtifactError,
     IllegalPlanError,
@@ -20,7 +21,6 @@ from ttscompile.errors import (
     RuntimeUnavailableError,
     TtscompileError,
 )
-from ttscompile.lattice import BoolArray, PlanArray, Source, check_plan, legalize, require_legal
 
 if TYPE_CHECKING:
     from ttscompile.artifact.load import Artifact
@@ -139,7 +139,7 @@ def open_runtime(artifact: Artifact, runtime: str = "onnxruntime", threads: int 
             f"threads must be an integer of at least 1 and at most {MOST_THREADS}; found {threads!r}."
         )
     if runtime == "onnxruntime":
-        from .onnxruntime_cpu import OnnxRuntime
+        from .onnxruntime.runtime import OnnxRuntime
 
         with fitting(artifact):
             return OnnxRuntime(artifact, threads)

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ttscompile.core.lattice import BoolArray, PlanArray, Source
 from ttscompile.errors import ArtifactError, IllegalPlanError
-from ttscompile.lattice import BoolArray, PlanArray, Source
 
 _TINY = 1e-12
 """A feature smaller than this, on average, has no relative change worth dividing for."""

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.config import ChunkSpec, FloatArray, PolicySpec, SamplerTable
-from ttscompile.correction import groups_of
+from ttscompile.core.correction import groups_of
+from ttscompile.core.spec import ChunkSpec, FloatArray, PolicySpec, SamplerTable
 from ttscompile.errors import ObservationError
 
 from .arrays import as_array, check_finite

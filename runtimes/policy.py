@@ -14,14 +14,14 @@ import numpy.typing as npt
 
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import DENSE
-from ttscompile.config import FP32, ChunkSpec, FloatArray, Noise, ObservationSpec
+from ttscompile.core.spec import FP32, ChunkSpec, FloatArray, Noise, ObservationSpec
 from ttscompile.errors import IllegalPlanError, ObservationError, RuntimeUnavailableError, TtscompileError
 from ttscompile.ir.graph import TensorType
 
 from .arrays import check_noise, check_observation, check_seed, is_tensor, like
 from .base import CallReport, Runtime, open_runtime
 from .inpainting import check_prefix, known_samples, prefix_refusal
-from .liveness import RolloutNeeds, rollout_needs
+from .onnxruntime.liveness import RolloutNeeds, rollout_needs
 from .queues import Queues, is_window
 
 if TYPE_CHECKING:

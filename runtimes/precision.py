@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ttscompile.artifact.manifest import DENSE, PrecisionError
-from ttscompile.config import FP32, ChunkSpec, FloatArray, Noise
-from ttscompile.correction import Correction
+from ttscompile.core.correction import Correction
+from ttscompile.core.spec import FP32, ChunkSpec, FloatArray, Noise
 from ttscompile.errors import ObservationError
-from ttscompile.machine import has_integer_dot_product
+from ttscompile.measure.machine import has_integer_dot_product
 
 from .base import open_runtime
 from .random_calls import normalized, random_calls

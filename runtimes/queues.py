@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ttscompile.config import FloatArray, ObservationSpec
+from ttscompile.core.spec import FloatArray, ObservationSpec
 from ttscompile.errors import ObservationError
 
 from .arrays import Array, as_array, check_values, image_remedy

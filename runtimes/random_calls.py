@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.config import Noise, PolicySpec
+from ttscompile.core.spec import Noise, PolicySpec
 
 Observation = dict[str, npt.NDArray[Any]]
 

@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from tests.passes.specs import toy_spec
-from ttscompile.capture import capture
+from ttscompile.capture.export import capture
 from ttscompile.errors import CaptureError
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Batch, TensorType

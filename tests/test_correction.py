@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ttscompile.correction import LARGEST, Correction, correction_flops, groups_of, no_correction
+from ttscompile.core.correction import LARGEST, Correction, correction_flops, groups_of, no_correction
 from ttscompile.errors import IllegalPlanError
 
 

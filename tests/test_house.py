@@ -18,51 +18,31 @@ ROOT = Path(__file__).resolve().parents[1]
 MODULES = modules(ROOT)
 GRAPH = {name: imports(name, path) for name, path in MODULES.items()}
 
-BASE = {"errors", "config", "correction", "lattice", "update", "versions"}
+BASE = {"core", "errors", "measure"}
+"""What everything may import; neither knows more than the other parts of this set."""
+
 BELOW_ARTIFACT = BASE | {"ir", "artifact"}
-COMPILER = {"capture", "frontends", "lower", "passes", "samplers"}
 MAY_IMPORT = {
     "errors": set(),
-    "config": {"errors"},
-    "correction": {"errors"},
-    "lattice": {"errors"},
-    "update": {"config", "correction"},
-    "machine": set(),
-    "report": BELOW_ARTIFACT | {"machine", "plots", "points", "runtimes", "trajectories", "units", "verification"},
-    "units": set(),
-    "versions": set(),
-    "doctor": BELOW_ARTIFACT | {"machine", "runtimes"},
-    "plots": {"errors", "lattice", "points"},
-    "points": set(),
+    "core": {"errors"},
+    "measure": {"errors"},
+    "plots": BASE,
     "samplers": BASE,
     "trajectories": BASE,
     "ir": BASE,
-    "capture": BASE | {"ir"},
     "lower": BASE | {"ir"},
     "passes": BASE | {"ir"},
     "frontends": BASE | {"samplers"},
+    "capture": BASE | {"frontends", "ir"},
     "artifact": BASE | {"ir"},
-    "runtimes": BELOW_ARTIFACT | {"machine"},
-    "record_golden": BELOW_ARTIFACT | {"frontends", "runtimes"},
-    "verification": BELOW_ARTIFACT | {"runtimes", "trajectories"},
-    "calibration": BELOW_ARTIFACT | {"points", "record_golden", "runtimes", "trajectories"},
-    "narrow": BASE | {"frontends"},
-    "driver": BELOW_ARTIFACT | COMPILER | {"narrow", "record_golden", "runtimes"},
+    "runtimes": BELOW_ARTIFACT,
+    "doctor": BELOW_ARTIFACT | {"runtimes"},
+    "verification": BELOW_ARTIFACT | {"frontends", "runtimes", "trajectories"},
+    "calibration": BELOW_ARTIFACT | {"runtimes", "trajectories", "verification"},
+    "report": BELOW_ARTIFACT | {"plots", "runtimes", "trajectories", "verification"},
+    "driver": BELOW_ARTIFACT | {"capture", "frontends", "lower", "passes", "runtimes", "verification"},
     "cli": BELOW_ARTIFACT
-    | COMPILER
-    | {
-        "calibration",
-        "doctor",
-        "driver",
-        "machine",
-        "plots",
-        "points",
-        "report",
-        "runtimes",
-        "trajectories",
-        "units",
-        "verification",
-    },
+    | {"calibration", "doctor", "driver", "frontends", "plots", "report", "runtimes", "trajectories", "verification"},
 }
 """Part of the package -> the other parts that it may import, anywhere in its code. Design, section 4."""
 
@@ -74,19 +54,17 @@ COMPILES = (
     "ttscompile.frontends",
     "ttscompile.ir.evaluate",
     "ttscompile.lower",
-    "ttscompile.narrow",
     "ttscompile.passes",
-    "ttscompile.record_golden",
     "ttscompile.runtimes.reference",
     "ttscompile.samplers",
+    "ttscompile.verification.record_golden",
 )
 """Modules that may need the compiler's dependencies when they are imported; nothing else may, not even indirectly."""
 
 
 def part(module: str) -> str:
-    """``ttscompile.ir.graph`` -> ``ir``, ``ttscompile.capture_batch`` -> ``capture``, ``ttscompile`` -> nothing."""
-    name = module.removeprefix("ttscompile").lstrip(".").partition(".")[0]
-    return name if name in MAY_IMPORT else name.partition("_")[0]
+    """``ttscompile.ir.graph`` -> ``ir``, ``ttscompile`` -> nothing."""
+    return module.removeprefix("ttscompile").lstrip(".").partition(".")[0]
 
 
 def direction_errors(found: list[Import], known: set[str]) -> list[str]:
@@ -97,7 +75,7 @@ def direction_errors(found: list[Import], known: set[str]) -> list[str]:
         if target is None or target == "ttscompile":  # the package itself: its version, and the public names
             continue
         importer, imported = part(each.importer), part(target)
-        if importer not in {"", imported} and imported not in MAY_IMPORT[importer]:
+        if importer not in {"", "__main__", imported} and imported not in MAY_IMPORT[importer]:
             errors.append(f"{each.importer}:{each.line} imports {target}: {importer} must not know {imported}")
         if importer == imported == "passes" and target not in {"ttscompile.passes.base", "ttscompile.passes"}:
             errors.append(f"{each.importer}:{each.line} imports {target}: passes do not import each other")
@@ -105,11 +83,11 @@ def direction_errors(found: list[Import], known: set[str]) -> list[str]:
 
 
 def compiles(module: str) -> bool:
-    return any(module == name or module.startswith((f"{name}.", f"{name}_")) for name in COMPILES)
+    return any(module == name or module.startswith(f"{name}.") for name in COMPILES)
 
 
 def test_every_part_of_the_package_has_its_place_in_the_direction() -> None:
-    assert {part(name) for name in MODULES} - {""} == set(MAY_IMPORT)
+    assert {part(name) for name in MODULES} - {"", "__main__"} == set(MAY_IMPORT)
 
 
 def test_imports_go_one_way() -> None:
@@ -127,7 +105,7 @@ def test_imports_go_one_way() -> None:
         ("ttscompile.runtimes.base", "ttscompile.frontends"),
         ("ttscompile.runtimes.base", "ttscompile.calibration"),
         ("ttscompile.artifact.load", "ttscompile.runtimes.policy.load"),
-        ("ttscompile.errors", "ttscompile.config"),
+        ("ttscompile.errors", "ttscompile.core.spec"),
         ("ttscompile.driver", "ttscompile.cli"),
     ],
 )

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ttscompile.errors import IllegalPlanError
-from ttscompile.lattice import (
+from ttscompile.core.lattice import (
     UNWRITTEN,
     Source,
     check_plan,
@@ -21,6 +20,7 @@ from ttscompile.lattice import (
     sparsity,
     uniform_plan,
 )
+from ttscompile.errors import IllegalPlanError
 
 GROUPS = [0, 1, 2, 0, 1, 2]
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from ttscompile import machine
-from ttscompile.machine import fingerprint, one_line
+from ttscompile.measure import machine
+from ttscompile.measure.machine import fingerprint, one_line
 
 
 def test_the_fingerprint_is_json_and_names_what_decides_a_timing() -> None:

@@ -10,11 +10,11 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
 
+from ttscompile.core.lattice import Source
 from ttscompile.errors import IllegalPlanError
-from ttscompile.lattice import Source
+from ttscompile.measure.points import Point
 from ttscompile.plots import frontier
 from ttscompile.plots.plan import COLOURS, plot_plan
-from ttscompile.points import Point
 
 
 def pixels_of(source: Source, picture: Path) -> int:

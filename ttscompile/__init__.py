@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .calibration import calibrate
-    from .config import Affine, ChunkSpec, Noise, ObservationSpec, PolicySpec, SamplerTable
+    from .core.lattice import Source, legalize
+    from .core.spec import Affine, ChunkSpec, Noise, ObservationSpec, PolicySpec, SamplerTable
     from .driver import compile_denoiser, convert
     from .errors import TtscompileError
-    from .lattice import Source, legalize
     from .runtimes.base import CallReport
     from .runtimes.executor import AsyncExecutor, ExecutorSettings, GuardLimits
     from .runtimes.policy import CompiledPolicy, PolicyInfo, load
@@ -54,20 +54,20 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Affine": "config",
+    "Affine": "core.spec",
     "AsyncExecutor": "runtimes.executor",
     "CallReport": "runtimes.base",
-    "ChunkSpec": "config",
+    "ChunkSpec": "core.spec",
     "CompiledPolicy": "runtimes.policy",
     "EDMDenoiser": "samplers.edm",
     "ExecutorSettings": "runtimes.executor",
     "GuardLimits": "runtimes.executor",
-    "Noise": "config",
-    "ObservationSpec": "config",
+    "Noise": "core.spec",
+    "ObservationSpec": "core.spec",
     "PolicyInfo": "runtimes.policy",
-    "PolicySpec": "config",
-    "SamplerTable": "config",
-    "Source": "lattice",
+    "PolicySpec": "core.spec",
+    "SamplerTable": "core.spec",
+    "Source": "core.lattice",
     "TtscompileError": "errors",
     "Verification": "verification",
     "calibrate": "calibration",
@@ -75,7 +75,7 @@ _HOMES = {
     "convert": "driver",
     "edm_table": "samplers.edm",
     "flow_matching_table": "samplers.flow",
-    "legalize": "lattice",
+    "legalize": "core.lattice",
     "load": "runtimes.policy",
     "verify": "verification",
 }

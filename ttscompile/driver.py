@@ -15,8 +15,9 @@ from .artifact.files import replace_file
 from .artifact.load import load_artifact
 from .artifact.precision import LoweredBlocks
 from .artifact.write import require_replaceable, write_artifact
-from .capture import capture
-from .config import FP32, PolicySpec
+from .capture.export import capture
+from .capture.narrow import narrow, unneeded
+from .core.spec import FP32, PolicySpec
 from .errors import ArtifactError, PassError
 from .frontends import load_checkpoint_policy
 from .frontends.encoded import EncodedDenoiser
@@ -30,7 +31,6 @@ from .lower.joint import chain_blocks, join_blocks
 from .lower.precision import lower_precision, require_precision
 from .lower.program import lower_program
 from .lower.single_file import lower_single_file
-from .narrow import narrow, unneeded
 from .passes.base import Pass
 from .passes.clean_up import CleanUp
 from .passes.cut_copies import CutCopies
@@ -44,8 +44,8 @@ from .passes.split_features import SplitFeatures
 from .passes.split_tokens import SplitTokens
 from .passes.unfold_batch import UnfoldBatch
 from .passes.widen_attention import WidenAttention
-from .record_golden import record_original
 from .runtimes.precision import measure_precision
+from .verification.record_golden import record_original
 
 if TYPE_CHECKING:
     from onnx import ModelProto

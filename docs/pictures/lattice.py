@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from ttscompile.lattice import Source
+from ttscompile.core.lattice import Source
 from ttscompile.plots.plan import COLOURS
 
 STEPS, KINDS = 6, ("SA", "FF", "SA", "FF", "SA", "FF")

@@ -14,14 +14,14 @@ from pathlib import Path
 import numpy as np
 
 from ttscompile.artifact.load import Artifact, load_artifact
-from ttscompile.artifact.manifest import block_name
 from ttscompile.cli.timing import Contestant, Measurement
-from ttscompile.lattice import PlanArray, plan_flops
-from ttscompile.runtimes.idle import WORTH
-from ttscompile.runtimes.lowering import lower_plan
-from ttscompile.runtimes.onnxruntime_sessions import Bound, open_sessions
+from ttscompile.core.lattice import PlanArray, plan_flops
+from ttscompile.ir.pieces import block_name
+from ttscompile.runtimes.onnxruntime.idle import WORTH
+from ttscompile.runtimes.onnxruntime.instructions import lower_plan
+from ttscompile.runtimes.onnxruntime.sessions import Bound, open_sessions
+from ttscompile.runtimes.onnxruntime.workspace import Workspace
 from ttscompile.runtimes.random_calls import random_calls
-from ttscompile.runtimes.workspace import Workspace
 
 FLOOR, TAILS = "blocks back to back", "tails back to back"
 SEQUENCES = 5

@@ -13,7 +13,8 @@ from torch import nn
 import ttscompile
 from ttscompile import Source
 from ttscompile.artifact.write import update_calibration
-from ttscompile.config import ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
+from ttscompile.core.lattice import PlanArray, uniform_plan
+from ttscompile.core.spec import ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.scheduler import configured_sampler
 from ttscompile.frontends.transformer_for_diffusion import (
@@ -21,7 +22,6 @@ from ttscompile.frontends.transformer_for_diffusion import (
     TransformerConfig,
     TransformerForDiffusion,
 )
-from ttscompile.lattice import PlanArray, uniform_plan
 
 PUSHT = Path(__file__).parents[1] / "pusht" / "pusht_dpt_ema_fp16.ckpt"
 PUSHT_WIDTH = 256

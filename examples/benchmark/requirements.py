@@ -34,8 +34,8 @@ import ttscompile
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.cli.output import identity_of, only_results_on_stdout, print_json, progress, results_console, run, table
 from ttscompile.cli.timing import Contestant, Measurement, original_policy, plan_contestant
-from ttscompile.lattice import PlanArray
-from ttscompile.machine import fingerprint, one_line
+from ttscompile.core.lattice import PlanArray
+from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.runtimes.random_calls import random_calls
 
 OURS, LONGER = "compiled", "compiled, longer loop"

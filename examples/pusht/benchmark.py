@@ -32,7 +32,7 @@ import ttscompile
 from ttscompile import Source
 from ttscompile.artifact.load import load_artifact
 from ttscompile.cli.output import print_identity
-from ttscompile.machine import fingerprint, one_line
+from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.runtimes.policy import PolicyInfo
 
 CHECKPOINT = Path(__file__).with_name("pusht_dpt_ema_fp16.ckpt")

@@ -25,7 +25,7 @@ from variants import Variant, first_seed_option, open_variant, results_console, 
 
 import ttscompile
 from ttscompile.calibration import CalibrationResult
-from ttscompile.machine import fingerprint, one_line
+from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.plots.plan import plot_plan
 
 BUILD = Path(__file__).resolve().parents[2] / "build" / "pusht"

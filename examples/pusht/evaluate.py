@@ -39,7 +39,7 @@ from variants import (
 
 from ttscompile.artifact.manifest import abbreviated
 from ttscompile.cli.output import identity_of
-from ttscompile.machine import fingerprint, one_line
+from ttscompile.measure.machine import fingerprint, one_line
 
 TIMED_CALLS = 15
 

@@ -35,7 +35,7 @@ import ttscompile
 from ttscompile import AsyncExecutor, ExecutorSettings
 from ttscompile.cli.output import identity_of, print_identity
 from ttscompile.errors import DeadlineMissedError
-from ttscompile.machine import fingerprint, one_line
+from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.runtimes.policy import PolicyInfo
 
 EAGER, COMPILED = "eager PyTorch", "compiled"

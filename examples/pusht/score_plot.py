@@ -13,8 +13,8 @@ from bootstrap import Estimate
 from rollout import seeded_noise
 from variants import Variant
 
+from ttscompile.measure.units import ms
 from ttscompile.plots.figure import plain_powers
-from ttscompile.units import ms
 
 WARM_UP = 2
 MARKERS = "osD^vP*"

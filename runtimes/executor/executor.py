@@ -23,7 +23,7 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.config import FloatArray
+from ttscompile.core.spec import FloatArray
 from ttscompile.errors import ExecutorClosedError, ExecutorError, InfeasibleError, WorkerDeadError
 from ttscompile.runtimes.arrays import check_seed
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.config import Affine, FloatArray
+from ttscompile.core.spec import Affine, FloatArray
 from ttscompile.errors import ExecutorError
 
 

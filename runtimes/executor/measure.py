@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.config import ChunkSpec, FloatArray, ObservationSpec
+from ttscompile.core.spec import ChunkSpec, FloatArray, ObservationSpec
 
 from .clock import Clock
 from .settings import ExecutorSettings, Policy

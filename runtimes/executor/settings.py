@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
-from ttscompile.config import ChunkSpec, ObservationSpec
+from ttscompile.core.spec import ChunkSpec, ObservationSpec
 from ttscompile.errors import ExecutorError
 
 from .guard import GuardLimits

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ttscompile.config import Affine, FloatArray
+from ttscompile.core.spec import Affine, FloatArray
 from ttscompile.errors import DeadlineMissedError, ExecutorError, ObservationError, StaleObservationError
 
 from .feasibility import Feasibility, LatencyWindow

@@ -18,7 +18,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.config import FloatArray
+from ttscompile.core.spec import FloatArray
 
 Times: TypeAlias = npt.NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.config import ObservationSpec
+from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import ObservationError
 from ttscompile.runtimes.arrays import as_array, check_finite
 

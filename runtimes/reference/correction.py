@@ -1,11 +1,11 @@
-"""``ttscompile.correction`` with torch, differentiable: what a correction adds to a sample, and what it remembers."""
+"""``core.correction`` with torch, differentiable: what a correction adds to a sample, and what it remembers."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from ttscompile.correction import HISTORY
+from ttscompile.core.correction import HISTORY
 
 
 def empty_history(sample: Tensor) -> Tensor:

@@ -15,14 +15,14 @@ import torch
 from torch import Tensor
 
 from ttscompile.artifact.load import Artifact
-from ttscompile.artifact.manifest import block_name
-from ttscompile.config import Noise, PolicySpec
-from ttscompile.correction import Correction
+from ttscompile.core.correction import Correction
+from ttscompile.core.lattice import PlanArray, Source, check_plan, require_legal
+from ttscompile.core.spec import Noise, PolicySpec
 from ttscompile.errors import IllegalPlanError, PassError
 from ttscompile.ir.evaluate import Evaluator
 from ttscompile.ir.graph import Graph, TensorType
+from ttscompile.ir.pieces import block_name
 from ttscompile.ir.program import Binding, Pieces, Program
-from ttscompile.lattice import PlanArray, Source, check_plan, require_legal
 from ttscompile.runtimes.criterion import Criterion
 from ttscompile.runtimes.inpainting import Known
 

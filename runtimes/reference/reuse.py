@@ -10,9 +10,9 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from ttscompile.core.lattice import BoolArray, Source
 from ttscompile.errors import IllegalPlanError
 from ttscompile.ir.graph import TensorType
-from ttscompile.lattice import BoolArray, Source
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ import numpy.typing as npt
 import torch
 
 from ttscompile.artifact.manifest import PRUNER
-from ttscompile.config import FloatArray, Noise
-from ttscompile.correction import Correction
+from ttscompile.core.correction import Correction
+from ttscompile.core.spec import FloatArray, Noise
 from ttscompile.runtimes.base import (
     GIVEN,
     CallReport,

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ttscompile.config import SamplerTable
-from ttscompile.correction import Correction
+from ttscompile.core.correction import Correction
+from ttscompile.core.spec import SamplerTable
 from ttscompile.runtimes.inpainting import Known
 
 from .correction import correct, empty_history, remember

@@ -12,7 +12,7 @@ from ttscompile import SamplerTable
 from ttscompile.artifact import load_artifact
 from ttscompile.artifact.ceiling import few_steps, many_steps, usual_sparsity
 from ttscompile.artifact.manifest import FlopsRecord, Manifest
-from ttscompile.lattice import dense_plan
+from ttscompile.core.lattice import dense_plan
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from ttscompile.artifact import codec
 from ttscompile.artifact.manifest import Manifest, PlanRecord
 from ttscompile.artifact.spec_json import spec_from_json, spec_to_json, type_from_json, type_to_json
 from ttscompile.artifact.strict_json import Value, dump, parse
-from ttscompile.config import Affine, ObservationSpec, PolicySpec, SamplerTable
+from ttscompile.core.spec import Affine, ObservationSpec, PolicySpec, SamplerTable
 from ttscompile.errors import ArtifactError
 from ttscompile.ir.graph import Batch, TensorType
 

@@ -19,9 +19,9 @@ from ttscompile.artifact.manifest import Manifest, PrecisionError
 from ttscompile.artifact.precision import LoweredBlocks
 from ttscompile.artifact.strict_json import Value
 from ttscompile.artifact.write import update_calibration, write_artifact
+from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import ArtifactError
 from ttscompile.ir.joint import DENSE_STEP, JOINT
-from ttscompile.lattice import uniform_plan
 from ttscompile.lower.joint import chain_blocks, join_blocks
 from ttscompile.lower.precision import lower_precision
 

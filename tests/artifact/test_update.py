@@ -18,7 +18,7 @@ from tests.artifact.tiny import CHANNELS, HORIZON, STEPS, tiny_models, tiny_prog
 from ttscompile.artifact import load_artifact
 from ttscompile.artifact.manifest import Manifest, PlanRecord
 from ttscompile.artifact.write import update_calibration, write_artifact
-from ttscompile.correction import no_correction
+from ttscompile.core.correction import no_correction
 from ttscompile.errors import ArtifactError, IllegalPlanError
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -7,10 +7,10 @@ import onnx
 from onnx import ModelProto, NodeProto, TensorProto
 from onnx.helper import make_graph, make_model, make_node, make_opsetid, make_tensor_value_info
 
-from ttscompile.artifact.manifest import block_name
-from ttscompile.config import Affine, ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
+from ttscompile.core.spec import Affine, ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
 from ttscompile.ir.graph import Batch, Graph, Node, Ref, TensorType
 from ttscompile.ir.joint import DENSE_STEP, JOINT
+from ttscompile.ir.pieces import block_name
 from ttscompile.ir.program import Binding, Block, Pieces, Program, Reuse
 from ttscompile.lower.joint import chain_blocks, join_blocks
 

@@ -17,8 +17,8 @@ from ttscompile.calibration.latency import measure_budget
 from ttscompile.calibration.progress import Bar
 from ttscompile.calibration.state import FILE, StateFile
 from ttscompile.calibration.whole_steps import Errors, WholeSteps
+from ttscompile.core.lattice import Source
 from ttscompile.errors import CalibrationError, CalibrationFailedError
-from ttscompile.lattice import Source
 
 from .killed import killed
 

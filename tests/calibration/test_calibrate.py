@@ -17,8 +17,8 @@ from ttscompile.calibration import CalibrationResult, calibrate, strategies
 from ttscompile.calibration.calls import split_episodes
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.state import FILE
+from ttscompile.core.lattice import Source, uniform_plan
 from ttscompile.errors import ArtifactError, CalibrationError, CalibrationFailedError
-from ttscompile.lattice import Source, uniform_plan
 
 from . import policies
 from .killed import killed

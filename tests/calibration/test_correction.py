@@ -13,7 +13,7 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration import correction
 from ttscompile.calibration.correction import anchors_of, fit_correction
 from ttscompile.calibration.strategies import Task
-from ttscompile.lattice import PlanArray, Source, dense_plan, uniform_plan
+from ttscompile.core.lattice import PlanArray, Source, dense_plan, uniform_plan
 
 from . import tasks
 from .tasks import MakeTask

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from ttscompile.calibration import execute
+from ttscompile.core.lattice import Source, dense_plan
 from ttscompile.errors import IllegalPlanError
-from ttscompile.lattice import Source, dense_plan
 
 from .tasks import MakeTask
 

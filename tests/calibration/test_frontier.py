@@ -20,10 +20,10 @@ from ttscompile.artifact.write import update_calibration
 from ttscompile.calibration.frontier import _require_same_policy, compare
 from ttscompile.cli import main
 from ttscompile.cli.compare import default_sparsities
+from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import CalibrationError, OutputError
-from ttscompile.lattice import uniform_plan
+from ttscompile.measure.points import Frontier, MeasuredPoint
 from ttscompile.plots.frontier import plot_frontier
-from ttscompile.points import Frontier, MeasuredPoint
 
 from . import policies
 

@@ -30,8 +30,8 @@ from ttscompile.calibration.strategies import NAMES, open_strategy
 from ttscompile.calibration.strategies.tts import Tts
 from ttscompile.calibration.targets import draw_calls, with_targets
 from ttscompile.calibration.whole_steps import WholeSteps
+from ttscompile.core.lattice import PlanArray, Source, uniform_plan
 from ttscompile.errors import CalibrationError, CalibrationFailedError
-from ttscompile.lattice import PlanArray, Source, uniform_plan
 from ttscompile.runtimes.reference.model import Contexts, ReferenceModel
 from ttscompile.trajectories import load_trajectories
 

@@ -11,7 +11,7 @@ import torch
 from ttscompile.calibration import linear, sensitivity
 from ttscompile.calibration.linear import LinearModel, linearise
 from ttscompile.calibration.strategies import Task
-from ttscompile.lattice import PlanArray, Source, whole_steps_plan
+from ttscompile.core.lattice import PlanArray, Source, whole_steps_plan
 
 from . import tasks
 from .tasks import MakeTask

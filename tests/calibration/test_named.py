@@ -11,8 +11,8 @@ import pytest
 import ttscompile
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration import CalibrationResult, calibrate, families
+from ttscompile.core.lattice import Source
 from ttscompile.errors import IllegalPlanError
-from ttscompile.lattice import Source
 
 
 @pytest.fixture(scope="module")

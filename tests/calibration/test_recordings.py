@@ -21,7 +21,7 @@ import zarr
 from PIL import Image
 
 from tests.hostile.pickles import Runs
-from ttscompile.config import ObservationSpec
+from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import TrajectoryError
 from ttscompile.trajectories import Episode, apart, load_trajectories
 from ttscompile.trajectories import frames as trajectories_frames

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 from ttscompile.artifact.write import update_calibration
 from ttscompile.cli import main
-from ttscompile.lattice import uniform_plan
+from ttscompile.core.lattice import uniform_plan
 
 
 def run(*arguments: object) -> Any:

@@ -14,11 +14,11 @@ from click.testing import CliRunner
 
 from ttscompile.artifact.write import update_calibration
 from ttscompile.cli import main
+from ttscompile.core.lattice import uniform_plan
 from ttscompile.doctor import diagnosis as doctor
 from ttscompile.doctor import machine as doctor_machine
 from ttscompile.doctor import packages as doctor_packages
 from ttscompile.doctor.finding import Finding, Level
-from ttscompile.lattice import uniform_plan
 
 
 @pytest.fixture(scope="module")
@@ -183,8 +183,8 @@ def test_a_busy_machine_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_int8_without_integer_dot_products_is_a_warning(calibrated: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from ttscompile import machine
     from ttscompile.artifact.manifest import Manifest
+    from ttscompile.measure import machine
 
     monkeypatch.setattr(machine, "has_integer_dot_product", lambda: False)
     monkeypatch.setattr(Manifest, "precision_name", "int8")

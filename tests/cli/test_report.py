@@ -20,15 +20,15 @@ import ttscompile
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import update_calibration
 from ttscompile.cli import main
+from ttscompile.core.lattice import Source, uniform_plan
 from ttscompile.errors import ReportError
-from ttscompile.lattice import Source, uniform_plan
+from ttscompile.measure.units import plain
 from ttscompile.report import Given, build, facts, pictures, render, verified
 from ttscompile.report.measure import run_episode
 from ttscompile.report.page import Table
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.trajectories import Episode
-from ttscompile.units import plain
 from ttscompile.verification import Rung, Verification
 from ttscompile.verification.rung import ErrorMap
 

@@ -9,7 +9,7 @@ import numpy as np
 from tests.passes.specs import toy_spec
 from ttscompile import Affine
 from ttscompile.cli.timing import _different_statistics
-from ttscompile.units import ms
+from ttscompile.measure.units import ms
 
 
 def test_policies_of_one_shape_are_told_apart_by_their_statistics() -> None:

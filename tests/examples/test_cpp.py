@@ -14,8 +14,8 @@ import pytest
 from tests.lower.test_single_file import Episode, groups, inputs, make
 from tests.runtimes.plans import random_plan
 from tests.runtimes.toys import toy_program
-from ttscompile.correction import no_correction
-from ttscompile.lattice import Source
+from ttscompile.core.correction import no_correction
+from ttscompile.core.lattice import Source
 from ttscompile.lower.single_file import ANCHORS, CORRECTION, CORRECTION_BIAS
 
 SOURCE = Path(__file__).resolve().parents[2] / "examples" / "cpp" / "main.cpp"

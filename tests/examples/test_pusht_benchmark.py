@@ -10,8 +10,8 @@ from rich.console import Console
 from rollout import NoiseShape
 
 from ttscompile import Source
-from ttscompile.lattice import illegal_cells
-from ttscompile.machine import fingerprint, one_line
+from ttscompile.core.lattice import illegal_cells
+from ttscompile.measure.machine import fingerprint, one_line
 
 SHAPE = NoiseShape(steps=4, sample=(16, 2), stochastic=False)
 

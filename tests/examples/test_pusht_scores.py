@@ -11,7 +11,7 @@ from variants import Variant, open_variant
 
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import update_calibration
-from ttscompile.lattice import uniform_plan
+from ttscompile.core.lattice import uniform_plan
 
 
 class Sleeper:

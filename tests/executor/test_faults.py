@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ttscompile.config import Affine
+from ttscompile.core.spec import Affine
 from ttscompile.errors import (
     DeadlineMissedError,
     ExecutorClosedError,

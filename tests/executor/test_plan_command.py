@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 from ttscompile.artifact.write import update_calibration
 from ttscompile.cli import main
-from ttscompile.lattice import dense_plan, uniform_plan
+from ttscompile.core.lattice import dense_plan, uniform_plan
 
 
 def run(*arguments: object) -> tuple[int, str, str]:

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import nn
 
-from ttscompile.config import Noise, PolicySpec
+from ttscompile.core.spec import Noise, PolicySpec
 from ttscompile.errors import ObservationError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.checkpoint import plain_config, read_checkpoint

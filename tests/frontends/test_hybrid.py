@@ -16,8 +16,8 @@ from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 
 import ttscompile
 from ttscompile.artifact import load_artifact
-from ttscompile.capture import capture
-from ttscompile.config import ChunkSpec, Noise, ObservationSpec, PolicySpec
+from ttscompile.capture.export import capture
+from ttscompile.core.spec import ChunkSpec, Noise, ObservationSpec, PolicySpec
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends import diffusion_policy, load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy

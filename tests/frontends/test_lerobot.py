@@ -17,7 +17,7 @@ from torch.nn import functional
 import ttscompile
 from ttscompile.artifact.load import load_artifact
 from ttscompile.cli import main
-from ttscompile.config import Noise, ObservationSpec
+from ttscompile.core.spec import Noise, ObservationSpec
 from ttscompile.driver import transform
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends import load_checkpoint_policy

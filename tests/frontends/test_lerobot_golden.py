@@ -14,7 +14,7 @@ from torch import nn
 
 import ttscompile
 from ttscompile.artifact.load import load_artifact
-from ttscompile.config import Noise, PolicySpec
+from ttscompile.core.spec import Noise, PolicySpec
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.runtimes import open_runtime

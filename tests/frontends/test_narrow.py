@@ -17,11 +17,11 @@ from tests.families.test_vla import FAMILIES, loaded
 from tests.frontends.test_diffusion_policy import VARIANTS, Build, Save
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.spec_json import spec_to_json
+from ttscompile.capture.narrow import narrow, unneeded
 from ttscompile.cli import main
 from ttscompile.errors import ObservationError, SpecError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
-from ttscompile.narrow import narrow, unneeded
 from ttscompile.verification import verify
 
 KEPT, HORIZON, STREAMS = 4, 6, 2

@@ -15,7 +15,7 @@ from diffusers.schedulers.scheduling_lcm import LCMScheduler
 from diffusers.schedulers.scheduling_pndm import PNDMScheduler
 from diffusers.schedulers.scheduling_unipc_multistep import UniPCMultistepScheduler
 
-from ttscompile.config import SamplerTable
+from ttscompile.core.spec import SamplerTable
 from ttscompile.errors import SpecError
 from ttscompile.samplers.multistep import set_timesteps
 from ttscompile.samplers.table import sampler_table

@@ -12,7 +12,7 @@ from torch import nn
 
 import ttscompile
 from ttscompile import EDMDenoiser, edm_table
-from ttscompile.config import ChunkSpec, Noise, ObservationSpec, PolicySpec
+from ttscompile.core.spec import ChunkSpec, Noise, ObservationSpec, PolicySpec
 from ttscompile.errors import NoResidualBlocksError, SpecError
 from ttscompile.frontends.eager import eager_policy
 

@@ -22,8 +22,8 @@ def make(folder: Path) -> None:
     from tests.runtimes.toys import pencil_program, toy_program, written_artifact
     from ttscompile.artifact.write import update_calibration
     from ttscompile.calibration.state import StateFile
-    from ttscompile.correction import no_correction
-    from ttscompile.lattice import dense_plan
+    from ttscompile.core.correction import no_correction
+    from ttscompile.core.lattice import dense_plan
 
     torch.set_num_threads(1)
     written_artifact(pencil_program(), folder / "artifacts" / "pencil")

@@ -110,7 +110,7 @@ def lerobot(rng: random.Random, corpus: Path, folder: Path) -> Callable[[], None
 
 def trajectories(rng: random.Random, corpus: Path, folder: Path) -> Callable[[], None]:
     """A recording of episodes."""
-    from ttscompile.config import ObservationSpec
+    from ttscompile.core.spec import ObservationSpec
     from ttscompile.trajectories import load_trajectories
 
     target = folder / "calls.npz"
@@ -130,7 +130,7 @@ def recording(kind: str, write_bad: Callable[[random.Random, Path, Path], Path])
 
     def make(rng: random.Random, corpus: Path, folder: Path) -> Callable[[], None]:
         from tests.calibration.test_recordings import read_here
-        from ttscompile.config import ObservationSpec
+        from ttscompile.core.spec import ObservationSpec
         from ttscompile.trajectories import apart, load_trajectories
 
         joined = {"obs": ObservationSpec((2, 8))}, {"obs": ("keypoint", "state:2")}

@@ -23,7 +23,7 @@ from tests.hostile.forged import rehash
 from ttscompile.artifact import load_artifact
 from ttscompile.artifact.write import write_artifact
 from ttscompile.calibration.state import StateFile
-from ttscompile.config import ObservationSpec
+from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import ArtifactError, CalibrationError, CheckpointError, TrajectoryError, TtscompileError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.checkpoint import plain_config

@@ -10,8 +10,8 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from ttscompile.capture import capture
-from ttscompile.config import ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
+from ttscompile.capture.export import capture
+from ttscompile.core.spec import ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
 from ttscompile.ir.graph import Graph, TensorType
 
 TOKENS, WIDTH, HEADS, CONDITIONS = 6, 16, 4, 3

@@ -10,13 +10,13 @@ import torch
 
 from tests.lower.modules import TOKENS, WIDTH, spec, table
 from tests.passes.graphs import Builder
-from ttscompile.config import SamplerTable
-from ttscompile.correction import Correction, no_correction
+from ttscompile.core.correction import Correction, no_correction
+from ttscompile.core.spec import SamplerTable
+from ttscompile.core.update import matrices
 from ttscompile.errors import LoweringError
 from ttscompile.ir.advance import fuse_advance
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Batch, Graph, Ref
-from ttscompile.update import matrices
 
 B = Batch()
 SHAPE = (B, TOKENS, WIDTH)

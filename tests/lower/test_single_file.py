@@ -25,13 +25,13 @@ from ttscompile import Noise, legalize
 from ttscompile.artifact import load_artifact
 from ttscompile.artifact.precision import LoweredBlocks
 from ttscompile.artifact.write import write_artifact
-from ttscompile.correction import Correction, no_correction
+from ttscompile.core.correction import Correction, no_correction
+from ttscompile.core.lattice import Source
 from ttscompile.driver import compile_denoiser
 from ttscompile.errors import ArtifactError, LoweringError
 from ttscompile.ir.graph import Batch
 from ttscompile.ir.joint import DENSE_STEP, JOINT
 from ttscompile.ir.program import Program
-from ttscompile.lattice import Source
 from ttscompile.lower.joint import chain_blocks, join_blocks
 from ttscompile.lower.precision import lower_precision
 from ttscompile.lower.program import lower_program

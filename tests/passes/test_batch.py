@@ -10,8 +10,8 @@ from torch import nn
 
 from tests.passes.graphs import B, Builder
 from tests.passes.specs import toy_spec
-from ttscompile.capture import capture
-from ttscompile.capture_batch import unify_batch
+from ttscompile.capture.batch import unify_batch
+from ttscompile.capture.export import capture
 from ttscompile.driver import transform
 from ttscompile.errors import CaptureError, PassError
 from ttscompile.ir.evaluate import evaluate

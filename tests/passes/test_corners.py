@@ -21,7 +21,7 @@ from ttscompile.passes.find_residual_blocks import find_residual_blocks
 from ttscompile.passes.hoist import Hoist
 from ttscompile.passes.insert_pruner import InsertPruner
 from ttscompile.passes.partition import Partition
-from ttscompile.record_golden import record_original
+from ttscompile.verification.record_golden import record_original
 
 SHAPE = (B, 4, 2)
 

@@ -226,7 +226,7 @@ class _Decoder(nn.Module):
 
 def test_a_captured_decoder_has_three_blocks_a_layer() -> None:
     from tests.passes.specs import toy_spec
-    from ttscompile.capture import capture
+    from ttscompile.capture.export import capture
 
     graph, _ = capture(_Decoder(), toy_spec(sample=(4, 2), obs=(3, 16)))
     table = find_residual_blocks(graph, "sample")

@@ -11,8 +11,8 @@ import torch
 from torch import nn
 
 from tests.passes.graphs import B, Builder
-from ttscompile.capture import capture
-from ttscompile.config import ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
+from ttscompile.capture.export import capture
+from ttscompile.core.spec import ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
 from ttscompile.errors import PassError
 from ttscompile.ir.binding import bindings
 from ttscompile.ir.evaluate import evaluate

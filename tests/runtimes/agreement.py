@@ -6,7 +6,7 @@ import numpy as np
 
 from ttscompile import Noise
 from ttscompile.artifact import Artifact
-from ttscompile.lattice import Source
+from ttscompile.core.lattice import Source
 from ttscompile.runtimes import Runtime
 
 from .plans import random_plan

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ttscompile import legalize
-from ttscompile.lattice import BoolArray, PlanArray
+from ttscompile.core.lattice import BoolArray, PlanArray
 
 
 def random_plan(

@@ -16,12 +16,12 @@ import pytest
 from ttscompile import Noise, Source
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.write import update_calibration
+from ttscompile.core.lattice import dense_plan, uniform_plan
 from ttscompile.errors import ArtifactError, IllegalPlanError
-from ttscompile.lattice import dense_plan, uniform_plan
 from ttscompile.runtimes import Runtime, open_runtime
-from ttscompile.runtimes.onnxruntime_cpu import OnnxRuntime
+from ttscompile.runtimes.onnxruntime.runtime import OnnxRuntime
+from ttscompile.runtimes.onnxruntime.workspace import Workspace
 from ttscompile.runtimes.reference.model import ReferenceModel
-from ttscompile.runtimes.workspace import Workspace
 
 from .agreement import random_inputs
 from .conftest import MakeArtifact
@@ -179,7 +179,7 @@ def test_a_first_call_with_a_schedule_binds_nothing(
     make_artifact: MakeArtifact, monkeypatch: pytest.MonkeyPatch, whole_steps: bool
 ) -> None:
     """What a session is bound to is settled at load; a call that binds costs many times a warm one."""
-    from ttscompile.runtimes import bound_block, workspace
+    from ttscompile.runtimes.onnxruntime import bound_block, workspace
 
     schedule = uniform_plan(5, 5, 2)
     if not whole_steps:
@@ -249,7 +249,7 @@ def test_a_batch_that_finds_no_memory_leaves_a_runtime_that_works(
         raise MemoryError
 
     with monkeypatch.context() as patched:
-        patched.setattr("ttscompile.runtimes.onnxruntime_cpu.Workspace", full)
+        patched.setattr("ttscompile.runtimes.onnxruntime.runtime.Workspace", full)
         with pytest.raises(MemoryError):
             runtime.predict(obs, noise, dense_plan(5, 5))
     assert isinstance(runtime, OnnxRuntime)

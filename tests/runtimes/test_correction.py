@@ -11,9 +11,9 @@ import ttscompile
 from ttscompile import Noise, Source
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.write import update_calibration
-from ttscompile.correction import Correction, no_correction
+from ttscompile.core.correction import Correction, no_correction
+from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import ArtifactError, IllegalPlanError
-from ttscompile.lattice import uniform_plan
 from ttscompile.runtimes import open_runtime
 
 from .agreement import random_inputs
@@ -107,7 +107,7 @@ def test_the_first_call_binds_nothing(
     runtime = open_runtime(artifact, "onnxruntime")
     obs, noise = random_inputs(artifact, np.random.default_rng(1), 1)
     made: list[object] = []
-    monkeypatch.setattr("ttscompile.runtimes.workspace.Bound", lambda *arguments: made.append(arguments))
+    monkeypatch.setattr("ttscompile.runtimes.onnxruntime.workspace.Bound", lambda *arguments: made.append(arguments))
     plans, correction = artifact.schedule("fast")[None], artifact.corrections["fast"]
     runtime.predict(obs, noise, plans, plan_name="fast", correction=correction)
     assert made == []

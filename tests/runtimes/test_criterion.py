@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ttscompile.core.lattice import Source
 from ttscompile.errors import ArtifactError, IllegalPlanError
-from ttscompile.lattice import Source
 from ttscompile.runtimes.criterion import Criterion, relative_change
 
 TEACACHE = Criterion("teacache", 0, 1.0, (2.0, 0.0), accumulates=True, warmup=1, closes=True)

@@ -9,12 +9,12 @@ import pytest
 
 from ttscompile import SamplerTable, Source
 from ttscompile.artifact import Artifact
-from ttscompile.correction import Correction
+from ttscompile.core.correction import Correction
+from ttscompile.core.lattice import legalize, uniform_plan
 from ttscompile.ir.idle import IDLE
-from ttscompile.lattice import legalize, uniform_plan
 from ttscompile.runtimes import open_runtime
-from ttscompile.runtimes.idle import IdleSteps
-from ttscompile.runtimes.onnxruntime_cpu import OnnxRuntime
+from ttscompile.runtimes.onnxruntime.idle import IdleSteps
+from ttscompile.runtimes.onnxruntime.runtime import OnnxRuntime
 
 from .agreement import random_inputs
 from .conftest import MakeArtifact

@@ -18,9 +18,9 @@ import ttscompile
 from ttscompile import Affine, ChunkSpec, SamplerTable, Source
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.write import write_artifact
+from ttscompile.core.lattice import dense_plan, uniform_plan
 from ttscompile.errors import ObservationError
 from ttscompile.ir.program import Program
-from ttscompile.lattice import dense_plan, uniform_plan
 from ttscompile.lower.program import lower_program
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.inpainting import MaskedUpdates, known_samples, noise_levels, prefix_refusal
@@ -278,5 +278,5 @@ def test_a_policy_whose_sampler_tells_no_noise_levels_says_so(toy_artifact: Arti
 def test_where_channels_share_their_matrices_all_of_them_must_be_actions(monkeypatch: pytest.MonkeyPatch) -> None:
     spec = replace(toy(ddim()).spec, chunk=ChunkSpec(1, START, HORIZON))
     assert prefix_refusal(spec) is None
-    monkeypatch.setattr("ttscompile.correction.LARGEST", 1)
+    monkeypatch.setattr("ttscompile.core.correction.LARGEST", 1)
     assert "only 1 of the sample's 2 channels are actions" in (prefix_refusal(spec) or "")

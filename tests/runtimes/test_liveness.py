@@ -10,10 +10,10 @@ import pytest
 from ttscompile import Source
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.write import update_calibration
+from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import IllegalPlanError
-from ttscompile.lattice import uniform_plan
-from ttscompile.runtimes.liveness import readable_rollout, rollout_needs
-from ttscompile.runtimes.onnxruntime_cpu import OnnxRuntime
+from ttscompile.runtimes.onnxruntime.liveness import readable_rollout, rollout_needs
+from ttscompile.runtimes.onnxruntime.runtime import OnnxRuntime
 from ttscompile.runtimes.policy import load
 from ttscompile.runtimes.reference.runtime import ReferenceRuntime
 

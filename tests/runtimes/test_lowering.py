@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ttscompile import Source
+from ttscompile.core.lattice import PlanArray, dense_plan, uniform_plan
 from ttscompile.errors import IllegalPlanError
-from ttscompile.lattice import PlanArray, dense_plan, uniform_plan
-from ttscompile.runtimes.decode import decode_first, decode_rest
-from ttscompile.runtimes.lowering import Lowered, LoweringCache, lower_plan
-from ttscompile.runtimes.rollout_store import RolloutStore
+from ttscompile.runtimes.onnxruntime.decode import decode_first, decode_rest
+from ttscompile.runtimes.onnxruntime.instructions import Lowered, LoweringCache, lower_plan
+from ttscompile.runtimes.onnxruntime.rollout_store import RolloutStore
 
 from .literal import Episode, Toy
 from .plans import random_plan

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from ttscompile.lattice import Source, uniform_plan
-from ttscompile.runtimes.lowering import LoweringCache, lower_plan
+from ttscompile.core.lattice import Source, uniform_plan
+from ttscompile.runtimes.onnxruntime.instructions import LoweringCache, lower_plan
 
 from .plans import random_plan
 

@@ -17,13 +17,13 @@ from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.calibration.calls import Calls
 from ttscompile.calibration.correction import fit_correction
 from ttscompile.calibration.execute import Executor
-from ttscompile.correction import correction_flops
+from ttscompile.core.correction import correction_flops
+from ttscompile.core.update import update_flops
 from ttscompile.ir.program import Program
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.runtimes.reference.model import ReferenceModel, noise_tensors
 from ttscompile.samplers.table import sampler_table
-from ttscompile.update import update_flops
 
 from .agreement import largest_difference, random_inputs
 from .literal import Episode

@@ -12,12 +12,12 @@ import pytest
 
 from ttscompile import Noise, Source
 from ttscompile.artifact import Artifact
+from ttscompile.core.lattice import dense_plan, legalize, uniform_plan
 from ttscompile.errors import ArtifactError, IllegalPlanError, ObservationError, RuntimeUnavailableError
 from ttscompile.ir.program import Binding
-from ttscompile.lattice import dense_plan, legalize, uniform_plan
 from ttscompile.runtimes import Runtime, open_runtime
+from ttscompile.runtimes.onnxruntime.workspace import Workspace
 from ttscompile.runtimes.reference.runtime import ReferenceRuntime
-from ttscompile.runtimes.workspace import Workspace
 
 from .agreement import largest_difference, random_inputs
 from .conftest import MakeArtifact

@@ -12,8 +12,8 @@ import pytest
 import ttscompile
 from ttscompile import Noise
 from ttscompile.artifact import load_artifact
+from ttscompile.core.lattice import Source
 from ttscompile.ir.program import Program
-from ttscompile.lattice import Source
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy, PolicyInfo
 

@@ -15,9 +15,9 @@ import ttscompile
 from ttscompile import Noise, Source
 from ttscompile.artifact import Artifact
 from ttscompile.artifact.write import update_calibration
-from ttscompile.config import Affine
+from ttscompile.core.lattice import dense_plan, uniform_plan
+from ttscompile.core.spec import Affine
 from ttscompile.errors import IllegalPlanError, ObservationError, TtscompileError
-from ttscompile.lattice import dense_plan, uniform_plan
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy, load
 

@@ -11,7 +11,7 @@ import torch
 
 from ttscompile import Noise
 from ttscompile.artifact import Artifact
-from ttscompile.config import ObservationSpec
+from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import IllegalPlanError, ObservationError
 from ttscompile.runtimes.arrays import check_observation
 from ttscompile.runtimes.policy import CompiledPolicy, load

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from ttscompile import Noise, Source
 from ttscompile.artifact import Artifact
+from ttscompile.core.lattice import PlanArray
 from ttscompile.errors import IllegalPlanError, PassError
 from ttscompile.ir.program import Program
-from ttscompile.lattice import PlanArray
 from ttscompile.runtimes.reference.model import Contexts, ReferenceModel, RolloutCache
 
 from .literal import Episode

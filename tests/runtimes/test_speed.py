@@ -9,7 +9,7 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 import ttscompile
-from ttscompile.lattice import uniform_plan
+from ttscompile.core.lattice import uniform_plan
 
 pytestmark = pytest.mark.alone
 

@@ -12,7 +12,7 @@ from ttscompile.artifact import Artifact
 from ttscompile.ir.joint import JOINT
 from ttscompile.ir.program import Program
 from ttscompile.runtimes import open_runtime
-from ttscompile.runtimes.onnxruntime_sessions import SINGLE_THREADED, JointBlock, open_sessions
+from ttscompile.runtimes.onnxruntime.sessions import SINGLE_THREADED, JointBlock, open_sessions
 
 from .agreement import largest_difference
 from .toys import toy_program

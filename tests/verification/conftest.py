@@ -12,10 +12,10 @@ import ttscompile
 from tests.calibration import policies
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import update_calibration
-from ttscompile.correction import no_correction
+from ttscompile.core.correction import no_correction
+from ttscompile.core.lattice import Source
 from ttscompile.ir.program import Program
-from ttscompile.lattice import Source
-from ttscompile.record_golden import record_plans
+from ttscompile.verification.record_golden import record_plans
 
 from . import policy
 

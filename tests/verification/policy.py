@@ -9,7 +9,7 @@ from torch import nn
 
 from tests.calibration import policies
 from ttscompile import PolicySpec
-from ttscompile.lattice import Source, whole_steps_plan
+from ttscompile.core.lattice import Source, whole_steps_plan
 
 STEPS, HORIZON, CHANNELS = policies.STEPS, policies.HORIZON, policies.CHANNELS
 WIDTH, LAYERS, BLOCKS = 128, 3, 6

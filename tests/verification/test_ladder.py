@@ -20,11 +20,11 @@ from ttscompile.artifact import tensors
 from ttscompile.artifact.golden import DIGITS, load_golden, load_golden_plans
 from ttscompile.artifact.load import load_artifact, read_manifest
 from ttscompile.artifact.write import update_calibration
-from ttscompile.correction import Correction, no_correction
+from ttscompile.core.correction import Correction, no_correction
+from ttscompile.core.lattice import Source
 from ttscompile.errors import ArtifactError
 from ttscompile.ir.program import Program
-from ttscompile.lattice import Source
-from ttscompile.record_golden import record_original, record_plans
+from ttscompile.verification.record_golden import record_original, record_plans
 from ttscompile.verification.rung import FAILED, PASSED, SKIPPED, Rung
 
 from . import policy

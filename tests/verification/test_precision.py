@@ -11,10 +11,10 @@ import ttscompile
 from ttscompile.artifact.golden import GoldenPlan, load_golden, load_golden_plans
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import update_calibration
-from ttscompile.lattice import Source
-from ttscompile.record_golden import record_plans
+from ttscompile.core.lattice import Source
 from ttscompile.runtimes import open_runtime
 from ttscompile.verification.calls import check_plans_precision
+from ttscompile.verification.record_golden import record_plans
 from ttscompile.verification.rung import FAILED, PASSED, Rung
 
 from . import policy

@@ -10,9 +10,10 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from ..config import INT8
+from ..core.spec import INT8
 from ..errors import ArtifactError
 from ..ir.joint import OF_ALL_BLOCKS
+from ..ir.pieces import block_name
 from ..ir.program import Binding, Reuse
 from .manifest import (
     DENSE,
@@ -30,7 +31,6 @@ from .manifest import (
     PrecisionRecord,
     Requires,
     Stores,
-    block_name,
 )
 from .spec_json import spec_from_json, spec_to_json, type_from_json, type_to_json
 from .strict_json import Value, dump, dump_compact, parse

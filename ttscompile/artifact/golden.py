@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..artifact import tensors
-from ..config import FloatArray, Noise, PolicySpec
+from ..core.spec import FloatArray, Noise, PolicySpec
 from ..errors import ArtifactError
 from ..ir.graph import TensorType
 from .manifest import Manifest

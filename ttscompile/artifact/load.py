@@ -14,19 +14,20 @@ import numpy as np
 import numpy.typing as npt
 
 from ..artifact import tensors
-from ..config import FP32
-from ..correction import Correction
+from ..core.correction import Correction
+from ..core.lattice import PlanArray, Source, check_plan, dense_plan
+from ..core.spec import FP32
 from ..errors import ArtifactError, IllegalPlanError
 from ..ir.graph import Graph
+from ..ir.pieces import block_name
 from ..ir.program import Binding, Block, Pieces, Program
 from ..ir.serialize import graph_from_json
-from ..lattice import PlanArray, Source, check_plan, dense_plan
-from ..versions import release
+from ..measure.versions import release
 from .archive import Unpacked, is_checkpoint, unpack
 from .codec import decode
 from .files import verify
 from .identity import identities
-from .manifest import DENSE, MANIFEST, Manifest, Requires, abbreviated, block_name
+from .manifest import DENSE, MANIFEST, Manifest, Requires, abbreviated
 from .onnx_files import check_model
 from .size import check_size
 from .strict_json import REMEDY, parse

@@ -9,10 +9,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ..config import FP32, PolicySpec
+from ..core.lattice import PlanArray, plan_flops
+from ..core.spec import FP32, PolicySpec
 from ..ir.graph import TensorType
 from ..ir.program import Binding, Reuse
-from ..lattice import PlanArray, plan_flops
 
 FORMAT = "ttscompile artifact"
 SCHEMA_VERSION = 3
@@ -277,8 +277,3 @@ class Manifest:
 def abbreviated(identity: str) -> str:
     """The first 12 digits of an identity, for people; JSON has all 64."""
     return identity[:_SHOWN]
-
-
-def block_name(index: int) -> str:
-    """``block_07``: name of a block's piece and graph."""
-    return f"block_{index:02d}"

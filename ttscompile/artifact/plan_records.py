@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..core.lattice import plan_flops, sparsity
 from ..errors import ArtifactError
-from ..lattice import plan_flops, sparsity
 from .load import check_schedule
 from .manifest import DENSE, PRUNER, Manifest, PlanRecord
 from .strict_json import Value, dump_compact, parse

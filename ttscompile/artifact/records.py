@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy.typing as npt
 
-from ..config import SamplerTable
+from ..core.spec import SamplerTable
+from ..core.update import update_flops
 from ..errors import ArtifactError
 from ..ir.advance import outputs, own_inputs
 from ..ir.flops import graph_flops
@@ -15,9 +16,9 @@ from ..ir.graph import Graph, TensorType
 from ..ir.idle import IDLE, TOTAL
 from ..ir.idle import OUTPUTS as IDLE_OUTPUTS
 from ..ir.joint import CONTEXT, DENSE_STEP, JOINT, OF_ALL_BLOCKS, RESIDUAL, STREAM, dense_step_outputs, join
+from ..ir.pieces import block_name
 from ..ir.program import Binding, Pieces, Program
-from ..update import update_flops
-from .manifest import BlockRecord, ContextRecord, FlopsRecord, PieceRecord, Requires, block_name
+from .manifest import BlockRecord, ContextRecord, FlopsRecord, PieceRecord, Requires
 
 if TYPE_CHECKING:
     from onnx import ModelProto

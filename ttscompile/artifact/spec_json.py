@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..config import Affine, ChunkSpec, FloatArray, ObservationSpec, PolicySpec, SamplerTable
+from ..core.spec import Affine, ChunkSpec, FloatArray, ObservationSpec, PolicySpec, SamplerTable
 from ..errors import ArtifactError, SpecError
 from ..ir.graph import Batch, Size, TensorType
 from .strict_json import REMEDY, Value

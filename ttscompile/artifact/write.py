@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from .. import __version__
 from ..artifact import tensors
-from ..correction import Correction
+from ..core.correction import Correction
 from ..errors import ArtifactError
 from ..ir.program import Binding, Program
 from ..ir.serialize import graph_to_json

@@ -9,8 +9,8 @@ from typing import Any
 
 from ..artifact.ceiling import TYPICAL_SPARSITY
 from ..artifact.manifest import Manifest
+from ..core.lattice import dense_plan
 from ..errors import CalibrationError
-from ..lattice import dense_plan
 
 SPARSITY, FLOPS, LATENCY, ERROR = "target_sparsity", "target_flops", "latency_ms", "max_action_error"
 """The ways to ask."""

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from ..config import PolicySpec
+from ..core.spec import PolicySpec
 from ..errors import CalibrationError
 from ..ir.graph import Graph
 from ..runtimes.reference.model import Contexts, ReferenceModel

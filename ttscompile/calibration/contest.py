@@ -12,9 +12,9 @@ import numpy.typing as npt
 
 from ..artifact.load import Artifact
 from ..artifact.manifest import DENSE
-from ..config import FP32, Noise
-from ..lattice import Source
-from ..points import MeasuredPoint
+from ..core.lattice import Source
+from ..core.spec import FP32, Noise
+from ..measure.points import MeasuredPoint
 from ..runtimes.base import open_runtime
 from ..runtimes.policy import CompiledPolicy
 from ..runtimes.random_calls import random_noise

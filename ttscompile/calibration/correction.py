@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..correction import Correction, groups_of
-from ..lattice import BoolArray, PlanArray, Source
+from ..core.correction import Correction, groups_of
+from ..core.lattice import BoolArray, PlanArray, Source
 from ..runtimes.reference.correction import correct, features, remember
 from ..runtimes.reference.sampler import Carried
 from .calls import Calls

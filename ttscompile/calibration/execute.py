@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 from ..artifact.load import Artifact
-from ..correction import Correction
+from ..core.correction import Correction
+from ..core.lattice import BoolArray, PlanArray, Source, dense_plan
 from ..errors import IllegalPlanError
-from ..lattice import BoolArray, PlanArray, Source, dense_plan
 from ..runtimes.reference.model import ReferenceModel
 from ..runtimes.reference.sampler import Carried
 from .calls import Calls, Selector

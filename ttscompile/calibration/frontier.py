@@ -20,9 +20,9 @@ import torch
 
 from ..artifact.load import Artifact, load_artifact
 from ..artifact.manifest import DENSE
-from ..correction import FEATURES
+from ..core.correction import FEATURES
 from ..errors import CalibrationError
-from ..points import Frontier
+from ..measure.points import Frontier
 from ..runtimes.base import open_runtime
 from ..runtimes.policy import CompiledPolicy
 from ..trajectories.episodes import Episode, load_trajectories

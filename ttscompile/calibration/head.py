@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..core.lattice import PlanArray, Source
 from ..ir.evaluate import Evaluator
 from ..ir.graph import Graph, Ref, backward_slice
-from ..lattice import PlanArray, Source
 from .calls import Calls
 from .linear import Matrix
 from .switches import Switch

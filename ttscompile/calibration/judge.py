@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 from ..artifact.load import Artifact
 from ..artifact.manifest import UNIFORM, Manifest
+from ..core.lattice import PlanArray, uniform_plan
 from ..errors import CalibrationFailedError
-from ..lattice import PlanArray, uniform_plan
 from ..runtimes.base import pruner_plan
 from .budget import ERROR, FLOPS, Goal
 from .calls import LARGEST, Actions, Calls

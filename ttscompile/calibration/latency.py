@@ -10,10 +10,10 @@ import numpy as np
 
 from ..artifact.load import Artifact
 from ..artifact.manifest import PlanRecord
-from ..config import Noise
-from ..correction import Correction
+from ..core.correction import Correction
+from ..core.lattice import PlanArray, sparsity, uniform_plan
+from ..core.spec import Noise
 from ..errors import CalibrationError
-from ..lattice import PlanArray, sparsity, uniform_plan
 from ..runtimes.base import Runtime, open_runtime
 from ..runtimes.policy import CompiledPolicy
 from .budget import LATENCY, Budget, Goal

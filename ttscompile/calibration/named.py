@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from ..correction import Correction
-from ..lattice import PlanArray
+from ..core.correction import Correction
+from ..core.lattice import PlanArray
 from .families import Families
 from .strategies import Task
 from .whole_steps import WholeSteps

@@ -15,11 +15,11 @@ from ..artifact.ceiling import few_steps, usual_sparsity
 from ..artifact.load import Artifact, load_artifact
 from ..artifact.manifest import PRUNER, UNIFORM
 from ..artifact.write import update_calibration
-from ..correction import FEATURES
+from ..core.correction import FEATURES
+from ..core.lattice import sparsity
 from ..errors import CalibrationError
-from ..lattice import sparsity
-from ..record_golden import record_plans
 from ..trajectories.episodes import Episode, load_trajectories
+from ..verification.record_golden import record_plans
 from .budget import ERROR, LATENCY, Budget, Goal, cells_of, goal_of
 from .calls import Actions, Calls, require_seed, split_episodes
 from .clock import Clock

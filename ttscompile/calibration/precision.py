@@ -9,8 +9,8 @@ import numpy as np
 
 from ..artifact.load import Artifact
 from ..artifact.manifest import DENSE
-from ..correction import Correction
-from ..lattice import PlanArray, Source
+from ..core.correction import Correction
+from ..core.lattice import PlanArray, Source
 from ..runtimes.precision import Call, action_errors, compare
 from ..runtimes.random_calls import normalized, random_noise
 from ..trajectories.episodes import Episode

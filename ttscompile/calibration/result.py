@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..artifact.manifest import FlopsRecord
-from ..lattice import PlanArray, plan_flops, sparsity
+from ..core.lattice import PlanArray, plan_flops, sparsity
 from .calls import FloatArray
 
 

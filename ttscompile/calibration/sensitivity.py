@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..lattice import PlanArray, Source
+from ..core.lattice import PlanArray, Source
 from .calls import Calls, IntArray
 from .execute import Executor
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ..lattice import BoolArray
+from ..core.lattice import BoolArray
 from .calls import IntArray
 from .linear import Matrix
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import torch
 
-from ..config import PolicySpec
+from ..core.spec import PolicySpec
 from ..trajectories.episodes import Episode
 from .calls import Calls, Split, prepare_calls, sample_calls
 from .clock import Clock

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from ..correction import Correction
-from ..lattice import PlanArray, whole_steps_plan
+from ..core.correction import Correction
+from ..core.lattice import PlanArray, whole_steps_plan
 from .correction import fit_correction
 from .crowded import CROWDING, crowded_family
 

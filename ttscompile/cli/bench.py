@@ -19,7 +19,7 @@ from ttscompile.cli.output import (
     table,
 )
 from ttscompile.cli.timing import Measurement, contestants, measure
-from ttscompile.machine import fingerprint, one_line
+from ttscompile.measure.machine import fingerprint, one_line
 
 RIVALS = ("original", "eager", "onnxruntime-dense")
 """The checkpoint with the sampler it was saved with; with the artifact's; and the artifact computed in full."""

@@ -25,13 +25,13 @@ from ttscompile.cli.output import (
 )
 from ttscompile.cli.recordings import FilesCommand, Sources, require_recordings, trajectories_options
 from ttscompile.errors import RuntimeUnavailableError
-from ttscompile.machine import fingerprint, one_line
+from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.plots.frontier import plot_frontier
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from ttscompile.points import Frontier
+    from ttscompile.measure.points import Frontier
 
 
 def _strategies(_: click.Context, __: click.Parameter, value: str) -> tuple[str, ...]:

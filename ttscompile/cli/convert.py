@@ -13,7 +13,7 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import require_replaceable
 from ttscompile.cli.output import json_option, only_results_on_stdout, print_json, progress, results
 from ttscompile.cli.summary import document, print_summary
-from ttscompile.config import FP32, PRECISIONS
+from ttscompile.core.spec import FP32, PRECISIONS
 from ttscompile.errors import CheckpointError
 
 

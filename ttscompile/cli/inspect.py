@@ -13,8 +13,8 @@ from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import DENSE
 from ttscompile.cli.output import artifact_argument, json_option, print_json, progress, results
 from ttscompile.cli.summary import document, print_summary
+from ttscompile.core.lattice import PlanArray
 from ttscompile.errors import ArtifactError, ObservationError
-from ttscompile.lattice import PlanArray
 from ttscompile.plots.plan import plot_plan
 from ttscompile.trajectories import read_npz
 

@@ -18,9 +18,9 @@ from rich.table import Table
 from ttscompile.artifact.load import load_artifact, read_manifest
 from ttscompile.artifact.manifest import UNIFORM, Manifest, abbreviated
 from ttscompile.errors import TtscompileError
-from ttscompile.units import flops as flops
-from ttscompile.units import ms as ms
-from ttscompile.units import share as share
+from ttscompile.measure.units import flops as flops
+from ttscompile.measure.units import ms as ms
+from ttscompile.measure.units import share as share
 
 artifact_argument = click.argument("directory", type=click.Path(path_type=Path))
 json_option = click.option(

@@ -24,7 +24,7 @@ from ttscompile.cli.output import (
     table,
 )
 from ttscompile.errors import DeadlineMissedError
-from ttscompile.machine import fingerprint, one_line
+from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings, Feasibility, GuardLimits, MonotonicClock
 from ttscompile.runtimes.executor.jitter import Jitter, measure_jitter
 from ttscompile.runtimes.executor.measure import measure_latencies, neutral_observation

@@ -12,9 +12,9 @@ import numpy as np
 
 import ttscompile
 from ttscompile.artifact.load import load_artifact
-from ttscompile.config import FP32, Affine, Noise, PolicySpec
+from ttscompile.core.lattice import Source
+from ttscompile.core.spec import FP32, Affine, Noise, PolicySpec
 from ttscompile.errors import RuntimeUnavailableError, SpecError
-from ttscompile.lattice import Source
 from ttscompile.runtimes.random_calls import Observation, normalized, random_calls
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from ttscompile.artifact.manifest import abbreviated
 from ttscompile.cli.output import artifact_argument, json_option, only_results_on_stdout, print_json, progress, results
 from ttscompile.cli.output import table as make_table
 from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
-from ttscompile.machine import fingerprint, one_line
+from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.plots.errors import plot_errors
 from ttscompile.verification import Verification
 from ttscompile.verification.rung import FAILED, SKIPPED, Rung

@@ -41,8 +41,8 @@ def artifact_findings(directory: Path) -> list[Finding]:
 
 
 def _needs(artifact: Artifact) -> list[Finding]:
-    from ..machine import has_integer_dot_product
-    from ..runtimes.liveness import rollout_needs
+    from ..measure.machine import has_integer_dot_product
+    from ..runtimes.onnxruntime.liveness import rollout_needs
 
     manifest = artifact.manifest
     needs = manifest.requires

@@ -10,7 +10,7 @@ from itertools import pairwise
 from math import floor
 from pathlib import Path
 
-from ..machine import X86, cpuinfo
+from ..measure.machine import X86, cpuinfo
 from .finding import Finding, Level
 
 _X86 = {

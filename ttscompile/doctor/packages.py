@@ -10,7 +10,7 @@ import sys
 from importlib.metadata import PackageNotFoundError, requires, version
 from typing import NamedTuple
 
-from ..versions import release
+from ..measure.versions import release
 from .finding import Finding, Level
 
 PYTHON = (3, 11)

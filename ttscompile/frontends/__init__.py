@@ -7,7 +7,7 @@ from pathlib import Path
 
 from torch import nn
 
-from ..config import PolicySpec
+from ..core.spec import PolicySpec
 from ..errors import CheckpointError
 from .diffusion_policy import load_diffusion_policy
 from .lerobot import load_lerobot

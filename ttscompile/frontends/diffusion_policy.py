@@ -15,7 +15,7 @@ from typing import Any
 
 from torch import nn
 
-from ..config import ChunkSpec, ObservationSpec, PolicySpec
+from ..core.spec import ChunkSpec, ObservationSpec, PolicySpec
 from ..errors import CheckpointError
 from ..frontends import diffusion_policy_hybrid as hybrid
 from .checkpoint import plain_config, read_checkpoint

@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from ..config import ObservationSpec
+from ..core.spec import ObservationSpec
 from ..errors import CheckpointError
 from .diffusion_policy_weights import Weights, affine
 from .robomimic_encoder import Camera, ObservationEncoder

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from ..config import Affine
+from ..core.spec import Affine
 from ..errors import CheckpointError
 from .saved_weights import require_finite, require_names, require_shape, unwrapped
 from .transformer_for_diffusion import TransformerConfig, TransformerForDiffusion

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import torch
 from torch import nn
 
-from ..config import Noise, PolicySpec
+from ..core.spec import Noise, PolicySpec
 from ..errors import ObservationError
 from .encoded import EncodedDenoiser
 

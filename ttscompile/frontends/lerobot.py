@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from ..config import ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
+from ..core.spec import ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
 from ..errors import CheckpointError, SpecError
 from ..samplers.flow import flow_matching_table
 from .clip_config import TextConfig, VisionConfig, encoder_config, find_encoder

@@ -16,7 +16,7 @@ import torch
 from safetensors.torch import load_file
 from torch import nn
 
-from ..config import Affine
+from ..core.spec import Affine
 from ..errors import CheckpointError
 from .json_files import read_json
 

@@ -22,7 +22,7 @@ from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
 from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultistepScheduler
 
-from ..config import SamplerTable
+from ..core.spec import SamplerTable
 from ..errors import CheckpointError, SpecError, TtscompileError
 from ..samplers.table import sampler_table
 

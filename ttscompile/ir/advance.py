@@ -3,7 +3,7 @@
     stream --tail--> prediction --sampler, correction--> sample_next --stem--> stream_next
 
 The pieces are small; run one by one they cost more in calls than in arithmetic. Inside, the number of operations
-counts: samples are ``[D, B, T]``, so that the update is one product (``ttscompile.update``) and nothing is turned.
+counts: samples are ``[D, B, T]``, so that the update is one product (``core.update``) and nothing is turned.
 What is carried from a step to the next comes in pairs ``NAME`` and ``NAME_next``; ``memory`` only where there is one.
 Push-T, 1 thread: 41 us with samples ``[B, T, D]``, a product for each coefficient and one for the correction; 31 us so.
 """
@@ -12,11 +12,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from ttscompile.config import PolicySpec, SamplerTable
-from ttscompile.correction import HISTORY as HISTORY_ENTRIES
-from ttscompile.correction import groups_of
+from ttscompile.core.correction import HISTORY as HISTORY_ENTRIES
+from ttscompile.core.correction import groups_of
+from ttscompile.core.spec import PolicySpec, SamplerTable
+from ttscompile.core.update import clips, columns, rows
 from ttscompile.errors import LoweringError
-from ttscompile.update import clips, columns, rows
 
 from .graph import Argument, Batch, Graph, Node, Ref, TensorType
 
@@ -47,7 +47,7 @@ def outputs(sampler: SamplerTable) -> tuple[str, ...]:
 def fuse_advance(tail: Graph, stem: Graph, spec: PolicySpec) -> Graph:
     """Concatenate tail, sampler update and stem.
 
-    The update is that of ``ttscompile.update``, with what belongs to the step as inputs. A term of the denoised sample
+    The update is that of ``core.update``, with what belongs to the step as inputs. A term of the denoised sample
     whose column of the sampler's table is zero at every step is left out.
 
     Args:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from ..config import PolicySpec
+from ..core.spec import PolicySpec
 from .graph import Batch, Graph
 from .program import Binding
 

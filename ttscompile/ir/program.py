@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..config import PolicySpec
+from ..core.spec import PolicySpec
 from .graph import Graph, TensorType
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from onnx import AttributeProto, ModelProto, NodeProto, TensorProto, helper
 
-from ..config import BF16, FP32, INT8, PRECISIONS
+from ..core.spec import BF16, FP32, INT8, PRECISIONS
 from ..errors import LoweringError
 from .onnx_model import live_nodes
 

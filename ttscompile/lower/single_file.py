@@ -18,7 +18,7 @@ All B streams of a batch follow one plan. For K steps and N blocks the inputs ar
                                             ROLLOUT, and the cache stays empty
 ======================= =================== ==========================================================================
 
-For a schedule that has a correction (``ttscompile.correction``), its anchors, weights and bias may be given as
+For a schedule that has a correction (``ttscompile.core.correction``), its anchors, weights and bias may be given as
 ``correction_anchors``, ``correction`` and ``correction_bias``; inputs that are left out correct nothing. onnxruntime
 warns, when it loads the file, that these three have values and can be overridden. The outputs are
 
@@ -39,12 +39,12 @@ from collections.abc import Mapping
 import numpy as np
 from onnx import ModelProto, ValueInfoProto, helper
 
-from ..config import PolicySpec
-from ..correction import FEATURES, HISTORY, no_correction
+from ..core.correction import FEATURES, HISTORY, no_correction
+from ..core.spec import PolicySpec
+from ..core.update import columns, diagonals, rows
 from ..errors import LoweringError
 from ..ir.graph import TensorType
 from ..ir.program import Program
-from ..update import columns, diagonals, rows
 from .contexts import Contexts
 from .graph_writer import GraphWriter, Weights, tensor
 from .loop import GROUP, DenoisingLoop, LoopInputs
@@ -151,7 +151,7 @@ def _normalized(main: GraphWriter, key: str, spec: PolicySpec) -> str:
 
 
 def _update(main: GraphWriter, spec: PolicySpec, streams: str) -> tuple[str, str]:
-    """``ttscompile.update`` in ONNX: matrices of all steps, and offsets of all steps."""
+    """``ttscompile.core.update`` in ONNX: matrices of all steps, and offsets of all steps."""
     (horizon, dimensions), sampler = spec.sample, spec.sampler
     high, wide = rows(sampler, horizon), columns(sampler, horizon)
     places = np.zeros((sampler.steps, 1, high // horizon, 1, wide // horizon, 1), np.float32)

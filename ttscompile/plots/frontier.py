@@ -7,7 +7,7 @@ from math import log
 from pathlib import Path
 from textwrap import wrap
 
-from ..points import Point
+from ..measure.points import Point
 from .figure import beside, new_figure, plain_powers, write_picture
 
 COLOURS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")

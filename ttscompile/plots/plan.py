@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ..core.lattice import PlanArray, Source, sparsity
 from ..errors import IllegalPlanError
-from ..lattice import PlanArray, Source, sparsity
 from .figure import STEPS_AXIS, block_names, new_figure, write_picture
 
 COLOURS = {

@@ -8,12 +8,12 @@ from typing import Any
 
 from ..artifact.load import Artifact
 from ..artifact.manifest import DENSE
-from ..machine import fingerprint, one_line
-from ..points import efficient
+from ..measure.machine import fingerprint, one_line
+from ..measure.points import efficient
+from ..measure.units import flops, ms, share
 from ..report import facts, pictures
 from ..runtimes.policy import CompiledPolicy
 from ..trajectories.episodes import Episode
-from ..units import flops, ms, share
 from .frontier import Compared, from_record
 from .measure import Course, Latency, measure_parts, run_episode
 from .page import Page, Picture, Section, Table, require_packages

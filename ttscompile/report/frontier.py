@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..errors import ReportError
-from ..points import Point
+from ..measure.points import Point
 from .facts import scores
 from .measure import Latency
 

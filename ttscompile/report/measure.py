@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..lattice import PlanArray, Source
+from ..core.lattice import PlanArray, Source
 from ..runtimes.base import CallReport
 from ..runtimes.executor.measure import neutral_observation
 from ..runtimes.policy import CompiledPolicy

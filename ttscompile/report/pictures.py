@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..lattice import PlanArray, Source, sparsity
+from ..core.lattice import PlanArray, Source, sparsity
+from ..measure.points import Point
+from ..measure.units import ms
 from ..plots.figure import STEPS_AXIS, beside, new_figure, plain_powers
 from ..plots.frontier import plot_frontier
 from ..plots.plan import COLOURS, plot_plan
-from ..points import Point
-from ..units import ms
 from .measure import PARTS, Course, Latency
 
 if TYPE_CHECKING:

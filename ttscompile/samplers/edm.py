@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from ..config import SamplerTable
+from ..core.spec import SamplerTable
 from ..errors import SpecError
 from .flow import deterministic_table
 

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from ..config import SamplerTable
+from ..core.spec import SamplerTable
 from ..errors import SpecError
 
 METHODS = ("euler", "rk4")

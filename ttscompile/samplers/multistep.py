@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from ..config import SamplerTable
+from ..core.spec import SamplerTable
 from ..errors import SpecError
 
 _SHAPE = (2, 3, 4)

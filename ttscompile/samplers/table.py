@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..config import SamplerTable
+from ..core.spec import SamplerTable
 from ..errors import SpecError
 from .multistep import multistep_table, set_timesteps
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..config import ObservationSpec
+from ..core.spec import ObservationSpec
 from ..errors import TrajectoryError
 from .apart import frames_apart
 from .frames import Frames, few, observation_frames, require_proportion

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..config import ObservationSpec
+from ..core.spec import ObservationSpec
 from ..errors import TrajectoryError
 
 Array = npt.NDArray[Any]

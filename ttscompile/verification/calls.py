@@ -11,10 +11,10 @@ import numpy.typing as npt
 from ..artifact.golden import Golden, GoldenPlan, project
 from ..artifact.load import Artifact
 from ..artifact.manifest import DENSE
-from ..config import Noise
-from ..correction import Correction
+from ..core.correction import Correction
+from ..core.lattice import PlanArray, Source
+from ..core.spec import Noise
 from ..errors import RuntimeUnavailableError
-from ..lattice import PlanArray, Source
 from ..runtimes.base import Runtime, open_runtime
 from ..runtimes.policy import CompiledPolicy
 from .network import block_errors, describe_blocks, largest

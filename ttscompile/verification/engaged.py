@@ -11,8 +11,8 @@ import numpy as np
 from ..artifact.golden import Golden
 from ..artifact.load import Artifact
 from ..artifact.manifest import DENSE
-from ..config import Noise
-from ..lattice import Source
+from ..core.lattice import Source
+from ..core.spec import Noise
 from ..runtimes.policy import CompiledPolicy
 from .rung import FAILED, PASSED, SKIPPED, Rung
 

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from ..artifact.golden import Golden
 from ..artifact.load import Artifact
 from ..artifact.manifest import DENSE
-from ..config import Noise, PolicySpec
+from ..core.spec import Noise, PolicySpec
 from ..runtimes.policy import CompiledPolicy
 from ..runtimes.random_calls import random_noise
 from ..trajectories.episodes import Episode

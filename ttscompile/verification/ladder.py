@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from ..artifact.golden import load_golden, load_golden_plans
 from ..artifact.load import Artifact
-from ..config import FP32
+from ..core.spec import FP32
 from ..errors import ArtifactError, TtscompileError
 from ..runtimes.base import open_runtime
 from ..runtimes.policy import CompiledPolicy

@@ -10,8 +10,9 @@ import numpy.typing as npt
 
 from ..artifact.golden import Golden, probe_stream, project
 from ..artifact.load import Artifact
-from ..artifact.manifest import Manifest, block_name
-from ..config import FloatArray
+from ..artifact.manifest import Manifest
+from ..core.spec import FloatArray
+from ..ir.pieces import block_name
 from .probe import Probe
 from .rung import ErrorMap, Rung, finite, verdict
 

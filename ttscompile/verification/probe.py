@@ -13,13 +13,13 @@ import numpy as np
 import numpy.typing as npt
 
 from ..artifact.load import Artifact
-from ..artifact.manifest import block_name
-from ..config import FloatArray, Noise
-from ..correction import HISTORY, Correction, no_correction
+from ..core.correction import HISTORY, Correction, no_correction
+from ..core.lattice import PlanArray, Source
+from ..core.spec import FloatArray, Noise
+from ..core.update import clips, matrices
+from ..ir.pieces import block_name
 from ..ir.program import Binding
-from ..lattice import PlanArray, Source
-from ..runtimes.onnxruntime_sessions import open_sessions, repeat_streams, run_named
-from ..update import clips, matrices
+from ..runtimes.onnxruntime.sessions import open_sessions, repeat_streams, run_named
 
 Array = npt.NDArray[Any]
 

@@ -18,7 +18,7 @@ from ttscompile.calibration.strategies.bac import (
     spend,
     union,
 )
-from ttscompile.lattice import Source
+from ttscompile.core.lattice import Source
 
 from ..tasks import MakeTask
 

@@ -10,8 +10,8 @@ from ttscompile.calibration.strategies import plan_of
 from ttscompile.calibration.strategies.dbcache import dbcache, proposals
 from ttscompile.calibration.strategies.online import decide, within
 from ttscompile.calibration.strategies.teacache import dense_changes, proposal
+from ttscompile.core.lattice import Source
 from ttscompile.errors import CalibrationError
-from ttscompile.lattice import Source
 from ttscompile.runtimes.criterion import Criterion
 
 from ..tasks import MakeTask

@@ -9,7 +9,7 @@ import torch
 from ttscompile.calibration import sensitivity
 from ttscompile.calibration.strategies.base import Task
 from ttscompile.calibration.strategies.slopes import chains, slopes
-from ttscompile.lattice import PlanArray, Source
+from ttscompile.core.lattice import PlanArray, Source
 
 from ..tasks import MakeTask
 

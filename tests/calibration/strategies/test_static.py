@@ -7,7 +7,7 @@ import pytest
 
 from ttscompile.calibration.strategies import deepcache, delta_dit, gates, plan_of
 from ttscompile.calibration.strategies.gates import Gates
-from ttscompile.lattice import PlanArray, Source
+from ttscompile.core.lattice import PlanArray, Source
 
 from ..tasks import MakeTask
 

@@ -17,8 +17,8 @@ from ttscompile.calibration.strategies import (
     plan_of,
     require_reach,
 )
+from ttscompile.core.lattice import Source, illegal_cells
 from ttscompile.errors import CalibrationError
-from ttscompile.lattice import Source, illegal_cells
 
 from ..tasks import MakeTask
 

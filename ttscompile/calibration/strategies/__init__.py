@@ -26,8 +26,8 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+from ...core.lattice import Source
 from ...errors import CalibrationError
-from ...lattice import Source
 from ..clock import Clock
 from ..search import search_plan
 from ..whole_steps import WholeSteps

@@ -22,7 +22,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from ...lattice import BoolArray, PlanArray, Source
+from ...core.lattice import BoolArray, PlanArray, Source
 from ..calls import Calls
 from ..execute import Executor
 from .base import Task

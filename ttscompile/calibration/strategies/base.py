@@ -9,8 +9,8 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from ...correction import Correction
-from ...lattice import PlanArray
+from ...core.correction import Correction
+from ...core.lattice import PlanArray
 from ...runtimes.criterion import Criterion
 from ..calls import Actions, Calls
 from ..clock import Clock

@@ -7,7 +7,7 @@ blocks are the shallow branch of a U-Net; in a chain of blocks they are the firs
 
 from __future__ import annotations
 
-from ...lattice import PlanArray, Source, dense_plan, uniform_plan
+from ...core.lattice import PlanArray, Source, dense_plan, uniform_plan
 from .base import Task
 from .fixed import Chosen, best_of
 

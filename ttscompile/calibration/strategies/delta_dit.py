@@ -8,7 +8,7 @@ ones. How many blocks stay fresh, and where late begins, is left to the user; he
 
 from __future__ import annotations
 
-from ...lattice import PlanArray, Source, uniform_plan
+from ...core.lattice import PlanArray, Source, uniform_plan
 from .base import Task
 from .fixed import Chosen, best_of
 

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ...lattice import BoolArray, PlanArray, Source, whole_steps_plan
+from ...core.lattice import BoolArray, PlanArray, Source, whole_steps_plan
 from ..crowded import crowded_family
 from .base import Array, Found, Task
 

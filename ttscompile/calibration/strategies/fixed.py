@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...lattice import PlanArray, dense_plan
+from ...core.lattice import PlanArray, dense_plan
 from ...runtimes.criterion import Criterion
 from .base import Array, Found, Task
 

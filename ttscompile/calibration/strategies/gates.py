@@ -20,7 +20,7 @@ from collections.abc import Mapping
 import numpy as np
 import numpy.typing as npt
 
-from ...lattice import BoolArray, PlanArray, Source, uniform_plan
+from ...core.lattice import BoolArray, PlanArray, Source, uniform_plan
 from .base import Array, Found, Task
 from .fixed import COMPARED
 from .slopes import slopes

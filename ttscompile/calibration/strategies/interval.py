@@ -5,7 +5,7 @@ Source: FORA (2024) and the action head of EfficientVLA (NeurIPS 2025), see ``do
 
 from __future__ import annotations
 
-from ...lattice import uniform_plan
+from ...core.lattice import uniform_plan
 from .base import Task
 from .fixed import Chosen, best_of
 

@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...core.lattice import PlanArray, Source
 from ...errors import CalibrationFailedError
-from ...lattice import PlanArray, Source
 from ...runtimes.criterion import Criterion
 from ..calls import Calls
 from ..execute import Executor

@@ -18,7 +18,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from ...lattice import PlanArray, Source
+from ...core.lattice import PlanArray, Source
 from ..calls import Actions, Calls
 from ..execute import Executor
 from ..sensitivity import chunks, sensitivity

@@ -14,8 +14,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...correction import Correction
-from ...lattice import PlanArray
+from ...core.correction import Correction
+from ...core.lattice import PlanArray
 from ..adaptation import Adaptation
 from ..head import has_head
 from ..whole_steps import WholeSteps

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from ttscompile.config import FloatArray, SamplerTable
-from ttscompile.correction import FEATURES, HISTORY
+from ttscompile.core.correction import FEATURES, HISTORY
+from ttscompile.core.spec import FloatArray, SamplerTable
+from ttscompile.core.update import clips, rows
 from ttscompile.ir.idle import BASE, PRODUCT, SHIFT, TOTAL
-from ttscompile.update import clips, rows
 
-from .onnxruntime_sessions import Array, Bound
+from .sessions import Array, Bound
 
 WORTH = 3
 """So many idle steps in a row are quicker here; one or two are not, since the stem has to run once more after them."""

@@ -7,11 +7,11 @@ from itertools import islice
 
 import numpy as np
 
-from ttscompile.lattice import BoolArray
+from ttscompile.core.lattice import BoolArray
 
 from .idle import WORTH, IdleSteps
-from .lowering import Lowered
-from .onnxruntime_sessions import Array
+from .instructions import Lowered
+from .sessions import Array
 from .workspace import Workspace
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ttscompile.artifact.manifest import Manifest
-from ttscompile.lattice import BoolArray, Source
+from ttscompile.core.lattice import BoolArray, Source
 
 if TYPE_CHECKING:
     from ttscompile.artifact.load import Artifact

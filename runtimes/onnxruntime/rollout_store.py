@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .onnxruntime_sessions import Array
+from .sessions import Array
 
 
 class RolloutStore:

@@ -17,8 +17,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from .config import FloatArray, SamplerTable
 from .correction import FEATURES, Correction, correction_flops
+from .spec import FloatArray, SamplerTable
 
 
 def clips(sampler: SamplerTable) -> bool:

@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from torch import nn
 
-from .config import PolicySpec
-from .errors import SpecError
-from .frontends.eager import evaluation
+from ..core.spec import PolicySpec
+from ..errors import SpecError
+from ..frontends.eager import evaluation
 
 TOLERANCE = 1e-4
 """Of the prediction's deviation. Rounding is a hundredth of it; a network that attends to later steps is far above."""

@@ -14,21 +14,22 @@ from typing import Any
 
 import numpy as np
 
-from ttscompile.artifact.manifest import ContextRecord, Manifest, PieceRecord, block_name
-from ttscompile.config import FloatArray, Noise
-from ttscompile.correction import HISTORY, Correction, no_correction
+from ttscompile.artifact.manifest import ContextRecord, Manifest, PieceRecord
+from ttscompile.core.correction import HISTORY, Correction, no_correction
+from ttscompile.core.spec import FloatArray, Noise
+from ttscompile.core.update import matrices
 from ttscompile.errors import ArtifactError, ObservationError
 from ttscompile.ir.graph import TensorType
 from ttscompile.ir.idle import IDLE
 from ttscompile.ir.joint import CONTEXT, DENSE_STEP, STREAM
+from ttscompile.ir.pieces import block_name
 from ttscompile.ir.program import Binding
-from ttscompile.update import matrices
+from ttscompile.runtimes.inpainting import Known, MaskedUpdates
 
 from .bound_block import BoundBlock
 from .idle import IdleSteps
-from .inpainting import Known, MaskedUpdates
-from .onnxruntime_sessions import Array, Bound, repeat_streams, run_named
 from .rollout_store import RolloutStore
+from .sessions import Array, Bound, repeat_streams, run_named
 
 STEM, ADVANCE = "stem", "advance"
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from .errors import IllegalPlanError
+from ..errors import IllegalPlanError
 
 PlanArray = npt.NDArray[np.int8]
 BoolArray = npt.NDArray[np.bool_]

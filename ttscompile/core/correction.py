@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from .errors import IllegalPlanError
+from ..errors import IllegalPlanError
 
 FEATURES = 6
 """Samples and predictions that the correction reads: of the step, and of the last two anchors."""

@@ -7,8 +7,8 @@ one graph and ``7 * c`` in the other is ``c * B``; one that is equal in both is 
 
 from __future__ import annotations
 
-from .errors import CaptureError
-from .ir.graph import Argument, Batch, Graph, Node, Size, TensorType
+from ..errors import CaptureError
+from ..ir.graph import Argument, Batch, Graph, Node, Size, TensorType
 
 BATCHES = (5, 7)
 """Batch sizes to capture with: primes that are no divisors of what networks are made of."""

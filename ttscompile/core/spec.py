@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from .errors import SpecError
+from ..errors import SpecError
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -243,7 +243,7 @@ class PolicySpec:
         sample_argument: name of the module's sample argument.
         timestep_argument: name of the module's timestep argument (a ``[B]`` tensor).
         source: what this was compiled from, for people: format and variant, no path.
-        left_out: steps that the original predicts after the last one of the sample (``ttscompile.narrow``).
+        left_out: steps that the original predicts after the last one of the sample (``ttscompile.capture.narrow``).
     """
 
     sample: tuple[int, int]

@@ -19,12 +19,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ttscompile.artifact.manifest import DENSE, PRUNER
-from ttscompile.config import FloatArray, Noise
-from ttscompile.correction import Correction
+from ttscompile.core.correction import Correction
+from ttscompile.core.lattice import BoolArray, PlanArray, Source, check_plan, require_legal
+from ttscompile.core.spec import FloatArray, Noise
 from ttscompile.errors import IllegalPlanError
-from ttscompile.lattice import BoolArray, PlanArray, Source, check_plan, require_legal
-
-from .base import (
+from ttscompile.runtimes.base import (
     GIVEN,
     CallReport,
     Timings,
@@ -36,11 +35,12 @@ from .base import (
     pruner_plan,
     settle_plan,
 )
+from ttscompile.runtimes.inpainting import Known
+
 from .decode import decode_first, decode_rest
-from .inpainting import Known
+from .instructions import Lowered, LoweringCache
 from .liveness import readable_rollout
-from .lowering import Lowered, LoweringCache
-from .onnxruntime_sessions import open_blocks, open_sessions
+from .sessions import open_blocks, open_sessions
 from .workspace import Workspace
 
 if TYPE_CHECKING:

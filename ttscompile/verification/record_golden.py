@@ -15,19 +15,19 @@ import numpy.typing as npt
 import torch
 from torch import nn
 
-from .artifact.golden import DIGITS, Golden, GoldenPlan, load_golden, pattern, probe_stream, project
-from .artifact.load import Artifact
-from .config import FloatArray, Noise, PolicySpec
-from .errors import CaptureError
-from .frontends.eager import eager_policy
-from .frontends.encoded import EncodedDenoiser
-from .ir.dataflow import reachable_from
-from .ir.evaluate import Evaluator
-from .ir.graph import Graph, TensorType, backward_slice
-from .ir.program import Block, Program
-from .ir.rows import Rows
-from .runtimes.base import pruner_plan, settle_plan
-from .runtimes.reference.model import ReferenceModel
+from ..artifact.golden import DIGITS, Golden, GoldenPlan, load_golden, pattern, probe_stream, project
+from ..artifact.load import Artifact
+from ..core.spec import FloatArray, Noise, PolicySpec
+from ..errors import CaptureError
+from ..frontends.eager import eager_policy
+from ..frontends.encoded import EncodedDenoiser
+from ..ir.dataflow import reachable_from
+from ..ir.evaluate import Evaluator
+from ..ir.graph import Graph, TensorType, backward_slice
+from ..ir.program import Block, Program
+from ..ir.rows import Rows
+from ..runtimes.base import pruner_plan, settle_plan
+from ..runtimes.reference.model import ReferenceModel
 
 STREAMS = 2
 """Streams of the call, so that what mixes streams up shows; one where that would take long or much room."""

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.lattice import UNWRITTEN, BoolArray, PlanArray, Source, origins, require_legal
+from ttscompile.core.lattice import UNWRITTEN, BoolArray, PlanArray, Source, origins, require_legal
 
 Add = tuple[int, int, int, int]
 """Add a sum to the stream, after making it if it is new: the slot where it is kept while it is needed; the first row

@@ -23,13 +23,13 @@ import numpy as np
 import numpy.typing as npt
 
 from ttscompile.artifact.files import verify
-from ttscompile.artifact.manifest import PieceRecord, block_name
+from ttscompile.artifact.manifest import PieceRecord
 from ttscompile.errors import ArtifactError, RuntimeUnavailableError
 from ttscompile.ir.graph import TensorType
 from ttscompile.ir.idle import IDLE
 from ttscompile.ir.joint import JOINT, OF_ALL_BLOCKS, RESIDUAL, STREAM, Joint, join
-
-from .precision import EXACT_INTEGERS, needs_care
+from ttscompile.ir.pieces import block_name
+from ttscompile.runtimes.precision import EXACT_INTEGERS, needs_care
 
 if TYPE_CHECKING:
     from ttscompile.artifact.load import Artifact

@@ -9,7 +9,7 @@ import numpy as np
 
 from ttscompile.ir.program import Binding
 
-from .onnxruntime_sessions import Array
+from .sessions import Array
 
 if TYPE_CHECKING:
     from .workspace import Workspace

@@ -21,11 +21,11 @@ import torch.export._trace
 from torch import nn
 from torch.export.graph_signature import InputKind, OutputKind
 
-from .capture_batch import BATCHES, REMEDY, unify_batch
-from .config import PolicySpec
-from .errors import CaptureError
-from .ir.evaluate import Evaluator, without_stack_traces
-from .ir.graph import GETITEM, Argument, Batch, Enum, Graph, Node, Ref, Size, TensorType
+from ..core.spec import PolicySpec
+from ..errors import CaptureError
+from ..ir.evaluate import Evaluator, without_stack_traces
+from ..ir.graph import GETITEM, Argument, Batch, Enum, Graph, Node, Ref, Size, TensorType
+from .batch import BATCHES, REMEDY, unify_batch
 
 EXAMPLE_STREAMS = 3
 """Batch size of the example inputs; neither 0 nor 1, which torch.export would specialise on."""

@@ -1,0 +1,1 @@
+"""The product on the CPU: numpy and onnxruntime."""

@@ -1,0 +1,1 @@
+"""What is taken from the original network: its graph (``export``), with the batch as a symbol (``batch``), narrowed."""

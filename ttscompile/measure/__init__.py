@@ -1,0 +1,1 @@
+"""How figures are taken, compared and written: the machine, versions, units, points of error and latency."""
