@@ -1,94 +1,91 @@
-"""What every runtime is: one call in, the denoised sample and a report out; state only between calls of an episode."""
+"""What every runtime does alike: settle the plan of a call, know what may be reused, and say what was done.
+
+    caller's thread    start | first_step                                        | other_steps
+    helper             ----- | logits, the plan that they make, its instructions  ------------
+
+The helper is one thread that lives as long as the runtime, and only where a pruner makes the plan; it sleeps on a
+queue. Everything else runs on the caller's thread. What executes the pieces is a ``Backend``.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from ttscompile.artifact.load import Artifact
+from ttscompile.artifact.manifest import DENSE, PRUNER
 from ttscompile.core.correction import Correction
-from ttscompile.core.lattice import BoolArray, PlanArray, Source, check_plan, legalize, require_legal
-from ttscompile.core.spec import FloatArray, Noise, SamplerTable
-from ttscompile.errors import (
-    ArtifactError,
-    IllegalPlanError,
-    ObservationError,
-    RuntimeUnavailableError,
-    TtscompileError,
-)
+from ttscompile.core.lattice import BoolArray, PlanArray, Source, check_plan, require_legal
+from ttscompile.core.spec import FloatArray, Noise, PolicySpec
+from ttscompile.errors import IllegalPlanError, ObservationError
 
-if TYPE_CHECKING:
-    from ttscompile.artifact.load import Artifact
-
-    from .inpainting import Known
-
-GIVEN = "given"
-"""``CallReport.plan_name`` of a matrix that the caller gave no name."""
-
-RUNTIMES = ("onnxruntime", "reference")
-
-MOST_THREADS = 1024
-"""More than any machine has a use for: onnxruntime tries to make as many as it is told, for minutes."""
+from .backend import Backend, Call
+from .inpainting import Known
+from .report import GIVEN, CallReport, Timings
+from .settle import LoweringCache, pruner_plan, settle_plan
 
 
-@dataclass(frozen=True)
-class Timings:
-    """Wall time of one call in milliseconds.
+@dataclass(frozen=True, eq=False)
+class _Settled:
+    """The plan that a call executes, and what it took to have it.
 
     Attributes:
-        prologue: condition values and step values from the observation.
-        pruner: the pruner network and what makes a plan of its logits; 0 if the plan was given.
-        wait_pruner: how long the denoising loop stood still for the plan: all of the pruner unless a runtime overlaps
-            it with step 0.
-        decode: the denoising loop, without that wait.
-        total: from the normalised observation to the denoised sample.
+        plans: int8 ``[B, K, blocks]``.
+        lowered: of each stream, by the backend.
+        legalised: replaced cells of each stream.
+        pruner: ms that the pruner took, from the condition values to the instructions; 0 if the plan was given.
     """
 
-    prologue: float
-    pruner: float
-    wait_pruner: float
-    decode: float
-    total: float
-
-
-@dataclass(frozen=True)
-class CallReport:
-    """What one call did.
-
-    Attributes:
-        plan: int8 ``[B, K, blocks]`` of ``Source``, as executed. Read-only.
-        plan_name: ``dense``, the name of a plan of the artifact, or ``given`` for a matrix of the caller's.
-        computed: computed cells of each stream.
-        legalised: cells of each stream that were replaced because their residual was never computed.
-        flops: FLOPs of each stream, multiply and add counted as two, prologue and pruner included.
-        timings: wall time in milliseconds.
-    """
-
-    plan: PlanArray
-    plan_name: str
-    computed: tuple[int, ...]
+    plans: PlanArray
+    lowered: tuple[Any, ...]
     legalised: tuple[int, ...]
-    flops: tuple[float, ...]
-    timings: Timings
+    pruner: float = 0.0
 
 
-class Runtime(Protocol):
+class Runtime:
     """One episode at a time on a fixed number of streams.
 
     Nothing here locks: a runtime belongs to one thread (``CompiledPolicy`` sees to that).
+
+    Which entries of the rollout cache are kept: of a call with a plan of the artifact, those that the backend says. A
+    dense call, and one whose plan is a matrix of the caller's, keeps all that it computes; and from the first such
+    matrix on every call does, since another may read any of it.
+
+    Args:
+        artifact: loaded and checked.
+        backend: opened on the same artifact.
+
+    Attributes:
+        backend: as given.
     """
+
+    def __init__(self, artifact: Artifact, backend: Backend[Any]) -> None:
+        self._manifest, self._groups = artifact.manifest, artifact.manifest.groups
+        self.backend = backend
+        self._lowering = LoweringCache(backend.lower)
+        for schedule in artifact.schedules.values():
+            self._lowering.lower(schedule)
+        self._helper = ThreadPoolExecutor(1, "ttscompile-pruner") if PRUNER in self._manifest.pieces else None
+        if self._helper is not None and any(plan.kind == PRUNER for plan in self._manifest.plans.values()):
+            self._helper.submit(lambda: None).result()  # the thread is there before the first call
+        self._matrices = False  # whether one was ever given
+        self._written: BoolArray | None = None
+        self._dropped: BoolArray | None = None  # computed in this episode, and not kept
 
     @property
     def streams(self) -> int | None:
         """B of the episode under way; None after ``reset`` and before the first call."""
+        return None if self._written is None else len(self._written)
 
     def reset(self) -> None:
-        """Forget the rollout cache: a new episode, of any number of streams."""
+        """Forget the rollout cache: a new episode, of any number of streams. Its memory is kept."""
+        self._written = self._dropped = None
 
     def predict(
         self,
@@ -120,128 +117,115 @@ class Runtime(Protocol):
                 and the artifact has no pruner.
             ObservationError: the number of streams differs from the episode's, or ``noise`` does not fit.
         """
+        backend = self.backend
+        streams = check_call(self.streams, noise, self._manifest.spec)
+        cells = (streams, self._manifest.steps, len(self._groups))
+        written = np.zeros(cells, dtype=np.bool_) if self._written is None else self._written
+        dropped = np.zeros(cells, dtype=np.bool_) if self._dropped is None else self._dropped
+        if plan is None and self._helper is None:
+            raise IllegalPlanError(
+                "no plan was given and the artifact has no pruner to make one. Give plan='dense', the name of a plan of"
+                " the artifact, or a matrix; or calibrate the artifact with strategy='tts'."
+            )
+        settled = None if plan is None else self._settle(plan, written, dropped, repair)
+        if plan_name not in (DENSE, *self._manifest.plans):
+            self._matrices = True
+        keep = np.ones_like(backend.keeps) if self._matrices or plan_name == DENSE else backend.keeps
+        backend.prepare(streams, None if settled is None else settled.lowered)
 
-
-def open_runtime(artifact: Artifact, runtime: str = "onnxruntime", threads: int = 1) -> Runtime:
-    """Make a runtime for an artifact.
-
-    Args:
-        artifact: loaded and checked.
-        runtime: ``onnxruntime`` or ``reference``.
-        threads: threads of arithmetic. The reference runtime runs with torch's own setting.
-
-    Raises:
-        RuntimeUnavailableError: no runtime of this name, its packages are missing, or the threads cannot be had.
-        ArtifactError: the parts of the artifact do not fit each other.
-    """
-    if not isinstance(threads, int) or isinstance(threads, bool) or not 1 <= threads <= MOST_THREADS:
-        raise RuntimeUnavailableError(
-            f"threads must be an integer of at least 1 and at most {MOST_THREADS}; found {threads!r}."
+        start = time.perf_counter()
+        self.reset()  # a call that fails ends the episode: its residuals stand beside those of earlier ones
+        backend.start(Call(obs, noise, correction, known, keep, written))
+        prologue = time.perf_counter()
+        waited = 0.0
+        if settled is None:
+            settled, waited = self._prune_beside_first_step(written)
+        else:
+            backend.first_step()
+        sample = backend.other_steps(settled.lowered)
+        stop = time.perf_counter()
+        computed = settled.plans == Source.COMPUTE
+        self._written, self._dropped = np.where(computed, keep, written), np.where(computed, ~keep, dropped)
+        report = CallReport(
+            plan=_frozen(settled.plans),
+            plan_name=plan_name or (PRUNER if plan is None else GIVEN),
+            computed=tuple(int(n) for n in np.count_nonzero(computed, axis=(1, 2))),
+            legalised=settled.legalised,
+            flops=tuple(self._manifest.flops.call(one, plan is None) for one in settled.plans),
+            timings=Timings(
+                prologue=_milliseconds(start, prologue),
+                pruner=settled.pruner,
+                wait_pruner=waited,
+                decode=_milliseconds(prologue, stop) - waited,
+                total=_milliseconds(start, stop),
+            ),
         )
-    if runtime == "onnxruntime":
-        from .onnxruntime.runtime import OnnxRuntime
+        return sample, report
 
-        with fitting(artifact):
-            return OnnxRuntime(artifact, threads)
-    if runtime == "reference":
+    def _prune_beside_first_step(self, written: BoolArray) -> tuple[_Settled, float]:
+        """Step 0, and meanwhile the plan of the steps after it; ms that the loop stood still for it."""
+        assert self._helper is not None
+        pruning: Future[_Settled] = self._helper.submit(_prune, self.backend, self._lowering, self._groups, written)
         try:
-            from .reference.runtime import ReferenceRuntime
-        except ModuleNotFoundError as error:
-            raise RuntimeUnavailableError(
-                f"runtime 'reference' needs torch, and {error.name!r} is not installed. Install 'ttscompile[compile]',"
-                " or use runtime='onnxruntime'."
-            ) from error
-        with fitting(artifact):
-            return ReferenceRuntime(artifact)
-    raise RuntimeUnavailableError(f"no runtime is called {runtime!r}; expected one of {', '.join(RUNTIMES)}.")
+            self.backend.first_step()
+            ready = time.perf_counter()
+            return pruning.result(), _milliseconds(ready, time.perf_counter())
+        finally:
+            wait([pruning])  # it reads the backend's memory: nobody may go on before it is done, not even with an error
+
+    def _settle(self, plan: npt.ArrayLike, written: BoolArray, dropped: BoolArray, repair: bool) -> _Settled:
+        """The plan of a caller.
+
+        Whether a plan that was lowered before is legal depends on its ROLLOUT reads alone, which is quickly checked.
+        """
+        streams, steps, blocks = written.shape
+        if repair:
+            plans, legalised = settle_plan(plan, self._groups, written, repair)
+        else:
+            plans, legalised = check_plan(plan, steps, blocks, streams), (0,) * streams
+        rollout = plans == Source.ROLLOUT.value  # numpy takes five times as long to compare with the enum itself
+        if (rollout & dropped).any():
+            _, k, b = np.argwhere(rollout & dropped)[0].tolist()
+            raise IllegalPlanError(
+                f"the plan reads the ROLLOUT residual of step {k}, block {b}, which an earlier call of this episode"
+                " computed with a plan of the artifact, and did not keep: no plan of the artifact reads it."
+                " Begin the episode with a matrix (one of zeros computes all, as plan='dense' does): from a first"
+                " matrix on every call keeps what it computes."
+            )
+
+        def check() -> None:
+            require_legal(plans, self._groups, written)
+
+        if (rollout & ~written).any():
+            check()
+        return _Settled(plans, tuple(self._lowering.lower(one, check) for one in plans), legalised)
 
 
-@contextmanager
-def fitting(artifact: Artifact) -> Iterator[None]:
-    """Within the block whatever fails is an error of the artifact: its hashes are right, and its parts do not fit.
-
-    Opening a runtime runs every piece once, so that an artifact that somebody put together is refused here.
-
-    Raises:
-        ArtifactError: in place of any other exception.
-    """
-    try:
-        yield
-    except TtscompileError:
-        raise
-    except Exception as error:
-        raise ArtifactError(
-            f"{artifact.path}: its manifest, tables and graphs do not fit each other"
-            f" ({type(error).__name__}: {str(error)[:300]}). Convert the checkpoint again."
-        ) from error
+def _prune(
+    backend: Backend[Any], lowering: LoweringCache[Any], groups: tuple[int, ...], written: BoolArray
+) -> _Settled:
+    """The pruner's plan and its instructions. Not a method: the helper must not keep the runtime alive."""
+    start = time.perf_counter()
+    plans, legalised = settle_plan(pruner_plan(backend.logits()), groups, written, repair=True)
+    lowered = tuple(lowering.lower(one) for one in plans)
+    return _Settled(plans, lowered, legalised, _milliseconds(start, time.perf_counter()))
 
 
-def settle_plan(
-    plan: npt.ArrayLike, groups: Sequence[int], written: BoolArray, repair: bool
-) -> tuple[PlanArray, tuple[int, ...]]:
-    """The plan that will be executed.
-
-    Args:
-        plan: ``[K, blocks]`` or ``[B, K, blocks]``.
-        groups: FORWARD group of each block.
-        written: bool ``[B, K, blocks]``; rollout entries that exist.
-        repair: replace illegal reads rather than refuse them.
-
-    Returns:
-        A legal plan, int8 ``[B, K, blocks]``, and the number of replaced cells of each stream.
-
-    Raises:
-        IllegalPlanError: wrong shape, or illegal and not to be repaired.
-    """
-    streams, steps, blocks = written.shape
-    plans = check_plan(plan, steps, blocks, streams)
-    if not repair:
-        require_legal(plans, groups, written)
-        return plans, (0,) * streams
-    legal, _ = legalize(plans, groups, written)
-    return legal, tuple(int(n) for n in np.count_nonzero(legal != plans, axis=(1, 2)))
-
-
-def pruner_plan(logits: npt.NDArray[np.float32]) -> PlanArray:
-    """Plans from the pruner's logits ``[B, K, blocks, 4]``: the largest of the four sources, int8 ``[B, K, blocks]``.
-
-    Raises:
-        IllegalPlanError: the logits are not numbers.
-    """
-    if np.isnan(logits).any():
-        raise IllegalPlanError(
-            "the pruner's logits hold NaN, so there is no plan to execute: its weights are broken."
-            " Calibrate the artifact again, or use plan='dense'."
-        )
-    plan: PlanArray = np.argmax(logits, axis=-1).astype(np.int8)
-    return plan
-
-
-def no_pruner() -> IllegalPlanError:
-    """The error of a call without a plan on an artifact without a pruner."""
-    return IllegalPlanError(
-        "no plan was given and the artifact has no pruner to make one. Give plan='dense', the name of a plan of the"
-        " artifact, or a matrix; or calibrate the artifact with strategy='tts'."
-    )
-
-
-def check_call(streams: int | None, noise: Noise, sample: tuple[int, int], sampler: SamplerTable) -> int:
+def check_call(streams: int | None, noise: Noise, spec: PolicySpec) -> int:
     """Number of streams of a call whose noise fits it.
 
     Args:
         streams: B of the episode under way, or None.
         noise: of the call.
-        sample: ``(T, D)``.
-        sampler: says whether the draws of the steps are read.
+        spec: of the policy; its sampler says whether the draws of the steps are read.
 
     Raises:
         ObservationError: see ``Runtime.predict``.
     """
+    sampler, (horizon, channels) = spec.sampler, spec.sample
     initial: tuple[int, ...] = np.shape(noise.initial)
-    if len(initial) != 3 or initial[1:] != sample or initial[0] < 1:
-        raise ObservationError(
-            f"noise.initial has shape {initial}; expected [B, T, D] = (B, {sample[0]}, {sample[1]})."
-        )
+    if len(initial) != 3 or initial[1:] != spec.sample or initial[0] < 1:
+        raise ObservationError(f"noise.initial has shape {initial}; expected [B, T, D] = (B, {horizon}, {channels}).")
     found = initial[0]
     expected = (sampler.steps, *initial)
     draws = noise.steps if sampler.stochastic else None
@@ -260,18 +244,13 @@ def check_call(streams: int | None, noise: Noise, sample: tuple[int, int], sampl
     return found
 
 
-def computed_cells(plans: PlanArray) -> tuple[int, ...]:
-    """Computed cells of each stream."""
-    return tuple(int(n) for n in np.count_nonzero(plans == Source.COMPUTE, axis=(1, 2)))
-
-
-def frozen(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def _frozen(plans: PlanArray) -> PlanArray:
     """A read-only copy: what a report holds must not change after the call, and the caller's plan is the caller's."""
-    array = array.copy()
-    array.flags.writeable = False
-    return array
+    copied = plans.copy()
+    copied.flags.writeable = False
+    return copied
 
 
-def milliseconds(start: float, stop: float | None = None) -> float:
-    """Milliseconds between two readings of ``time.perf_counter``, the second being now by default."""
-    return 1000.0 * ((time.perf_counter() if stop is None else stop) - start)
+def _milliseconds(start: float, stop: float) -> float:
+    """Milliseconds between two readings of ``time.perf_counter``."""
+    return 1000.0 * (stop - start)

@@ -1,109 +1,75 @@
-"""The reference as a runtime: an artifact in, the same calls as every other runtime."""
+"""The reference as a backend: an artifact in, the same calls as every other runtime."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 
 import numpy as np
-import numpy.typing as npt
 import torch
+from torch import Tensor
 
-from ttscompile.artifact.manifest import PRUNER
-from ttscompile.core.correction import Correction
-from ttscompile.core.spec import FloatArray, Noise
-from ttscompile.runtimes.base import (
-    GIVEN,
-    CallReport,
-    Timings,
-    check_call,
-    computed_cells,
-    fitting,
-    frozen,
-    milliseconds,
-    no_pruner,
-    pruner_plan,
-    settle_plan,
-)
-from ttscompile.runtimes.inpainting import Known
+from ttscompile.artifact.load import Artifact
+from ttscompile.core.lattice import PlanArray
+from ttscompile.core.spec import FloatArray
+from ttscompile.runtimes.backend import Call, fitting
 
 from .model import ReferenceModel, noise_tensors
 from .reuse import RolloutCache
 
-if TYPE_CHECKING:
-    from ttscompile.artifact.load import Artifact
 
+class ReferenceBackend:
+    """A ``Backend`` on ``ReferenceModel``.
 
-class ReferenceRuntime:
-    """A ``Runtime`` on ``ReferenceModel``; see ``base.Runtime``.
+    Args:
+        artifact: loaded and checked.
 
     Attributes:
+        keeps: all entries of the rollout cache.
         model: what it runs.
     """
 
     def __init__(self, artifact: Artifact) -> None:
         self._artifact = artifact
         self.model = ReferenceModel.from_artifact(artifact)
-        self._manifest = artifact.manifest
-        self._cache: RolloutCache | None = None
+        self.keeps = np.ones((self.model.steps, self.model.blocks), dtype=np.bool_)
+        self._residuals: Mapping[tuple[int, int], Tensor] = {}
 
-    @property
-    def streams(self) -> int | None:
-        """B of the episode under way."""
-        return None if self._cache is None else len(self._cache.written)
+    def lower(self, plan: PlanArray) -> PlanArray:
+        """The plan as it is."""
+        return plan
 
-    def reset(self) -> None:
-        """Forget the rollout cache."""
-        self._cache = None
+    def prepare(self, streams: int, plans: Sequence[PlanArray] | None) -> None:
+        """Nothing: torch takes memory as it goes."""
 
-    def predict(
-        self,
-        obs: Mapping[str, FloatArray],
-        noise: Noise,
-        plan: npt.ArrayLike | None = None,
-        *,
-        plan_name: str | None = None,
-        repair: bool = False,
-        correction: Correction | None = None,
-        known: Known | None = None,
-    ) -> tuple[FloatArray, CallReport]:
-        """Denoise one chunk; see ``base.Runtime.predict``."""
-        spec = self._manifest.spec
-        streams = check_call(self.streams, noise, spec.sample, spec.sampler)
-        cache = self._cache if self._cache is not None else self.model.empty_cache(streams)
-        pruned = plan is None
-        if plan is None:
-            if "pruner" not in self._manifest.pieces:
-                raise no_pruner()
-        else:
-            plans, legalised = settle_plan(plan, self.model.groups, cache.written, repair)
-        start = time.perf_counter()
-        self.reset()  # a call that fails from here on ends the episode
+    def start(self, call: Call) -> None:
+        """See ``Backend.start``."""
+        self._call = call
+        with self._computing():
+            self._contexts = self.model.prologue({key: torch.from_numpy(np.array(a)) for key, a in call.obs.items()})
+
+    def logits(self) -> FloatArray:
+        """See ``Backend.logits``."""
+        with self._computing():
+            return np.asarray(self.model.logits(self._contexts).numpy(), dtype=np.float32)
+
+    def first_step(self) -> None:
+        """Nothing: the model takes all steps at once."""
+
+    def other_steps(self, plans: Sequence[PlanArray]) -> FloatArray:
+        """See ``Backend.other_steps``."""
+        call = self._call
+        cache = RolloutCache(self._residuals if call.written.any() else {}, call.written)
+        noise = noise_tensors(call.noise, self._artifact.manifest.spec.sampler.stochastic)
+        with self._computing():
+            made = self.model.denoise(
+                self._contexts, *noise, np.stack(plans), cache, correction=call.correction, known=call.known
+            )
+        self._residuals = made.cache.residuals
+        return np.asarray(made.sample.numpy(), dtype=np.float32)
+
+    @contextmanager
+    def _computing(self) -> Iterator[None]:
+        """Without gradients, which belong to a thread; what fails is an error of the artifact."""
         with fitting(self._artifact), torch.no_grad():
-            contexts = self.model.prologue({key: torch.from_numpy(np.array(value)) for key, value in obs.items()})
-            prologue = time.perf_counter()
-            if pruned:
-                wanted = pruner_plan(self.model.logits(contexts).numpy())
-                plans, legalised = settle_plan(wanted, self.model.groups, cache.written, True)
-            pruner = time.perf_counter()
-            initial, steps = noise_tensors(noise, spec.sampler.stochastic)
-            result = self.model.rollout(contexts, initial, steps, plans, cache, correction=correction, known=known)
-        self._cache = result.cache
-        stop = time.perf_counter()
-        wait = milliseconds(prologue, pruner) if pruned else 0.0
-        report = CallReport(
-            plan=frozen(plans),
-            plan_name=plan_name or (PRUNER if pruned else GIVEN),
-            computed=computed_cells(plans),
-            legalised=legalised,
-            flops=tuple(self._manifest.flops.call(one, pruned) for one in plans),
-            timings=Timings(
-                prologue=milliseconds(start, prologue),
-                pruner=wait,
-                wait_pruner=wait,
-                decode=milliseconds(pruner, stop),
-                total=milliseconds(start, stop),
-            ),
-        )
-        return np.asarray(result.sample.numpy(), dtype=np.float32), report
+            yield
