@@ -142,7 +142,7 @@ def decoded(manifest: Manifest, change: Change) -> Manifest:
     ("change", "message"),
     [
         (lambda p: p.update(name="int4"), "precision.name: expected one of 'int8'"),
-        (lambda p: p.update(name=8), "precision.name: expected one of 'int8'"),
+        (lambda p: p.update(name=8), "precision.name: expected a string"),
         (lambda p: p.update(weights="../weights"), "precision.weights: expected a plain file name"),
         (lambda p: p.update(weights="weights.safetensors"), "which nothing else uses"),
         (lambda p: p.update(weights="block_00_int8.onnx"), "which nothing else uses"),

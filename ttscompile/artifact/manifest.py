@@ -217,7 +217,7 @@ class PrecisionRecord:
         error: what it does to the actions; None before it is measured.
     """
 
-    name: Literal["int8"]
+    name: Annotated[str, Rule("one of 'int8'", "int8".__eq__)]
     weights: FileName
     models: Mapping[str, FileName]
     error: PrecisionError | None

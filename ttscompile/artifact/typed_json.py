@@ -85,18 +85,22 @@ def _read(kind: Any, value: Value) -> Any:
     if kind is TensorType:
         members = value.keys("dtype", "shape")
         return TensorType(tuple(map(_size, members["shape"].items())), _read(DType, members["dtype"]))
+    if isinstance(kind, enum.EnumMeta):
+        return {one.value: one for one in kind}[value.text(*(one.value for one in kind))]
     if is_dataclass(kind):
-        hints = _hints(kind)
-        members = value.keys(*hints)
-        read = {name: _read(hint, members[name]) for name, hint in hints.items()}
-        try:
-            return kind(**read)  # type: ignore[operator]
-        except SpecError as error:
-            raise ArtifactError(f"{value.path}: {error} {REMEDY}") from error
-    if isinstance(kind, type) and issubclass(kind, enum.Enum):
-        return kind(value.text(*(one.value for one in kind)))
+        return _record(cast(Any, kind), value)
     plain = {int: value.integer, float: value.number, str: value.text, bool: value.boolean, Any: lambda: value.data}
     return plain[kind]()
+
+
+def _record(kind: Any, value: Value) -> Any:
+    hints = _hints(kind)
+    members = value.keys(*hints)
+    read = {name: _read(hint, members[name]) for name, hint in hints.items()}
+    try:
+        return kind(**read)
+    except SpecError as error:
+        raise ArtifactError(f"{value.path}: {error} {REMEDY}") from error
 
 
 @cache
