@@ -14,7 +14,7 @@ import enum
 import math
 import re
 import types
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
 from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
@@ -83,13 +83,20 @@ def _read(kind: Any, value: Value) -> Any:
         key, item = arguments
         return {_read(key, Value(name, value.path)): _read(item, one) for name, one in value.members().items()}
     if kind is TensorType:
-        members = value.keys("dtype", "shape")
-        return TensorType(tuple(map(_size, members["shape"].items())), _read(DType, members["dtype"]))
+        parts = value.keys("dtype", "shape")
+        return TensorType(tuple(map(_size, parts["shape"].items())), _read(DType, parts["dtype"]))
     if isinstance(kind, enum.EnumMeta):
-        return {one.value: one for one in kind}[value.text(*(one.value for one in kind))]
+        members = {str(one.value): one for one in cast(type[enum.Enum], kind)}
+        return members[value.text(*members)]
     if is_dataclass(kind):
-        return _record(cast(Any, kind), value)
-    plain = {int: value.integer, float: value.number, str: value.text, bool: value.boolean, Any: lambda: value.data}
+        return _record(kind, value)
+    plain: Mapping[Any, Callable[[], Any]] = {
+        int: value.integer,
+        float: value.number,
+        str: value.text,
+        bool: value.boolean,
+        Any: lambda: value.data,
+    }
     return plain[kind]()
 
 
