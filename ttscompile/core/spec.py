@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import SpecError
+from .rules import DType, Positive
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -147,9 +148,9 @@ class ObservationSpec:
             (``image``). Random observations are drawn within them. Kept as tuples.
     """
 
-    shape: tuple[int, ...]
+    shape: tuple[Positive, ...]
     normalizer: Affine | None = None
-    dtype: str = "float32"
+    dtype: DType = "float32"
     window: bool = True
     bounds: tuple[float | tuple[float, ...], float | tuple[float, ...]] | None = None
 
@@ -246,7 +247,7 @@ class PolicySpec:
         left_out: steps that the original predicts after the last one of the sample (``ttscompile.capture.narrow``).
     """
 
-    sample: tuple[int, int]
+    sample: tuple[Positive, Positive]
     observations: Mapping[str, ObservationSpec]
     sampler: SamplerTable
     chunk: ChunkSpec
