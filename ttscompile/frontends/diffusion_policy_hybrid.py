@@ -18,7 +18,8 @@ from ..core.spec import ObservationSpec
 from ..errors import CheckpointError
 from .diffusion_policy_weights import Weights, affine
 from .robomimic_encoder import Camera, ObservationEncoder
-from .saved_weights import names_of, require_finite, require_names, require_shape
+from .saved_weights import names_of, require_weights
+from .settings import Settings, is_shape
 from .transformer_for_diffusion import TransformerConfig
 
 POLICY = "DiffusionTransformerHybridImagePolicy"
@@ -89,7 +90,7 @@ def read_shape_meta(policy: Mapping[str, Any]) -> Observed:
 
 def _shape(attributes: Any, where: str) -> tuple[int, ...]:
     shape = attributes.get("shape") if isinstance(attributes, dict) else None
-    if not isinstance(shape, list) or not shape or not all(type(n) is int and n > 0 for n in shape):
+    if not is_shape(shape):
         raise CheckpointError(f"cfg.policy.shape_meta.{where}.shape is {shape!r}; expected positive whole numbers.")
     return tuple(shape)
 
@@ -105,12 +106,17 @@ def build_encoder(policy: Mapping[str, Any], observed: Observed, weights: Weight
     Raises:
         CheckpointError: settings, weights or normalisers that do not fit.
     """
-    switches = {name: policy.get(name, False) for name in ("obs_encoder_group_norm", "eval_fixed_crop")}
-    for name, value in switches.items():
-        if type(value) is not bool:
-            raise CheckpointError(f"cfg.policy.{name} is {value!r}; expected true or false.")
-    crop = _crop(policy, observed)
-    if crop is not None and not switches["eval_fixed_crop"] and observed.cameras:
+    settings = Settings(policy, "cfg.policy.")
+    group_norm = settings.flag("obs_encoder_group_norm", False)
+    fixed = settings.flag("eval_fixed_crop", False)
+    crop = settings.size("crop_shape", [76, 76])
+    for key, (_, height, width) in observed.cameras.items():
+        if crop is not None and (crop[0] >= height or crop[1] >= width):
+            raise CheckpointError(
+                f"cfg.policy.crop_shape is {list(crop)}, and the images of {key!r} are {height} x {width}; expected a"
+                " crop that is smaller; the original refuses this, too."
+            )
+    if crop is not None and not fixed and observed.cameras:
         warnings.warn(
             "eval_fixed_crop is false: the original crops its images at random even in evaluation. The compiled policy"
             " always takes the centre, as the original does with eval_fixed_crop = true.",
@@ -121,7 +127,7 @@ def build_encoder(policy: Mapping[str, Any], observed: Observed, weights: Weight
         scale, offset = _image_normalizer(weights, key)
         cameras[key] = Camera(shape, crop, scale, offset)
     low_dim = {key: math.prod(shape) for key, shape in observed.low_dim.items()}
-    encoder = ObservationEncoder(cameras, low_dim, observed.order, switches["obs_encoder_group_norm"])
+    encoder = ObservationEncoder(cameras, low_dim, observed.order, group_norm)
     for key, position in encoder.position.items():
         _load_camera(encoder.cameras[position], weights, key)
     known = tuple(f"{_PREFIX}{key}." for key in cameras)
@@ -133,22 +139,6 @@ def build_encoder(policy: Mapping[str, Any], observed: Observed, weights: Weight
             " ttscompile.compile_denoiser(module, spec)."
         )
     return encoder
-
-
-def _crop(policy: Mapping[str, Any], observed: Observed) -> tuple[int, int] | None:
-    """``crop_shape``, which must be smaller than every image; the original's default is 76 x 76."""
-    crop = policy.get("crop_shape", [76, 76])
-    if crop is None:
-        return None
-    if not isinstance(crop, list) or len(crop) != 2 or not all(type(n) is int and n > 0 for n in crop):
-        raise CheckpointError(f"cfg.policy.crop_shape is {crop!r}; expected [height, width] or null.")
-    for key, (_, height, width) in observed.cameras.items():
-        if crop[0] >= height or crop[1] >= width:
-            raise CheckpointError(
-                f"cfg.policy.crop_shape is {crop}, and the images of {key!r} are {height} x {width}; expected a crop"
-                " that is smaller; the original refuses this, too."
-            )
-    return crop[0], crop[1]
 
 
 def _image_normalizer(weights: Weights, key: str) -> tuple[float, float]:
@@ -182,19 +172,14 @@ def _load_camera(module: torch.nn.Module, weights: Weights, key: str) -> None:
         found[name] = value
         saved[name] = saved.get(name, full)
     expected = {name: value for name, value in module.state_dict().items() if not name.endswith("num_batches_tracked")}
-    missing = [prefix + name for name in expected if name not in found]
-    extra = [saved[name] for name in found if name not in expected]
-    require_names(
-        missing,
-        extra,
-        "the weights of the image encoder are not those of robomimic's ResNet-18 with spatial softmax and"
-        " obs_encoder_group_norm as configured",
-        "Use ttscompile.compile_denoiser(module, spec) for another encoder.",
+    require_weights(
+        {saved.get(name, prefix + name): value for name, value in expected.items()},
+        {saved[name]: value for name, value in found.items()},
+        "cfg.policy (shape_meta, crop_shape, obs_encoder_group_norm)",
+        what="the weights of the image encoder are not those of robomimic's ResNet-18 with spatial softmax",
     )
-    for name, value in found.items():
-        require_shape(saved[name], value, expected[name].shape, "cfg.policy.shape_meta and crop_shape")
-        require_finite(saved[name], value)
-        if name in _GRID and not torch.allclose(value, expected[name], atol=_ROUNDING):
+    for name in _GRID:
+        if not torch.allclose(found[name], expected[name], atol=_ROUNDING):
             raise CheckpointError(f"{saved[name]} is not the grid from -1 to 1 of a spatial softmax; it was changed.")
     module.load_state_dict({name: value for name, value in found.items() if name not in _GRID}, strict=False)
 

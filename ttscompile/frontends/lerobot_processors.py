@@ -1,6 +1,6 @@
 """LeRobot's processors: what is done to observations before the policy, and to actions after it.
 
-Source: ``lerobot.processor`` of huggingface/lerobot 0.6, of which only the arithmetic of its normalisers matters here.
+Source: ``lerobot.processor`` of huggingface/lerobot 0.6; the arithmetic is in ``lerobot_statistics``.
 """
 
 from __future__ import annotations
@@ -11,24 +11,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from safetensors.torch import load_file
-from torch import nn
 
-from ..core.spec import Affine
 from ..errors import CheckpointError
 from .json_files import read_json
+from .lerobot_statistics import STATISTICS, Statistics
+from .saved_weights import read_tensors
 
 ACTION = "action"
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
 
-_STATISTICS = {
-    "MEAN_STD": ("mean", "std"),
-    "MIN_MAX": ("min", "max"),
-    "QUANTILES": ("q01", "q99"),
-    "QUANTILE10": ("q10", "q90"),
-}
 _RENAME, _TOKENIZE, _NORMALIZE = "rename_observations_processor", "tokenizer_processor", "normalizer_processor"
 _UNNORMALIZE, _BATCH, _DEVICE = "unnormalizer_processor", "to_batch_processor", "device_processor"
 _KNOWN_STEPS: Mapping[str, frozenset[str]] = {
@@ -36,80 +28,6 @@ _KNOWN_STEPS: Mapping[str, frozenset[str]] = {
     POSTPROCESSOR: frozenset({_BATCH, _DEVICE, _UNNORMALIZE}),
 }
 _ONCE = frozenset({_RENAME, _TOKENIZE, _NORMALIZE, _UNNORMALIZE})
-_LEAST_STD = 1e-30
-"""Stands for a standard deviation of zero, which gives the mean whatever the network says."""
-
-
-@dataclass(frozen=True)
-class Statistics:
-    """How one feature is normalised: its mode, and the two statistics that the mode names, float32.
-
-    Attributes:
-        mode: ``MEAN_STD``, ``MIN_MAX``, ``QUANTILES`` or ``QUANTILE10``.
-        first: mean, or the lower end of the range.
-        second: standard deviation, or the upper end.
-        eps: of the processor's configuration.
-    """
-
-    mode: str
-    first: torch.Tensor
-    second: torch.Tensor
-    eps: float
-
-    @property
-    def width(self) -> torch.Tensor:
-        """What is divided by: ``std + eps``; or the range, and ``eps`` where that is zero."""
-        if self.mode == "MEAN_STD":
-            return self.second + self.eps
-        width = self.second - self.first
-        return torch.where(width == 0, torch.tensor(self.eps, dtype=width.dtype), width)
-
-    @property
-    def bounds(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Of a vector: the range that the statistics speak of; of MEAN_STD two deviations to each side."""
-        low, high = self.first, self.second
-        if self.mode == "MEAN_STD":
-            low, high = self.first - 2 * self.second, self.first + 2 * self.second
-        low, high = torch.minimum(low, high), torch.maximum(low, high)
-        return tuple(low.tolist()), tuple(high.tolist())
-
-    def inverse(self) -> Affine:
-        """The inverse as an ``Affine``, for vectors. MEAN_STD inverts with the bare standard deviation."""
-        first = self.first.double().numpy()
-        if self.mode == "MEAN_STD":
-            scale = 1 / np.maximum(self.second.double().numpy(), _LEAST_STD)
-            return Affine(scale=scale.astype(np.float32), offset=(-first * scale).astype(np.float32))
-        scale = 2 / self.width.double().numpy()
-        return Affine(scale=scale.astype(np.float32), offset=(-first * scale - 1).astype(np.float32))
-
-
-class Normalizer(nn.Module):
-    """``(x - mean) / (std + eps)``, or ``2 (x - low) / range - 1``, as LeRobot writes it.
-
-    It is part of the compiled network rather than an ``Affine`` of the observation: images are normalised by channel,
-    and a channel that never changed in training is divided by 1e-8, which only this order of operations survives.
-
-    Args:
-        statistics: of a feature, broadcast against its values; None leaves them as they are.
-    """
-
-    first: torch.Tensor
-    width: torch.Tensor
-
-    def __init__(self, statistics: Statistics | None) -> None:
-        super().__init__()
-        self.mode = None if statistics is None else statistics.mode
-        if statistics is not None:
-            self.register_buffer("first", statistics.first, persistent=False)
-            self.register_buffer("width", statistics.width, persistent=False)
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """``[B, To, ...]`` -> the same."""
-        if self.mode is None:
-            return x
-        if self.mode == "MEAN_STD":
-            return (x - self.first) / self.width
-        return 2 * (x - self.first) / self.width - 1
 
 
 @dataclass(frozen=True)
@@ -150,23 +68,6 @@ def read_processors(directory: Path, features: Mapping[str, tuple[str, tuple[int
         renamed=renamed,
         tokenizer=tokenizers[0] if tokenizers else None,
     )
-
-
-def read_tensors(path: Path) -> dict[str, torch.Tensor]:
-    """The tensors of a safetensors file on the CPU; the format holds nothing that could run.
-
-    Raises:
-        CheckpointError: missing or damaged.
-    """
-    if not path.is_file():
-        raise CheckpointError(f"{path}: no such file. Copy the policy's directory whole.")
-    try:
-        tensors: dict[str, torch.Tensor] = load_file(path, device="cpu")
-    except Exception as error:  # what the reader raises depends on where the file is damaged
-        raise CheckpointError(
-            f"{path}: not a safetensors file, or a truncated one: {error!s:.300}. Copy it again."
-        ) from error
-    return tensors
 
 
 def _steps(directory: Path, name: str) -> list[dict[str, Any]]:
@@ -264,17 +165,17 @@ def _statistics(
         skipped = kind != "ACTION" and (key not in own or (only is not None and key not in only))
         if mode == "IDENTITY" or skipped:
             continue
-        if mode not in _STATISTICS:
-            known = ", ".join(("IDENTITY", *_STATISTICS))
+        if mode not in STATISTICS:
+            known = ", ".join(("IDENTITY", *STATISTICS))
             raise CheckpointError(
                 f"{directory}: {registered} normalises {kind} by {mode!r:.80}; expected one of {known}."
             )
-        names = [f"{key}.{name}" for name in _STATISTICS[mode]]
+        names = [f"{key}.{name}" for name in STATISTICS[mode]]
         if not any(name.rpartition(".")[0] == key for name in tensors):
             warnings.warn(
                 f"{directory}: {registered} has no statistics of {key}, so it is not normalised ({mode} is configured);"
                 " lerobot does the same.",
-                stacklevel=5,
+                stacklevel=6,
             )
             continue
         missing = [name for name in names if name not in tensors]
