@@ -281,7 +281,7 @@ def test_weights_that_do_not_fit(
         ({"shape_meta": {"obs": {"a": {"shape": [4]}}, "action": {"shape": [3, 2]}}}, r"action\.shape is \[3, 2\]"),
         (
             {"shape_meta": {"obs": {"a": {"shape": [4], "type": "depth"}}, "action": {"shape": [3]}}},
-            r"obs\.a\.type is 'depth'; expected rgb or low_dim",
+            r"obs\.a\.type is 'depth'; expected low_dim or rgb",
         ),
         (
             {"shape_meta": {"obs": {"a": {"shape": [4, 4], "type": "rgb"}}, "action": {"shape": [3]}}},

@@ -33,21 +33,9 @@ from .transformer_for_diffusion import (
 
 _POLICY = "DiffusionTransformerLowdimPolicy"
 _NETWORK = "TransformerForDiffusion"
-_POLICY_KEYS = frozenset(
-    {
-        "_target_",
-        "model",
-        "noise_scheduler",
-        "horizon",
-        "obs_dim",
-        "action_dim",
-        "n_action_steps",
-        "n_obs_steps",
-        "num_inference_steps",
-        "obs_as_cond",
-        "pred_action_steps_only",
-    }
-)
+_SIZES = ("horizon", "obs_dim", "action_dim", "n_action_steps", "n_obs_steps")
+_SWITCHES = ("obs_as_cond", "pred_action_steps_only")
+_POLICY_KEYS = frozenset({*_SIZES, *_SWITCHES, "_target_", "model", "noise_scheduler", "num_inference_steps"})
 
 
 def load(path: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
@@ -79,11 +67,11 @@ def build(payload: Mapping[str, Any], options: LoadOptions) -> tuple[nn.Module, 
     policy = config.require("policy")
     encoder = None
     if name == hybrid.POLICY:
-        observed = hybrid.read_shape_meta(policy)
+        action_dim, observed = hybrid.read_shape_meta(policy)
         encoder = hybrid.build_encoder(policy, observed, weights)
-        policy |= {"obs_dim": encoder.width, "action_dim": observed.action_dim}
+        policy |= {"obs_dim": encoder.width, "action_dim": action_dim}
         policy["obs_as_cond"] = policy.get("obs_as_cond", True)
-        network = build_network(hybrid.network_config(policy, observed, encoder.width), weights)
+        network = build_network(hybrid.network_config(policy, action_dim, encoder.width), weights)
         known = _POLICY_KEYS | hybrid.ENCODER_KEYS | hybrid.NETWORK_KEYS
     else:
         network = build_network(_network_config(config), weights)
@@ -153,12 +141,12 @@ def _network_config(config: Config) -> TransformerConfig:
 def _check_policy(policy: dict[str, Any], network: TransformerConfig) -> tuple[int, str]:
     """Check sizes against each other and fill in defaults; gives T of the sample and the name of the variant."""
     settings = Settings(policy, "cfg.policy.")
-    for name in ("obs_as_cond", "pred_action_steps_only"):
+    for name in _SWITCHES:
         policy[name] = settings.flag(name, False)
     policy["num_inference_steps"] = policy.get("num_inference_steps")
     if not isinstance(policy.get("noise_scheduler"), dict):
         raise CheckpointError("cfg.policy.noise_scheduler is missing; expected the settings of a diffusers scheduler.")
-    for name in ("horizon", "obs_dim", "action_dim", "n_action_steps", "n_obs_steps"):
+    for name in _SIZES:
         settings.number(name)
 
     as_cond, only_steps = policy["obs_as_cond"], policy["pred_action_steps_only"]

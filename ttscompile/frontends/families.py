@@ -33,15 +33,7 @@ SPACINGS = ("leading", "trailing", "linspace")
 class LoadOptions:
     """What can be asked of a checkpoint in place of what it says itself; None leaves it as it was saved.
 
-    Attributes:
-        sampler: one of ``DIFFUSION_SAMPLERS`` on the betas of a diffusion policy; ``euler`` or ``rk4`` of a policy that
-            was trained with flow matching.
-        steps: number of denoising or integration steps.
-        spacing: one of ``SPACINGS``: the timesteps that fewer steps visit.
-        task: the one instruction that is compiled in, so that the robot needs no tokenizer; without it the tokens of
-            an instruction are an observation.
-        encoders: folder with the configurations (and tokenizers) of a policy's CLIP encoders, where they are neither in
-            nor beside the checkpoint.
+    The fields are the arguments of ``ttscompile.convert`` of the same names, and are described there.
     """
 
     sampler: str | None = None

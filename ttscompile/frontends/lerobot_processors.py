@@ -15,7 +15,7 @@ import torch
 
 from ..errors import CheckpointError
 from .json_files import read_json
-from .lerobot_statistics import STATISTICS, Statistics
+from .lerobot_statistics import STATISTICS, Features, Statistics
 from .saved_weights import read_tensors
 
 ACTION = "action"
@@ -47,12 +47,12 @@ class Processors:
     tokenizer: Mapping[str, Any] | None
 
 
-def read_processors(directory: Path, features: Mapping[str, tuple[str, tuple[int, ...]]]) -> Processors:
+def read_processors(directory: Path, features: Features) -> Processors:
     """The pipelines of a directory that LeRobot saved.
 
     Args:
         directory: of the policy.
-        features: of the policy: type (``STATE``, ``VISUAL``, ``ACTION``) and shape by name.
+        features: of the policy.
 
     Raises:
         CheckpointError: a file is missing or damaged; a step is not known, there twice, or out of order.
@@ -112,9 +112,7 @@ def _steps(directory: Path, name: str) -> list[dict[str, Any]]:
     return steps
 
 
-def _renamed(
-    directory: Path, steps: list[dict[str, Any]], features: Mapping[str, tuple[str, tuple[int, ...]]]
-) -> dict[str, str]:
+def _renamed(directory: Path, steps: list[dict[str, Any]], features: Features) -> dict[str, str]:
     """The policy's name of each renamed observation -> the robot's."""
     step = next((step for step in steps if step["registry_name"] == _RENAME), None)
     names = {} if step is None else _mapping(step, directory, "rename_map")
@@ -139,7 +137,7 @@ def _statistics(
     directory: Path,
     steps: list[dict[str, Any]],
     registered: str,
-    features: Mapping[str, tuple[str, tuple[int, ...]]],
+    features: Features,
 ) -> dict[str, Statistics]:
     """Statistics of each feature that a normalising step changes."""
     found = [step for step in steps if step["registry_name"] == registered]

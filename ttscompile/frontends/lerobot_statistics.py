@@ -5,6 +5,7 @@ Source: ``lerobot.processor`` of huggingface/lerobot 0.6.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,9 @@ import torch
 from torch import nn
 
 from ..core.spec import Affine
+
+Features = Mapping[str, tuple[str, tuple[int, ...]]]
+"""Type (``STATE``, ``VISUAL``, ``ACTION``) and shape by the policy's name, as its configuration has them."""
 
 STATISTICS = {
     "MEAN_STD": ("mean", "std"),
