@@ -79,7 +79,7 @@ def convert(
     Args:
         checkpoint: a file or directory that the training code saved.
         directory: where the artifact goes; an artifact that is there is replaced, anything else is left alone.
-        format: ``diffusion_policy`` or ``lerobot``; ``auto`` tells by what is there.
+        format: name of the policy's family, ``diffusion_policy`` or ``lerobot``; ``auto`` tells by what is there.
         sampler: ``ddpm``, ``ddim`` or ``dpmsolver++`` in place of a diffusion policy's own, ``euler`` or ``rk4`` in
             place of a flow-matching policy's; None keeps it.
         steps: number of denoising or integration steps; None keeps the checkpoint's. ``rk4`` evaluates the network four

@@ -26,7 +26,7 @@ from ttscompile.frontends.families import FAMILIES, FORMATS, SAMPLERS, SPACINGS
     type=click.Choice(FORMATS),
     default="auto",
     show_default=True,
-    help="Of CHECKPOINT; auto finds out.",
+    help=" ".join(["Of CHECKPOINT; auto finds out.", *(f"{each.name}: {each.reads}." for each in FAMILIES)]),
 )
 @click.option(
     "--sampler",
@@ -82,11 +82,9 @@ def convert(
     single_file: Path | None,
     explain: bool,
     as_json: bool,
-    **of_checkpoint: Any,
+    **of_checkpoint: Any,  # the format and the options of families: ttscompile.convert takes them by the same names
 ) -> None:
-    """Compile CHECKPOINT, a trained policy: a .ckpt file of Diffusion Policy, or the directory of a LeRobot policy.
-
-    Nothing in it is executed.
+    """Compile CHECKPOINT, a trained policy of one of the formats below. Nothing in it is executed.
 
     The artifact computes everything until 'ttscompile calibrate' gives it a plan.
     """

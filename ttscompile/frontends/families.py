@@ -139,4 +139,5 @@ def find_family(path: Path, format: str) -> Family:
         return found
     if path.is_dir():
         refuse_directory(path)
-    raise CheckpointError(f"{path}: no such {rows[0].kind}; expected {rows[0].reads}.")
+    wrong = f"not of the format {format}" if path.exists() else f"no such {rows[0].kind}"
+    raise CheckpointError(f"{path}: {wrong}; expected {rows[0].reads}.")

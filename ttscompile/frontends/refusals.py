@@ -144,7 +144,8 @@ def refuse_policy(name: str, rows: Iterable[Refusal] = POLICIES, where: str = ""
         CheckpointError: always.
     """
     row = _first(rows, [name.lower()])
-    raise CheckpointError(f"{where}the policy is {name}: {row.what}. {row.remedy}")
+    shown = f"{name!a:.80}".strip("'\"")
+    raise CheckpointError(f"{where}the policy is {shown}: {row.what}. {row.remedy}")
 
 
 def refuse_payload(payload: Mapping[str, Any]) -> None:
