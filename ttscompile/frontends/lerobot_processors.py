@@ -17,6 +17,7 @@ from ..errors import CheckpointError
 from .json_files import read_json
 from .lerobot_statistics import STATISTICS, Features, Statistics
 from .saved_weights import read_tensors
+from .settings import Settings
 
 ACTION = "action"
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
@@ -115,7 +116,7 @@ def _steps(directory: Path, name: str) -> list[dict[str, Any]]:
 def _renamed(directory: Path, steps: list[dict[str, Any]], features: Features) -> dict[str, str]:
     """The policy's name of each renamed observation -> the robot's."""
     step = next((step for step in steps if step["registry_name"] == _RENAME), None)
-    names = {} if step is None else _mapping(step, directory, "rename_map")
+    names = {} if step is None else Settings(step["config"], f"{directory}: {_RENAME}.").names("rename_map")
     renamed = {new: old for old, new in names.items()}
     given = [renamed.get(key, key) for key, (kind, _) in features.items() if kind != "ACTION"]
     if len(renamed) < len(names) or len(set(given)) < len(given):
@@ -126,36 +127,24 @@ def _renamed(directory: Path, steps: list[dict[str, Any]], features: Features) -
     return renamed
 
 
-def _mapping(step: Mapping[str, Any], directory: Path, key: str) -> dict[str, str]:
-    value = step["config"].get(key, {})
-    if not isinstance(value, dict) or not all(isinstance(item, str) for item in value.values()):
-        raise CheckpointError(f"{directory}: {step['registry_name']}.{key} is {value!r:.80}; expected names by name.")
-    return value
-
-
 def _statistics(
-    directory: Path,
-    steps: list[dict[str, Any]],
-    registered: str,
-    features: Features,
+    directory: Path, steps: list[dict[str, Any]], registered: str, features: Features
 ) -> dict[str, Statistics]:
     """Statistics of each feature that a normalising step changes."""
     found = [step for step in steps if step["registry_name"] == registered]
     if len(found) != 1:
         raise CheckpointError(f"{directory}: expected one step {registered}; found {len(found)}.")
     (step,) = found
-    config, modes = step["config"], _mapping(step, directory, "norm_map")
-    eps = config.get("eps", 1e-8)
+    settings = Settings(step["config"], f"{directory}: {registered}.")
+    modes, eps = settings.names("norm_map"), settings.values.get("eps", 1e-8)
     if not isinstance(eps, float) or not eps > 0:
-        raise CheckpointError(f"{directory}: {registered}.eps is {eps!r:.80}; expected a positive number.")
+        raise settings.refusal("eps", "a positive number")
     tensors = _state(directory, step)
-    only, own = config.get("normalize_observation_keys"), config.get("features", {})
+    only, own = settings.values.get("normalize_observation_keys"), settings.values.get("features", {})
     if not isinstance(own, dict):
-        raise CheckpointError(f"{directory}: {registered}.features is {own!r:.80}; expected type and shape by name.")
+        raise settings.refusal("features", "type and shape by name")
     if only is not None and not (isinstance(only, list) and all(isinstance(key, str) for key in only)):
-        raise CheckpointError(
-            f"{directory}: {registered}.normalize_observation_keys is {only!r:.80}; expected a list of names, or null."
-        )
+        raise settings.refusal("normalize_observation_keys", "a list of names, or null")
     result = {}
     for key, (kind, shape) in features.items():
         mode = modes.get(kind, "IDENTITY")
@@ -164,10 +153,7 @@ def _statistics(
         if mode == "IDENTITY" or skipped:
             continue
         if mode not in STATISTICS:
-            known = ", ".join(("IDENTITY", *STATISTICS))
-            raise CheckpointError(
-                f"{directory}: {registered} normalises {kind} by {mode!r:.80}; expected one of {known}."
-            )
+            raise settings.refusal("norm_map", f"one of IDENTITY, {', '.join(STATISTICS)} for {kind}")
         names = [f"{key}.{name}" for name in STATISTICS[mode]]
         if not any(name.rpartition(".")[0] == key for name in tensors):
             warnings.warn(
@@ -178,9 +164,7 @@ def _statistics(
             continue
         missing = [name for name in names if name not in tensors]
         if missing:
-            raise CheckpointError(
-                f"{directory}: {registered} needs {', '.join(missing)} for {mode}; its file has none."
-            )
+            raise CheckpointError(f"{directory}: {registered} needs {', '.join(missing)} for {mode}; there is none.")
         first, second = (_broadcast(directory, name, tensors[name], kind, shape) for name in names)
         result[key] = Statistics(mode, first, second, eps)
     return result

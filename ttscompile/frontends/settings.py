@@ -52,6 +52,13 @@ class Settings:
             raise self.refusal(name, "a name")
         return value
 
+    def names(self, name: str) -> dict[str, str]:
+        """Names by name; none where the entry is absent."""
+        value = self.values.get(name, {})
+        if not isinstance(value, dict) or not all(isinstance(item, str) for item in value.values()):
+            raise self.refusal(name, "names by name")
+        return value
+
     def size(self, name: str, default: list[int] | None, most: int | None = None) -> tuple[int, int] | None:
         """Height and width of an image, ``most`` pixels each at most; None for null."""
         value = self.values.get(name, default)
