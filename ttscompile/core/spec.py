@@ -143,9 +143,9 @@ class ObservationSpec:
         dtype: numpy name of the dtype that callers must give.
         window: whether the first axis, where there are several, is time: the last To frames. A key without frames, such
             as an instruction, is what it is at the time of the call.
-        bounds: the smallest and largest value that there can be, each a number or one for each entry of the last axis;
-            None if that is not known. Integers outside them are refused: they are rows of an embedding. So are images
-            (``image``). Random observations are drawn within them. Kept as tuples.
+        bounds: the range of the values that random observations are drawn from, low and high, each a number or one for
+            each entry of the last axis; None if that is not known. Integers outside it are refused: they are rows of an
+            embedding. So are images (``image``). A vector may stray from it. Kept as tuples.
     """
 
     shape: tuple[Positive, ...]
