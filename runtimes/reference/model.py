@@ -23,7 +23,6 @@ from ttscompile.ir.evaluate import Evaluator
 from ttscompile.ir.graph import Graph, TensorType
 from ttscompile.ir.pieces import block_name
 from ttscompile.ir.program import Binding, Pieces, Program
-from ttscompile.runtimes.criterion import Criterion
 from ttscompile.runtimes.inpainting import Known
 
 from .reuse import Caches, Cell, RolloutCache, reuse, stream_axis
@@ -260,42 +259,6 @@ class ReferenceModel:
                 samples.append(carried.sample)
         kept = RolloutCache(caches.rollout, cache.written | (plan == Source.COMPUTE))
         return Rollout(carried.sample, kept, tuple(samples))
-
-    def decided_rollout(
-        self,
-        contexts: Contexts,
-        initial: Tensor,
-        noise: Tensor | None,
-        criterion: Criterion,
-        cache: RolloutCache | None = None,
-    ) -> tuple[Rollout, PlanArray]:
-        """One call whose plan is decided step by step; see ``criterion``.
-
-        Otherwise as ``rollout``, and never corrected: a correction belongs to a schedule.
-
-        Returns:
-            The result, and the plan that was decided, int8 ``[B, K, blocks]``: ``rollout`` with it gives the result.
-        """
-        cache = cache if cache is not None else self.empty_cache(contexts.streams)
-        decisions = criterion.begin(self.steps, self.blocks, contexts.streams)
-        plan = np.full((contexts.streams, self.steps, self.blocks), Source.COMPUTE, np.int8)
-        caches = Caches(rollout=dict(cache.residuals))
-        carried, axis = self.begin(initial), stream_axis(self._types[0])
-        for k in range(self.steps):
-            stream = self.stem(carried.sample, k, contexts)
-            feature = stream if criterion.always == 0 else torch.zeros_like(stream)
-            for b in range(self.blocks):
-                if b == criterion.always:
-                    plan[:, k] = decisions.decide(k, feature.movedim(axis, 0).detach().numpy())
-                gates = torch.nn.functional.one_hot(torch.from_numpy(plan[:, k, b].astype(np.int64)), 4).float()
-                cell = Cell(k, b, self.groups[b], plan[:, k, b], gates, self._types[b])
-                residual = reuse(cell, self._candidate(cell, stream, contexts), caches, write_gradients=False)
-                stream = stream + residual
-                if b < criterion.always:
-                    feature = feature + residual
-            prediction = self.tail(stream, k, contexts)
-            carried = self.advance(carried, prediction, None if noise is None else noise[k], k)
-        return Rollout(carried.sample, RolloutCache(caches.rollout, cache.written | (plan == Source.COMPUTE))), plan
 
     def _candidate(self, cell: Cell, stream: Tensor, contexts: Contexts) -> Tensor | None:
         """The computed residual of all streams, or of those that take it with zeros for the others; None if none do."""

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ttscompile.artifact.load import load_artifact
-from ttscompile.calibration.calls import Actions, prepare_calls, sample_calls
+from ttscompile.calibration.calls import prepare_calls, sample_calls
 from ttscompile.calibration.execute import Executor
-from ttscompile.calibration.strategies import Task
+from ttscompile.calibration.task import Task
 from ttscompile.trajectories import load_trajectories
 
 MakeTask = Callable[..., Task]
@@ -25,5 +25,4 @@ def make_task(
     chosen = sample_calls(recorded, episodes, calls, seed=0, repeats=100)
     prepared = prepare_calls(executor.model, spec, recorded, chosen, (0, episodes.start))
     prepared = prepared.answered(executor.run_dense(prepared))
-    kinds = tuple(block.kind for block in artifact.manifest.blocks)
-    return Task(executor, Actions(spec), prepared, budget, seed, artifact.pruner, kinds)
+    return Task.of(artifact, executor, prepared, budget, seed)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -14,7 +15,7 @@ from ..core.spec import PolicySpec
 from ..errors import CalibrationError
 from ..ir.graph import Graph
 from ..runtimes.reference.model import Contexts, ReferenceModel
-from ..trajectories.episodes import Episode
+from ..trajectories.episodes import Episode, load_trajectories
 
 IntArray = npt.NDArray[np.int64]
 FloatArray = npt.NDArray[np.float32]
@@ -61,6 +62,26 @@ def split_episodes(count: int, fraction: float, seed: int) -> Split:
         calibration=tuple(sorted(int(i) for i in order[held_out:])),
         validation=tuple(sorted(int(i) for i in order[:held_out])),
     )
+
+
+def load_episodes(
+    spec: PolicySpec,
+    trajectories: Sequence[str | os.PathLike[str]],
+    observation: Mapping[str, Sequence[str]] | None,
+) -> list[Episode]:
+    """The recorded episodes, as the policy observes them; see ``load_trajectories``.
+
+    Raises:
+        CalibrationError: there is only one.
+        TrajectoryError: the recordings do not fit the policy.
+    """
+    episodes = load_trajectories(trajectories, spec.observations, spec.chunk.stop - spec.chunk.start, observation)
+    if len(episodes) < 2:
+        raise CalibrationError(
+            "the trajectories hold one episode; expected at least two: a plan is judged on episodes that it was not"
+            " learned from. Record more; about sixteen are enough."
+        )
+    return episodes
 
 
 @dataclass(frozen=True)

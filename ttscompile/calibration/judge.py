@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ..artifact.load import Artifact
-from ..artifact.manifest import UNIFORM, Manifest
+from ..artifact.manifest import PRUNER, UNIFORM, Manifest
 from ..core.lattice import PlanArray, uniform_plan
 from ..errors import CalibrationFailedError
 from ..runtimes.base import pruner_plan
@@ -14,13 +14,11 @@ from .calls import LARGEST, Actions, Calls
 from .execute import Executor
 from .named import Named
 from .result import CalibrationResult, PlanScore
-from .strategies import Found
+from .strategies import FITTED, strategy_of
+from .task import Found
 
-PRUNED, SCHEDULE = "tts", "schedule"
-"""Names of plans in the artifact: the pruner's, and the best that does not depend on the observation."""
-
-BASELINE = "interval"
-"""The strategy that is no better than the uniform schedule, and need not be."""
+SCHEDULE = "schedule"
+"""Name in the artifact of the best plan that does not depend on the observation."""
 
 BETTER = 0.9
 """A plan has to bring the error below this share of the uniform schedule's."""
@@ -53,14 +51,14 @@ def judge(
     scores = {}
     corrected, plain = executor.corrected(found.correction), executor.corrected(None)
     judged = [(SCHEDULE, found.schedule, corrected), (UNIFORM, uniform_of(artifact, budget), plain)]
-    judged += [(name, one.plan, executor.corrected(one.correction)) for name, one in named.plans.items()]
+    judged += [(name, one.schedule, executor.corrected(one.correction)) for name, one in named.plans.items()]
     for name, plan, runs in judged:
         errors = actions.errors(runs.run(plan, calls), calls.targets, units=True)
         scores[name] = PlanScore.of(errors, plan[None], manifest.flops, pruned=False)
     if found.pruner is not None:
         plans = pruner_plan(executor.logits(calls, found.pruner))
         errors = actions.errors(corrected.run(plans, calls), calls.targets, units=True)
-        scores[PRUNED] = PlanScore.of(errors, plans, manifest.flops, pruned=True)
+        scores[PRUNER] = PlanScore.of(errors, plans, manifest.flops, pruned=True)
     return scores
 
 
@@ -73,11 +71,11 @@ def default_of(scores: Mapping[str, PlanScore], goal: Goal, cells: int, manifest
         cells: what it comes to.
         manifest: of the artifact.
     """
-    pruned = scores.get(PRUNED)
+    pruned = scores.get(PRUNER)
     if pruned is None or pruned.sparsity < goal.sparsity(cells, manifest) - 1e-9:
         return SCHEDULE
     saves = goal.kind != FLOPS or pruned.flops_saved >= goal.value - 1e-9
-    return PRUNED if saves and pruned.error <= scores[SCHEDULE].error else SCHEDULE
+    return PRUNER if saves and pruned.error <= scores[SCHEDULE].error else SCHEDULE
 
 
 def require_success(result: CalibrationResult, goal: Goal) -> None:
@@ -103,7 +101,7 @@ def require_success(result: CalibrationResult, goal: Goal) -> None:
         raise CalibrationFailedError(
             f"{what} saves {chosen.flops_saved:.4f} of the FLOPs of a dense call; the target is {goal.value:g}: its"
             " blocks cost more than the average. The artifact is as it was. Raise the target a little, or take strategy"
-            " 'tts', which computes whole steps."
+            f" {' or '.join(map(repr, FITTED))}, which computes whole steps."
         )
     if goal.kind == ERROR and not chosen.error <= goal.value:
         raise CalibrationFailedError(
@@ -111,7 +109,7 @@ def require_success(result: CalibrationResult, goal: Goal) -> None:
             f" validation calls; at most {goal.value:g} was asked for. The artifact is as it was. Allow a larger error,"
             " more time, or calibrate with more episodes."
         )
-    if result.strategy != BASELINE and not chosen.error < BETTER * baseline.error:
+    if not strategy_of(result.strategy).baseline and not chosen.error < BETTER * baseline.error:
         raise CalibrationFailedError(
             f"{what} is no better than the uniform schedule: on the validation calls its actions are {chosen.error:.4g}"
             f" off on average, the uniform schedule's {baseline.error:.4g} (expected below {BETTER:.0%} of that). The"

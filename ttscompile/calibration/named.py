@@ -8,11 +8,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from ..core.correction import Correction
-from ..core.lattice import PlanArray
-from .families import Families
-from .strategies import Task
-from .whole_steps import WholeSteps
+from .crowded import CrowdedSchedules
+from .strategies import Strategy
+from .task import Found, Task
 
 SAFE, FAST = "safe", "fast"
 
@@ -21,30 +19,15 @@ SHARE = 0.2
 
 
 @dataclass(frozen=True)
-class NamedPlan:
-    """A plan beside the target.
-
-    Attributes:
-        steps: that it computes.
-        plan: int8 ``[K, blocks]``.
-        correction: None where it is better without.
-    """
-
-    steps: tuple[int, ...]
-    plan: PlanArray
-    correction: Correction | None
-
-
-@dataclass(frozen=True)
 class Named:
     """Plans beside the target.
 
     Attributes:
-        plans: by name.
+        plans: by name; the steps that a plan computes are in its notes.
         skipped: why a name has no plan.
     """
 
-    plans: Mapping[str, NamedPlan] = field(default_factory=dict)
+    plans: Mapping[str, Found] = field(default_factory=dict)
     skipped: Mapping[str, str] = field(default_factory=dict)
 
     def without(self, name: str, reason: str) -> Named:
@@ -53,18 +36,17 @@ class Named:
         return Named(kept, {**self.skipped, name: reason})
 
 
-def named_plans(families: Families, whole: WholeSteps, task: Task, strategy: str, cells: int) -> Named:
+def named_plans(crowded: CrowdedSchedules, task: Task, strategy: Strategy, cells: int) -> Named:
     """Those of ``safe`` and ``fast`` that can be made.
 
     Args:
-        families: compares schedules.
-        whole: makes them.
+        crowded: compares schedules.
         task: with the calls that corrections are fitted on.
-        strategy: that found the target's plan; only ``tts`` has corrections.
+        strategy: that found the target's plan.
         cells: computed by the target's plan.
     """
-    if strategy != "tts":
-        reason = f"strategy {strategy!r} fits no correction"
+    if not strategy.fits_correction:
+        reason = f"strategy {strategy.name!r} fits no correction"
         return Named(skipped={SAFE: reason, FAST: reason})
     model = task.executor.model
     target = max(1, cells // model.blocks)
@@ -78,11 +60,11 @@ def named_plans(families: Families, whole: WholeSteps, task: Task, strategy: str
         counts[FAST] = max(2, target // 2)
     else:
         skipped[FAST] = f"the target computes {target} whole step{'s' * (target > 1)}: half of that is too little"
-    plans: dict[str, NamedPlan] = {}
+    plans: dict[str, Found] = {}
     for name, count in counts.items():
-        best = families.best(count, f"plan {name}")
+        best = crowded.best(count, f"plan {name}")
         if best is None:
             skipped[name] = "the time limit left none for it"
         else:
-            plans[name] = NamedPlan(best.steps, whole.plan(best.steps), whole.correction(best.steps))
+            plans[name] = task.whole_steps(best.steps)
     return Named(plans, skipped)

@@ -1,6 +1,6 @@
 """How actions respond to what each cell of a plan adds: one sparse rollout with its gradient, and all blocks beside it.
 
-``linear`` and ``strategies.slopes`` predict from this what another plan would do, without running it.
+``pruner.linear`` and ``published.slopes`` predict from this what another plan would do, without running it.
 """
 
 from __future__ import annotations
