@@ -11,8 +11,8 @@ import numpy as np
 from ..core.correction import Correction
 from ..core.lattice import PlanArray, whole_steps_plan
 from .calls import Actions, Calls
-from .correction import fit_correction
 from .execute import Executor
+from .fit_correction import fit_correction
 
 FITTED, COMPARED = 384, 128
 """Calls on which a candidate's correction is fitted, and others on which its error is measured; fewer if there are

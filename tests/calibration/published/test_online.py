@@ -34,7 +34,7 @@ def criterion_of(found: Found) -> Criterion:
 
 
 def decided_by_the_reference(model: ReferenceModel, calls: Calls, rule: Criterion) -> tuple[torch.Tensor, PlanArray]:
-    """One call of each stream by the reference alone: every step is a rollout of the plan that is decided so far.
+    """One call of each stream by the reference alone: every step is a call with the plan that is decided so far.
 
     Returns:
         The denoised samples ``[N, T, D]``, and the plans ``[N, K, blocks]``.
@@ -44,14 +44,14 @@ def decided_by_the_reference(model: ReferenceModel, calls: Calls, rule: Criterio
     axis = model.stem(calls.initial, 0, calls.contexts).shape.index(calls.count)
     with torch.no_grad():
         for k in range(model.steps):
-            known = model.rollout(calls.contexts, calls.initial, calls.noise, plan, keep_samples=True).samples
+            known = model.denoise(calls.contexts, calls.initial, calls.noise, plan).samples
             stream = model.stem(known[k - 1] if k else calls.initial, k, calls.contexts)
             feature = stream if rule.always == 0 else torch.zeros_like(stream)
             for b in range(rule.always):
                 residual = model.block(b, k, stream, calls.contexts)
                 stream, feature = stream + residual, feature + residual
             plan[:, k] = decisions.decide(k, feature.movedim(axis, 0).numpy())
-        return model.rollout(calls.contexts, calls.initial, calls.noise, plan).sample, plan
+        return model.denoise(calls.contexts, calls.initial, calls.noise, plan).sample, plan
 
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
@@ -73,7 +73,7 @@ def test_the_reference_decides_the_same(make_task: MakeTask, rule: Criterion) ->
     sample, plans = decided_by_the_reference(model, calls, rule)
     np.testing.assert_array_equal(plans, decided.plans)
     torch.testing.assert_close(sample, decided.samples, rtol=0, atol=2e-6)
-    given = model.rollout(calls.contexts, calls.initial, calls.noise, plans)
+    given = model.denoise(calls.contexts, calls.initial, calls.noise, plans)
     torch.testing.assert_close(sample, given.sample, rtol=0, atol=0)
     np.testing.assert_array_equal(given.cache.written, plans == Source.COMPUTE)
     assert given.cache.residuals.keys() == {(int(k), int(b)) for _, k, b in np.argwhere(plans == Source.COMPUTE)}
@@ -150,7 +150,7 @@ def test_changes_of_dense_calls(make_task: MakeTask) -> None:
     before, after = dense_changes(task.executor, calls)
     assert before.shape == after.shape == (9 * 2,)
     model, dense = task.executor.model, np.zeros((10, 6), np.int8)
-    samples = model.rollout(calls.contexts, calls.initial, calls.noise, dense, keep_samples=True).samples
+    samples = model.denoise(calls.contexts, calls.initial, calls.noise, dense).samples
     stems = [model.stem(s, k, calls.contexts) for k, s in ((3, samples[2]), (4, samples[3]))]
     expected = (stems[1] - stems[0]).abs().mean((1, 2)) / stems[0].abs().mean((1, 2))
     np.testing.assert_allclose(before.reshape(9, 2)[3], expected.numpy(), rtol=1e-5)

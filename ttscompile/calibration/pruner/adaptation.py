@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ...core.lattice import PlanArray, Source
-from ...runtimes.base import pruner_plan
+from ...runtimes.settle import pruner_plan
 from ..task import Array, Task
 from .head import capacity, has_head, head_features, head_weights
 from .linear import Matrix, linearise
