@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from ttscompile.artifact.load import load_artifact
@@ -24,5 +25,5 @@ def make_task(
     recorded = load_trajectories([recording], spec.observations, 4)
     chosen = sample_calls(recorded, episodes, calls, seed=0, repeats=100)
     prepared = prepare_calls(executor.model, spec, recorded, chosen, (0, episodes.start))
-    prepared = prepared.answered(executor.run_dense(prepared))
+    prepared = replace(prepared, path=executor.run_dense(prepared))
     return Task.of(artifact, executor, prepared, budget, seed)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +14,7 @@ from torch import Tensor
 from ..core.spec import PolicySpec
 from ..errors import CalibrationError
 from ..ir.graph import Graph
+from ..runtimes.random_calls import normalized
 from ..runtimes.reference.model import Contexts, ReferenceModel
 from ..trajectories.episodes import Episode, load_trajectories
 
@@ -92,16 +93,14 @@ class Calls:
         contexts: what the loop reads beside the stream.
         initial: the sample at step 0, ``[N, T, D]``.
         noise: the draw used at each step, ``[K, N, T, D]``; None if the sampler is deterministic.
-        targets: the denoised sample of the dense policy with the same noise, ``[N, T, D]``; empty before it is known.
         episodes: number of the episode that each call is from, ``[N]``.
-        path: the sample of the dense policy after each step, ``[N, K, T, D]``; its last are the targets. None before
-            it is known.
+        path: the sample of the dense policy after each step with the same noise, ``[N, K, T, D]``; None before it is
+            known.
     """
 
     contexts: Contexts
     initial: Tensor
     noise: Tensor | None
-    targets: Tensor
     episodes: IntArray
     path: Tensor | None = None
 
@@ -110,9 +109,11 @@ class Calls:
         """N."""
         return len(self.initial)
 
-    def answered(self, path: Tensor) -> Calls:
-        """These calls with what the dense policy makes of them, ``[N, K, T, D]``."""
-        return replace(self, targets=path[:, -1], path=path)
+    @property
+    def targets(self) -> Tensor:
+        """The denoised sample of the dense policy, ``[N, T, D]``."""
+        assert self.path is not None
+        return self.path[:, -1]
 
 
 def sample_calls(
@@ -158,14 +159,10 @@ def prepare_calls(
     noise = None
     if spec.sampler.stochastic:
         noise = torch.from_numpy(draw.standard_normal((spec.sampler.steps, *shape), dtype=np.float32))
-    normalized = {}
-    for key, one in spec.observations.items():
-        array = np.stack([episodes[n].observations[key][row] for n, row in chosen])
-        normalized[key] = torch.from_numpy(array if one.normalizer is None else one.normalizer.normalize(array))
+    observed = {key: np.stack([episodes[n].observations[key][row] for n, row in chosen]) for key in spec.observations}
     with torch.no_grad():
-        contexts = model.prologue(normalized)
-    numbers = np.array([n for n, _ in chosen], np.int64)
-    return Calls(contexts, initial, noise, torch.empty(0, *spec.sample), numbers)
+        contexts = model.prologue({key: torch.from_numpy(one) for key, one in normalized(spec, observed).items()})
+    return Calls(contexts, initial, noise, np.array([n for n, _ in chosen], np.int64))
 
 
 class Selector:
@@ -186,7 +183,6 @@ class Selector:
             contexts=Contexts(len(index), self._take(contexts.condition, index), steps),
             initial=calls.initial[index],
             noise=None if calls.noise is None else calls.noise[:, index],
-            targets=calls.targets[index] if len(calls.targets) else calls.targets,
             episodes=calls.episodes[index.numpy()],
             path=None if calls.path is None else calls.path[index],
         )

@@ -150,7 +150,7 @@ def _task(
         paths.append(found)
         progress("dense calls to learn from", sum(map(len, paths)), calls.count)
     # Without constants of a pruner nobody spends time on plans that depend on the observation: schedules are compared.
-    return replace(Task.of(artifact, executor, calls.answered(torch.cat(paths)), 0, seed), pruner={})
+    return replace(Task.of(artifact, executor, replace(calls, path=torch.cat(paths)), 0, seed), pruner={})
 
 
 def _enter(
@@ -158,8 +158,7 @@ def _enter(
 ) -> list[Entrant]:
     """Everything that takes part: the artifact's own plans, those of strategies, and those of other artifacts."""
     named = {f"{strategy} {sparsity:g}": one for (strategy, sparsity), one in found.items()}
-    corrections = {name: one.correction for name, one in named.items() if one.correction is not None}
-    whole = with_plans(artifact, {name: one.schedule for name, one in named.items()}, corrections)
+    whole = with_plans(artifact, named)
     policy = CompiledPolicy(whole, open_runtime(whole, "onnxruntime", threads))
     entrants = [Entrant("this artifact", name, policy, name, True) for name in (DENSE, *artifact.manifest.plans)]
     for strategy, sparsity in found:

@@ -10,9 +10,8 @@ from ..core.lattice import PlanArray, uniform_plan
 from ..errors import CalibrationFailedError
 from ..runtimes.settle import pruner_plan
 from .budget import ERROR, FLOPS, Goal
-from .calls import LARGEST, Actions, Calls
+from .calls import LARGEST, Actions, Calls, FloatArray
 from .execute import Executor
-from .named import Named
 from .result import CalibrationResult, PlanScore
 from .strategies import FITTED, strategy_of
 from .task import Found
@@ -24,41 +23,37 @@ BETTER = 0.9
 """A plan has to bring the error below this share of the uniform schedule's."""
 
 
-def uniform_of(artifact: Artifact, budget: int) -> PlanArray:
+def uniform_of(manifest: Manifest, budget: int) -> Found:
     """The baseline: whole steps, evenly spaced; the last cells of the budget are rounded up to one, in its favour."""
-    manifest = artifact.manifest
     blocks = len(manifest.blocks)
-    return uniform_plan(manifest.steps, blocks, -(-budget // blocks))
+    return Found(uniform_plan(manifest.steps, blocks, -(-budget // blocks)))
 
 
-def judge(
-    artifact: Artifact, executor: Executor, found: Found, named: Named, calls: Calls, budget: int
-) -> dict[str, PlanScore]:
-    """Scores of the plans that a strategy found, of those beside it, and of the baseline.
+def judge(artifact: Artifact, executor: Executor, plans: Mapping[str, Found], calls: Calls) -> dict[str, PlanScore]:
+    """Scores of plans, and of those of the pruner that belongs to the one that is called ``schedule``.
 
     Args:
         artifact: the policy.
-        executor: of the policy.
-        found: by the strategy.
-        named: plans beside the target.
-        calls: of episodes that it did not learn from, with targets.
-        budget: computed cells.
+        executor: runs the policy.
+        plans: by name.
+        calls: of episodes that nothing was learned from, with targets.
 
     Returns:
         By the name of the plan.
     """
-    manifest, actions = artifact.manifest, Actions(artifact.manifest.spec)
-    scores = {}
-    corrected, plain = executor.corrected(found.correction), executor.corrected(None)
-    judged = [(SCHEDULE, found.schedule, corrected), (UNIFORM, uniform_of(artifact, budget), plain)]
-    judged += [(name, one.schedule, executor.corrected(one.correction)) for name, one in named.plans.items()]
-    for name, plan, runs in judged:
-        errors = actions.errors(runs.run(plan, calls), calls.targets, units=True)
-        scores[name] = PlanScore.of(errors, plan[None], manifest.flops, pruned=False)
+    flops, actions = artifact.manifest.flops, Actions(artifact.manifest.spec)
+
+    def errors(found: Found, plan: PlanArray) -> FloatArray:
+        return actions.errors(executor.corrected(found.correction).run(plan, calls), calls.targets, units=True)
+
+    scores = {
+        name: PlanScore.of(errors(found, found.schedule), found.schedule[None], flops, pruned=False)
+        for name, found in plans.items()
+    }
+    found = plans[SCHEDULE]
     if found.pruner is not None:
-        plans = pruner_plan(executor.logits(calls, found.pruner))
-        errors = actions.errors(corrected.run(plans, calls), calls.targets, units=True)
-        scores[PRUNER] = PlanScore.of(errors, plans, manifest.flops, pruned=True)
+        made = pruner_plan(executor.logits(calls, found.pruner))
+        scores[PRUNER] = PlanScore.of(errors(found, made), made, flops, pruned=True)
     return scores
 
 

@@ -5,9 +5,6 @@ Both are whole steps, the best of the crowded family, with a correction fitted o
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-
 from .crowded import CrowdedSchedules
 from .strategies import Strategy
 from .task import Found, Task
@@ -18,25 +15,9 @@ SHARE = 0.2
 """Of the time that is kept from the search, for these plans."""
 
 
-@dataclass(frozen=True)
-class Named:
-    """Plans beside the target.
-
-    Attributes:
-        plans: by name; the steps that a plan computes are in its notes.
-        skipped: why a name has no plan.
-    """
-
-    plans: Mapping[str, Found] = field(default_factory=dict)
-    skipped: Mapping[str, str] = field(default_factory=dict)
-
-    def without(self, name: str, reason: str) -> Named:
-        """The same without one of the plans, and why."""
-        kept = {other: plan for other, plan in self.plans.items() if other != name}
-        return Named(kept, {**self.skipped, name: reason})
-
-
-def named_plans(crowded: CrowdedSchedules, task: Task, strategy: Strategy, cells: int) -> Named:
+def named_plans(
+    crowded: CrowdedSchedules, task: Task, strategy: Strategy, cells: int
+) -> tuple[dict[str, Found], dict[str, str]]:
     """Those of ``safe`` and ``fast`` that can be made.
 
     Args:
@@ -44,10 +25,13 @@ def named_plans(crowded: CrowdedSchedules, task: Task, strategy: Strategy, cells
         task: with the calls that corrections are fitted on.
         strategy: that found the target's plan.
         cells: computed by the target's plan.
+
+    Returns:
+        Plans by name, with the computed steps in their notes; and by name why there is no plan.
     """
     if not strategy.fits_correction:
         reason = f"strategy {strategy.name!r} fits no correction"
-        return Named(skipped={SAFE: reason, FAST: reason})
+        return {}, {SAFE: reason, FAST: reason}
     model = task.executor.model
     target = max(1, cells // model.blocks)
     skipped: dict[str, str] = {}
@@ -67,4 +51,4 @@ def named_plans(crowded: CrowdedSchedules, task: Task, strategy: Strategy, cells
             skipped[name] = "the time limit left none for it"
         else:
             plans[name] = task.whole_steps(best.steps)
-    return Named(plans, skipped)
+    return plans, skipped

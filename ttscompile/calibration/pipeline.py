@@ -8,6 +8,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from .crowded import CrowdedSchedules, budget_of_error
 from .execute import Executor
 from .judge import SCHEDULE, default_of, judge, require_success, uniform_of
 from .latency import measure_budget
-from .named import SAFE, SHARE, Named, named_plans
+from .named import FAST, SAFE, SHARE, named_plans
 from .precision_error import precision_record
 from .progress import Bar
 from .pruner.head import has_head
@@ -166,11 +167,12 @@ def calibrate(
         found, intervals, stopped = _search(open_search(strategy, task), state, task.clock, bar, max_intervals)
         if goal.kind == ERROR:
             found, budget = _relax(artifact, crowded, task, found, budget, sets["validation"])
-        named = named_plans(crowded, task, chosen, budget.cells)
-    scores = judge(artifact, executor, found, named, sets["validation"], budget.cells)
+        named, skipped = named_plans(crowded, task, chosen, budget.cells)
+    plans = {SCHEDULE: found, UNIFORM: uniform_of(artifact.manifest, budget.cells), **named}
+    scores = judge(artifact, executor, plans, sets["validation"])
     if SAFE in scores and not scores[SAFE].error < scores[SCHEDULE].error:
-        error = scores.pop(SAFE).error
-        named = named.without(SAFE, f"{error:.4g} off, no safer than {SCHEDULE}: its search was cut short")
+        del plans[SAFE]
+        skipped[SAFE] = f"{scores.pop(SAFE).error:.4g} off, no safer than {SCHEDULE}: its search was cut short"
     result = CalibrationResult(
         strategy=strategy,
         seed=seed,
@@ -178,7 +180,7 @@ def calibrate(
         budget=budget.record(),
         default_plan=default_of(scores, goal, budget.cells, artifact.manifest),
         plans=scores,
-        skipped=named.skipped,
+        skipped=skipped,
         episodes={"calibration": split.calibration, "validation": split.validation},
         calls={name: calls.count for name, calls in sets.items()},
         intervals=intervals,
@@ -187,27 +189,26 @@ def calibrate(
     )
     require_success(result, goal)
     precision = precision_record(artifact, episodes, split.validation, SCHEDULE, found.schedule, found.correction, seed)
-    _write(Path(path), artifact, result, found, named, {**found.notes, **precision})
+    _write(Path(path), artifact, result, plans, precision)
     state.remove()
     return result
 
 
 def _write(
-    path: Path, artifact: Artifact, result: CalibrationResult, found: Found, named: Named, notes: dict[str, object]
+    path: Path, artifact: Artifact, result: CalibrationResult, plans: Mapping[str, Found], precision: Mapping[str, Any]
 ) -> None:
     """Put the plans into the artifact."""
-    corrections = {name: one.correction for name, one in named.plans.items() if one.correction is not None}
-    if found.correction is not None:
-        corrections[SCHEDULE] = found.correction
-        if found.pruner is not None:
-            corrections[PRUNER] = found.correction
-    uniform = uniform_of(artifact, int(result.budget["cells"]))
+    found = plans[SCHEDULE]
+    corrections = {name: one.correction for name, one in plans.items() if one.correction is not None}
+    if found.pruner is not None and found.correction is not None:
+        corrections[PRUNER] = found.correction
+    steps = {name: one.notes["steps"] for name, one in plans.items() if name in (SAFE, FAST)}
     update_calibration(
         path,
         found.pruner,
-        {SCHEDULE: found.schedule, UNIFORM: uniform, **{name: one.schedule for name, one in named.plans.items()}},
+        {name: one.schedule for name, one in plans.items()},
         result.default_plan,
-        {**result.record(), **notes, "named_steps": {name: one.notes["steps"] for name, one in named.plans.items()}},
+        {**result.record(), **found.notes, **precision, "named_steps": steps},
         corrections=corrections,
         model_identity=artifact.manifest.model_identity,
         golden=record_plans,
@@ -279,7 +280,7 @@ def _relax(
     steps, blocks = artifact.manifest.steps, len(artifact.manifest.blocks)
 
     def misses(one: Found, cells: int) -> bool:
-        scores = judge(artifact, task.executor, one, Named(), held_out, cells)
+        scores = judge(artifact, task.executor, {SCHEDULE: one}, held_out)
         return not scores[default_of(scores, budget.goal, cells, artifact.manifest)].error <= budget.goal.value
 
     while misses(found, budget.cells):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -59,7 +60,7 @@ def with_targets(
     state.progress[key] = len(path)
     if len(path) < calls.count:
         calls = executor.selector.calls(calls, np.arange(len(path)))
-    return calls.answered(path)
+    return replace(calls, path=path)
 
 
 def dense_rounds(executor: Executor, calls: Calls, begin: int = 0) -> Iterator[torch.Tensor]:

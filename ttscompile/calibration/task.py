@@ -26,15 +26,15 @@ class Found:
 
     Attributes:
         schedule: int8 ``[K, blocks]``, within the budget.
-        pruner: all constants of the pruner, by name, for plans that depend on the observation; None for none.
         notes: what is worth keeping about how it was found; JSON.
         correction: of the sampler's steps, for the schedule and the pruner's plans; None for none.
+        pruner: all constants of the pruner, by name, for plans that depend on the observation; None for none.
     """
 
     schedule: PlanArray
-    pruner: Mapping[str, Array] | None
-    notes: Mapping[str, Any]
+    notes: Mapping[str, Any] = field(default_factory=dict)
     correction: Correction | None = None
+    pruner: Mapping[str, Array] | None = None
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class Task:
 
     def whole_steps(self, steps: Sequence[int], **notes: Any) -> Found:
         """The schedule that computes these steps, with its correction; they are added to the notes."""
-        return Found(self.whole.plan(steps), None, {"steps": list(steps), **notes}, self.whole.correction(steps))
+        return Found(self.whole.plan(steps), {"steps": list(steps), **notes}, self.whole.correction(steps))
 
 
 class Search(Protocol):

@@ -102,7 +102,7 @@ class Tts:
         self.close()
         assert self._adaptation is not None
         notes = {"steps": list(self._steps), "switches": self._adaptation.switches}
-        return Found(self.plan, self._adaptation.pruner, notes, correction=self._correction)
+        return Found(self.plan, notes, self._correction, self._adaptation.pruner)
 
     def _try(self, candidates: list[tuple[int, ...] | None]) -> None:
         """Take the best of the candidates if it is better than the schedule so far."""

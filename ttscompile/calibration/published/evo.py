@@ -81,7 +81,7 @@ class Evo(NothingAfter):
 
     def found(self) -> Found:
         """The best schedule, and no pruner."""
-        return Found(self.plan, None, {"generations": self._generation})
+        return Found(self.plan, {"generations": self._generation})
 
     def _first(self) -> BoolArray:
         """Whole-step plans, and random ones."""

@@ -78,7 +78,7 @@ class Fixed(NothingAfter):
 
     def found(self) -> Found:
         """The schedule, and no pruner."""
-        return Found(self._chosen.plan, None, self._chosen.notes)
+        return Found(self._chosen.plan, self._chosen.notes)
 
 
 def fixed(choose: Callable[[Task], Chosen]) -> Callable[[Task], Fixed]:

@@ -108,7 +108,7 @@ class Gates(NothingAfter):
 
     def found(self) -> Found:
         """The schedule, and no pruner."""
-        return Found(self.plan, None, {"gradient_steps": self._interval})
+        return Found(self.plan, {"gradient_steps": self._interval})
 
     def _step(self, gradient: npt.NDArray[np.float64], interval: int) -> None:
         """Adam, with one size for all cells: a cell that hardly matters must not move as far as one that does."""
