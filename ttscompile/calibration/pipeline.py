@@ -28,7 +28,7 @@ from .crowded import CrowdedSchedules, budget_of_error
 from .execute import Executor
 from .judge import SCHEDULE, default_of, judge, require_success, uniform_of
 from .latency import measure_budget
-from .named import FAST, SAFE, SHARE, named_plans
+from .named import SAFE, SHARE, named_plans
 from .precision_error import precision_record
 from .progress import Bar
 from .pruner.head import has_head
@@ -202,7 +202,7 @@ def _write(
     corrections = {name: one.correction for name, one in plans.items() if one.correction is not None}
     if found.pruner is not None and found.correction is not None:
         corrections[PRUNER] = found.correction
-    steps = {name: one.notes["steps"] for name, one in plans.items() if name in (SAFE, FAST)}
+    steps = {name: one.notes["steps"] for name, one in plans.items() if name not in (SCHEDULE, UNIFORM)}
     update_calibration(
         path,
         found.pruner,

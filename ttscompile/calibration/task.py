@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -29,12 +30,14 @@ class Found:
         notes: what is worth keeping about how it was found; JSON.
         correction: of the sampler's steps, for the schedule and the pruner's plans; None for none.
         pruner: all constants of the pruner, by name, for plans that depend on the observation; None for none.
+        error: of the schedule on calls to learn from, normalised; NaN where it was not measured.
     """
 
     schedule: PlanArray
     notes: Mapping[str, Any] = field(default_factory=dict)
     correction: Correction | None = None
     pruner: Mapping[str, Array] | None = None
+    error: float = math.nan
 
 
 @dataclass(frozen=True)

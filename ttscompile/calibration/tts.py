@@ -14,7 +14,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..core.correction import Correction
 from ..core.lattice import PlanArray
 from .crowded import crowded_family
 from .pruner.adaptation import Adaptation
@@ -46,7 +45,7 @@ class Tts:
         self.closing = Adaptation.INTERVALS if has_head(task.pruner) else 0
         self.intervals = len(self._crowded) + len(self._moves) + self.closing
         self._adaptation: Adaptation | None = None
-        self._correction: Correction | None = None
+        self._settled: Found | None = None
 
     @property
     def plan(self) -> PlanArray:
@@ -66,10 +65,9 @@ class Tts:
     def close(self) -> None:
         """Settle the schedule, with a correction from all calls."""
         if self._adaptation is None:
-            task = self._task
-            self._correction = self._whole.correction(self._steps)
-            corrected = replace(task, executor=task.executor.corrected(self._correction))
-            self._adaptation = Adaptation(corrected, self.plan)
+            task, self._settled = self._task, self._task.whole_steps(self._steps)
+            corrected = replace(task, executor=task.executor.corrected(self._settled.correction))
+            self._adaptation = Adaptation(corrected, self._settled.schedule)
 
     def advance(self, interval: int) -> None:
         """Try a schedule of the family, or two moves of a step; or adapt the plan to observations."""
@@ -101,8 +99,9 @@ class Tts:
         """The schedule with its correction, and the pruner if plans that depend on the observation were better."""
         self.close()
         assert self._adaptation is not None
-        notes = {"steps": list(self._steps), "switches": self._adaptation.switches}
-        return Found(self.plan, notes, self._correction, self._adaptation.pruner)
+        assert self._settled is not None
+        notes = {**self._settled.notes, "switches": self._adaptation.switches}
+        return replace(self._settled, notes=notes, pruner=self._adaptation.pruner)
 
     def _try(self, candidates: list[tuple[int, ...] | None]) -> None:
         """Take the best of the candidates if it is better than the schedule so far."""

@@ -25,8 +25,8 @@ from torch import Tensor
 from ...core.lattice import BoolArray, PlanArray, Source
 from ..calls import Calls
 from ..execute import Executor
-from ..task import Task
-from .fixed import Chosen, best_of, fixed
+from ..task import Found, Task
+from .fixed import best_of, fixed
 
 Scores = npt.NDArray[np.float64]
 
@@ -40,7 +40,7 @@ FEED_FORWARD = "feed_forward"
 
 
 @fixed
-def bac(task: Task) -> Chosen:
+def bac(task: Task) -> Found:
     """The schedule of the scheduler and the union."""
     model = task.executor.model
     calls, select = task.some_calls(DENSE_CALLS), task.executor.selector.calls

@@ -11,9 +11,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ...errors import CalibrationError
-from ..task import Task
+from ..task import Found, Task
 from .criterion import Criterion
-from .fixed import Chosen, fixed
+from .fixed import fixed
 from .online import online
 
 FIRST = (1, 2, 3)
@@ -26,7 +26,7 @@ START = 0.5
 
 
 @fixed
-def dbcache(task: Task) -> Chosen:
+def dbcache(task: Task) -> Found:
     """The best of ``proposals``, with the threshold for the budget."""
     return online(task, proposals(task))
 

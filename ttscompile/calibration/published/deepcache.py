@@ -8,8 +8,8 @@ blocks are the shallow branch of a U-Net; in a chain of blocks they are the firs
 from __future__ import annotations
 
 from ...core.lattice import PlanArray, Source, dense_plan, uniform_plan
-from ..task import Task
-from .fixed import Chosen, best_of, fixed
+from ..task import Found, Task
+from .fixed import best_of, fixed
 
 
 def edge_plan(steps: int, blocks: int, full_steps: int, edge: int) -> PlanArray:
@@ -39,7 +39,7 @@ def candidates(steps: int, blocks: int, budget: int) -> list[tuple[PlanArray, di
 
 
 @fixed
-def deepcache(task: Task) -> Chosen:
+def deepcache(task: Task) -> Found:
     """The best of ``candidates``."""
     model = task.executor.model
     return best_of(task, candidates(model.steps, model.blocks, task.budget))

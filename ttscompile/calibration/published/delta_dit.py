@@ -9,8 +9,8 @@ ones. How many blocks stay fresh, and where late begins, is left to the user; he
 from __future__ import annotations
 
 from ...core.lattice import PlanArray, Source, uniform_plan
-from ..task import Task
-from .fixed import Chosen, best_of, fixed
+from ..task import Found, Task
+from .fixed import best_of, fixed
 
 BOUNDARIES = (0.25, 0.5, 0.75)
 """Share of the steps after which it is the front blocks that are reused."""
@@ -44,7 +44,7 @@ def candidates(steps: int, blocks: int, budget: int) -> list[tuple[PlanArray, di
 
 
 @fixed
-def delta_dit(task: Task) -> Chosen:
+def delta_dit(task: Task) -> Found:
     """The best of ``candidates``."""
     model = task.executor.model
     return best_of(task, candidates(model.steps, model.blocks, task.budget))

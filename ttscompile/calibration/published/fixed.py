@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import wraps
 from typing import Any
 
@@ -15,21 +14,6 @@ from ..task import Array, Found, NothingAfter, Task
 
 COMPARED = 16
 """Calls on which candidates are compared; fewer if there are fewer."""
-
-
-@dataclass(frozen=True)
-class Chosen:
-    """A plan, and how it was chosen.
-
-    Attributes:
-        plan: ``[K, blocks]``.
-        error: of the calls that it was compared on, normalised.
-        notes: its parameters; JSON.
-    """
-
-    plan: PlanArray
-    error: float
-    notes: Mapping[str, Any]
 
 
 class Fixed(NothingAfter):
@@ -45,43 +29,43 @@ class Fixed(NothingAfter):
 
     intervals = 1
 
-    def __init__(self, task: Task, choose: Callable[[Task], Chosen]) -> None:
+    def __init__(self, task: Task, choose: Callable[[Task], Found]) -> None:
         self._task, self._choose = task, choose
         model = task.executor.model
-        self._chosen = Chosen(dense_plan(model.steps, model.blocks), float("nan"), {})
+        self._found = Found(dense_plan(model.steps, model.blocks))
         self.done = False
 
     @property
     def loss(self) -> float:
         """Error of the plan."""
-        return self._chosen.error
+        return self._found.error
 
     @property
     def plan(self) -> PlanArray:
         """The schedule; dense before it was made."""
-        return self._chosen.plan
+        return self._found.schedule
 
     def advance(self, interval: int) -> None:
         """Make the plan."""
-        self._chosen, self.done = self._choose(self._task), True
+        self._found, self.done = self._choose(self._task), True
 
     def state(self) -> dict[str, Array]:
         """The plan."""
-        notes = np.frombuffer(json.dumps(self._chosen.notes, sort_keys=True).encode(), np.uint8)
-        return {"plan": self._chosen.plan, "error": np.array(self._chosen.error), "notes": notes}
+        notes = np.frombuffer(json.dumps(self._found.notes, sort_keys=True).encode(), np.uint8)
+        return {"plan": self.plan, "error": np.array(self.loss), "notes": notes}
 
     def restore(self, state: Mapping[str, Array]) -> None:
         """Go back to where ``state`` was taken."""
         notes = json.loads(state["notes"].tobytes())
-        self._chosen = Chosen(np.array(state["plan"], np.int8), float(state["error"]), notes)
+        self._found = Found(np.array(state["plan"], np.int8), notes, error=float(state["error"]))
         self.done = True
 
     def found(self) -> Found:
         """The schedule, and no pruner."""
-        return Found(self._chosen.plan, self._chosen.notes)
+        return self._found
 
 
-def fixed(choose: Callable[[Task], Chosen]) -> Callable[[Task], Fixed]:
+def fixed(choose: Callable[[Task], Found]) -> Callable[[Task], Fixed]:
     """Make a strategy of a function that chooses a plan; a decorator."""
 
     @wraps(choose)
@@ -91,7 +75,7 @@ def fixed(choose: Callable[[Task], Chosen]) -> Callable[[Task], Fixed]:
     return strategy
 
 
-def best_of(task: Task, candidates: Sequence[tuple[PlanArray, Mapping[str, Any]]]) -> Chosen:
+def best_of(task: Task, candidates: Sequence[tuple[PlanArray, Mapping[str, Any]]]) -> Found:
     """The candidate with the lowest error of some of the calls to learn from; the first of equals.
 
     Args:
@@ -101,4 +85,4 @@ def best_of(task: Task, candidates: Sequence[tuple[PlanArray, Mapping[str, Any]]
     calls = task.some_calls(COMPARED)
     errors = [task.error(plan, calls) for plan, _ in task.clock.in_time(candidates)]
     best = int(np.argmin(errors))
-    return Chosen(candidates[best][0], errors[best], candidates[best][1])
+    return Found(*candidates[best], error=errors[best])

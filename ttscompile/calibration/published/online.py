@@ -22,9 +22,9 @@ from ...core.lattice import PlanArray, Source
 from ...errors import CalibrationFailedError
 from ..calls import Calls
 from ..execute import Executor, State, last
-from ..task import Array, Task
+from ..task import Array, Found, Task
 from .criterion import Criterion
-from .fixed import COMPARED, Chosen, best_of
+from .fixed import COMPARED, best_of
 
 HALVINGS, DOUBLINGS = 9, 20
 """Of the interval that the threshold is in."""
@@ -115,7 +115,7 @@ def fit_threshold(
     return found
 
 
-def online(task: Task, proposed: Sequence[tuple[Criterion, float]]) -> Chosen:
+def online(task: Task, proposed: Sequence[tuple[Criterion, float]]) -> Found:
     """Fit every criterion that is proposed, take the best, and fit it again on more calls.
 
     Args:
@@ -142,7 +142,7 @@ def online(task: Task, proposed: Sequence[tuple[Criterion, float]]) -> Chosen:
     chosen = best_of(task, [(plan, {}) for plan in within(decided.plans, task.budget)[:FROZEN]])
     cells = {"mean": float(decided.cells.mean()), "most": int(decided.cells.max())}
     notes = {"criterion": best.record(), "computed_cells": cells}
-    return Chosen(chosen.plan, _error(task, decided, calls), notes)
+    return Found(chosen.schedule, notes, error=_error(task, decided, calls))
 
 
 def _error(task: Task, decided: Decided, calls: Calls) -> float:

@@ -15,9 +15,9 @@ import numpy as np
 
 from ..calls import Calls
 from ..execute import Executor
-from ..task import Array, Task
+from ..task import Array, Found, Task
 from .criterion import Criterion, relative_change
-from .fixed import Chosen, fixed
+from .fixed import fixed
 from .online import online
 
 DEGREE = 4
@@ -27,7 +27,7 @@ DENSE_CALLS = 8
 
 
 @fixed
-def teacache(task: Task) -> Chosen:
+def teacache(task: Task) -> Found:
     """The criterion with the polynomial of this policy, and the threshold for the budget."""
     return online(task, proposal(task))
 
