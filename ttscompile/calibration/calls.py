@@ -53,9 +53,9 @@ def split_episodes(count: int, fraction: float, seed: int) -> Split:
     """Divide episodes at random.
 
     Args:
-        count: number of episodes, at least two.
+        count: the number of episodes, at least two.
         fraction: of them for validation; at least one, and at least one is left to learn from.
-        seed: of the division.
+        seed: the seed of the division.
     """
     order = np.random.default_rng((seed, 0)).permutation(count)
     held_out = min(max(round(count * fraction), 1), count - 1)
@@ -93,7 +93,7 @@ class Calls:
         contexts: what the loop reads beside the stream.
         initial: the sample at step 0, ``[N, T, D]``.
         noise: the draw used at each step, ``[K, N, T, D]``; None if the sampler is deterministic.
-        episodes: number of the episode that each call is from, ``[N]``.
+        episodes: the number of the episode that each call is from, ``[N]``.
         path: the sample of the dense policy after each step with the same noise, ``[N, K, T, D]``; None before it is
             known.
     """
@@ -122,10 +122,10 @@ def sample_calls(
     """At most ``limit`` calls, drawn at random from some episodes: number of the episode, and row in it.
 
     Args:
-        episodes: all of them.
+        episodes: all recorded episodes.
         numbers: which to draw from.
         limit: number of calls.
-        seed: of the draw.
+        seed: the seed of the draw.
         repeats: how often a call may be drawn (it will have another noise each time), after all the others were.
     """
     draw = np.random.default_rng((seed, 1, *numbers))
@@ -144,11 +144,11 @@ def prepare_calls(
     """Draw the noise of calls and run the prologue.
 
     Args:
-        model: of the policy.
-        spec: of the policy.
-        episodes: all of them.
+        model: the reference model of the policy.
+        spec: the specification of the policy.
+        episodes: all recorded episodes.
         chosen: number of the episode, and row in it, of each call.
-        seed: of the noise.
+        seed: the seed of the noise.
 
     Returns:
         The calls, without targets.
@@ -196,10 +196,10 @@ class Selector:
 
 
 class Actions:
-    """From denoised samples to what is executed, and how far two of them are apart.
+    """Finds what is executed of denoised samples, and how far two of them are apart.
 
     Args:
-        spec: of the policy.
+        spec: the specification of the policy.
 
     Attributes:
         size: number of executed action numbers of a call.

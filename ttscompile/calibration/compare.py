@@ -40,7 +40,7 @@ LEARNED = 256
 """Calls that strategies learn from, at most. ``calibrate`` takes up to 960: its corrections are better."""
 
 FRACTION = 0.25
-"""Of the episodes, to judge on: the default of ``calibrate``, so that with its seed its plans saw none of them."""
+"""Share of the episodes to judge on. It is the default of ``calibrate``: with its seed, its plans saw none of them."""
 
 
 def compare(
@@ -62,7 +62,7 @@ def compare(
     """Measure plans against each other. Nothing is written.
 
     Args:
-        path: of the artifact, whose dense policy is the truth.
+        path: the artifact whose dense policy is the truth.
         trajectories: recorded episodes, see ``ttscompile.trajectories``.
         strategies: names; each finds a plan for each sparsity.
         sparsities: shares of the cells to reuse.
@@ -70,8 +70,8 @@ def compare(
         others: artifacts of the same policy, for instance with other samplers; all their plans take part.
         calls: held-out calls, at most.
         learned: calls that strategies learn from, at most.
-        threads: of onnxruntime.
-        seed: of the split, the calls, the noise and the searches.
+        threads: how many threads onnxruntime uses.
+        seed: the seed of the split, the calls, the noise and the searches.
         intervals: of a search, at most; None for the strategy's own number.
         max_minutes: of a search, about: what it has found by then takes part, and a warning says so. A strategy that
             has no plan within the budget by then is left out.

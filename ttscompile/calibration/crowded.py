@@ -25,14 +25,14 @@ COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 """Numbers of computed steps that an error budget is tried with, before bisection between two of them."""
 
 TRIED = (1.0, 2.0, 3.0, 4.0)
-"""Of ``CROWDING``, while only the number of steps is in question."""
+"""Those of ``CROWDING`` that are tried while only the number of steps is in question."""
 
 
 def crowded_steps(steps: int, full_steps: int, crowding: float) -> tuple[int, ...]:
     """Which steps to compute, in order.
 
     Args:
-        steps: K.
+        steps: K, the number of denoising steps.
         full_steps: how many steps are computed; step 0 is one of them.
         crowding: the i-th of m is at ``K * (1 - (1 - i/m) ** crowding)``.
     """
@@ -66,8 +66,8 @@ class CrowdedSchedules:
     """Compares crowded schedules, and remembers every comparison in the state.
 
     Args:
-        whole: compares.
-        state: of the calibration.
+        whole: compares schedules of whole steps.
+        state: the state of the calibration.
         clock: nothing is begun that would end, with the correction and the judgement that follow, after its limit.
         bar: shows the progress.
     """
@@ -81,9 +81,9 @@ class CrowdedSchedules:
         """The best of the family of ``full_steps`` computed steps, of those that there was time for; None if of none.
 
         Args:
-            full_steps: at least one.
-            what: it is for; for the bar.
-            crowding: members of the family.
+            full_steps: how many steps are computed, at least one.
+            what: what the schedule is for, as the bar shows it.
+            crowding: the crowdings of the members of the family.
         """
         found: tuple[Errors, tuple[int, ...]] | None = None
         members = crowded_family(self._whole.steps, full_steps, crowding)
@@ -120,9 +120,9 @@ def budget_of_error(crowded: CrowdedSchedules, goal: Goal, steps: int, blocks: i
     Judged on calls to learn from that its correction was not fitted on: the held-out episodes stay out of it.
 
     Args:
-        crowded: compares.
+        crowded: compares crowded schedules.
         goal: of kind ``max_action_error``.
-        steps: K.
+        steps: K, the number of denoising steps.
         blocks: number of residual blocks.
 
     Raises:

@@ -33,9 +33,9 @@ def judge(artifact: Artifact, executor: Executor, plans: Mapping[str, Found], ca
     """Scores of plans, and of those of the pruner that belongs to the one that is called ``schedule``.
 
     Args:
-        artifact: the policy.
+        artifact: the artifact of the policy.
         executor: runs the policy.
-        plans: by name.
+        plans: the plans by name.
         calls: of episodes that nothing was learned from, with targets.
 
     Returns:
@@ -61,10 +61,10 @@ def default_of(scores: Mapping[str, PlanScore], goal: Goal, cells: int, manifest
     """The pruner's plans if they are no worse than the schedule on held-out calls, and keep the budget as it does.
 
     Args:
-        scores: of all plans.
+        scores: the scores of all plans.
         goal: what was asked for.
-        cells: what it comes to.
-        manifest: of the artifact.
+        cells: how many computed cells the goal comes to.
+        manifest: the manifest of the artifact.
     """
     pruned = scores.get(PRUNER)
     if pruned is None or pruned.sparsity < goal.sparsity(cells, manifest) - 1e-9:
@@ -77,7 +77,7 @@ def require_success(result: CalibrationResult, goal: Goal) -> None:
     """Raise unless the default plan is what was asked for.
 
     Args:
-        result: of the calibration.
+        result: the result of the calibration.
         goal: what was asked for.
 
     Raises:

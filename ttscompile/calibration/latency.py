@@ -27,8 +27,8 @@ def with_plans(artifact: Artifact, plans: Mapping[str, Found]) -> Artifact:
     """The artifact, in memory, with more schedules: a runtime treats them as it does those of the file.
 
     Args:
-        artifact: loaded.
-        plans: by name.
+        artifact: a loaded artifact.
+        plans: the plans by name.
     """
     records = {name: PlanRecord("schedule", sparsity(one.schedule), None) for name, one in plans.items()}
     corrections = {name: one.correction for name, one in plans.items() if one.correction is not None}
@@ -47,7 +47,7 @@ def measure_budget(artifact: Artifact, goal: Goal, pruned: bool) -> Budget:
     run, what the loop waits for it is added.
 
     Args:
-        artifact: the policy.
+        artifact: the artifact of the policy.
         goal: of kind ``latency_ms``.
         pruned: whether the pruner may run.
 

@@ -12,19 +12,19 @@ from .task import Found, Task
 SAFE, FAST = "safe", "fast"
 
 SHARE = 0.2
-"""Of the time that is kept from the search, for these plans."""
+"""Share of the time limit that is kept from the search for these plans."""
 
 
 def named_plans(
     crowded: CrowdedSchedules, task: Task, strategy: Strategy, cells: int
 ) -> tuple[dict[str, Found], dict[str, str]]:
-    """Those of ``safe`` and ``fast`` that can be made.
+    """Make ``safe`` and ``fast``, where they can be made.
 
     Args:
-        crowded: compares schedules.
-        task: with the calls that corrections are fitted on.
-        strategy: that found the target's plan.
-        cells: computed by the target's plan.
+        crowded: compares crowded schedules.
+        task: has the calls that corrections are fitted on.
+        strategy: the strategy that found the target's plan.
+        cells: how many cells the target's plan computes.
 
     Returns:
         Plans by name, with the computed steps in their notes; and by name why there is no plan.

@@ -86,14 +86,14 @@ def calibrate(
         trajectories: recordings: ``.npz``, zarr, HDF5 or LeRobot data sets, see ``ttscompile.trajectories``.
         target_sparsity: share of the cells to reuse; if no budget is given, 0.95, or what leaves five whole steps.
         strategy: how the plan is found, see ``ttscompile.calibration.strategies``.
-        seed: of the split, the noise and the search.
+        seed: the seed of the split, the noise and the search.
         resume: go on where a calibration with the same arguments was interrupted, with the same calls whatever
             ``max_minutes`` is now; begins anew if none was.
         target_flops: share of the FLOPs of a dense call to save, prologue and pruner counted.
         latency_ms: of a call with onnxruntime on this machine. Measured once, for as many whole steps as fit.
         max_action_error: mean absolute error of the executed actions on held-out episodes, in their units; the plan is
             the sparsest that was found below it. Only with a strategy that fits corrections.
-        threads: of the calls that are timed for ``latency_ms``.
+        threads: how many threads the calls have that are timed for ``latency_ms``.
         max_minutes: the best plan so far is taken in time to be finished by then, as far as what was done before lets
             it be known; what has to be done at least is done. Also decides how many calls are used.
         validation_fraction: of the episodes.

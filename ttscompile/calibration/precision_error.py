@@ -34,13 +34,13 @@ def precision_record(
     So this is the error of the precision alone; that of the plan is measured in fp32, and has its own figures.
 
     Args:
-        artifact: the policy.
-        episodes: all of them.
-        numbers: of those that were held out.
-        name: of a schedule beside ``dense``.
+        artifact: the artifact of the policy.
+        episodes: all recorded episodes.
+        numbers: the numbers of the held-out episodes.
+        name: the name of the schedule, which is measured beside ``dense``.
         plan: the schedule, ``[K, blocks]``; left out if it reads earlier calls, which these calls do not have.
         correction: of the schedule; None for none.
-        seed: of calls and noise.
+        seed: the seed of the choice of calls and of their noise.
 
     Returns:
         ``{"precision": {"name": .., "calls": .., "plans": {plan: {"error": .., "error_p90": ..}}}}`` for the

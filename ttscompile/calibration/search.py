@@ -30,7 +30,7 @@ def plan_of(name: str, task: Task, intervals: int | None = None, seconds: float 
     """What a strategy finds, whether or not it is any better than the uniform schedule: for comparisons.
 
     Args:
-        name: of the strategy.
+        name: the name of the strategy.
         task: see ``Task``; its clock is not used.
         intervals: how many at most; None for the strategy's own number.
         seconds: after which nothing more is begun that can be left out.

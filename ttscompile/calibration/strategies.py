@@ -26,8 +26,8 @@ class Strategy:
     """A way to find a plan.
 
     Attributes:
-        name: as users give it.
-        source: of the method.
+        name: what users call it.
+        source: where the method is from.
         maker: where the function is that makes a ``Search`` of a ``Task``, as ``module:function`` below this package.
         least: how many cells its plans compute at least, of ``(steps, blocks)``; by default those of step 0.
         fits_correction: whether its schedule is of whole steps, with a correction of the sampler that is fitted to it.
@@ -59,7 +59,7 @@ class Strategy:
         """Refuse a budget that the strategy cannot keep.
 
         Args:
-            steps: K.
+            steps: K, the number of denoising steps.
             blocks: number of residual blocks.
             budget: cells that may be computed, step 0 included.
 

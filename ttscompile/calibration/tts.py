@@ -25,7 +25,7 @@ DISTANCES = (8, 4, 2, 1)
 
 
 class Tts:
-    """See the module.
+    """The search of this module; see ``Search``.
 
     Args:
         task: see ``Task``.

@@ -36,7 +36,7 @@ class WholeSteps:
     """Compares schedules of whole steps.
 
     Args:
-        executor: runs plans.
+        executor: runs the policy.
         actions: which part of the sample counts.
         calls: with what the dense policy answers to them.
         seed: decides which of the calls corrections are fitted on, and which schedules are compared on.
@@ -81,7 +81,7 @@ class WholeSteps:
         return self._pace * full_steps
 
     def correcting(self, full_steps: int) -> float:
-        """Seconds that ``correction`` of a schedule takes, likewise."""
+        """Seconds that ``correction`` of a schedule takes, by the comparisons so far; 0 before any."""
         share = self._calls.count / (self._fitted.count + 2 * self._compared.count)
         return (1 + share) * self.comparing(full_steps)
 

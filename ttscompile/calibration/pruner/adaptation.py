@@ -30,7 +30,7 @@ class Adaptation:
     Attributes:
         done: whether nothing is left to do.
         pruner: constants of the pruner; None before the last interval, or if no switch helps.
-        switches: how many it has.
+        switches: how many switches the pruner has.
     """
 
     INTERVALS = 5

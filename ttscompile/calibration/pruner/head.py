@@ -55,9 +55,9 @@ def head_weights(
     edge. All other cells have a margin that no sum of switches reaches.
 
     Args:
-        constants: of the pruner, as they are.
+        constants: the pruner's constants as they are.
         schedule: ``[K, blocks]``.
-        switches: at most ``capacity``.
+        switches: the switches to express, at most ``capacity`` of them.
         features: ``[N, F]``, for the scale of the switches' functions.
     """
     new = {name: np.array(value) for name, value in constants.items()}

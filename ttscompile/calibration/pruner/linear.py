@@ -73,11 +73,11 @@ def linearise(executor: Executor, actions: Actions, plan: PlanArray, calls: Call
     values near it, and projected on random directions for each call.
 
     Args:
-        executor: runs plans.
+        executor: runs the policy.
         actions: which part of the sample counts.
         plan: ``[K, blocks]``.
-        calls: with targets.
-        seed: of the directions.
+        calls: calls whose targets are known.
+        seed: the seed of the directions.
     """
     generator = torch.Generator().manual_seed(seed)
     difference = actions.executed(executor.run(plan, calls)) - actions.executed(calls.targets)

@@ -108,7 +108,7 @@ def bubbling(change: Scores, kinds: Sequence[str]) -> dict[int, list[int]]:
 
     Args:
         change: ``[blocks]``, mean absolute difference of a block's residual between two steps.
-        kinds: of the blocks.
+        kinds: the kind of each block.
     """
     followed = [b for b, kind in enumerate(kinds) if kind == FEED_FORWARD] or list(range(len(kinds)))
     sources = np.argsort(-change, kind="stable")[:BUBBLING]
@@ -129,7 +129,7 @@ def spend(schedules: Sequence[Sequence[Schedule]], followed: Mapping[int, Sequen
 
     Args:
         schedules: of each block, with 1, 2, ... computations.
-        followed: see ``bubbling``.
+        followed: what ``bubbling`` returns.
         budget: cells; at least one for each block.
     """
 
@@ -166,7 +166,7 @@ def dense_statistics(executor: Executor, calls: Calls) -> tuple[Scores, Scores]:
 
 
 def dense_residuals(executor: Executor, calls: Calls) -> list[Tensor]:
-    """Of each block, what it adds at every step of dense calls: ``[N, K, size]``."""
+    """What each block adds at every step of dense calls: ``[N, K, size]`` a block."""
     kept: list[list[Tensor]] = [[] for _ in executor.axes]
     for _, residuals in executor.dense_steps(calls):
         for rows, residual, axis in zip(kept, residuals, executor.axes, strict=True):

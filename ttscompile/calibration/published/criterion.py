@@ -67,9 +67,9 @@ class Criterion:
         """The decisions of one call; to be made anew for each call.
 
         Args:
-            steps: K.
+            steps: K, the number of denoising steps.
             blocks: number of residual blocks.
-            streams: B.
+            streams: B, the number of streams.
 
         Raises:
             IllegalPlanError: the policy has no block after the first ``always`` ones.
@@ -86,10 +86,10 @@ class Decisions:
     """What a criterion decides during one call of B streams. Streams do not influence each other.
 
     Args:
-        criterion: decides.
-        steps: K.
+        criterion: the rule that decides.
+        steps: K, the number of denoising steps.
         blocks: number of residual blocks.
-        streams: B.
+        streams: B, the number of streams.
     """
 
     def __init__(self, criterion: Criterion, steps: int, blocks: int, streams: int) -> None:
@@ -101,7 +101,7 @@ class Decisions:
         """The row of the plan at step k; to be asked for every step, in order.
 
         Args:
-            k: step.
+            k: the number of the step.
             feature: ``[B, ...]``, see ``Criterion.always``.
 
         Returns:

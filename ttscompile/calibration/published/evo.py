@@ -28,7 +28,7 @@ LEAST = 4
 
 
 class Evo(NothingAfter):
-    """See the module."""
+    """The genetic search of this module; see ``Search``."""
 
     intervals = GENERATIONS
 
@@ -47,12 +47,12 @@ class Evo(NothingAfter):
 
     @property
     def loss(self) -> float:
-        """Its error on the calls that all are compared on."""
+        """Error of the best schedule on the calls that all plans are compared on."""
         return float(self._errors.min()) if self._generation else float("nan")
 
     @property
     def done(self) -> bool:
-        """Whether all generations were."""
+        """Whether all generations were measured."""
         return self._generation >= self.intervals
 
     def advance(self, interval: int) -> None:
@@ -67,7 +67,7 @@ class Evo(NothingAfter):
         self._generation = interval + 1
 
     def state(self) -> dict[str, Array]:
-        """The generation."""
+        """The current generation."""
         return {
             "population": self._population.astype(np.int8),
             "errors": self._errors,
@@ -137,7 +137,7 @@ def repair(computed: BoolArray, budget: int, least: int, draw: np.random.Generat
         computed: bool ``[K, blocks]``.
         budget: at least ``least`` for each block, at most all cells.
         least: at least 1, at most K.
-        draw: random numbers.
+        draw: the source of random numbers.
     """
     fixed = computed.copy()
     fixed[0] = True

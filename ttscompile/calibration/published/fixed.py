@@ -21,10 +21,10 @@ class Fixed(NothingAfter):
 
     Args:
         task: see ``Task``.
-        choose: makes the plan.
+        choose: the function that makes the plan.
 
     Attributes:
-        done: whether it was made.
+        done: whether the plan was made.
     """
 
     intervals = 1
@@ -37,7 +37,7 @@ class Fixed(NothingAfter):
 
     @property
     def loss(self) -> float:
-        """Error of the plan."""
+        """Error of the plan on the calls that it was chosen on."""
         return self._found.error
 
     @property

@@ -41,11 +41,11 @@ RATE = 0.15
 """Length of a step, where gradients are divided by their running size; the start is a score of 1."""
 
 MEMORY = 0.9
-"""Of the running gradient and of its running size."""
+"""Share of the running gradient, and of its running size, that is kept from one step to the next."""
 
 
 class Gates(NothingAfter):
-    """See the module.
+    """Gradient steps on the scores of the cells; see ``Search``.
 
     Args:
         task: see ``Task``.

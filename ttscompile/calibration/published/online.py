@@ -27,7 +27,7 @@ from .criterion import Criterion
 from .fixed import COMPARED, best_of
 
 HALVINGS, DOUBLINGS = 9, 20
-"""Of the interval that the threshold is in."""
+"""How often the interval that the threshold is in is halved, and its upper end doubled before, at most."""
 
 COUNTED = 32
 """Calls whose computed cells decide the last threshold; fewer if there are fewer."""
@@ -58,9 +58,9 @@ def decide(executor: Executor, criterion: Criterion, calls: Calls) -> Decided:
     """Run calls with plans that the criterion decides step by step.
 
     Args:
-        executor: of the policy.
-        criterion: decides.
-        calls: N of them.
+        executor: runs the policy.
+        criterion: the rule that decides.
+        calls: the N calls to run.
     """
     model, state = executor.model, State()
     decisions = criterion.begin(model.steps, model.blocks, calls.count)
@@ -146,7 +146,7 @@ def online(task: Task, proposed: Sequence[tuple[Criterion, float]]) -> Found:
 
 
 def _error(task: Task, decided: Decided, calls: Calls) -> float:
-    """Of the plans that were decided."""
+    """Mean error of the plans that were decided, normalised."""
     return float(task.actions.errors(decided.samples, calls.targets, units=False).mean())
 
 

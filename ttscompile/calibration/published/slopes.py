@@ -30,11 +30,11 @@ def slopes(executor: Executor, actions: Actions, plan: PlanArray, reuse: Source,
     """The slope of the mean error in every COMPUTE gate.
 
     Args:
-        executor: runs plans.
+        executor: runs the policy.
         actions: which part of the sample counts.
         plan: ``[K, blocks]`` of COMPUTE and ``reuse``, step 0 dense.
         reuse: FORWARD or TIMESTEP.
-        calls: with targets.
+        calls: calls whose targets are known.
 
     Returns:
         ``[K, blocks]``: by how much computing the cell, rather than reusing, changes the mean absolute error of the
