@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -21,7 +22,10 @@ import pytest
 import zarr
 from click.testing import CliRunner
 
+from tests.calibration import policies, tasks
+from tests.once import Once
 from tests.passes.test_pipeline import MODULES, spec
+from ttscompile.calibration import strategies
 from ttscompile.cli import main
 from ttscompile.frontends import families
 
@@ -59,7 +63,7 @@ NOT_RUN = {
     "ttscompile serve": "has no end; tests/executor/test_serve.py starts it",
     "ttscompile convert outputs/train": "a LeRobot policy: tests/frontends/test_lerobot_golden.py converts two",
     "ttscompile convert pretrained_model": "a LeRobot policy, with --task: tests/frontends/test_lerobot.py",
-    "ttscompile calibrate compiled/ --trajectories lerobot": "of LeRobot: tests/calibration/test_recordings.py",
+    "ttscompile calibrate compiled/ --trajectories lerobot": "of LeRobot: tests/trajectories/test_recordings.py",
 }
 """How the commands begin that are not run here, and why. Every other one is run; of these the options are checked."""
 
@@ -344,6 +348,18 @@ def test_the_policy_family_of_the_contributing_guide(tmp_path: Path, monkeypatch
     assert len(cases) == 5
     for changes, message in cases:
         refused(tmp_path, changes, message)
+
+
+def test_the_strategy_of_the_contributing_guide(once: Once, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The module, its row and its test as they stand in the guide."""
+    written, row, its_test = guide("A strategy")
+    contributed(written, "ttscompile.calibration.published.ends", tmp_path, monkeypatch)
+    monkeypatch.setattr(strategies, "STRATEGIES", (*strategies.STRATEGIES, eval(row, vars(strategies))))
+    test = contributed(its_test, "contributed_test", tmp_path, monkeypatch)
+    make_task = partial(tasks.make_task, policies.compiled(once), policies.record(tmp_path / "calls.npz"))
+    test.test_whole_steps_are_at_both_ends_where_the_calls_want_them(make_task)
+    for budget in test.test_a_budget_of_one_step_leaves_step_0.pytestmark[0].args[1]:
+        test.test_a_budget_of_one_step_leaves_step_0(make_task, budget)
 
 
 def test_the_site_is_built_and_loads_nothing_from_elsewhere(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from .measure.versions import VERSION as __version__
 
 if TYPE_CHECKING:
-    from .calibration import calibrate
+    from .calibration.pipeline import calibrate
     from .core.lattice import Source, legalize
     from .core.spec import Affine, ChunkSpec, Noise, ObservationSpec, PolicySpec, SamplerTable
     from .driver import compile_denoiser, convert
@@ -70,7 +70,7 @@ _HOMES = {
     "Source": "core.lattice",
     "TtscompileError": "errors",
     "Verification": "verification",
-    "calibrate": "calibration",
+    "calibrate": "calibration.pipeline",
     "compile_denoiser": "driver",
     "convert": "driver",
     "edm_table": "samplers.edm",

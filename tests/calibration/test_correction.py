@@ -12,7 +12,7 @@ import torch
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration import fit_correction as fitting
 from ttscompile.calibration.fit_correction import anchors_of, fit_correction
-from ttscompile.calibration.strategies import Task
+from ttscompile.calibration.task import Task
 from ttscompile.core.lattice import PlanArray, Source, dense_plan, uniform_plan
 
 from . import tasks

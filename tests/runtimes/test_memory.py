@@ -177,8 +177,8 @@ def test_calibration_runs_the_same_loop_and_its_corrections_help(made: Made) -> 
     initial, steps = noise_tensors(noise, artifact.manifest.spec.sampler.stochastic)
     with torch.no_grad():
         contexts = executor.model.prologue({"obs": torch.from_numpy(obs["obs"])})
-    calls = Calls(contexts, initial, steps, torch.zeros(0), np.zeros(count, np.int64))
-    calls = calls.answered(executor.run_dense(calls))
+    calls = Calls(contexts, initial, steps, np.zeros(count, np.int64))
+    calls = replace(calls, path=executor.run_dense(calls))
     plan = np.full((executor.model.steps, executor.model.blocks), T, np.int8)
     plan[[0, 3]] = C
     corrected = executor.corrected(fit_correction(executor, plan, calls))
