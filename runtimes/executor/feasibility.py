@@ -16,6 +16,7 @@ other without a gap in the actions if ``frame period + 2 * latency + margin <= p
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from statistics import median
 from typing import Any
@@ -117,14 +118,17 @@ class LatencyWindow:
 
     Args:
         window: calls that count.
+        latencies: seconds of the first ones.
 
     Attributes:
         bound: the longest of them, in seconds.
     """
 
-    def __init__(self, window: int) -> None:
+    def __init__(self, window: int, latencies: Iterable[float] = ()) -> None:
         self._latencies: deque[float] = deque(maxlen=window)
         self.bound = self._typical = 0.0
+        for latency in latencies:
+            self.add(latency)
 
     def add(self, latency: float) -> None:
         """Take the latency of a call, in seconds."""

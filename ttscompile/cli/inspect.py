@@ -12,10 +12,11 @@ import ttscompile
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import DENSE
 from ttscompile.cli.output import artifact_argument, json_option, print_json, progress, results
-from ttscompile.cli.summary import document, print_summary
+from ttscompile.cli.summary import print_summary
 from ttscompile.core.lattice import PlanArray
 from ttscompile.errors import ArtifactError, ObservationError
 from ttscompile.plots.plan import plot_plan
+from ttscompile.report.summary import document
 from ttscompile.trajectories import read_npz
 
 SCHEDULE = "schedule"
@@ -40,16 +41,15 @@ def inspect(directory: Path, picture: Path | None, name: str | None, observation
     if picture is None and (name is not None or observation is not None):
         raise click.UsageError("--plan and --observation choose what --plot draws; give --plot FILE too.")
     artifact = load_artifact(directory)
-    summary = document(directory, artifact)
     if picture is not None:
         name = name or _drawn_by_default(artifact, observation)
         plan = _plan(artifact, name, observation)
         plot_plan(plan, [block.kind for block in artifact.manifest.blocks], picture, f"plan {name!r}")
         progress().print(f"wrote {picture}", soft_wrap=True)
     if as_json:
-        print_json(summary)
+        print_json(document(artifact))
     else:
-        print_summary(summary, results())
+        print_summary(artifact, results())
 
 
 def _drawn_by_default(artifact: Artifact, observation: Path | None) -> str:

@@ -16,11 +16,12 @@ from rich.console import Console
 from rich.table import Table
 
 from ttscompile.artifact.load import load_artifact, read_manifest
-from ttscompile.artifact.manifest import UNIFORM, Manifest, abbreviated
+from ttscompile.artifact.manifest import Manifest, abbreviated
 from ttscompile.errors import TtscompileError
 from ttscompile.measure.units import flops as flops
 from ttscompile.measure.units import ms as ms
 from ttscompile.measure.units import share as share
+from ttscompile.report.page import Table as Made
 
 artifact_argument = click.argument("directory", type=click.Path(path_type=Path))
 json_option = click.option(
@@ -86,9 +87,13 @@ def table(*columns: str) -> Table:
     return made
 
 
-def marked(plan: str) -> str:
-    """The name of a plan in a table: the baseline, which no robot should run, is called so."""
-    return plan + " (baseline)" * (plan == UNIFORM)
+def print_table(made: Made, console: Console) -> None:
+    """A table of a report, if it has any rows."""
+    if made.rows:
+        shown = table(*made.head)
+        for row in made.rows:
+            shown.add_row(*row)
+        console.print(shown)
 
 
 def manifest_of(path: Path) -> Manifest:

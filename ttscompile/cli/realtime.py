@@ -10,12 +10,11 @@ import click
 import numpy as np
 
 import ttscompile
-from ttscompile.artifact.manifest import UNIFORM
+from ttscompile.artifact.manifest import UNIFORM, marked
 from ttscompile.cli.loop_options import loop_options
 from ttscompile.cli.output import (
     artifact_argument,
     json_option,
-    marked,
     ms,
     print_identity,
     print_json,
@@ -30,7 +29,6 @@ from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings, Feasib
 from ttscompile.runtimes.executor.jitter import Jitter, measure_jitter
 from ttscompile.runtimes.executor.measure import measure_latencies, neutral_observation
 from ttscompile.runtimes.executor.settings import resolve
-from ttscompile.runtimes.executor.state import feasibility
 from ttscompile.runtimes.policy import CompiledPolicy
 
 JITTER_HZ = 200
@@ -82,7 +80,7 @@ def realtime(
     with console.status("timing"):
         policy.reset()
         measured = measure_latencies(policy, MonotonicClock(), settings, resolved.tiers)
-    judged = {name: feasibility(settings, resolved, max(times.ms) / 1e3) for name, times in measured.items()}
+    judged = {name: resolved.feasibility(max(times.ms) / 1e3) for name, times in measured.items()}
     jitter = None
     if jitter_seconds is not None:
         beside = _run_on_a_robot(judged, policy.info.default_plan)

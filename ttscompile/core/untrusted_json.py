@@ -23,7 +23,7 @@ def parse_json(content: bytes, limit: int, *, allow_nan: bool = False) -> Any:
     """
     if len(content) > limit:
         raise ValueError(f"it has more than {limit:,} bytes")
-    numbers = {} if allow_nan else {"parse_constant": _no_constant, "parse_float": _finite}
+    numbers: dict[str, Any] = {} if allow_nan else {"parse_constant": _no_constant, "parse_float": _finite}
     try:
         data = json.loads(content.decode("utf-8"), object_pairs_hook=_unique, **numbers)
     except RecursionError:
