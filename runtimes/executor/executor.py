@@ -24,11 +24,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ttscompile.core.spec import FloatArray
-from ttscompile.errors import ExecutorClosedError, ExecutorError, InfeasibleError, WorkerDeadError
+from ttscompile.errors import ExecutorClosedError, ExecutorError, WorkerDeadError
 from ttscompile.runtimes.arrays import check_seed
 
 from .clock import Clock, MonotonicClock
-from .feasibility import Feasibility, LatencyWindow
+from .feasibility import Feasibility, LatencyWindow, fast_enough
 from .measure import measure_latencies, prefix_refusal
 from .pinning import pin
 from .settings import ExecutorSettings, Policy, resolve
@@ -148,7 +148,7 @@ class AsyncExecutor:
 
         Raises:
             DeadlineMissedError: there is none, and the last one was held for as long as it may be.
-            StaleObservationError: likewise, for want of recent observations.
+            StaleObservationError: the same, because no recent observation came.
             WorkerDeadError: the policy's thread has ended; ``__cause__`` says why.
             ExecutorClosedError: after ``close``.
         """
@@ -334,16 +334,7 @@ class AsyncExecutor:
         measured = self._measured()
         latencies = {name: LatencyWindow(settings.latency_window, values) for name, values in measured.items()}
         self._feasibility = {name: resolved.feasibility(max(values)) for name, values in measured.items()}
-        possible = tuple(name for name, each in self._feasibility.items() if each.feasible)
-        if not possible and settings.refuse_infeasible:
-            sums = "; ".join(f"plan {name!r}: {each.explain()}" for name, each in self._feasibility.items())
-            longest = next(iter(self._feasibility.values())).max_latency
-            raise InfeasibleError(
-                f"no plan is fast enough for this loop. {sums}. Use a plan whose calls take at most"
-                f" {1e3 * longest:.4g} ms, a lower rate, or more of each chunk (ExecutorSettings.horizon and reserve);"
-                " 'ttscompile realtime DIR' says what is feasible."
-            )
-        tiers = possible or resolved.tiers[-1:]
+        tiers = fast_enough(self._feasibility, settings.refuse_infeasible)
         with self._lock:
             self._state = ExecutorState(settings, resolved, self._normalizer, tiers, latencies)
         self._ready.set()

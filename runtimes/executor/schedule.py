@@ -23,7 +23,7 @@ class Schedule:
     Args:
         settings: as given.
         resolved: what follows from them and the policy.
-        guard: what chunks must be.
+        guard: checks chunks before they are scheduled.
 
     Attributes:
         grid: from seconds to ticks.

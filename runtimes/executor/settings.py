@@ -148,7 +148,7 @@ class Resolved:
         reserve: actions after these that may be.
         first: index of the first of them in ``action_pred``.
         channels: Da.
-        frames: what a frame holds.
+        frames: shapes and dtypes of what one frame holds.
         max_age: seconds.
         tiers: plans, slowest first.
         margin_ticks: control ticks that a chunk shall be there before it is needed.

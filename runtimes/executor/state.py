@@ -54,9 +54,9 @@ class ExecutorState:
     Args:
         settings: as given.
         resolved: what follows from them and the policy.
-        normalizer: of the actions.
+        normalizer: maps actions to their normalised range; None if the policy has none with a range.
         tiers: plans that are fast enough.
-        latencies: of each tier.
+        latencies: what calls of each tier took so far.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class ExecutorState:
 
     @property
     def plan(self) -> str:
-        """Of the next call."""
+        """Name of the plan that the next call runs."""
         return self._tiers.plan
 
     @property

@@ -96,7 +96,7 @@ class Window:
     """A complete window.
 
     Attributes:
-        time: of its newest frame.
+        time: when its newest frame was taken, in seconds.
         frames: To of them, oldest first.
     """
 

@@ -110,7 +110,9 @@ class ReferenceModel:
             PassError: the program has not been partitioned.
         """
         if program.pieces is None:
-            raise PassError("the program has no pieces: run all passes (driver.compile_module) before executing it.")
+            raise PassError(
+                "the program has no pieces: run all passes (ttscompile.driver.transform) before executing it."
+            )
         types = [block.type for block in program.blocks]
         groups = [block.group for block in program.blocks]
         return cls(program.pieces, program.spec, types, groups, program.weights, override)

@@ -26,14 +26,14 @@ SCHEDULE = "schedule"
 @click.command()
 @artifact_argument
 @click.option(
-    "--plot", "picture", type=click.Path(path_type=Path), help="Draw a plan into this file (.png, .svg, .pdf)."
+    "--plot", "picture", type=click.Path(path_type=Path), help="Draw a plan into this file (.png, .svg or .pdf)."
 )
-@click.option("--plan", "name", help="Which plan to draw; the artifact's default plan if not given.")
+@click.option("--plan", "name", help="The plan to draw. Without this option it is the artifact's default plan.")
 @click.option(
     "--observation",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="For a plan that depends on the observation: an .npz with an array a key, one observation or, of the calls of"
-    " one episode, [N, ...]. The plan of the last call is drawn.",
+    help="An .npz file with an array for each key of the observation, of one call or of the calls of one episode. It is"
+    " needed for plans that depend on the observation; the plan of its last call is drawn.",
 )
 @json_option
 def inspect(directory: Path, picture: Path | None, name: str | None, observation: Path | None, as_json: bool) -> None:

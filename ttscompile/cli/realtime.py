@@ -14,6 +14,7 @@ from ttscompile.artifact.manifest import UNIFORM, marked
 from ttscompile.cli.loop_options import loop_options
 from ttscompile.cli.output import (
     artifact_argument,
+    count_option,
     json_option,
     ms,
     print_identity,
@@ -37,45 +38,41 @@ JITTER_HZ = 200
 @click.command()
 @artifact_argument
 @loop_options
-@click.option("--plan", "names", multiple=True, help="Which plan to measure; may be repeated. All, if not given.")
-@click.option("--runs", type=click.IntRange(min=1), default=20, show_default=True, help="Counted calls of each plan.")
+@click.option(
+    "--plan",
+    "names",
+    multiple=True,
+    help="A plan to measure; may be repeated. Without this option all plans are measured.",
+)
+@count_option("--runs", "Calls of each plan that are counted.", default=20)
 @click.option(
     "--jitter",
     "jitter_seconds",
     type=click.FloatRange(min=0, min_open=True),
-    help=f"Also run a {JITTER_HZ} Hz loop for so many seconds, alone and beside the default plan, and say how late it"
-    " wakes.",
+    help=f"Also run a loop of {JITTER_HZ} Hz for this many seconds, first alone and then beside the default plan, and"
+    " say how late it wakes.",
 )
 @json_option
 @click.pass_context
 def realtime(
     context: click.Context,
+    /,
     directory: Path,
     control_hz: float,
-    policy_hz: float | None,
-    horizon: int | None,
-    reserve: int | None,
     names: tuple[str, ...],
-    margin_ticks: int,
     threads: int,
     runs: int,
     jitter_seconds: float | None,
     as_json: bool,
+    **loop: Any,
 ) -> None:
     """Measure the plans of the artifact DIRECTORY and say which of them keep up with a control loop.
 
-    Exit status 1: none does.
+    The exit status is 1 if none does.
     """
     console = progress()
     policy = ttscompile.load(directory, threads=threads)
-    settings = ExecutorSettings(
-        policy_hz=policy_hz,
-        horizon=horizon,
-        reserve=reserve,
-        margin_ticks=margin_ticks,
-        measured_calls=runs,
-        tiers=names or policy.info.plans,
-    )
+    settings = ExecutorSettings(measured_calls=runs, tiers=names or policy.info.plans, **loop)
     resolved = resolve(settings, policy.info, control_hz)
     with console.status("timing"):
         policy.reset()
