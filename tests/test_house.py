@@ -105,10 +105,10 @@ def test_imports_go_one_way() -> None:
     ("importer", "target"),
     [
         ("ttscompile.ir.graph", "ttscompile.passes.hoist"),
-        ("ttscompile.passes.hoist", "ttscompile.runtimes.base"),
+        ("ttscompile.passes.hoist", "ttscompile.runtimes.runtime"),
         ("ttscompile.passes.hoist", "ttscompile.passes.partition"),
-        ("ttscompile.runtimes.base", "ttscompile.frontends"),
-        ("ttscompile.runtimes.base", "ttscompile.calibration"),
+        ("ttscompile.runtimes.runtime", "ttscompile.frontends"),
+        ("ttscompile.runtimes.runtime", "ttscompile.calibration"),
         ("ttscompile.artifact.load", "ttscompile.runtimes.policy.load"),
         ("ttscompile.errors", "ttscompile.core.spec"),
         ("ttscompile.driver", "ttscompile.cli"),
@@ -162,7 +162,7 @@ def test_passes_and_runtimes_import_what_is_outside_of_them_by_whole_names() -> 
 
 def test_the_runtime_side_needs_nothing_of_the_compilers() -> None:
     light = [name for name in MODULES if not compiles(name)]
-    assert "ttscompile.runtimes.base" in light
+    assert "ttscompile.runtimes.runtime" in light
     for name in light:
         chains = eager_closure(name, GRAPH)
         heavy = {foreign: " -> ".join(chain) for foreign, chain in chains.items() if foreign in COMPILERS_ONLY}

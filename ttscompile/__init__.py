@@ -25,13 +25,13 @@ if TYPE_CHECKING:
     from .driver import compile_denoiser as compile_denoiser
     from .driver import convert as convert
     from .errors import TtscompileError as TtscompileError
-    from .runtimes.base import CallReport as CallReport
     from .runtimes.executor import AsyncExecutor as AsyncExecutor
     from .runtimes.executor import ExecutorSettings as ExecutorSettings
     from .runtimes.executor import GuardLimits as GuardLimits
     from .runtimes.policy import CompiledPolicy as CompiledPolicy
     from .runtimes.policy import PolicyInfo as PolicyInfo
     from .runtimes.policy import load as load
+    from .runtimes.report import CallReport as CallReport
     from .samplers.edm import EDMDenoiser as EDMDenoiser
     from .samplers.edm import edm_table as edm_table
     from .samplers.flow import flow_matching_table as flow_matching_table
@@ -46,7 +46,7 @@ _HOMES = {
         "core.spec": ("Affine", "ChunkSpec", "Noise", "ObservationSpec", "PolicySpec", "SamplerTable"),
         "driver": ("compile_denoiser", "convert"),
         "errors": ("TtscompileError",),
-        "runtimes.base": ("CallReport",),
+        "runtimes.report": ("CallReport",),
         "runtimes.executor": ("AsyncExecutor", "ExecutorSettings", "GuardLimits"),
         "runtimes.policy": ("CompiledPolicy", "PolicyInfo", "load"),
         "samplers.edm": ("EDMDenoiser", "edm_table"),

@@ -16,7 +16,7 @@ from ..core.lattice import Source
 from ..core.spec import FP32, Noise
 from ..measure.points import MeasuredPoint
 from ..measure.timer import Timer, Times
-from ..runtimes.base import open_runtime
+from ..runtimes.open import open_runtime
 from ..runtimes.policy import CompiledPolicy
 from ..runtimes.random_calls import random_noise
 from ..trajectories.episodes import Episode

@@ -14,8 +14,9 @@ from ..core.lattice import PlanArray, sparsity, uniform_plan
 from ..core.spec import Noise
 from ..errors import CalibrationError
 from ..measure.timer import Timer
-from ..runtimes.base import Runtime, open_runtime
+from ..runtimes.open import open_runtime
 from ..runtimes.policy import CompiledPolicy
+from ..runtimes.runtime import Runtime
 from .budget import LATENCY, Budget, Goal
 
 WARM_UP, FEWEST, MOST, SECONDS = 2, 5, 25, 2.0

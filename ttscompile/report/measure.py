@@ -11,9 +11,9 @@ import numpy.typing as npt
 
 from ..core.lattice import PlanArray, Source
 from ..measure.timer import Timer, Times
-from ..runtimes.base import CallReport
 from ..runtimes.executor.measure import neutral_observation
 from ..runtimes.policy import CompiledPolicy
+from ..runtimes.report import CallReport
 from ..trajectories.episodes import Episode
 
 PARTS = ("prologue", "wait_pruner", "decode")
