@@ -71,9 +71,7 @@ def find_residual_blocks(graph: Graph, sample: str) -> BlockTable:
             "no residual block found: between the sample and the output no value a is updated as a + f(a)."
             f" The search walked {len(points)} dominators and ended at {where}."
             + "".join(f"\n  declined: {reason}" for reason in declined)
-            + "\nWithout residuals there is nothing to cache; this network cannot be made sparse by ttscompile. If it"
-            " adds the sample to its output, as EDM's preconditioning does, compile what is inside: EDMDenoiser and"
-            " edm_table."
+            + "\nNothing can be reused then. If the output is the sample plus more, use EDMDenoiser and edm_table."
         )
     links = _main_stream(graph, links, declined)
     blocks = _chain(graph, points, links, declined)

@@ -297,3 +297,8 @@ class Manifest:
 def abbreviated(identity: str) -> str:
     """The first 12 digits of an identity, for people; JSON has all 64."""
     return identity[:_SHOWN]
+
+
+def marked(plan: str) -> str:
+    """The name of a plan in a table: the baseline, which no robot should run, is called so."""
+    return plan + " (baseline)" * (plan == UNIFORM)

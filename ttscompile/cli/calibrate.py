@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 import ttscompile
+from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.strategies import DEFAULT, NAMES, STRATEGIES
 from ttscompile.cli.output import (
     artifact_argument,
@@ -17,7 +18,8 @@ from ttscompile.cli.output import (
     results,
 )
 from ttscompile.cli.recordings import FilesCommand, Sources, require_recordings, trajectories_options
-from ttscompile.cli.summary import document, print_summary
+from ttscompile.cli.summary import print_summary
+from ttscompile.report.summary import document
 
 
 @click.command(cls=FilesCommand)
@@ -102,8 +104,8 @@ def calibrate(
             threads=threads,
             max_minutes=max_minutes,
         )
-    summary = document(directory)
+    artifact = load_artifact(directory)
     if as_json:
-        print_json(summary)
+        print_json(document(artifact))
     else:
-        print_summary(summary, results())
+        print_summary(artifact, results())

@@ -12,10 +12,11 @@ from ttscompile.artifact.ceiling import few_steps, many_steps
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import require_replaceable
 from ttscompile.cli.output import json_option, only_results_on_stdout, print_json, progress, results
-from ttscompile.cli.summary import document, print_summary
+from ttscompile.cli.summary import print_summary
 from ttscompile.core.spec import FP32, PRECISIONS
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends.families import FAMILIES, FORMATS, SAMPLERS, SPACINGS
+from ttscompile.report.summary import document
 
 
 @click.command()
@@ -113,7 +114,6 @@ def convert(
             **of_checkpoint,
         )
     artifact = load_artifact(directory)
-    summary = document(directory, artifact)
     if (warning := few_steps(artifact.manifest)) is not None:
         console.print(f"warning: {warning}", soft_wrap=True)
     for stage in stages:
@@ -122,10 +122,10 @@ def convert(
     if of_checkpoint["sampler"] is None and (hint := many_steps(artifact.manifest)) is not None:
         console.print(f"hint: {hint}", soft_wrap=True)
     if as_json:
-        print_json(summary | {"stages": stages})
+        print_json(document(artifact) | {"stages": stages})
     else:
         console = results()
-        print_summary(summary, console)
+        print_summary(artifact, console)
         if single_file is not None:
             megabytes = single_file.stat().st_size / 1e6
             console.print(f"single file: {single_file}, {megabytes:.1f} MB", soft_wrap=True, highlight=False)

@@ -168,10 +168,10 @@ def _tokens(
     found = find_encoder(str(name), folders)
     if found is None or not any((found / file).is_file() for file in ("tokenizer.json", "vocab.json")):
         raise CheckpointError(
-            f"the tokenizer {str(name)!r:.200} is not on this machine, and nothing is ever downloaded; it is needed to"
-            " compile the policy for one task. Put config.json and the tokenizer's files (tokenizer.json, or vocab.json"
-            " and merges.txt) of the text encoder into one folder, and name it: encoders= in Python, --encoders on the"
-            " command line. Or leave the task out: the policy then takes tokens as an observation."
+            f"the tokenizer {str(name)!r:.200} is not on this machine, and nothing is ever downloaded. Put config.json"
+            " and tokenizer.json (or vocab.json and merges.txt) of the text encoder into one folder, and name it:"
+            " encoders= in Python, --encoders on the command line. Or leave the task out: the policy then takes tokens"
+            " as an observation."
         )
     files = [file for file in sorted(found.iterdir()) if file.suffix in (".json", ".txt")]
     large = [file.name for file in files if file.stat().st_size > _MOST_TOKENIZER_BYTES]
