@@ -12,7 +12,7 @@ import pytest
 
 import ttscompile
 
-from .imports import PACKAGES, Import, eager_closure, home, imports, modules
+from .imports import PACKAGES, Import, circles, eager_closure, home, imports, modules
 
 ROOT = Path(__file__).resolve().parents[1]
 MODULES = modules(ROOT)
@@ -94,6 +94,20 @@ def test_imports_go_one_way() -> None:
     found = [each for each_module in GRAPH.values() for each in each_module]
     assert len(found) > 100, "the walk over the source found hardly anything"
     assert direction_errors(found, set(MODULES)) == []
+
+
+def test_no_modules_import_each_other() -> None:
+    """Not even in functions, or for types alone: what depends on each other is one module, or is cut elsewhere."""
+    assert circles(GRAPH) == []
+
+
+def test_a_circle_is_found_wherever_its_imports_stand() -> None:
+    def graph(**targets: str) -> dict[str, list[Import]]:
+        return {name: [Import(name, target, 1, False) for target in to.split()] for name, to in targets.items()}
+
+    assert circles(graph(a="b numpy", b="c", c="d.name", d="")) == []
+    assert circles(graph(a="b", b="c e", c="d", d="b.name a.x", e="f", f="", x="a")) == [["a", "b", "c", "d"]]
+    assert circles(graph(a="b", b="a c", c="d", d="c")) == [["a", "b"], ["c", "d"]]
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from .measure.versions import __version__
+
 if TYPE_CHECKING:
     from .calibration import calibrate
     from .core.lattice import Source, legalize
@@ -22,8 +24,6 @@ if TYPE_CHECKING:
     from .samplers.edm import EDMDenoiser, edm_table
     from .samplers.flow import flow_matching_table
     from .verification import Verification, verify
-
-__version__ = "0.1.0"
 
 __all__ = [
     "Affine",
