@@ -237,9 +237,9 @@ class Workspace:
         arrays = [*self.sample, self.fresh, self.stream, self.current, self.table, self._sums, self._offset]
         arrays += [self._history, self._initial, self._prediction, *self._memory]
         arrays += [advances.updates for advances in self._advances.values()]
-        parts = [self._contexts, self.rollout, *self._blocks, *self._some.values()]
-        parts += [] if self.idle is None else [self.idle]
-        return sum(one.nbytes for one in (*arrays, *parts))
+        bound = sum(block.nbytes for block in (*self._blocks, *self._some.values()))
+        idle = 0 if self.idle is None else self.idle.nbytes
+        return sum(array.nbytes for array in arrays) + self._contexts.nbytes + self.rollout.nbytes + bound + idle
 
     def _advances_with(self, correction: Correction, known: Known | None = None) -> _Advances:
         """Bindings of all steps to the rows of a correction; made once for each, and once for its prefixes."""
