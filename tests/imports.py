@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Container, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -48,42 +48,13 @@ def imports(name: str, path: Path) -> list[Import]:
     ]
 
 
-def home(target: str, known: Container[str]) -> str | None:
+def home(target: str, known: set[str] | dict[str, Path]) -> str | None:
     """The module of the package that ``target`` is, or is a name in; None for somebody else's."""
     while target:
         if target in known:
             return target
         target = target.rpartition(".")[0]
     return None
-
-
-def circles(graph: dict[str, list[Import]]) -> list[list[str]]:
-    """Modules that import each other, directly or over others, wherever the imports stand; one list a circle."""
-    ahead = {
-        name: {target for each in found if (target := home(each.target, graph.keys())) not in (None, name)}
-        for name, found in graph.items()
-    }
-    while leaves := {name for name, targets in ahead.items() if not targets & ahead.keys()}:  # they close no circle
-        ahead = {name: targets for name, targets in ahead.items() if name not in leaves}
-    behind = {name: {other for other, targets in ahead.items() if name in targets} for name in ahead}
-    found = []
-    while ahead:
-        start = min(ahead)
-        circle = _reached(start, ahead) & _reached(start, behind)
-        if len(circle) > 1:
-            found.append(sorted(circle))
-        ahead = {name: targets for name, targets in ahead.items() if name not in circle}
-    return found
-
-
-def _reached(start: str, edges: dict[str, set[str]]) -> set[str]:
-    """``start``, and what can be reached from it."""
-    reached, pending = {start}, [start]
-    while pending:
-        new = edges.get(pending.pop(), set()) - reached
-        reached |= new
-        pending += new
-    return reached
 
 
 def eager_closure(start: str, graph: dict[str, list[Import]]) -> dict[str, list[str]]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from .measure.versions import __version__
+from .measure.versions import VERSION as __version__
 
 if TYPE_CHECKING:
     from .calibration import calibrate

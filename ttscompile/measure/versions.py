@@ -1,11 +1,11 @@
-"""The version of this package, and those of others, to compare them; the standard library alone, for the doctor."""
+"""This package's version, and versions to compare; the standard library alone, for the doctor."""
 
 from __future__ import annotations
 
 import re
 
-__version__ = "0.1.0"
-"""Of ttscompile; here, so that nothing has to import the package as a whole to know it."""
+VERSION = "0.1.0"
+"""Of ttscompile."""
 
 
 def release(text: str) -> tuple[int, ...]:
