@@ -50,7 +50,7 @@ def tails_contestant(directory: Path, threads: int, plan: PlanArray) -> Contesta
     work = Workspace(manifest, open_sessions(artifact, threads, blocks=False), artifact.tables, 1)
     ((obs, noise),) = random_calls(manifest.spec, 1, seed=0)
     for key, spec in manifest.spec.observations.items():
-        obs[key] = obs[key] if spec.normalizer is None else spec.normalizer.normalize(obs[key])
+        obs[key] = spec.normalized(obs[key])
     work.start(obs, noise, None)
 
     lowered = instructions_of(plan, manifest.groups)

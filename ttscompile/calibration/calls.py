@@ -140,7 +140,7 @@ def prepare_calls(
     normalized = {}
     for key, one in spec.observations.items():
         array = np.stack([episodes[n].observations[key][row] for n, row in chosen])
-        normalized[key] = torch.from_numpy(array if one.normalizer is None else one.normalizer.normalize(array))
+        normalized[key] = torch.from_numpy(one.normalized(array))
     with torch.no_grad():
         contexts = model.prologue(normalized)
     numbers = np.array([n for n, _ in chosen], np.int64)
