@@ -20,7 +20,7 @@ from ttscompile.ir.graph import TensorType
 
 from .arrays import check_noise, check_observation, check_seed, is_tensor, like
 from .inpainting import check_prefix, known_samples, prefix_refusal
-from .onnxruntime.liveness import RolloutNeeds, rollout_needs
+from .liveness import RolloutNeeds, rollout_needs
 from .open import kind_of, open_runtime
 from .queues import Queues, is_window
 from .report import CallReport

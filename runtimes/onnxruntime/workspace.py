@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ttscompile.artifact.manifest import Manifest
-from ttscompile.core.correction import HISTORY, Correction, no_correction
+from ttscompile.core.correction import HISTORY, Correction, no_correction, remember
 from ttscompile.core.spec import FloatArray, Noise
 from ttscompile.core.update import matrices
 from ttscompile.errors import ArtifactError, ObservationError
@@ -27,7 +27,7 @@ from ttscompile.runtimes.inpainting import Known, MaskedUpdates
 
 from .bound_block import BoundBlock
 from .contexts import ContextValues
-from .idle import IdleSteps
+from .idle_steps import IdleSteps
 from .rollout_store import RolloutStore
 from .sessions import Array, Bound, run_named
 
@@ -136,10 +136,7 @@ class Workspace:
         """Tail, sampler, correction, and the next step's stem: reads ``stream``, writes ``fresh`` and a sample."""
         self._advance.steps[k].run()
         if self._advance.anchors[k]:
-            half, horizon = self._history.shape[2] // 2, self._prediction.shape[2]
-            self._history[:, :, half:] = self._history[:, :, :half]
-            self._history[:, :, :horizon] = self.sample[k % 2]
-            self._history[:, :, horizon:half] = self._prediction
+            remember(self._history, self.sample[k % 2], self._prediction)
 
     def enter_idle(self, k: int) -> None:
         """Hand the state of step k over to ``idle``."""

@@ -13,7 +13,7 @@ from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import DENSE, Manifest, abbreviated
 from ttscompile.cli.output import flops, marked, share, table
 from ttscompile.measure.units import plain
-from ttscompile.runtimes.onnxruntime.liveness import rollout_needs
+from ttscompile.runtimes.liveness import rollout_needs
 
 
 def document(directory: Path, artifact: Artifact | None = None) -> dict[str, Any]:
