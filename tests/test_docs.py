@@ -28,6 +28,7 @@ from tests.passes.test_pipeline import MODULES, spec
 from ttscompile.calibration import strategies
 from ttscompile.cli import main
 from ttscompile.frontends import families
+from ttscompile.runtimes import open as open_module
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -360,6 +361,21 @@ def test_the_strategy_of_the_contributing_guide(once: Once, tmp_path: Path, monk
     test.test_whole_steps_are_at_both_ends_where_the_calls_want_them(make_task)
     for budget in test.test_a_budget_of_one_step_leaves_step_0.pytestmark[0].args[1]:
         test.test_a_budget_of_one_step_leaves_step_0(make_task, budget)
+
+
+def test_the_runtime_of_the_contributing_guide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its module, how it is opened, its row and its test as they stand in the guide."""
+    module, opening, row, its_test = guide("A runtime")
+    contributed(module, "ttscompile.runtimes.resolved", tmp_path, monkeypatch)
+    names = vars(open_module).copy()
+    exec(opening, names)
+    for name, kind in eval(f"{{{row}}}", names).items():
+        monkeypatch.setitem(open_module.RUNTIMES, name, kind)
+    test = contributed(its_test, "contributed_test", tmp_path, monkeypatch)
+    agrees = test.test_it_agrees_with_the_reference
+    for streams in agrees.pytestmark[0].args[1]:
+        agrees(tmp_path / str(streams), streams)
+    test.test_the_pruners_plan_and_reuse_over_calls(tmp_path / "pruned")
 
 
 def test_the_site_is_built_and_loads_nothing_from_elsewhere(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from ttscompile.artifact.write import update_calibration
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import IllegalPlanError
 from ttscompile.runtimes import open_runtime
-from ttscompile.runtimes.onnxruntime.liveness import readable_rollout, rollout_needs
+from ttscompile.runtimes.liveness import readable_rollout, rollout_needs
 from ttscompile.runtimes.policy import load
 
 from .agreement import random_inputs

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -201,10 +202,13 @@ class ObservationSpec:
             drawn = self.normalizer.unnormalize(drawn)
         return drawn.astype(self.dtype)
 
-    def draw_normalized(self, rng: np.random.Generator, streams: int) -> npt.NDArray[np.generic]:
+    def draw_normalized(self, rng: np.random.Generator, streams: int) -> npt.NDArray[Any]:
         """Random observations ``[streams, *shape]`` as the network is given them."""
-        raw = np.concatenate([self.draw(rng) for _ in range(streams)])
-        return raw if self.normalizer is None else self.normalizer.normalize(raw.astype(np.float32))
+        return self.normalized(np.concatenate([self.draw(rng) for _ in range(streams)]))
+
+    def normalized(self, array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """What the network is given of observations ``[..., *shape]``; the array itself without a normaliser."""
+        return array if self.normalizer is None else self.normalizer.normalize(array)
 
 
 @dataclass(frozen=True)
@@ -229,6 +233,11 @@ class ChunkSpec:
     def __post_init__(self) -> None:
         if not 0 <= self.start < self.stop or self.action_dim < 1:
             raise SpecError(f"chunk [{self.start}:{self.stop}] of {self.action_dim} channels is empty.")
+
+    def unnormalized(self, sample: FloatArray) -> FloatArray:
+        """The actions ``[..., Da]`` of denoised samples ``[..., D]``, in their own units."""
+        actions = sample[..., : self.action_dim]
+        return actions if self.normalizer is None else self.normalizer.unnormalize(actions)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,7 @@
-"""The policy's denoising loop in plain PyTorch: what a compiled policy is measured against."""
+"""The policy's denoising loop in plain PyTorch: what a compiled policy is measured against.
+
+It shares nothing with the loop of the reference runtime on purpose: what it gives is the record that this is held to.
+"""
 
 from __future__ import annotations
 

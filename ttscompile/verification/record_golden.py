@@ -73,7 +73,7 @@ def _record_original(module: nn.Module, program: Program) -> Golden:
         raw = np.concatenate([one.draw(draw) for _ in range(streams)])
         raw = np.stack([np.resize(each, one.shape) for each in pattern(raw, one.shape)])
         observations[key] = raw
-        normalized[key] = raw if one.normalizer is None else one.normalizer.normalize(raw)
+        normalized[key] = one.normalized(raw)
     original, kept = spec.original, spec.sample[0]
     shape = (streams, *original.sample)
     initial = draw.standard_normal(shape, dtype=np.float32)
@@ -92,9 +92,7 @@ def _record_original(module: nn.Module, program: Program) -> Golden:
             "the module's prediction on a random observation within the range of its normaliser is not a number."
             " Look for NaN in its weights, and check normaliser and sampler."
         )
-    actions = sample[..., : spec.chunk.action_dim]
-    if spec.chunk.normalizer is not None:
-        actions = spec.chunk.normalizer.unnormalize(actions)
+    actions = spec.chunk.unnormalized(sample)
     evaluated = _spread(steps, EVALUATIONS)
     anchors = _spread(steps, steps if small else max(3, int(steps * EFFORT / program.dense_flops)))
     inside = _Inside(program, tensors, streams)

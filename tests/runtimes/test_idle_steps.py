@@ -14,7 +14,7 @@ from ttscompile.core.lattice import legalize, uniform_plan
 from ttscompile.ir.idle import IDLE
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.onnxruntime.backend import OnnxBackend
-from ttscompile.runtimes.onnxruntime.idle import IdleSteps
+from ttscompile.runtimes.onnxruntime.idle_steps import IdleSteps
 
 from .agreement import random_inputs
 from .conftest import MakeArtifact

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ttscompile.core.correction import FEATURES, HISTORY
+from ttscompile.core.correction import FEATURES, remember
 from ttscompile.core.spec import FloatArray, SamplerTable
 from ttscompile.core.update import clips, rows
 from ttscompile.ir.idle import BASE, PRODUCT, SHIFT, TOTAL
@@ -129,9 +129,7 @@ class IdleSteps:
             if self._memories:
                 self._memory[...] = next_memory
             if anchors[k]:
-                half = HISTORY // 2 * horizon
-                self._history[:, :, half:] = self._history[:, :, :half]
-                self._history[:, :, :half] = self._features[:, :, :half]
+                remember(self._history, self._features[:, :, :horizon], self._features[:, :, horizon : 2 * horizon])
 
 
 def _by_part(array: FloatArray, horizon: int) -> FloatArray:
