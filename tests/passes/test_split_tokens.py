@@ -134,7 +134,7 @@ def test_a_chunk_of_keys_and_values_is_split_with_its_items() -> None:
 
     b, joined = tokens()
     half = TensorType((B, 3, 4), "float32")
-    b.nodes.append(Node("kv", "aten.chunk.default", (joined, 2, 2), (), (half, half)))
+    b.nodes.append(Node("kv", "aten.split.Tensor", (joined, 4, 2), (), (half, half)))
     b.nodes.append(Node("k", GETITEM, (Ref("kv"), 1), (), (half,)))
     graph = b.graph(Ref("k"))
     result, _ = split(graph)
