@@ -31,6 +31,9 @@ the fastest wave. Embeddings have waves whose frequencies fall by the same facto
 follows sums over them: the root of their mean square is ``sqrt(1 / (2 log 10^4))``, a quarter, of the fastest. That
 leaves u times the largest angle.
 
+**Promises.** For real policies and their originals the README promises 1e-5 of the range of the actions. That is
+about the bound of one evaluation of networks of that size, and ten times what is found; tests of it have that figure.
+
 What is compared may be larger or smaller than 1, so all of this is times its largest number: an error of a small
 element comes from the large ones that it was computed with. ``tests/test_rounding.py`` shows that other orders of
 summation stay within these bounds, and that what a defect changes does not.
@@ -51,6 +54,9 @@ FLOAT32 = 2.0**-24
 """u: half of what 1 and the next number are apart."""
 
 FLOAT64 = 2.0**-53
+
+PROMISED = 1e-5
+"""Of the range of the actions: what the support table says of compiled policies and their originals."""
 
 FACTOR = 3
 """By which the difference of two sums may exceed ``sqrt(terms) u``; see above."""
