@@ -38,7 +38,7 @@ pytest: $(READY)
 	$(BIN)/pytest -m "alone and not soak"
 
 # The same as on a processor without AVX-512: torch, MKL, oneDNN, OpenBLAS and numpy each have a switch of their own.
-# onnxruntime has none; of its products of fp32 the sums are in one order with either.
+# onnxruntime has none; its matrix products of fp32 give the same bits with either (Conv and Softmax do not).
 test-avx2: export ATEN_CPU_CAPABILITY := avx2
 test-avx2: export MKL_ENABLE_INSTRUCTIONS := AVX2
 test-avx2: export ONEDNN_MAX_CPU_ISA := AVX2
