@@ -108,7 +108,7 @@ def test_defects_of_an_action_head_are_far_outside(name: str) -> None:
 
 
 def test_what_is_counted() -> None:
-    """By hand: a convolution, a product, an attention, a norm, a mean, an addition, and angles in float32 alone."""
+    """By hand: a convolution, a product, an attention, a norm, a mean, an addition, functions; angles of float32."""
     functional, x = nn.functional, torch.ones(1, 2, 4, 8)
     image, kernel, left, right = (torch.ones(shape) for shape in ((1, 3, 5, 5), (2, 3, 3, 3), (2, 7), (7, 5)))
     with Counted() as counted:
@@ -119,7 +119,7 @@ def test_what_is_counted() -> None:
     assert counted.terms == 7
     with Counted() as counted:
         functional.scaled_dot_product_attention(x, x, x)
-    assert counted.terms == 8 + 4
+    assert counted.terms == 8 + 4 + 16
     with Counted() as counted:
         functional.layer_norm(x, (8,))
     assert counted.terms == 8
@@ -129,6 +129,9 @@ def test_what_is_counted() -> None:
     with Counted() as counted:
         (x + x).transpose(0, 1).unsqueeze(0)
     assert (counted.terms, counted.angle) == (1, 0.0)
+    with Counted() as counted:
+        functional.gelu(x.tanh())
+    assert counted.terms == 16 + 16
     with Counted() as counted:
         (3 * x).sin()
         (50 * x.double()).cos()
