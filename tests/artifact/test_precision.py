@@ -13,6 +13,7 @@ import pytest
 
 from tests.artifact.folders import contents, flip
 from tests.artifact.tiny import HORIZON, WIDTH, tiny_models, tiny_program
+from tests.rounding import assert_equal_but_for_rounding
 from ttscompile.artifact import codec
 from ttscompile.artifact.load import load_artifact, read_manifest
 from ttscompile.artifact.manifest import Manifest, PrecisionError
@@ -83,7 +84,7 @@ def test_blocks_are_opened_in_the_precision_that_was_asked_for(int8: Path) -> No
         results.append(session.run(None, feed)[0])
         assert one.onnx_path("stem").name == "stem.onnx"
     expected = x @ artifact.weights["block.0.weight"].T
-    np.testing.assert_allclose(results[1], expected, rtol=1e-5, atol=1e-4)
+    assert_equal_but_for_rounding(results[1], expected, terms=WIDTH)
     assert 0 < np.linalg.norm(results[0] - expected) / np.linalg.norm(expected) < 0.02
     with pytest.raises(ArtifactError, match=r"'bf16': expected one that the artifact holds, \['fp32', 'int8'\]"):
         artifact.at_precision("bf16")

@@ -6,8 +6,8 @@ import itertools
 
 import numpy as np
 import pytest
-import torch
 
+from tests.rounding import Counted, assert_equal_but_for_rounding, bound
 from ttscompile.calibration.published.bac import (
     Schedule,
     best_schedules,
@@ -89,19 +89,20 @@ def test_statistics_of_a_dense_call(make_task: MakeTask) -> None:
     one, other = (residuals[4][0, k].double().numpy() for k in (2, 7))
     again = residuals[4][1].double().numpy()
     cosines = [a @ b / np.linalg.norm(a) / np.linalg.norm(b) for a, b in ((one, other), (again[2], again[7]))]
-    assert similarity[4, 2, 7] == pytest.approx(np.mean(cosines), abs=1e-5)
+    assert similarity[4, 2, 7] == pytest.approx(np.mean(cosines), abs=3 * bound(one.size))  # a product, two norms
     pairs = [np.abs(rows[t] - rows[u]).mean() for rows in residuals[4].numpy() for t in range(10) for u in range(10)]
-    assert change[4] == pytest.approx(np.mean(pairs), rel=1e-4)
+    assert change[4] == pytest.approx(np.mean(pairs), rel=bound(100 * one.size))
 
 
 def test_the_residuals_are_those_of_the_reference(make_task: MakeTask) -> None:
     task = make_task(20)
     calls = task.executor.selector.calls(task.calls, [3])
     dense = np.zeros((10, 6), np.int8)
-    rollout = task.executor.model.denoise(calls.contexts, calls.initial, calls.noise, dense)
+    with Counted() as counted:
+        rollout = task.executor.model.denoise(calls.contexts, calls.initial, calls.noise, dense)
     residuals = dense_residuals(task.executor, calls)
     for (k, b), expected in rollout.cache.residuals.items():
-        torch.testing.assert_close(residuals[b][0, k], expected.flatten())
+        assert_equal_but_for_rounding(residuals[b][0, k], expected.flatten(), counted.terms)
 
 
 def test_the_plan_reads_timestep_only(make_task: MakeTask) -> None:
