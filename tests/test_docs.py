@@ -27,6 +27,7 @@ from tests.once import Once
 from tests.passes.test_pipeline import MODULES, spec
 from ttscompile.calibration import strategies
 from ttscompile.cli import main
+from ttscompile.frontends import families
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -329,6 +330,24 @@ def test_the_pass_of_the_contributing_guide(tmp_path: Path, monkeypatch: pytest.
     assert len(cases) == 2
     for graph in cases:
         near_misses(graph)
+
+
+def test_the_policy_family_of_the_contributing_guide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its module, its row and its test as they stand in the guide."""
+    module, row, its_test = guide("A policy family")
+    rows = eval(f"({row})", vars(families).copy())
+    monkeypatch.setattr(families, "FAMILIES", (*rows, *families.FAMILIES))
+    contributed(module, "ttscompile.frontends.action_dit", tmp_path, monkeypatch)
+    test = contributed(its_test, "contributed_test", tmp_path, monkeypatch)
+    for name in ("compiled", "options"):
+        (tmp_path / name).mkdir()
+    test.test_the_compiled_policy_is_the_network_that_was_saved(tmp_path / "compiled")
+    test.test_options_of_other_families_are_refused(tmp_path / "options")
+    refused = test.test_a_file_that_is_no_such_policy_is_refused
+    cases = refused.pytestmark[0].args[1]
+    assert len(cases) == 5
+    for changes, message in cases:
+        refused(tmp_path, changes, message)
 
 
 def test_the_strategy_of_the_contributing_guide(once: Once, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

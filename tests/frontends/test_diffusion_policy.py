@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,21 +13,10 @@ from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 from ttscompile.errors import CheckpointError, SpecError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.diffusion_policy_weights import choose_weights
+from ttscompile.frontends.families import LoadOptions
 from ttscompile.samplers.table import sampler_table
 
-Build = Callable[..., dict[str, Any]]
-Save = Callable[[dict[str, Any]], Path]
-
-VARIANTS: list[tuple[str, bool, dict[str, Any]]] = [
-    ("token-wise condition encoder", True, {}),
-    ("token-wise condition encoder", True, {"causal_attn": False, "n_layer": 2, "n_emb": 24, "n_head": 3}),
-    ("token-wise condition encoder", True, {"causal_attn": False, "n_obs_steps": None}),
-    ("transformer condition encoder", True, {"n_cond_layers": 2}),
-    ("inpainting", False, {}),
-    ("inpainting", False, {"n_cond_layers": 1, "causal_attn": False}),
-    ("encoder-only", False, {"time_as_cond": False}),
-    ("encoder-only", False, {"time_as_cond": False, "causal_attn": False}),
-]
+from .variants import VARIANTS, Build, Save
 
 
 @pytest.mark.parametrize(("variant", "as_cond", "model"), VARIANTS)
@@ -300,7 +287,7 @@ def test_the_checkpoints_own_sampler(payload: Build, save: Save) -> None:
     assert load_checkpoint_policy(save(built))[1].sampler.timesteps.tolist() == [19, 14, 9, 4]
     built["cfg"]["policy"]["eta"] = 0.5
     assert load_checkpoint_policy(save(built))[1].sampler.stochastic
-    assert not load_checkpoint_policy(save(built), sampler="ddpm")[1].sampler.out_to_next.any()
+    assert not load_checkpoint_policy(save(built), options=LoadOptions(sampler="ddpm"))[1].sampler.out_to_next.any()
 
 
 def test_settings_of_old_schedulers(payload: Build, save: Save) -> None:
@@ -329,12 +316,12 @@ def test_sampler_override_keeps_the_betas(payload: Build, save: Save) -> None:
     path = save(payload())
     betas = {"num_train_timesteps": 20, "beta_schedule": "squaredcos_cap_v2"}
     for spacing, timesteps in ((None, [15, 10, 5, 0]), ("trailing", [19, 14, 9, 4])):
-        found = load_checkpoint_policy(path, sampler="ddim", steps=4, spacing=spacing)[1].sampler
+        found = load_checkpoint_policy(path, options=LoadOptions(sampler="ddim", steps=4, spacing=spacing))[1].sampler
         expected = sampler_table(DDIMScheduler(**betas, timestep_spacing=spacing or "leading"), 4)
         assert found.timesteps.tolist() == timesteps
         for column in found.COLUMNS:
             np.testing.assert_array_equal(getattr(found, column), getattr(expected, column))
-    assert load_checkpoint_policy(path, steps=5)[1].sampler.stochastic
+    assert load_checkpoint_policy(path, options=LoadOptions(steps=5))[1].sampler.stochastic
 
 
 @pytest.mark.parametrize(
@@ -350,7 +337,7 @@ def test_sampler_override_keeps_the_betas(payload: Build, save: Save) -> None:
 def test_impossible_samplers(payload: Build, save: Save, arguments: dict[str, Any], message: str) -> None:
     """What was asked for, and what can be asked for."""
     with pytest.raises(SpecError, match=message):
-        load_checkpoint_policy(save(payload()), **arguments)
+        load_checkpoint_policy(save(payload()), options=LoadOptions(**arguments))
 
 
 def test_another_schedulers_betas(payload: Build, save: Save) -> None:
@@ -360,4 +347,4 @@ def test_another_schedulers_betas(payload: Build, save: Save) -> None:
         "_target_": "diffusers.DPMSolverMultistepScheduler",
         "solver_order": 2,
     }
-    assert load_checkpoint_policy(save(built), sampler="ddim", steps=5)[1].sampler.name == "ddim"
+    assert load_checkpoint_policy(save(built), options=LoadOptions(sampler="ddim", steps=5))[1].sampler.name == "ddim"

@@ -22,6 +22,7 @@ from ttscompile.errors import CheckpointError
 from ttscompile.frontends import diffusion_policy, load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.encoded import EncodedDenoiser
+from ttscompile.frontends.families import AS_SAVED
 from ttscompile.frontends.robomimic_encoder import ResidualBlock, SpatialSoftmax
 from ttscompile.ir.flops import graph_flops
 from ttscompile.ir.program import Program
@@ -59,9 +60,7 @@ def build(two_cameras: Payload) -> Callable[..., tuple[Any, Any]]:
         config = copy.deepcopy(two_cameras["cfg"])
         config["policy"].update(policy)
         kept = {k: v for k, v in two_cameras["state_dicts"]["ema_model"].items() if not without or without not in k}
-        return diffusion_policy.build(
-            {"cfg": config, "state_dicts": {"ema_model": kept | (weights or {})}}, None, None, None
-        )
+        return diffusion_policy.build({"cfg": config, "state_dicts": {"ema_model": kept | (weights or {})}}, AS_SAVED)
 
     return run
 
@@ -282,7 +281,7 @@ def test_weights_that_do_not_fit(
         ({"shape_meta": {"obs": {"a": {"shape": [4]}}, "action": {"shape": [3, 2]}}}, r"action\.shape is \[3, 2\]"),
         (
             {"shape_meta": {"obs": {"a": {"shape": [4], "type": "depth"}}, "action": {"shape": [3]}}},
-            r"obs\.a\.type is 'depth'; expected rgb or low_dim",
+            r"obs\.a\.type is 'depth'; expected low_dim or rgb",
         ),
         (
             {"shape_meta": {"obs": {"a": {"shape": [4, 4], "type": "rgb"}}, "action": {"shape": [3]}}},

@@ -24,10 +24,13 @@ from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.clip_config import TextConfig
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.encoded import EncodedDenoiser
+from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.image_geometry import ResizeCrop
-from ttscompile.frontends.lerobot import build_module
+from ttscompile.frontends.lerobot import with_inputs
 from ttscompile.frontends.lerobot_config import read_lerobot_config
-from ttscompile.frontends.lerobot_processors import Normalizer, Statistics, read_processors
+from ttscompile.frontends.lerobot_processors import read_processors
+from ttscompile.frontends.lerobot_statistics import Normalizer, Statistics
+from ttscompile.frontends.lerobot_weights import Network
 from ttscompile.runtimes import open_runtime
 
 from ..runtimes.agreement import largest_difference
@@ -39,7 +42,7 @@ PLAIN = {"use_rope": False, "use_positional_encoding": True}
 
 def load(directory: Path, **options: Any) -> tuple[EncodedDenoiser, Any]:
     """Module and specification."""
-    module, spec = load_checkpoint_policy(directory, **options)
+    module, spec = load_checkpoint_policy(directory, options=LoadOptions(**options))
     assert isinstance(module, EncodedDenoiser)
     return module, spec
 
@@ -255,7 +258,8 @@ def test_a_task_that_is_compiled_in_leaves_no_text_encoder(tmp_path: Path) -> No
     obs = observe(spec, streams=1)
     config = read_lerobot_config(directory)
     task = (obs[TOKENS], obs[MASK])
-    baked = build_module(config, read_processors(directory, config.features), None, TextConfig(**TEXT), task)
+    network = Network(config, None, TextConfig(**TEXT))
+    baked = with_inputs(network, config, read_processors(directory, config.features), None, task)
     for part in ("encoder.observation_encoder", "denoiser"):
         baked.get_submodule(part).load_state_dict(module.get_submodule(part).state_dict())
     pieces = transform(baked.eval(), replace(spec, observations={STATE: spec.observations[STATE]})).pieces
@@ -310,8 +314,8 @@ def test_encoders_folder(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"'somebody/clip-small' is not on this machine.*--encoders"):
         load_checkpoint_policy(directory)
     for folder in (elsewhere, elsewhere / "clip-small"):
-        load_checkpoint_policy(directory, encoders=folder)
+        load_checkpoint_policy(directory, options=LoadOptions(encoders=folder))
     with pytest.raises(CheckpointError, match=r"tokenizer .*is not on this machine.*--encoders"):
-        load_checkpoint_policy(directory, encoders=elsewhere, task="push")
+        load_checkpoint_policy(directory, options=LoadOptions(encoders=elsewhere, task="push"))
     (elsewhere / "clip-small").rename(directory / "clip-small")
     load_checkpoint_policy(directory)

@@ -17,6 +17,7 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.core.spec import Noise, PolicySpec
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
+from ttscompile.frontends.families import LoadOptions
 from ttscompile.runtimes import open_runtime
 
 from ..families.support import record
@@ -163,7 +164,7 @@ def test_runtimes_agree_on_random_plans(golden: Golden, compiled: Path) -> None:
 
 def test_a_task_that_is_compiled_in(golden: Golden) -> None:
     """The tokenizer's files beside the policy make LeRobot's tokens; the instruction is no observation any more."""
-    module, spec = load_checkpoint_policy(golden.directory, task=str(golden.numbers["task"]))
+    module, spec = load_checkpoint_policy(golden.directory, options=LoadOptions(task=str(golden.numbers["task"])))
     encoder: Any = module.get_submodule("encoder")
     assert torch.equal(encoder.task_tokens, torch.from_numpy(golden.numbers["tokens"]))
     assert torch.equal(encoder.task_mask, torch.from_numpy(golden.numbers["attention_mask"]))

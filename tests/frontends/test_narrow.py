@@ -13,10 +13,10 @@ import torch
 from click.testing import CliRunner
 
 import ttscompile
-from tests.families.test_vla import FAMILIES, loaded
-from tests.frontends.test_diffusion_policy import VARIANTS, Build, Save
+from tests.families.heads import FAMILIES, loaded
+from tests.frontends.variants import VARIANTS, Build, Save
 from ttscompile.artifact.load import load_artifact
-from ttscompile.artifact.spec_json import spec_to_json
+from ttscompile.artifact.typed_json import to_json
 from ttscompile.capture.narrow import narrow, unneeded
 from ttscompile.cli import main
 from ttscompile.errors import ObservationError, SpecError
@@ -105,7 +105,7 @@ def test_the_rest_of_the_prediction_is_the_original(payload: Build, save: Save, 
     folder = tmp_path / "narrow"
     program = ttscompile.convert(checkpoint, folder, prediction_horizon=KEPT)
     artifact = load_artifact(folder)
-    assert spec_to_json(artifact.manifest.spec.original) == spec_to_json(original)
+    assert to_json(artifact.manifest.spec.original) == to_json(original)
     # Of the original's FLOPs two thirds are left, and less where more than tokens counts.
     assert artifact.manifest.flops.call(artifact.schedule("dense"), pruned=False) < 0.7 * program.dense_flops
 
