@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ttscompile.calibration.published.criterion import Criterion, relative_change
+from ttscompile.calibration.published.criterion import Criterion, Decisions, relative_change
 from ttscompile.core.lattice import Source
 from ttscompile.errors import ArtifactError, IllegalPlanError
 
@@ -19,7 +19,7 @@ DBCACHE = Criterion("dbcache", 1, 0.5, (1.0, 0.0), accumulates=False, warmup=1, 
 
 def decided(rule: Criterion, features: list[list[float]]) -> list[str]:
     """Of each stream, a word with a C for each step that is computed whole; ``features[k]`` has one number a stream."""
-    decisions = rule.begin(len(features), 3, len(features[0]))
+    decisions = Decisions(rule, len(features), 3, len(features[0]))
     words = [""] * len(features[0])
     for k, row in enumerate(features):
         found = decisions.decide(k, np.array(row, np.float32)[:, None])
@@ -67,7 +67,7 @@ def test_streams_decide_on_their_own() -> None:
 
 
 def test_decisions_do_not_hold_on_to_the_feature() -> None:
-    decisions = DBCACHE.begin(3, 2, 1)
+    decisions = Decisions(DBCACHE, 3, 2, 1)
     feature = np.array([[10.0]], np.float32)
     decisions.decide(0, feature)
     feature[0] = 20.0  # a runtime's buffer, used again
@@ -96,4 +96,4 @@ def test_numbers_that_cannot_be_are_refused(change: dict[str, Any], named: str) 
 
 def test_a_policy_with_nothing_left_to_decide_is_refused() -> None:
     with pytest.raises(IllegalPlanError, match="first 1 blocks at every step; the policy has 1"):
-        DBCACHE.begin(10, 1, 2)
+        Decisions(DBCACHE, 10, 1, 2)

@@ -10,7 +10,7 @@ import torch
 
 from tests.rounding import FLOAT64, Counted, assert_equal_but_for_rounding, bound
 from ttscompile.calibration.calls import Calls
-from ttscompile.calibration.published.criterion import Criterion
+from ttscompile.calibration.published.criterion import Criterion, Decisions
 from ttscompile.calibration.published.dbcache import dbcache, proposals
 from ttscompile.calibration.published.online import decide, within
 from ttscompile.calibration.published.teacache import dense_changes, proposal
@@ -40,7 +40,7 @@ def decided_by_the_reference(model: ReferenceModel, calls: Calls, rule: Criterio
     Returns:
         The denoised samples ``[N, T, D]``, and the plans ``[N, K, blocks]``.
     """
-    decisions = rule.begin(model.steps, model.blocks, calls.count)
+    decisions = Decisions(rule, model.steps, model.blocks, calls.count)
     plan = np.full((calls.count, model.steps, model.blocks), Source.COMPUTE, np.int8)
     axis = model.stem(calls.initial, 0, calls.contexts).shape.index(calls.count)
     with torch.no_grad():

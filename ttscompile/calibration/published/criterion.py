@@ -63,24 +63,6 @@ class Criterion:
         """As JSON."""
         return {**asdict(self), "polynomial": list(self.polynomial)}
 
-    def begin(self, steps: int, blocks: int, streams: int) -> Decisions:
-        """The decisions of one call; to be made anew for each call.
-
-        Args:
-            steps: K, the number of denoising steps.
-            blocks: number of residual blocks.
-            streams: B, the number of streams.
-
-        Raises:
-            IllegalPlanError: the policy has no block after the first ``always`` ones.
-        """
-        if self.always >= blocks:
-            raise IllegalPlanError(
-                f"the criterion {self.name!r} computes the first {self.always} blocks at every step; the policy has"
-                f" {blocks}, so that nothing is left to decide. Calibrate again."
-            )
-        return Decisions(self, steps, blocks, streams)
-
 
 class Decisions:
     """What a criterion decides during one call of B streams. Streams do not influence each other.
@@ -90,9 +72,17 @@ class Decisions:
         steps: K, the number of denoising steps.
         blocks: number of residual blocks.
         streams: B, the number of streams.
+
+    Raises:
+        IllegalPlanError: the policy has no block after the first ``always`` ones.
     """
 
     def __init__(self, criterion: Criterion, steps: int, blocks: int, streams: int) -> None:
+        if criterion.always >= blocks:
+            raise IllegalPlanError(
+                f"the criterion {criterion.name!r} computes the first {criterion.always} blocks at every step; the"
+                f" policy has {blocks}, so that nothing is left to decide. Calibrate again."
+            )
         self._criterion, self._steps, self._blocks = criterion, steps, blocks
         self._accumulated = np.zeros(streams)
         self._compared: npt.NDArray[np.float32] = np.empty((streams, 0), np.float32)

@@ -23,7 +23,7 @@ from ...errors import CalibrationFailedError
 from ..calls import Calls
 from ..execute import Executor, State, last
 from ..task import Array, Found, Task
-from .criterion import Criterion
+from .criterion import Criterion, Decisions
 from .fixed import COMPARED, best_of
 
 HALVINGS, DOUBLINGS = 9, 20
@@ -63,7 +63,7 @@ def decide(executor: Executor, criterion: Criterion, calls: Calls) -> Decided:
         calls: the N calls to run.
     """
     model, state = executor.model, State()
-    decisions = criterion.begin(model.steps, model.blocks, calls.count)
+    decisions = Decisions(criterion, model.steps, model.blocks, calls.count)
     first, others = range(criterion.always), range(criterion.always, model.blocks)
     computed = np.full((1, model.blocks), Source.COMPUTE, np.int8)
     rows: list[PlanArray] = []
