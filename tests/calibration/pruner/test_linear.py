@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from tests.rounding import Counted, assert_equal_but_for_rounding
+from ttscompile.calibration import sensitivity
 from ttscompile.calibration.pruner import linear
 from ttscompile.calibration.pruner.linear import LinearModel, linearise
 from ttscompile.calibration.task import Task
