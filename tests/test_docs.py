@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -21,8 +22,12 @@ import pytest
 import zarr
 from click.testing import CliRunner
 
+from tests.calibration import policies, tasks
+from tests.once import Once
 from tests.passes.test_pipeline import MODULES, spec
+from ttscompile.calibration import strategies
 from ttscompile.cli import main
+from ttscompile.frontends import families
 from ttscompile.runtimes import open as open_module
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -59,7 +64,7 @@ NOT_RUN = {
     "ttscompile serve": "has no end; tests/executor/test_serve.py starts it",
     "ttscompile convert outputs/train": "a LeRobot policy: tests/frontends/test_lerobot_golden.py converts two",
     "ttscompile convert pretrained_model": "a LeRobot policy, with --task: tests/frontends/test_lerobot.py",
-    "ttscompile calibrate compiled/ --trajectories lerobot": "of LeRobot: tests/calibration/test_recordings.py",
+    "ttscompile calibrate compiled/ --trajectories lerobot": "of LeRobot: tests/trajectories/test_recordings.py",
 }
 """How the commands begin that are not run here, and why. Every other one is run; of these the options are checked."""
 
@@ -326,6 +331,36 @@ def test_the_pass_of_the_contributing_guide(tmp_path: Path, monkeypatch: pytest.
     assert len(cases) == 2
     for graph in cases:
         near_misses(graph)
+
+
+def test_the_policy_family_of_the_contributing_guide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its module, its row and its test as they stand in the guide."""
+    module, row, its_test = guide("A policy family")
+    rows = eval(f"({row})", vars(families).copy())
+    monkeypatch.setattr(families, "FAMILIES", (*rows, *families.FAMILIES))
+    contributed(module, "ttscompile.frontends.action_dit", tmp_path, monkeypatch)
+    test = contributed(its_test, "contributed_test", tmp_path, monkeypatch)
+    for name in ("compiled", "options"):
+        (tmp_path / name).mkdir()
+    test.test_the_compiled_policy_is_the_network_that_was_saved(tmp_path / "compiled")
+    test.test_options_of_other_families_are_refused(tmp_path / "options")
+    refused = test.test_a_file_that_is_no_such_policy_is_refused
+    cases = refused.pytestmark[0].args[1]
+    assert len(cases) == 5
+    for changes, message in cases:
+        refused(tmp_path, changes, message)
+
+
+def test_the_strategy_of_the_contributing_guide(once: Once, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The module, its row and its test as they stand in the guide."""
+    written, row, its_test = guide("A strategy")
+    contributed(written, "ttscompile.calibration.published.ends", tmp_path, monkeypatch)
+    monkeypatch.setattr(strategies, "STRATEGIES", (*strategies.STRATEGIES, eval(row, vars(strategies))))
+    test = contributed(its_test, "contributed_test", tmp_path, monkeypatch)
+    make_task = partial(tasks.make_task, policies.compiled(once), policies.record(tmp_path / "calls.npz"))
+    test.test_whole_steps_are_at_both_ends_where_the_calls_want_them(make_task)
+    for budget in test.test_a_budget_of_one_step_leaves_step_0.pytestmark[0].args[1]:
+        test.test_a_budget_of_one_step_leaves_step_0(make_task, budget)
 
 
 def test_the_runtime_of_the_contributing_guide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

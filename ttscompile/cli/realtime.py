@@ -10,12 +10,12 @@ import click
 import numpy as np
 
 import ttscompile
-from ttscompile.artifact.manifest import UNIFORM
+from ttscompile.artifact.manifest import UNIFORM, marked
 from ttscompile.cli.loop_options import loop_options
 from ttscompile.cli.output import (
     artifact_argument,
+    count_option,
     json_option,
-    marked,
     ms,
     print_identity,
     print_json,
@@ -30,7 +30,6 @@ from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings, Feasib
 from ttscompile.runtimes.executor.jitter import Jitter, measure_jitter
 from ttscompile.runtimes.executor.measure import measure_latencies, neutral_observation
 from ttscompile.runtimes.executor.settings import resolve
-from ttscompile.runtimes.executor.state import feasibility
 from ttscompile.runtimes.policy import CompiledPolicy
 
 JITTER_HZ = 200
@@ -39,50 +38,46 @@ JITTER_HZ = 200
 @click.command()
 @artifact_argument
 @loop_options
-@click.option("--plan", "names", multiple=True, help="Which plan to measure; may be repeated. All, if not given.")
-@click.option("--runs", type=click.IntRange(min=1), default=20, show_default=True, help="Counted calls of each plan.")
+@click.option(
+    "--plan",
+    "names",
+    multiple=True,
+    help="A plan to measure; may be repeated. Without this option all plans are measured.",
+)
+@count_option("--runs", "Calls of each plan that are counted.", default=20)
 @click.option(
     "--jitter",
     "jitter_seconds",
     type=click.FloatRange(min=0, min_open=True),
-    help=f"Also run a {JITTER_HZ} Hz loop for so many seconds, alone and beside the default plan, and say how late it"
-    " wakes.",
+    help=f"Also run a loop of {JITTER_HZ} Hz for this many seconds, first alone and then beside the default plan, and"
+    " say how late it wakes.",
 )
 @json_option
 @click.pass_context
 def realtime(
     context: click.Context,
+    /,
     directory: Path,
     control_hz: float,
-    policy_hz: float | None,
-    horizon: int | None,
-    reserve: int | None,
     names: tuple[str, ...],
-    margin_ticks: int,
     threads: int,
     runs: int,
     jitter_seconds: float | None,
     as_json: bool,
+    **loop: Any,
 ) -> None:
     """Measure the plans of the artifact DIRECTORY and say which of them keep up with a control loop.
 
-    Exit status 1: none does.
+    The exit status is 1 if none does.
     """
     console = progress()
     policy = ttscompile.load(directory, threads=threads)
-    settings = ExecutorSettings(
-        policy_hz=policy_hz,
-        horizon=horizon,
-        reserve=reserve,
-        margin_ticks=margin_ticks,
-        measured_calls=runs,
-        tiers=names or policy.info.plans,
-    )
+    settings = ExecutorSettings(measured_calls=runs, tiers=names or policy.info.plans, **loop)
     resolved = resolve(settings, policy.info, control_hz)
     with console.status("timing"):
         policy.reset()
         measured = measure_latencies(policy, MonotonicClock(), settings, resolved.tiers)
-    judged = {name: feasibility(settings, resolved, max(times.ms) / 1e3) for name, times in measured.items()}
+    judged = {name: resolved.feasibility(max(times.ms) / 1e3) for name, times in measured.items()}
     jitter = None
     if jitter_seconds is not None:
         beside = _run_on_a_robot(judged, policy.info.default_plan)

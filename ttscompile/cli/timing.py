@@ -34,11 +34,11 @@ class Contestant:
     """One way to make a call.
 
     Attributes:
-        label: for people.
+        label: name of the contestant, for people.
         plan: that it runs; for people and the warning about a dense one.
         call: one call, given an observation of one stream and noise.
         report: the report of the last call; None if there is none, and everything was computed.
-        spec: of the policy.
+        spec: specification of the policy.
         dense_flops: of a call without a report; None where they are not known.
     """
 
@@ -55,11 +55,11 @@ class Measurement:
     """What the counted calls of one contestant took.
 
     Attributes:
-        label: of the contestant.
-        plan: that it ran.
+        label: name of the contestant, for people.
+        plan: name of the plan that it ran.
         times_ms: wall time of each call.
         prologue_ms: median of the report's timing; None without reports.
-        pruner_ms: likewise.
+        pruner_ms: median of the pruner's own time; None without reports.
         flops: median over the calls; None where they are not known.
         sparsity: mean share of reused cells.
         legalised: cells that had to be replaced because they were never computed, all calls together.
@@ -96,7 +96,7 @@ def contestants(
 
     Args:
         directory: the artifact.
-        threads: of each.
+        threads: threads that each computes with.
         plan: of the compiled policy; None for the artifact's default.
         against: ``original``, ``eager``, ``onnxruntime-dense``.
         checkpoint: for ``original`` and ``eager``.
@@ -161,10 +161,10 @@ def plan_contestant(label: str, policy: CompiledPolicy, plan: str, spec: PolicyS
     """A plan of a compiled policy.
 
     Args:
-        label: for people.
+        label: name of the contestant, for people.
         policy: loaded; contestants may share one if their plans read nothing of earlier calls.
         plan: its name.
-        spec: of the policy.
+        spec: specification of the policy.
     """
     return Contestant(
         label=label,
@@ -182,7 +182,7 @@ def _eager(checkpoint: Path, threads: int, manifest: Manifest, as_saved: bool) -
         import torch
 
         from ttscompile.frontends.eager import eager_policy
-        from ttscompile.frontends.encoded import EncodedDenoiser
+        from ttscompile.frontends.encoded import parts
     except ModuleNotFoundError as error:
         raise RuntimeUnavailableError(
             f"the original network needs {error.name}, which is not installed. Run: pip install 'ttscompile[compile]',"
@@ -195,7 +195,7 @@ def _eager(checkpoint: Path, threads: int, manifest: Manifest, as_saved: bool) -
         return network_contestant("eager PyTorch", eager_policy(module, whole), whole, manifest.flops.dense)
     sampler, dense = original.sampler, manifest.flops.dense
     # An encoder runs once a call, whatever the sampler: what it takes is not known apart.
-    flops = None if isinstance(module, EncodedDenoiser) else dense / manifest.steps * sampler.steps
+    flops = dense / manifest.steps * sampler.steps if parts(module).encoder is None else None
     label = f"original, {sampler.name} {sampler.steps}"
     return network_contestant(label, eager_policy(module, original), original, flops)
 
@@ -205,7 +205,7 @@ def original_policy(checkpoint: Path, spec: PolicySpec) -> tuple[nn.Module, Poli
 
     Args:
         checkpoint: as ``convert`` took it.
-        spec: of the artifact.
+        spec: specification of the policy in the artifact.
 
     Raises:
         SpecError: the checkpoint is of another policy.
@@ -230,9 +230,9 @@ def network_contestant(label: str, run: EagerPolicy, spec: PolicySpec, dense_flo
     """The whole network in PyTorch, once a step.
 
     Args:
-        label: for people.
+        label: name of the contestant, for people.
         run: of ``ttscompile.frontends.eager``.
-        spec: of the policy.
+        spec: specification of the policy.
         dense_flops: of a call; None where they are not known.
     """
     import torch

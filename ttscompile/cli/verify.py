@@ -9,7 +9,15 @@ from rich.console import Console
 
 import ttscompile
 from ttscompile.artifact.manifest import abbreviated
-from ttscompile.cli.output import artifact_argument, json_option, only_results_on_stdout, print_json, progress, results
+from ttscompile.cli.output import (
+    artifact_argument,
+    count_option,
+    json_option,
+    only_results_on_stdout,
+    print_json,
+    progress,
+    results,
+)
 from ttscompile.cli.output import table as make_table
 from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
 from ttscompile.measure.machine import fingerprint, one_line
@@ -19,13 +27,13 @@ from ttscompile.plots.errors import plot_errors
 @click.command(cls=FilesCommand)
 @artifact_argument
 @trajectories_options(required=False)
-@click.option("--calls", type=click.IntRange(min=1), default=24, show_default=True, help="Recorded calls, at least.")
-@click.option("--threads", type=click.IntRange(min=1), default=1, show_default=True, help="Of onnxruntime.")
+@count_option("--calls", "Recorded calls to check at least; whole episodes are taken.", default=24)
+@count_option("--threads", "Threads that onnxruntime computes with.")
 @click.option(
     "--plot",
     "picture",
     type=click.Path(path_type=Path),
-    help="Draw the errors of residuals, steps across and blocks down, into this file (.png, .svg, .pdf).",
+    help="Draw the error of every block at every step into this file (.png, .svg or .pdf).",
 )
 @json_option
 @click.pass_context
@@ -41,8 +49,8 @@ def verify(
 ) -> None:
     """Check the artifact DIRECTORY against the answers of the original network that it holds.
 
-    Neither the checkpoint nor torch is needed. Without --trajectories the error of reuse is told, and not judged. Exit
-    status 1: a check failed; the first that did says where and what to do.
+    Neither the checkpoint nor PyTorch is needed. Without --trajectories the error of the plans is shown, and not
+    judged. The exit status is 1 if a check failed; the output says where, and what to do.
     """
     console = progress()
     with only_results_on_stdout(), console.status("verifying") as status:

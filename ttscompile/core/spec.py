@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import SpecError
+from .rules import DType, Positive
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -143,14 +144,14 @@ class ObservationSpec:
         dtype: numpy name of the dtype that callers must give.
         window: whether the first axis, where there are several, is time: the last To frames. A key without frames, such
             as an instruction, is what it is at the time of the call.
-        bounds: the smallest and largest value that there can be, each a number or one for each entry of the last axis;
-            None if that is not known. Integers outside them are refused: they are rows of an embedding. So are images
-            (``image``). Random observations are drawn within them. Kept as tuples.
+        bounds: the range of the values that random observations are drawn from, low and high, each a number or one for
+            each entry of the last axis; None if that is not known. Integers outside it are refused: they are rows of an
+            embedding. So are images (``image``). A vector may stray from it. Kept as tuples.
     """
 
-    shape: tuple[int, ...]
+    shape: tuple[Positive, ...]
     normalizer: Affine | None = None
-    dtype: str = "float32"
+    dtype: DType = "float32"
     window: bool = True
     bounds: tuple[float | tuple[float, ...], float | tuple[float, ...]] | None = None
 
@@ -255,7 +256,7 @@ class PolicySpec:
         left_out: steps that the original predicts after the last one of the sample (``ttscompile.capture.narrow``).
     """
 
-    sample: tuple[int, int]
+    sample: tuple[Positive, Positive]
     observations: Mapping[str, ObservationSpec]
     sampler: SamplerTable
     chunk: ChunkSpec

@@ -12,7 +12,7 @@ from torch import nn
 
 from ..core.spec import Noise, PolicySpec
 from ..errors import ObservationError
-from .encoded import EncodedDenoiser
+from .encoded import parts
 
 EagerPolicy = Callable[[Mapping[str, torch.Tensor], Noise], torch.Tensor]
 
@@ -69,7 +69,8 @@ def evaluation(
 ) -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor]:
     """One evaluation of the denoiser, a function of sample and timesteps, for these observations."""
     named = {spec.arguments[key]: value for key, value in observations.items()}
-    if isinstance(module, EncodedDenoiser):
-        encoded, denoiser = module.encoder(named), module.denoiser
+    encoder, denoiser = parts(module)
+    if encoder is not None:
+        encoded = encoder(named)
         return lambda sample, timestep: denoiser(sample, timestep, encoded)
     return lambda sample, timestep: module(**{spec.sample_argument: sample, spec.timestep_argument: timestep}, **named)

@@ -97,10 +97,9 @@ def require_precision(precision: str) -> None:
     """
     if precision == BF16:
         raise LoweringError(
-            "precision 'bf16': expected an onnxruntime whose CPU provider multiplies bfloat16 matrices; found none:"
-            " on x86 it has no such kernel even where the processor has the instructions (avx512_bf16, amx_bf16), on"
-            " ARM ttscompile has not been tried with it, and storing bfloat16 to compute in float32 saves no time."
-            " Convert with precision 'int8', which is faster and whose action error is measured, or 'fp32'."
+            "precision 'bf16': expected an onnxruntime whose CPU provider multiplies bfloat16 matrices; on x86 it has"
+            " no such kernel, whatever the processor has, and on ARM ttscompile has not been tried. Convert with"
+            " precision 'int8', which is faster and whose action error is measured, or 'fp32'."
         )
     if precision not in (FP32, INT8):
         raise LoweringError(f"precision {precision!r}: expected one of {', '.join(map(repr, PRECISIONS))}.")

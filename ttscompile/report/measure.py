@@ -34,7 +34,7 @@ class Latency:
         quartiles: first and third of the total.
         parts: of ``PARTS`` by name.
         pruner: the pruner's own time, most of it beside step 0.
-        flops: of a call.
+        flops: FLOPs of a call.
     """
 
     plan: str
@@ -50,7 +50,7 @@ class Course:
     """One episode with the default plan.
 
     Attributes:
-        name: of the episode.
+        name: file and number of the episode.
         plans: int8 ``[R, K, blocks]``, as executed.
         legalised: cells of each call that were replaced because they were never computed.
     """

@@ -46,7 +46,7 @@ def _map(found: Verification) -> tuple[Picture, ...]:
         )
     )
     caption = "Relative error of every block's residual at the steps that were looked at: steps across, blocks down."
-    return (Picture(png, alt=caption, caption=caption),)
+    return (Picture(png, caption),)
 
 
 def _told(rung: Rung) -> str:

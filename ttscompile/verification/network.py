@@ -83,7 +83,7 @@ def block_errors(
     """Relative errors of each block taken alone, ``[A, blocks]``.
 
     Args:
-        manifest: of the artifact.
+        manifest: manifest of the artifact.
         golden: its record.
         function: gives the residuals.
         rows: which of the recorded steps; None for all.

@@ -20,7 +20,7 @@ from ..artifact.load import Artifact
 from ..core.spec import FloatArray, Noise, PolicySpec
 from ..errors import CaptureError
 from ..frontends.eager import eager_policy
-from ..frontends.encoded import EncodedDenoiser
+from ..frontends.encoded import parts
 from ..ir.dataflow import reachable_from
 from ..ir.evaluate import Evaluator
 from ..ir.graph import Graph, TensorType, backward_slice
@@ -168,7 +168,7 @@ class _Watch:
     """What goes in and comes out of each evaluation of a module: ``[B, T, D]`` each.
 
     Args:
-        module: hooked. Of one with an observation encoder before it, which runs once a call, the rest.
+        module: whose part that is evaluated at every step is hooked.
         spec: names the sample's argument.
     """
 
@@ -176,8 +176,7 @@ class _Watch:
         self._argument = spec.sample_argument
         self.given: list[FloatArray] = []
         self.predicted: list[FloatArray] = []
-        evaluated = module.denoiser if isinstance(module, EncodedDenoiser) else module
-        evaluated.register_forward_hook(self._saw, with_kwargs=True)
+        parts(module).denoiser.register_forward_hook(self._saw, with_kwargs=True)
 
     def _saw(self, _: nn.Module, args: tuple[Any, ...], kwargs: dict[str, Any], output: torch.Tensor) -> None:
         sample = args[0] if args else kwargs[self._argument]

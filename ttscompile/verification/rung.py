@@ -17,12 +17,12 @@ class Rung:
     """One check.
 
     Attributes:
-        name: of the rung.
+        name: name of the rung.
         status: ``passed``, ``failed`` or ``skipped``.
         told: what was compared, and what was found.
         figure: the error; None where there is no number.
-        tolerance: what it may be.
-        unit: of both.
+        tolerance: the largest error that passes.
+        unit: what error and tolerance are shares or multiples of.
         remedy: what to do; empty if nothing is to be done.
         step: first denoising step that differs; None if none does, or none can be named.
         blocks: residual blocks that differ.
@@ -57,10 +57,10 @@ class ErrorMap:
     Attributes:
         steps: the steps that were looked at, ``[A]``.
         errors: relative error of each block's residual there, ``[A, blocks]``.
-        tolerance: what it may be.
+        tolerance: the largest error that passes.
         kinds: kind of each block.
         plan: name of a plan of which cells differ from what was calibrated; None if none does.
-        cells: bool ``[K, blocks]``, these cells; None likewise.
+        cells: bool ``[K, blocks]``, true for these cells; None if none differs.
     """
 
     steps: npt.NDArray[np.int64]
@@ -80,7 +80,7 @@ class Verification:
         identity: sha256 of what the artifact computes; None where that cannot be read.
         model_identity: the same without plans.
         rungs: in order; after one of integrity that failed there are none.
-        seconds: that it took.
+        seconds: how long all rungs took.
         map: errors of residuals; None if they were not looked at.
     """
 
