@@ -15,11 +15,11 @@ import numpy.typing as npt
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import DENSE
 from ttscompile.core.spec import FP32, ChunkSpec, FloatArray, Noise, ObservationSpec
-from ttscompile.errors import IllegalPlanError, ObservationError, RuntimeUnavailableError, TtscompileError
+from ttscompile.errors import IllegalPlanError, RuntimeUnavailableError, TtscompileError
 from ttscompile.ir.graph import TensorType
 
-from .arrays import check_noise, check_observation, check_seed, is_tensor, like
-from .inpainting import check_prefix, known_samples, prefix_refusal
+from .arrays import check_observation, check_seed, is_tensor, like
+from .inpainting import check_prefix, prefix_refusal
 from .liveness import RolloutNeeds, rollout_needs
 from .open import kind_of, open_runtime
 from .queues import Queues, is_window
@@ -289,21 +289,16 @@ class CompiledPolicy:
         spec = self._manifest.spec
         obs = check_observation(obs_dict, spec.observations)
         streams = len(next(iter(obs.values())))
-        if self._runtime.streams not in (None, streams):
-            raise ObservationError(
-                f"the observation holds {streams} streams, and the episode under way {self._runtime.streams}:"
-                " residuals are kept for each stream. Call reset() before changing the number of streams."
-            )
+        self._runtime.require_streams(streams)
         if prefix is not None:
             prefix = check_prefix(prefix, streams, spec, self._prefix_refusal)
             prefix = prefix if spec.chunk.normalizer is None else spec.chunk.normalizer.normalize(prefix)
-        noise = self._draw(streams) if noise is None else check_noise(noise, streams, spec)
         matrix, name, repair = self._plan(plan)
         correction = None if name is None else self._artifact.corrections.get(name)
-        known = None if prefix is None else known_samples(spec, prefix, noise.initial)
+        noise = self._draw(streams) if noise is None else noise
         normalized = {key: spec.observations[key].normalized(array) for key, array in obs.items()}
         sample, self._report = self._runtime.predict(
-            normalized, noise, matrix, plan_name=name, repair=repair, correction=correction, known=known
+            normalized, noise, matrix, plan_name=name, repair=repair, correction=correction, prefix=prefix
         )
         return spec.chunk.unnormalized(sample)
 

@@ -22,11 +22,12 @@ from ttscompile.artifact.load import Artifact
 from ttscompile.artifact.manifest import DENSE, PRUNER
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import BoolArray, PlanArray, Source, check_plan, require_legal
-from ttscompile.core.spec import FloatArray, Noise, PolicySpec
+from ttscompile.core.spec import FloatArray, Noise
 from ttscompile.errors import IllegalPlanError, ObservationError
 
+from .arrays import check_noise
 from .backend import Backend, Call
-from .inpainting import Known
+from .inpainting import known_samples
 from .report import GIVEN, CallReport, Timings
 from .settle import LoweringCache, pruner_plan, settle_plan
 
@@ -87,6 +88,18 @@ class Runtime:
         """Forget the rollout cache: a new episode, of any number of streams. Its memory is kept."""
         self._written = self._dropped = None
 
+    def require_streams(self, streams: int) -> None:
+        """Raise unless a call of so many streams may be the next one.
+
+        Raises:
+            ObservationError: the episode under way has another number.
+        """
+        if self.streams not in (None, streams):
+            raise ObservationError(
+                f"the observation holds {streams} streams, and the episode under way {self.streams}: residuals are kept"
+                " for each stream. Call reset() before changing the number of streams."
+            )
+
     def predict(
         self,
         obs: Mapping[str, FloatArray],
@@ -96,18 +109,18 @@ class Runtime:
         plan_name: str | None = None,
         repair: bool = False,
         correction: Correction | None = None,
-        known: Known | None = None,
+        prefix: FloatArray | None = None,
     ) -> tuple[FloatArray, CallReport]:
         """Denoise one chunk. A call that fails after its arguments were checked ends the episode, as ``reset`` does.
 
         Args:
             obs: normalised observation by key, ``[B, ...]`` each, of the dtype of its specification.
-            noise: ``initial [B, T, D]``; ``steps [K, B, T, D]``, needed by a stochastic sampler.
+            noise: see ``arrays.check_noise``.
             plan: ``[K, blocks]`` or ``[B, K, blocks]`` of ``Source``; None asks the pruner.
             plan_name: for the report; None for ``pruner`` or ``given``.
             repair: legalise ``plan`` and count it, rather than refuse it when it is illegal.
             correction: of the sampler's steps, which belongs to this plan; None for none.
-            known: what a prefix makes known of the samples, see ``inpainting``; None for nothing.
+            prefix: normalised actions that are committed already, ``[B, N, Da]``; see ``inpainting``. None for none.
 
         Returns:
             The denoised sample, float32 ``[B, T, D]``, and the report.
@@ -118,7 +131,10 @@ class Runtime:
             ObservationError: the number of streams differs from the episode's, or ``noise`` does not fit.
         """
         backend = self.backend
-        streams = check_call(self.streams, noise, self._manifest.spec)
+        spec, streams = self._manifest.spec, len(next(iter(obs.values())))
+        self.require_streams(streams)
+        noise = check_noise(noise, streams, spec)
+        known = None if prefix is None else known_samples(spec, prefix, noise.initial)
         cells = (streams, self._manifest.steps, len(self._groups))
         written = np.zeros(cells, dtype=np.bool_) if self._written is None else self._written
         dropped = np.zeros(cells, dtype=np.bool_) if self._dropped is None else self._dropped
@@ -209,39 +225,6 @@ def _prune(
     plans, legalised = settle_plan(pruner_plan(backend.logits()), groups, written, repair=True)
     lowered = tuple(lowering.lower(one) for one in plans)
     return _Settled(plans, lowered, legalised, _milliseconds(start, time.perf_counter()))
-
-
-def check_call(streams: int | None, noise: Noise, spec: PolicySpec) -> int:
-    """Number of streams of a call whose noise fits it.
-
-    Args:
-        streams: B of the episode under way, or None.
-        noise: of the call.
-        spec: of the policy; its sampler says whether the draws of the steps are read.
-
-    Raises:
-        ObservationError: see ``Runtime.predict``.
-    """
-    sampler, (horizon, channels) = spec.sampler, spec.sample
-    initial: tuple[int, ...] = np.shape(noise.initial)
-    if len(initial) != 3 or initial[1:] != spec.sample or initial[0] < 1:
-        raise ObservationError(f"noise.initial has shape {initial}; expected [B, T, D] = (B, {horizon}, {channels}).")
-    found = initial[0]
-    expected = (sampler.steps, *initial)
-    draws = noise.steps if sampler.stochastic else None
-    if sampler.stochastic and draws is None:
-        raise ObservationError(
-            f"noise.steps is None, and the sampler {sampler.name!r} draws noise at its steps; expected float32"
-            f" [K, B, T, D] = {expected}."
-        )
-    if draws is not None and np.shape(draws) != expected:
-        raise ObservationError(f"noise.steps has shape {np.shape(draws)}; expected [K, B, T, D] = {expected}.")
-    if streams is not None and streams != found:
-        raise ObservationError(
-            f"the call has {found} streams, and the episode under way has {streams}: the rollout cache is kept for"
-            " each stream. Call reset() before changing the number of streams."
-        )
-    return found
 
 
 def _frozen(plans: PlanArray) -> PlanArray:

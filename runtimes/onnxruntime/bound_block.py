@@ -25,7 +25,6 @@ class BoundBlock:
         stream: what it reads.
         residual: what it writes.
         count: n.
-        whole: whether these are all streams.
     """
 
     def __init__(
@@ -37,10 +36,10 @@ class BoundBlock:
         stream: Array,
         residual: Array,
         count: int,
-        whole: bool,
     ) -> None:
         self._stream, self._axis = stream, axis
         self.rows = np.moveaxis(residual, axis, 0)
+        whole = count == contexts.streams
         self._by_step: list[tuple[Array, Array]] = []  # where it is read from, and one value a step
         self._gathered: list[tuple[Array, Array, int, bool]] = []  # where, value, axis of the streams, one a step
         arrays: dict[str, Array] = {}

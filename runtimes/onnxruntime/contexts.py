@@ -24,12 +24,15 @@ class ContextValues:
         sessions: by piece.
         tables: TABLE contexts ``[K, ...]``.
         streams: B.
+
+    Attributes:
+        streams: B.
     """
 
     def __init__(
         self, manifest: Manifest, sessions: Mapping[str, Any], tables: Mapping[str, Array], streams: int
     ) -> None:
-        self._manifest, self._sessions, self._streams = manifest, sessions, streams
+        self._manifest, self._sessions, self.streams = manifest, sessions, streams
         self._step_inputs: dict[str, Array] = {}
         self._values: dict[str, Array] = {  # condition values; step and table values [K, ...]
             name: repeat_streams(tables[name], _row_axis(context), streams)
@@ -99,7 +102,7 @@ class ContextValues:
         if axis is None:
             raise ArtifactError(f"step value {name!r} has no axis for the streams. Convert the checkpoint again.")
         front = np.moveaxis(value, axis, 0)
-        split = front.reshape(self._manifest.steps, self._streams, *front.shape[1:])
+        split = front.reshape(self._manifest.steps, self.streams, *front.shape[1:])
         return np.moveaxis(split, 1, axis + 1)
 
 

@@ -218,9 +218,8 @@ class Workspace:
 
     def _bound_block(self, b: int, stream: Array, residual: Array, count: int) -> BoundBlock:
         """The session of block b on these arrays, which are of so many streams."""
-        name, whole = block_name(b), stream is self.stream
-        piece = self._manifest.pieces[name]
-        return BoundBlock(self._sessions[name], piece, self._contexts, self.axis, stream, residual, count, whole)
+        session, piece = self._sessions[block_name(b)], self._manifest.pieces[block_name(b)]
+        return BoundBlock(session, piece, self._contexts, self.axis, stream, residual, count)
 
     def sums(self, count: int) -> Array:
         """Room for sums, float32 ``[>= count, *stream]``; what was in it is lost when it grows."""

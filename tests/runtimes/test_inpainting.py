@@ -143,8 +143,7 @@ def test_both_runtimes_agree_on_prefixes(artifacts: dict[str, Artifact], name: s
         obs, noise = random_inputs(artifact, rng, streams)
         prefix = None if length is None else rng.uniform(-1, 1, (streams, length, 2)).astype(np.float32)
         correction = corrections[call % 3]
-        known = None if prefix is None else known_samples(artifact.manifest.spec, prefix, noise.initial)
-        ours, theirs = (r.predict(obs, noise, plans, correction=correction, known=known)[0] for r in runtimes)
+        ours, theirs = (r.predict(obs, noise, plans, correction=correction, prefix=prefix)[0] for r in runtimes)
         assert_equal_but_for_rounding(ours, theirs, terms)
         if prefix is not None:
             np.testing.assert_array_equal(ours[:, START : START + prefix.shape[1]], prefix)
@@ -200,13 +199,12 @@ def test_a_network_inpaints_as_the_loop_of_its_scheduler(make_artifact: MakeArti
         sample = scheduler.step(model.tail(stream, k, contexts), t, sample).prev_sample
     sample[here] = known
 
-    held = known_samples(program.spec, prefix, noise.initial)
     given = program.spec.observations["obs"].normalizer
     assert given is not None
     terms = call_terms(artifact)
     for name in ("reference", "onnxruntime"):
         runtime = open_runtime(artifact, name)
-        found, _ = runtime.predict(obs, noise, dense_plan(STEPS, BLOCKS), known=held)
+        found, _ = runtime.predict(obs, noise, dense_plan(STEPS, BLOCKS), prefix=prefix)
         assert_equal_but_for_rounding(found, sample, terms)
         plain, _ = runtime.predict(obs, noise, dense_plan(STEPS, BLOCKS))
         assert np.abs(found - plain)[:, START : START + 3, 1].max() > 1e-2  # the other channel saw it
@@ -239,9 +237,9 @@ def test_no_action_committed_is_no_prefix_and_a_prefix_leaves_nothing_behind(art
     plan = uniform_plan(STEPS, BLOCKS, 3)
     before = runtime.predict(obs, noise, plan, correction=correction)[0]
     for length in (0, 4, 0, 2, 0):
-        known = known_samples(artifact.manifest.spec, np.zeros((2, length, 2), np.float32), noise.initial)
-        assert (known is None) == (length == 0)
-        sample = runtime.predict(obs, noise, plan, correction=correction, known=known)[0]
+        prefix = np.zeros((2, length, 2), np.float32)
+        assert (known_samples(artifact.manifest.spec, prefix, noise.initial) is None) == (length == 0)
+        sample = runtime.predict(obs, noise, plan, correction=correction, prefix=prefix)[0]
         assert np.array_equal(sample, before) == (length == 0)
     np.testing.assert_array_equal(runtime.predict(obs, noise, plan, correction=correction)[0], before)
 

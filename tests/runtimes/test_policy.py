@@ -139,7 +139,7 @@ def test_plans_that_are_no_matrix_are_refused(policy: CompiledPolicy) -> None:
 
 @pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
 def test_a_stochastic_sampler_needs_its_draws(toy_artifact: Artifact, runtime: str) -> None:
-    with pytest.raises(ObservationError, match=r"noise.steps is None.*\[K, B, T, D\] = \(5, 2, 3, 2\)"):
+    with pytest.raises(ObservationError, match=r"noise.steps is missing.*\[K, B, T, D\] = \(5, 2, 3, 2\)"):
         open_runtime(toy_artifact, runtime).predict({"obs": OBS}, Noise(some_noise().initial), dense_plan(5, 5))
 
 
