@@ -254,7 +254,7 @@ class ExecutorState:
             return "discarded"
         outcome = self._schedule.add(job.observed, actions, now)
         if outcome == "scheduled":
-            self._plan_ahead()
+            self._update_due()
         refused = outcome == "refused"
         if refused:
             self.recorder.last_refusal = self._schedule.refusal
@@ -270,7 +270,7 @@ class ExecutorState:
         counts.switches_down += switched == 1
         counts.switches_up += switched == -1
         if switched:
-            self._plan_ahead()
+            self._update_due()
         return outcome
 
     def fail(self) -> None:
@@ -287,7 +287,7 @@ class ExecutorState:
         """Seconds that the next call has to start before its chunk is needed."""
         return self._latency + self._settings.margin_ticks / self._resolved.control_hz
 
-    def _plan_ahead(self) -> None:
+    def _update_due(self) -> None:
         """Say what of the schedule is in reserve: what goes on for longer than the next call has to take.
 
         At least half a tick is left between the two, so that a frame which comes so late still starts its call.
