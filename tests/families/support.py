@@ -11,6 +11,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+from tests.ir.meta import assert_types_of
 from ttscompile.ir.flops import graph_flops
 from ttscompile.ir.program import Program
 
@@ -34,6 +35,7 @@ def record(family: str, verified_against: str, sampler: str, program: Program) -
     Raises:
         AssertionError: the row is missing or says something else; the message holds the right one.
     """
+    assert_types_of(program)
     found = row(family, verified_against, sampler, program)
     committed = next((each for each in read_record()["families"] if each["family"] == family), None)
     assert committed == found, (

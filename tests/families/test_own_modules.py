@@ -12,6 +12,7 @@ from torch import nn
 import ttscompile
 from tests.families.checks import assert_runtimes_agree, in_loop, kinds
 from tests.families.modules import CHANNELS, FEATURES, HORIZON, MODULES, TOKENS
+from tests.ir.meta import assert_types_of
 from tests.passes.specs import toy_spec
 from tests.passes.test_pipeline import STREAMS, evaluate_pieces
 from tests.rounding import Counted, assert_equal_but_for_rounding
@@ -43,6 +44,7 @@ LOWERED = ("MM-DiT", "guidance")
 
 def assert_found(name: str, program: Program) -> None:
     found, coarse, share = FOUND[name]
+    assert_types_of(program)
     assert kinds(program) == found
     assert sum(block.residual is None for block in program.blocks) == coarse
     assert all(bool(block.reason) is (block.residual is None) for block in program.blocks)
