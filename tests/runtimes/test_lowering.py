@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.rounding import assert_equal_but_for_rounding
 from ttscompile import Source
 from ttscompile.core.lattice import PlanArray, dense_plan, uniform_plan
 from ttscompile.errors import IllegalPlanError
@@ -153,7 +154,9 @@ def test_instructions_do_what_section_2_says(
         decode_first(work, keep)  # type: ignore[arg-type]
         decode_rest(work, [cache.lower(plan) for plan in plans], keep)  # type: ignore[arg-type]
         expected = [episode.call(work.x[s], plans[s]) for s, episode in enumerate(episodes)]
-        np.testing.assert_allclose(work.sample[steps % 2], np.stack(expected), rtol=1e-4, atol=1e-4)
+        # Residual and stream are rounded for each block, three values for each step; weights of norm up to four.
+        terms = 4**2 * steps * (2 * len(groups) + 3)
+        assert_equal_but_for_rounding(work.sample[steps % 2], np.stack(expected), terms)
         ran = sorted((s, k, b) for k, b, some in work.runs for s in some)
         assert ran == sorted(map(tuple, np.argwhere(plans == C).tolist()))  # nothing else, and nothing twice
         assert len(work.runs) == np.count_nonzero((plans == C).any(axis=0))  # together where several compute
