@@ -234,7 +234,7 @@ def main(
         plot_plan(plan, kinds, picture)
         console.print(f"which blocks one call computes: {picture}")
     pair = [evaluations[0].rollout.episodes[0], evaluations[-1].rollout.episodes[0]]
-    save_animation(animation, pair, ["original", f"compiled, {speeds[0].median / speeds[-1].median:.0f} times faster"])
+    save_animation(animation, pair, [ORIGINAL, COMPILED])
     console.print(f"the episode of seed {first_seed}, original and compiled: {animation}")
     console.print(f"everything on one page: .venv/bin/ttscompile report {artifact} -o report.html", soft_wrap=True)
     console.print("what to do with a policy of your own: docs/tutorial.md", soft_wrap=True)
