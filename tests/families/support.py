@@ -77,7 +77,7 @@ def render(content: dict[str, list[Row]]) -> str:
     lines = [
         BEGIN,
         "| Policy | Compared with, and largest difference allowed | Sampler and steps | Residual blocks found |"
-        + " Arithmetic not repeated at every step |",
+        " Arithmetic not repeated at every step |",
         "| --- | --- | --- | --- | --- |",
     ]
     lines += [
