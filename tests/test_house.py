@@ -101,6 +101,15 @@ def test_imports_go_one_way() -> None:
     assert direction_errors(found, set(MODULES)) == []
 
 
+def test_no_modules_import_each_other() -> None:
+    """Not even in functions, or for types alone: what depends on each other is one module, or is cut elsewhere."""
+    ahead = {
+        name: {target: 1 for each in found if (target := home(each.target, MODULES)) not in (None, name)}
+        for name, found in GRAPH.items()
+    }
+    assert circles(ahead) == []
+
+
 @pytest.mark.parametrize(
     ("importer", "target"),
     [

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from .measure.versions import VERSION as __version__
 
 if TYPE_CHECKING:
-    from .calibration import calibrate as calibrate
+    from .calibration.pipeline import calibrate as calibrate
     from .core.lattice import Source as Source
     from .core.lattice import legalize as legalize
     from .core.spec import Affine as Affine
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 _HOMES = {
     name: home
     for home, names in {
-        "calibration": ("calibrate",),
+        "calibration.pipeline": ("calibrate",),
         "core.lattice": ("Source", "legalize"),
         "core.spec": ("Affine", "ChunkSpec", "Noise", "ObservationSpec", "PolicySpec", "SamplerTable"),
         "driver": ("compile_denoiser", "convert"),

@@ -9,7 +9,7 @@ import numpy as np
 
 from ttscompile.core.lattice import BoolArray
 
-from .idle import WORTH, IdleSteps
+from .idle_steps import WORTH, IdleSteps
 from .instructions import Instructions
 from .sessions import Array
 from .workspace import Workspace

@@ -12,6 +12,7 @@ import torch
 from torch import nn
 
 from tests.passes.specs import toy_spec
+from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile import PolicySpec
 from ttscompile.driver import _run as _pass
 from ttscompile.driver import transform
@@ -182,9 +183,10 @@ def test_the_pieces_compute_what_the_module_computes(name: str) -> None:
     module, program = compiled(name)
     for k, t in enumerate(program.spec.sampler.timesteps):
         sample, obs = torch.randn(STREAMS, 4, 2), torch.randn(STREAMS, 3, 7)
-        with torch.no_grad():
+        with torch.no_grad(), Counted() as counted:
             expected = module(sample, torch.full((STREAMS,), int(t)), obs)
-        torch.testing.assert_close(evaluate_pieces(program, sample, obs, k), expected, rtol=1e-5, atol=1e-5)
+        found = evaluate_pieces(program, sample, obs, k)
+        assert_equal_but_for_rounding(found, expected, counted.terms, counted.angle)
 
 
 def test_time_token_becomes_a_table_and_observation_tokens_are_encoded_once() -> None:
@@ -298,8 +300,11 @@ def test_pruner_averages_a_feature_that_is_huge() -> None:
     (feature,) = program.pieces.features
     obs = torch.randn(2, 600, 40)
     (logits,) = _run(program, program.pieces.pruner, {feature: obs})
-    (same,) = _run(program, program.pieces.pruner, {feature: obs.mean(1, keepdim=True).expand(-1, 600, -1)})
-    torch.testing.assert_close(logits, same)
+    with Counted() as counted:
+        (same,) = _run(program, program.pieces.pruner, {feature: obs.mean(1, keepdim=True).expand(-1, 600, -1)})
+    free = same.abs() < 1e6  # step 0 has the logits of a plan that is forced
+    assert_equal_but_for_rounding(logits, same, counted.terms)
+    assert_equal_but_for_rounding(logits[free], same[free], counted.terms)
 
 
 class NoResidual(nn.Module):

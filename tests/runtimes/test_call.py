@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.rounding import assert_equal_but_for_rounding
 from ttscompile import Noise, Source
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.write import update_calibration
@@ -23,7 +24,7 @@ from ttscompile.runtimes.onnxruntime.backend import OnnxBackend
 from ttscompile.runtimes.onnxruntime.workspace import Workspace
 from ttscompile.runtimes.reference.model import ReferenceModel
 
-from .agreement import random_inputs
+from .agreement import call_terms, random_inputs
 from .conftest import MakeArtifact
 from .toys import toy_program
 
@@ -211,9 +212,8 @@ def test_single_blocks_are_opened_by_the_first_plan_that_needs_them(toy_artifact
     runtime.reset()
     partial = uniform_plan(5, 5, 3)
     partial[4, 2] = Source.COMPUTE
-    np.testing.assert_allclose(
-        runtime.predict(obs, noise, partial)[0], other.predict(obs, noise, partial)[0], rtol=1e-5, atol=1e-6
-    )
+    found, expected = (each.predict(obs, noise, partial)[0] for each in (runtime, other))
+    assert_equal_but_for_rounding(found, expected, call_terms(toy_artifact))
     assert "block_00" in runtime.backend.sessions
 
 
@@ -223,7 +223,7 @@ def test_streams_that_compute_whole_steps_need_no_single_blocks(toy_artifact: Ar
     obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), 3)
     plans = np.stack([uniform_plan(5, 5, n) for n in (1, 2, 3)])
     found, expected = (each.predict(obs, noise, plans)[0] for each in (runtime, other))
-    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+    assert_equal_but_for_rounding(found, expected, call_terms(toy_artifact))
     assert "block_00" not in runtime.backend.sessions
 
 

@@ -7,16 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.rounding import assert_equal_but_for_rounding
 from ttscompile import Source
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.write import update_calibration
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import IllegalPlanError
 from ttscompile.runtimes import open_runtime
-from ttscompile.runtimes.onnxruntime.liveness import readable_rollout, rollout_needs
+from ttscompile.runtimes.liveness import readable_rollout, rollout_needs
 from ttscompile.runtimes.policy import load
 
-from .agreement import random_inputs
+from .agreement import call_terms, random_inputs
 
 C, T, R = Source.COMPUTE, Source.TIMESTEP, Source.ROLLOUT
 ENTRY = 3 * 4 * 4
@@ -78,7 +79,7 @@ def test_calls_with_the_artifacts_plans_keep_what_these_read(scheduled: Artifact
         plan = scheduled.schedule(name)
         found, report = runtime.predict(obs, noise, plan, plan_name=name, repair=True)
         expected, wanted = reference.predict(obs, noise, plan, plan_name=name, repair=True)
-        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+        assert_equal_but_for_rounding(found, expected, call_terms(scheduled))
         assert report.legalised == wanted.legalised
         if name == "plain":
             kept = runtime.backend.rollout_nbytes
@@ -114,7 +115,7 @@ def test_a_matrix_reads_no_older_residual_than_the_last_computed(scheduled: Arti
     with pytest.raises(IllegalPlanError, match=rf"step {k}, block 0, .* did not keep"):
         runtime.predict(obs, noise, gone)
     found, expected = (each.predict(obs, noise, there)[0] for each in (runtime, reference))
-    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+    assert_equal_but_for_rounding(found, expected, call_terms(scheduled))
     with pytest.raises(IllegalPlanError, match=rf"step {k}, block 0, .* did not keep"):  # that call computed none of it
         runtime.predict(obs, noise, gone)
 

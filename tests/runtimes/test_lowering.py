@@ -24,7 +24,7 @@ C, F, T, R = Source.COMPUTE, Source.FORWARD, Source.TIMESTEP, Source.ROLLOUT
 
 
 class FakeIdle:
-    """What ``runtimes.idle`` is to the loop: a total that is taken in."""
+    """What ``IdleSteps`` is to the loop: a total that is taken in."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
         self.total, self.prepared = np.zeros(shape, np.float32), np.zeros(shape, np.float32)

@@ -37,8 +37,8 @@ class Entrant:
     Attributes:
         series: see ``MeasuredPoint``.
         name: see ``MeasuredPoint``.
-        policy: that runs it.
-        plan: its name there.
+        policy: the policy that runs the plan.
+        plan: the plan's name in that policy.
         paired: whether it takes all the noise of the dense calls.
     """
 
@@ -62,11 +62,11 @@ def measure(
 
     Args:
         artifact: whose dense policy is the truth.
-        entrants: at least one.
-        episodes: all of them.
+        entrants: the plans that take part, at least one.
+        episodes: all recorded episodes.
         chosen: number of the episode, and row in it, of each call.
-        seed: of the noise.
-        threads: of the dense policy.
+        seed: the seed of the noise.
+        threads: how many threads the dense policy uses.
         progress: told how far it is.
 
     Returns:

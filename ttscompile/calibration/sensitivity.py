@@ -1,6 +1,6 @@
 """How actions respond to what each cell of a plan adds: one sparse rollout with its gradient, and all blocks beside it.
 
-``linear`` and ``strategies.slopes`` predict from this what another plan would do, without running it.
+``pruner.linear`` and ``published.slopes`` predict from this what another plan would do, without running it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ BYTES = 2**28
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """Of the cells of a plan, by their number ``k * blocks + b``.
+    """What each cell of a plan does, by its number ``k * blocks + b``.
 
     Attributes:
         computed: what the block computes there, or would, for each call: ``[N, size]``.
@@ -47,10 +47,10 @@ def sensitivity(
     """Run the plan, and go back from a figure.
 
     Args:
-        executor: runs plans.
+        executor: runs the policy.
         plan: ``[K, blocks]`` of COMPUTE and ``reuse``, step 0 dense.
         reuse: FORWARD or TIMESTEP.
-        calls: N of them.
+        calls: the N calls to run.
         copies: how many streams there are of each call, one after the other: ``[copies * N]``.
         figure: a number, of the denoised samples ``[copies * N, T, D]``.
     """

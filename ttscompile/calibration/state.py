@@ -32,12 +32,12 @@ class StateFile:
     """The state of one calibration.
 
     Args:
-        directory: of the artifact.
+        directory: the directory of the artifact.
         settings: everything that the outcome depends on; JSON. A state with other settings is not continued.
 
     Attributes:
-        arrays: by name.
-        progress: numbers; JSON.
+        arrays: the saved arrays by name.
+        progress: how far the calibration is, as JSON.
     """
 
     def __init__(self, directory: Path, settings: Mapping[str, Any]) -> None:

@@ -182,7 +182,7 @@ def _eager(checkpoint: Path, threads: int, manifest: Manifest, as_saved: bool) -
         import torch
 
         from ttscompile.frontends.eager import eager_policy
-        from ttscompile.frontends.encoded import EncodedDenoiser
+        from ttscompile.frontends.encoded import parts
     except ModuleNotFoundError as error:
         raise RuntimeUnavailableError(
             f"the original network needs {error.name}, which is not installed. Run: pip install 'ttscompile[compile]',"
@@ -195,7 +195,7 @@ def _eager(checkpoint: Path, threads: int, manifest: Manifest, as_saved: bool) -
         return network_contestant("eager PyTorch", eager_policy(module, whole), whole, manifest.flops.dense)
     sampler, dense = original.sampler, manifest.flops.dense
     # An encoder runs once a call, whatever the sampler: what it takes is not known apart.
-    flops = None if isinstance(module, EncodedDenoiser) else dense / manifest.steps * sampler.steps
+    flops = dense / manifest.steps * sampler.steps if parts(module).encoder is None else None
     label = f"original, {sampler.name} {sampler.steps}"
     return network_contestant(label, eager_policy(module, original), original, flops)
 

@@ -13,7 +13,7 @@ from ..ir.flops import graph_flops
 from ..ir.graph import TensorType
 from ..ir.program import Binding
 from ..measure.units import flops, plain, share
-from ..runtimes.onnxruntime.liveness import rollout_needs
+from ..runtimes.liveness import rollout_needs
 from .page import Section, Table
 
 _NOT_TOLD = ("plans", "precision", "sparsity", "flops_sparsity", "skipped")

@@ -7,7 +7,7 @@ from typing import Any
 
 from ..artifact.load import Artifact
 from ..artifact.manifest import DENSE, Manifest
-from ..runtimes.onnxruntime.liveness import rollout_needs
+from ..runtimes.liveness import rollout_needs
 from .facts import plan_flops
 
 
