@@ -24,7 +24,7 @@ from .frontends.encoded import EncodedDenoiser
 from .ir.dataflow import reachable_from
 from .ir.flops import graph_flops, node_flops
 from .ir.graph import Graph
-from .ir.joint import DENSE_STEP, JOINT
+from .ir.pieces import DENSE_STEP, JOINT
 from .ir.program import Program
 from .ir.verify import verify
 from .lower.joint import chain_blocks, join_blocks

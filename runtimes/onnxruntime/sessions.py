@@ -26,9 +26,8 @@ from ttscompile.artifact.files import verify
 from ttscompile.artifact.manifest import PieceRecord
 from ttscompile.errors import ArtifactError, RuntimeUnavailableError
 from ttscompile.ir.graph import TensorType
-from ttscompile.ir.idle import IDLE
-from ttscompile.ir.joint import JOINT, OF_ALL_BLOCKS, RESIDUAL, STREAM, Joint, join
-from ttscompile.ir.pieces import block_name
+from ttscompile.ir.joint import Joint, join
+from ttscompile.ir.pieces import IDLE, JOINT, OF_ALL_BLOCKS, RESIDUAL, STREAM, block_name
 from ttscompile.runtimes.precision import EXACT_INTEGERS, needs_care
 
 if TYPE_CHECKING:

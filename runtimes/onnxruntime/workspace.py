@@ -20,9 +20,7 @@ from ttscompile.core.spec import FloatArray, Noise
 from ttscompile.core.update import matrices
 from ttscompile.errors import ArtifactError, ObservationError
 from ttscompile.ir.graph import TensorType
-from ttscompile.ir.idle import IDLE
-from ttscompile.ir.joint import CONTEXT, DENSE_STEP, STREAM
-from ttscompile.ir.pieces import block_name
+from ttscompile.ir.pieces import CONTEXT, DENSE_STEP, IDLE, STREAM, block_name
 from ttscompile.ir.program import Binding
 from ttscompile.runtimes.inpainting import Known, MaskedUpdates
 

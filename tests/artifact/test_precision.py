@@ -21,7 +21,7 @@ from ttscompile.artifact.strict_json import Value
 from ttscompile.artifact.write import update_calibration, write_artifact
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import ArtifactError
-from ttscompile.ir.joint import DENSE_STEP, JOINT
+from ttscompile.ir.pieces import DENSE_STEP, JOINT
 from ttscompile.lower.joint import chain_blocks, join_blocks
 from ttscompile.lower.precision import lower_precision
 

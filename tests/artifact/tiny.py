@@ -9,8 +9,7 @@ from onnx.helper import make_graph, make_model, make_node, make_opsetid, make_te
 
 from ttscompile.core.spec import Affine, ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
 from ttscompile.ir.graph import Batch, Graph, Node, Ref, TensorType
-from ttscompile.ir.joint import DENSE_STEP, JOINT
-from ttscompile.ir.pieces import block_name
+from ttscompile.ir.pieces import DENSE_STEP, JOINT, block_name
 from ttscompile.ir.program import Binding, Block, Pieces, Program, Reuse
 from ttscompile.lower.joint import chain_blocks, join_blocks
 

@@ -13,9 +13,9 @@ from ttscompile.errors import PassError
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.flops import graph_flops
 from ttscompile.ir.graph import TensorType
-from ttscompile.ir.layout import sink_layout
 from ttscompile.ir.program import Program
 from ttscompile.ir.verify import verify, verify_graph
+from ttscompile.lower.layout import sink_layout
 from ttscompile.passes.find_residual_blocks import find_residual_blocks
 from ttscompile.passes.partition import Partition
 

@@ -1,4 +1,4 @@
-"""``ir.advance``: tail, sampler update and stem as one graph."""
+"""``lower.advance``: tail, sampler update and stem as one graph."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from ttscompile.core.correction import Correction, no_correction
 from ttscompile.core.spec import SamplerTable
 from ttscompile.core.update import matrices
 from ttscompile.errors import LoweringError
-from ttscompile.ir.advance import fuse_advance
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Batch, Graph, Ref
+from ttscompile.lower.advance import fuse_advance
 
 B = Batch()
 SHAPE = (B, TOKENS, WIDTH)

@@ -11,7 +11,7 @@ import torch
 from tests.runtimes.toys import B, f32, node, toy_program
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Graph, Node, Ref
-from ttscompile.ir.idle import OUTPUTS, TOTAL
+from ttscompile.ir.pieces import IDLE_OUTPUTS, TOTAL
 from ttscompile.ir.program import Pieces, Program
 from ttscompile.lower.idle import lower_idle
 from ttscompile.lower.program import OPSET
@@ -43,7 +43,7 @@ def test_the_prediction_is_the_tails(sequence_first: bool, size: float) -> None:
     rng = np.random.default_rng(0)
     x = rng.standard_normal((5, 3, 2)).astype(np.float32)
     total = (size * rng.standard_normal(pieces.stem.types()[pieces.stem.outputs[0]].at(5))).astype(np.float32)
-    base, product, shift = session(model, {}).run(list(OUTPUTS), {TOTAL: total})
+    base, product, shift = session(model, {}).run(list(IDLE_OUTPUTS), {TOTAL: total})
     y = np.einsum("ed,dbt->ebt", product, x.transpose(2, 0, 1)) + base
     found = y[3:] / np.sqrt((y[:3] ** 2).sum(axis=0)) + shift
     tensors = {name: torch.from_numpy(value) for name, value in weights.items()}

@@ -10,7 +10,8 @@ import torch
 
 from tests.runtimes.toys import toy_program
 from ttscompile.ir.graph import Batch, TensorType
-from ttscompile.ir.joint import RESIDUAL, STREAM, join
+from ttscompile.ir.joint import join
+from ttscompile.ir.pieces import RESIDUAL, STREAM
 from ttscompile.lower.program import lower_program
 
 from .sessions import session

@@ -1,4 +1,4 @@
-"""``ir.layout``: moving operations composed and delayed."""
+"""``lower.layout``: moving operations composed and delayed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tests.lower.modules import ALL, captured, random_values
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Argument, Batch, Graph, Node, Ref, Size, TensorType
-from ttscompile.ir.layout import product, ratio, sink_layout
+from ttscompile.lower.layout import product, ratio, sink_layout
 from ttscompile.lower.program import structural_key
 
 B = Batch()

@@ -14,10 +14,10 @@ from tests.lower.modules import ALL, TOKENS, WIDTH, captured, random_values, spe
 from tests.lower.sessions import run, session
 from tests.passes.graphs import Builder
 from ttscompile.errors import LoweringError
-from ttscompile.ir.advance import fuse_advance
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Batch, Graph, Node, Ref, TensorType
 from ttscompile.ir.program import Pieces, Program
+from ttscompile.lower.advance import fuse_advance
 from ttscompile.lower.program import OPSET, lower_graph, lower_program, structural_key
 
 B = Batch()

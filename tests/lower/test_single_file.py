@@ -30,7 +30,7 @@ from ttscompile.core.lattice import Source
 from ttscompile.driver import compile_denoiser
 from ttscompile.errors import ArtifactError, LoweringError
 from ttscompile.ir.graph import Batch
-from ttscompile.ir.joint import DENSE_STEP, JOINT
+from ttscompile.ir.pieces import DENSE_STEP, JOINT
 from ttscompile.ir.program import Program
 from ttscompile.lower.joint import chain_blocks, join_blocks
 from ttscompile.lower.precision import lower_precision

@@ -11,7 +11,7 @@ from ttscompile import SamplerTable, Source
 from ttscompile.artifact import Artifact
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import legalize, uniform_plan
-from ttscompile.ir.idle import IDLE
+from ttscompile.ir.pieces import IDLE
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.onnxruntime.idle import IdleSteps
 from ttscompile.runtimes.onnxruntime.runtime import OnnxRuntime

@@ -12,8 +12,7 @@ from typing import Any
 
 from ..core.spec import INT8
 from ..errors import ArtifactError
-from ..ir.joint import OF_ALL_BLOCKS
-from ..ir.pieces import block_name
+from ..ir.pieces import OF_ALL_BLOCKS, block_name
 from ..ir.program import Binding, Reuse
 from .manifest import (
     DENSE,

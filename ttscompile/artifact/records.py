@@ -10,13 +10,24 @@ import numpy.typing as npt
 from ..core.spec import SamplerTable
 from ..core.update import update_flops
 from ..errors import ArtifactError
-from ..ir.advance import outputs, own_inputs
 from ..ir.flops import graph_flops
 from ..ir.graph import Graph, TensorType
-from ..ir.idle import IDLE, TOTAL
-from ..ir.idle import OUTPUTS as IDLE_OUTPUTS
-from ..ir.joint import CONTEXT, DENSE_STEP, JOINT, OF_ALL_BLOCKS, RESIDUAL, STREAM, dense_step_outputs, join
-from ..ir.pieces import block_name
+from ..ir.joint import join
+from ..ir.pieces import (
+    CONTEXT,
+    DENSE_STEP,
+    IDLE,
+    IDLE_OUTPUTS,
+    JOINT,
+    OF_ALL_BLOCKS,
+    RESIDUAL,
+    STREAM,
+    TOTAL,
+    advance_inputs,
+    advance_outputs,
+    block_name,
+    dense_step_outputs,
+)
 from ..ir.program import Binding, Pieces, Program
 from .manifest import BlockRecord, ContextRecord, FlopsRecord, PieceRecord, Requires
 
@@ -212,7 +223,7 @@ def _interface(
     if name != "advance":
         return tuple(graphs[name].inputs), graphs[name].outputs
     contexts = [f"{part}.{context}" for part in ("tail", "stem") for context in _contexts(part, graphs[part])]
-    return (*own_inputs(sampler), *contexts), outputs(sampler)
+    return (*advance_inputs(sampler), *contexts), advance_outputs(sampler)
 
 
 def _is_block(piece: str) -> bool:

@@ -12,7 +12,7 @@ from rich.console import Console
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import DENSE, Manifest, abbreviated
 from ttscompile.cli.output import flops, marked, share, table
-from ttscompile.ir.joint import OF_ALL_BLOCKS
+from ttscompile.ir.pieces import OF_ALL_BLOCKS
 from ttscompile.measure.units import plain
 from ttscompile.runtimes.onnxruntime.liveness import rollout_needs
 

@@ -1,4 +1,19 @@
-"""The ONNX model of what idle steps need of a total; see ``ir.idle``."""
+"""The ONNX model of what a step without a computed block comes to where stem and tail are simple.
+
+Such an *idle* step adds a known sum of residuals to the stream, so that sample and prediction are bound by::
+
+    stream     = stem(sample) + total          affine in the sample, each token for itself
+    prediction = head(normalise(stream))       a LayerNorm, then affine, each token for itself
+
+The stream of a token has W numbers, but moves in as many directions as a sample has dimensions, D. With an orthonormal
+basis E of these directions, u what the total and the stem's constants say of the token, centred, and x its sample::
+
+    y          = [x R + u E, rest] / sqrt(W)   rest^2 = |u - (u E) E'|^2 + W eps; its squares add up to the variance
+    prediction = (x A H + u H) / |y| + h
+
+All but x is known as soon as the total is, which many steps in a row share. So a step is arithmetic on numbers of the
+size of the sample, in place of tensors of T x W and of seventeen operations of a session.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +27,7 @@ from onnx import ModelProto, helper
 
 from ..ir.evaluate import evaluate
 from ..ir.graph import Argument, Batch, Graph, Node, Ref, TensorType
-from ..ir.idle import BASE, IDLE, PRODUCT, SHIFT, TOTAL
+from ..ir.pieces import BASE, IDLE, PRODUCT, SHIFT, TOTAL
 from ..ir.program import Pieces
 from .graph_writer import GraphWriter, tensor
 from .onnx_model import IR_VERSION

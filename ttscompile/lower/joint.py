@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from onnx import GraphProto, ModelProto, NodeProto, TensorProto, ValueInfoProto, helper
 
 from ..ir.graph import Graph, TensorType
-from ..ir.joint import CONTEXT, DENSE_STEP, JOINT, RESIDUAL, STREAM, dense_step_outputs, halves, join
+from ..ir.joint import halves, join
+from ..ir.pieces import CONTEXT, DENSE_STEP, JOINT, RESIDUAL, STREAM, dense_step_outputs
 from .onnx_model import opsets, value_info
 
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from onnx import GraphProto, ModelProto
 
-from ..ir.advance import MEMORY, X0_COLUMNS
+from ..ir.pieces import MEMORY, X0_COLUMNS
 from ..ir.program import Program
 from .contexts import Contexts
 from .graph_writer import GraphWriter, Weights, sequence, tensor

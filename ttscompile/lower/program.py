@@ -19,16 +19,15 @@ import onnx
 import torch
 
 from ..errors import LoweringError
-from ..ir.advance import fuse_advance
 from ..ir.evaluate import resolve_op, without_stack_traces
 from ..ir.graph import Argument, Batch, Enum, Graph, Node, Ref, TensorType
-from ..ir.idle import IDLE
-from ..ir.joint import DENSE_STEP, JOINT
-from ..ir.layout import sink_layout
+from ..ir.pieces import DENSE_STEP, IDLE, JOINT
 from ..ir.program import Pieces, Program
+from .advance import fuse_advance
 from .attention import flatten_attention
 from .idle import lower_idle
 from .joint import chain_blocks, join_blocks
+from .layout import sink_layout
 from .onnx_model import name_model, only
 
 OPSET = 23
@@ -59,8 +58,8 @@ def lower_program(program: Program) -> dict[str, onnx.ModelProto]:
 
     Returns:
         By name: ``condition``, ``step`` (if any), ``pruner`` (if any), ``stem``, ``block_00``, ``block_01``..,
-        ``advance`` (tail, sampler update and stem in one; see ``ir.advance``), ``blocks`` and ``dense_step`` (all
-        blocks in one; see ``ir.joint``) and, if stem and tail allow it, ``idle`` (see ``ir.idle``). Graphs of the same
+        ``advance`` (tail, sampler update and stem in one; see ``lower.advance``), ``blocks`` and ``dense_step`` (all
+        blocks in one; see ``ir.joint``) and, if stem and tail allow it, ``idle`` (see ``lower.idle``). Graphs of one
         structure are exported once.
 
     Raises:

@@ -25,7 +25,7 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-from .graph import Argument, Batch, Graph, Node, Ref, Size, TensorType
+from ..ir.graph import Argument, Batch, Graph, Node, Ref, Size, TensorType
 
 _RESHAPES = frozenset(
     {

@@ -12,36 +12,29 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from ttscompile.core.correction import HISTORY as HISTORY_ENTRIES
-from ttscompile.core.correction import groups_of
-from ttscompile.core.spec import PolicySpec, SamplerTable
-from ttscompile.core.update import clips, columns, rows
-from ttscompile.errors import LoweringError
-
-from .graph import Argument, Batch, Graph, Node, Ref, TensorType
-
-STREAM = "stream"
-SAMPLE = "sample"
-OFFSET = "offset"
-HISTORY = "history"
-UPDATE = "update"
-MEMORY = "memory"
-SAMPLE_NEXT = "sample_next"
-STREAM_NEXT = "stream_next"
-PREDICTION = "prediction"
-MEMORY_NEXT = "memory_next"
-X0_COLUMNS = ("sample_to_x0", "out_to_x0")
-"""Columns of the sampler's table that are inputs of their own."""
-
-
-def own_inputs(sampler: SamplerTable) -> tuple[str, ...]:
-    """Inputs that are no contexts, in order."""
-    return (STREAM, SAMPLE, OFFSET, HISTORY, UPDATE, *X0_COLUMNS, *[MEMORY] * bool(sampler.memories))
-
-
-def outputs(sampler: SamplerTable) -> tuple[str, ...]:
-    """Outputs, in order."""
-    return (SAMPLE_NEXT, STREAM_NEXT, PREDICTION, *[MEMORY_NEXT] * bool(sampler.memories))
+from ..core.correction import HISTORY as HISTORY_ENTRIES
+from ..core.correction import groups_of
+from ..core.spec import PolicySpec, SamplerTable
+from ..core.update import clips, columns, rows
+from ..errors import LoweringError
+from ..ir.graph import Argument, Batch, Graph, Node, Ref, TensorType
+from ..ir.pieces import (
+    HISTORY,
+    MEMORY,
+    MEMORY_NEXT,
+    OFFSET,
+    PREDICTION,
+    SAMPLE,
+    SAMPLE_NEXT,
+    STEM,
+    STREAM,
+    STREAM_NEXT,
+    TAIL,
+    UPDATE,
+    X0_COLUMNS,
+    advance_context,
+    advance_outputs,
+)
 
 
 def fuse_advance(tail: Graph, stem: Graph, spec: PolicySpec) -> Graph:
@@ -67,25 +60,25 @@ def fuse_advance(tail: Graph, stem: Graph, spec: PolicySpec) -> Graph:
     """
     (stream, *tail_contexts), (sample, *stem_contexts) = tail.inputs, stem.inputs
     inputs = {STREAM: tail.inputs[stream], **_update_types(spec)}
-    inputs |= {f"tail.{name}": tail.inputs[name] for name in tail_contexts}
-    inputs |= {f"stem.{name}": stem.inputs[name] for name in stem_contexts}
+    inputs |= {advance_context(TAIL, name): tail.inputs[name] for name in tail_contexts}
+    inputs |= {advance_context(STEM, name): stem.inputs[name] for name in stem_contexts}
     constants = {**tail.constants, **stem.constants}
-    results = outputs(spec.sampler)
+    results = advance_outputs(spec.sampler)
     if clash := sorted((constants.keys() & inputs.keys()) | (constants.keys() & set(results))):
         raise LoweringError(
             f"the module has weights called {clash}, which are names of the compiled loop's own values."
             " Rename these parameters or buffers in the module."
         )
     taken = {*inputs, *constants, *results}
-    first = {n: n for n in tail.constants} | {n: f"tail.{n}" for n in tail_contexts} | {stream: STREAM}
-    nodes, names = _moved(tail, "tail", first, taken)
+    first = {n: n for n in tail.constants} | {n: advance_context(TAIL, n) for n in tail_contexts} | {stream: STREAM}
+    nodes, names = _moved(tail, TAIL, first, taken)
     turned = inputs[SAMPLE]
     nodes.append(Node(PREDICTION, "aten.permute.default", (Ref(names[tail.outputs[0]]), (2, 0, 1)), (), (turned,)))
     nodes += _Update(taken, turned).nodes_for(spec)
     following = _fresh("stem.sample", taken)
     nodes.append(Node(following, "aten.permute.default", (Ref(SAMPLE_NEXT), (1, 2, 0)), (), (stem.inputs[sample],)))
-    second = {n: n for n in stem.constants} | {n: f"stem.{n}" for n in stem_contexts} | {sample: following}
-    more, names = _moved(stem, "stem", second, taken)
+    second = {n: n for n in stem.constants} | {n: advance_context(STEM, n) for n in stem_contexts} | {sample: following}
+    more, names = _moved(stem, STEM, second, taken)
     nodes += more
     result = names[stem.outputs[0]]
     stream_type = stem.types()[stem.outputs[0]]
