@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 import ttscompile
-from tests.passes.test_pipeline import MODULES, spec
+from tests.passes.modules import MODULES, spec
 from tests.runtimes.agreement import largest_difference
 from ttscompile.artifact import load_artifact
 from ttscompile.runtimes import open_runtime

@@ -21,7 +21,7 @@ import pytest
 import zarr
 from click.testing import CliRunner
 
-from tests.passes.test_pipeline import MODULES, spec
+from tests.passes.modules import MODULES, spec
 from ttscompile.cli import main
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -18,11 +18,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.artifact.manifest import DENSE, PRUNER
+from ttscompile.artifact.manifest import DENSE
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import BoolArray, PlanArray, Source, check_plan, require_legal
 from ttscompile.core.spec import FloatArray, Noise
 from ttscompile.errors import IllegalPlanError
+from ttscompile.ir.pieces import PRUNER
 from ttscompile.runtimes.base import (
     GIVEN,
     CallReport,

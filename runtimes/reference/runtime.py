@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from ttscompile.artifact.manifest import PRUNER
 from ttscompile.core.correction import Correction
 from ttscompile.core.spec import FloatArray, Noise
+from ttscompile.ir.pieces import PRUNER
 from ttscompile.runtimes.base import (
     GIVEN,
     CallReport,

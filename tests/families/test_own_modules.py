@@ -12,8 +12,8 @@ from torch import nn
 import ttscompile
 from tests.families.checks import assert_runtimes_agree, in_loop, kinds
 from tests.families.modules import CHANNELS, FEATURES, HORIZON, MODULES, TOKENS
+from tests.passes.modules import STREAMS, evaluate_pieces
 from tests.passes.specs import toy_spec
-from tests.passes.test_pipeline import STREAMS, evaluate_pieces
 from ttscompile import PolicySpec
 from ttscompile.driver import transform
 from ttscompile.ir.program import Program

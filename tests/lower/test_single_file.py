@@ -18,7 +18,7 @@ import pytest
 from torch import nn
 
 import ttscompile
-from tests.passes.test_pipeline import MODULES, spec
+from tests.passes.modules import MODULES, spec
 from tests.runtimes.plans import random_plan
 from tests.runtimes.toys import pencil_program, toy_program
 from ttscompile import Noise, legalize
@@ -30,9 +30,8 @@ from ttscompile.core.lattice import Source
 from ttscompile.driver import compile_denoiser
 from ttscompile.errors import ArtifactError, LoweringError
 from ttscompile.ir.graph import Batch
-from ttscompile.ir.pieces import DENSE_STEP, JOINT
 from ttscompile.ir.program import Program
-from ttscompile.lower.joint import chain_blocks, join_blocks
+from ttscompile.lower.joint import lower_all_blocks
 from ttscompile.lower.precision import lower_precision
 from ttscompile.lower.program import lower_program
 from ttscompile.lower.single_file import lower_single_file
@@ -213,9 +212,7 @@ def test_blocks_of_another_precision(tmp_path: Path) -> None:
     program = toy_program(blocks=6)
     models = lower_program(program)
     lowered, weights, _ = lower_precision(models, program.weights, "int8")
-    assert program.pieces is not None
-    own = {**models, **lowered}
-    lowered |= {JOINT: join_blocks(program.pieces.blocks, own), DENSE_STEP: chain_blocks(program.pieces.blocks, own)}
+    lowered |= lower_all_blocks(program.pieces.blocks, {**models, **lowered})
     write_artifact(program, models, tmp_path / "artifact", LoweredBlocks("int8", lowered, weights))
     model = lower_single_file(program, {**models, **lowered}, {**program.weights, **weights})
     policy = ttscompile.load(tmp_path / "artifact", precision="int8")
@@ -255,7 +252,6 @@ def wider(program: Program) -> Program:
         (renamed("plan"), r"observations \['plan'\] have names of the single file's own"),
         (renamed("action_pred"), r"observations \['action_pred'\]"),
         (wider, "the residual stream changes its type"),
-        (lambda p: replace(p, pieces=None), "no pieces to lower"),
         (lambda p: replace(p, weights={k: v for k, v in p.weights.items() if k != "stem.w"}), "'stem.w' .* no value"),
     ],
 )

@@ -8,7 +8,7 @@ from tests.passes.graphs import B, Builder
 from tests.passes.specs import toy_spec
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Graph, Ref
-from ttscompile.ir.program import Program
+from ttscompile.ir.program import Captured
 from ttscompile.passes.find_residual_blocks import find_residual_blocks
 from ttscompile.passes.regroup_sums import RegroupSums
 
@@ -17,12 +17,13 @@ SHAPE = (B, 4, 8)
 
 def regrouped(graph: Graph) -> tuple[Graph, bool]:
     weights = {n: torch.randn(t.at(1)).numpy() for n, t in graph.constants.items()}
-    result = RegroupSums()(Program(toy_spec(sample=(4, 8)), graph, weights))
+    captured = Captured(toy_spec(sample=(4, 8)), graph, weights)
+    result = RegroupSums()(captured)
     value = {"sample": torch.randn(2, 4, 8)}
     tensors = {n: torch.from_numpy(w) for n, w in weights.items()}
     before, after = (evaluate(g, tensors, value)[0] for g in (graph, result.program.denoiser))
     torch.testing.assert_close(after, before)
-    return result.program.denoiser, result.modified
+    return result.program.denoiser, result.program is not captured
 
 
 def branches(builder: Builder, count: int) -> tuple[Ref, list[Ref]]:

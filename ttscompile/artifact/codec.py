@@ -12,8 +12,8 @@ from typing import Any
 
 from ..core.spec import INT8
 from ..errors import ArtifactError
-from ..ir.pieces import OF_ALL_BLOCKS, block_name
-from ..ir.program import Binding, Reuse
+from ..ir.pieces import ADVANCE, CONDITION, OF_ALL_BLOCKS, PRUNER, STEM, block_name
+from ..ir.program import Binding
 from .manifest import (
     DENSE,
     FORMAT,
@@ -84,10 +84,6 @@ def to_json(manifest: Manifest) -> dict[str, Any]:
             {"kind": b.kind, "type": type_to_json(b.type), "group": b.group, "flops": b.flops, "reason": b.reason}
             for b in manifest.blocks
         ],
-        "reuse": [
-            {"type": type_to_json(r.type), "forward": r.forward, "forward_blocks": list(r.forward_blocks)}
-            for r in manifest.reuse
-        ],
         "pieces": {
             name: {
                 "file": p.file,
@@ -123,7 +119,7 @@ def from_json(root: Value) -> Manifest:
     members = root.members()
     precision = members.get("precision")
     fields = Value({key: value.data for key, value in members.items() if key != "precision"}, root.path).keys(
-        *("format", "schema_version", "ttscompile_version", "identity", "model_identity", "spec", "blocks", "reuse"),
+        *("format", "schema_version", "ttscompile_version", "identity", "model_identity", "spec", "blocks"),
         *("pieces", "contexts", "features", "flops", "plans", "default_plan", "calibration", "stores", "requires"),
         "files",
     )
@@ -135,7 +131,6 @@ def from_json(root: Value) -> Manifest:
         model_identity=_sha256(fields["model_identity"]),
         spec=spec_from_json(fields["spec"]),
         blocks=tuple(_block(item) for item in fields["blocks"].items()),
-        reuse=tuple(_reuse(item) for item in fields["reuse"].items()),
         pieces={name: _piece(item) for name, item in fields["pieces"].members().items()},
         contexts={name: _context(item) for name, item in fields["contexts"].members().items()},
         features=_texts(fields["features"]),
@@ -158,18 +153,16 @@ def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:
     blocks = len(manifest.blocks)
     if len(manifest.flops.blocks) != blocks:
         fields["flops"].fail(f"FLOPs of {blocks} blocks")
-    if len(manifest.reuse) not in (0, blocks):
-        fields["reuse"].fail(f"none, or one for each of {blocks} blocks")
-    missing = {"condition", "stem", "advance", *OF_ALL_BLOCKS, *map(block_name, range(blocks))} - set(manifest.pieces)
+    missing = {CONDITION, STEM, ADVANCE, *OF_ALL_BLOCKS, *map(block_name, range(blocks))} - set(manifest.pieces)
     if missing:
         fields["pieces"].fail(f"the pieces {sorted(missing)} too")
     for name, piece in manifest.pieces.items():
         if not set(piece.contexts) <= set(manifest.contexts):
             fields["pieces"].fail(f"contexts of {name} that are among {list(manifest.contexts)}")
-    has_pruner = "pruner" in manifest.pieces
+    has_pruner = PRUNER in manifest.pieces
     if has_pruner != (manifest.stores.pruner is not None):
         fields["stores"].fail("a file of pruner weights exactly when there is a piece called pruner")
-    if not has_pruner and any(plan.kind == "pruner" for plan in manifest.plans.values()):
+    if not has_pruner and any(plan.pruned for plan in manifest.plans.values()):
         fields["plans"].fail("no plan of the kind pruner, because there is no piece called pruner")
     files = {piece.file for piece in manifest.pieces.values()} | {n for n in vars(manifest.stores).values() if n}
     if manifest.precision is not None:
@@ -180,7 +173,7 @@ def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:
         fields["plans"].fail("no plan called 'dense', which every artifact has")
     if manifest.default_plan not in {DENSE, *manifest.plans}:
         fields["default_plan"].fail(f"one of {[DENSE, *manifest.plans]}")
-    scheduled = any(plan.kind == "schedule" for plan in manifest.plans.values())
+    scheduled = any(not plan.pruned for plan in manifest.plans.values())
     if scheduled != (manifest.stores.plans is not None):
         fields["stores"].fail("a file of plans exactly when there are schedules")
 
@@ -241,12 +234,6 @@ def _block(value: Value) -> BlockRecord:
         flops=fields["flops"].integer(),
         reason=fields["reason"].text(),
     )
-
-
-def _reuse(value: Value) -> Reuse:
-    fields = value.keys("type", "forward", "forward_blocks")
-    blocks = tuple(item.integer() for item in fields["forward_blocks"].items())
-    return Reuse(type=type_from_json(fields["type"]), forward=fields["forward"].integer(), forward_blocks=blocks)
 
 
 def _piece(value: Value) -> PieceRecord:

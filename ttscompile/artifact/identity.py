@@ -6,16 +6,17 @@ import hashlib
 from collections.abc import Mapping
 from typing import Any
 
+from ..ir.pieces import PRUNER
 from .codec import to_json
-from .manifest import PRUNER, Manifest
+from .manifest import Manifest
 from .strict_json import dump_compact
 
 
 def identities(manifest: Manifest) -> tuple[str, str]:
     """Identity and model identity of what a manifest describes; its own two fields are not read.
 
-    The model identity covers weights, tables, graphs, sampler, normalisers, observations, chunk, block table and reuse
-    branches. The identity covers that, the pruner's weights, all plans, which of them is the default, and blocks of
+    The model identity covers weights, tables, graphs, sampler, normalisers, observations, chunk and block table.
+    The identity covers that, the pruner's weights, all plans, which of them is the default, and blocks of
     another precision: a calibration, which computes in fp32, belongs to the model with or without them. Neither covers
     what people are told: source, FLOPs, reasons, sparsities, errors, calibration record, versions.
 
@@ -29,7 +30,6 @@ def identities(manifest: Manifest) -> tuple[str, str]:
     model = {
         "spec": {key: value for key, value in document["spec"].items() if key != "source"},
         "blocks": [{key: block[key] for key in ("kind", "type", "group")} for block in document["blocks"]],
-        "reuse": document["reuse"],
         "pieces": pieces,
         "contexts": document["contexts"],
         "features": document["features"],

@@ -69,7 +69,7 @@ def hoisting(artifact: Artifact) -> Section:
     for context in manifest.contexts.values():
         bound[context.binding].append(context.type)
     table_bytes = sum(table.nbytes for table in artifact.tables.values())
-    condition = graph_flops(artifact.graphs["condition"]) if "condition" in artifact.graphs else 0
+    condition = graph_flops(artifact.pieces.condition)
     loop = steps * (record.stem + record.tail + sum(record.blocks))
     dense = record.prologue + loop
 
