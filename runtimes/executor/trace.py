@@ -1,6 +1,6 @@
 """What happened when, in Chrome's trace event format; https://ui.perfetto.dev opens the file.
 
-Format: "Trace Event Format", Google, 2016. Complete events (``X``), instants (``i``) and counters (``C``); times in
+Format: "Trace Event Format", Google, 2016. Complete events (``X``) and instants (``i``); times in
 microseconds.
 """
 
@@ -44,10 +44,6 @@ class Trace:
     def instant(self, thread: int, name: str, at: float, args: Mapping[str, Any] | None = None) -> None:
         """Something that happened."""
         self._events.append(("i", name, thread, at, 0.0, args))
-
-    def counter(self, name: str, at: float, value: float) -> None:
-        """A quantity from here on."""
-        self._events.append(("C", name, CONTROL, at, 0.0, {name: value}))
 
     def call(self, start: float, end: float, args: Mapping[str, Any], timings: Timings | None) -> None:
         """A call of the policy, with its parts if there is a report of them."""

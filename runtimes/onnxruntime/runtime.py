@@ -88,7 +88,7 @@ class OnnxRuntime:
         self._groups = self._manifest.groups
         self._lowering = LoweringCache(self._groups)
         self._schedules = tuple(self._lowering.lower(plan) for plan in artifact.schedules.values())
-        pruned = any(plan.kind == "pruner" for plan in self._manifest.plans.values())
+        pruned = any(plan.pruned for plan in self._manifest.plans.values())
         self._blocks = pruned or any(one.partial for one in self._schedules)  # whether single blocks have sessions
         self._sessions = open_sessions(artifact, threads, self._blocks)
         self._readable = readable_rollout(artifact)
@@ -96,7 +96,7 @@ class OnnxRuntime:
         self._matrices = False  # whether one was ever given
         self._written: BoolArray | None = None
         self._dropped: BoolArray | None = None  # computed in this episode, and not kept
-        self._helper = ThreadPoolExecutor(1, "ttscompile-pruner") if "pruner" in self._manifest.pieces else None
+        self._helper = ThreadPoolExecutor(1, "ttscompile-pruner") if PRUNER in self._manifest.pieces else None
         self._slots = max((one.slots for one in self._schedules), default=0)
         self._workspace: Workspace | None = self._open_workspace(1)
 
@@ -249,7 +249,7 @@ class OnnxRuntime:
             decode_first(work, np.zeros_like(self._readable))
             for k in range(spec.sampler.steps):
                 work.advance(k)
-        if self._helper is not None and any(plan.kind == "pruner" for plan in self._manifest.plans.values()):
+        if self._helper is not None and any(plan.pruned for plan in self._manifest.plans.values()):
             self._helper.submit(work.logits).result()
         return work
 

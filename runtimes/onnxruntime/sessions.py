@@ -27,7 +27,7 @@ from ttscompile.artifact.manifest import PieceRecord
 from ttscompile.errors import ArtifactError, RuntimeUnavailableError
 from ttscompile.ir.graph import TensorType
 from ttscompile.ir.joint import Joint, join
-from ttscompile.ir.pieces import IDLE, JOINT, OF_ALL_BLOCKS, RESIDUAL, STREAM, block_name
+from ttscompile.ir.pieces import ADVANCE, IDLE, JOINT, OF_ALL_BLOCKS, PRUNER, RESIDUAL, STEM, STREAM, block_name
 from ttscompile.runtimes.precision import EXACT_INTEGERS, needs_care
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 Array: TypeAlias = npt.NDArray[Any]
 
 
-SINGLE_THREADED = frozenset({"stem", "advance", "pruner", IDLE})
+SINGLE_THREADED = frozenset({STEM, ADVANCE, PRUNER, IDLE})
 """Pieces too small for a second thread."""
 
 SPIN_US = 50

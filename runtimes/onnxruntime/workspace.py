@@ -19,8 +19,21 @@ from ttscompile.core.correction import HISTORY, Correction, no_correction
 from ttscompile.core.spec import FloatArray, Noise
 from ttscompile.core.update import matrices
 from ttscompile.errors import ArtifactError, ObservationError
+from ttscompile.ir import pieces
 from ttscompile.ir.graph import TensorType
-from ttscompile.ir.pieces import CONTEXT, DENSE_STEP, IDLE, STREAM, block_name
+from ttscompile.ir.pieces import (
+    ADVANCE,
+    CONDITION,
+    CONTEXT,
+    DENSE_STEP,
+    IDLE,
+    PRUNER,
+    STEM,
+    STEP,
+    STREAM,
+    TAIL,
+    block_name,
+)
 from ttscompile.ir.program import Binding
 from ttscompile.runtimes.inpainting import Known, MaskedUpdates
 
@@ -28,8 +41,6 @@ from .bound_block import BoundBlock
 from .idle import IdleSteps
 from .rollout_store import RolloutStore
 from .sessions import Array, Bound, repeat_streams, run_named
-
-STEM, ADVANCE = "stem", "advance"
 
 
 class Workspace:
@@ -126,16 +137,16 @@ class Workspace:
             self._offset += correction.bias
         if known is not None:
             self._offset[:, known.channels, :, known.positions] = known.values[1:].transpose(0, 3, 1, 2)
-        piece = self._manifest.pieces["condition"]
+        piece = self._manifest.pieces[CONDITION]
         if piece.outputs:
             feed = {name: np.ascontiguousarray(obs[name]) for name in piece.inputs}
-            for name, value in run_named(self._sessions["condition"], piece.outputs, feed).items():
+            for name, value in run_named(self._sessions[CONDITION], piece.outputs, feed).items():
                 if name in self._values:
                     np.copyto(self._values[name], value)
                 else:
                     self._values[name] = value  # a feature, which only the pruner reads
-        if "step" in self._manifest.pieces:
-            self._run_step(self._manifest.pieces["step"])
+        if STEP in self._manifest.pieces:
+            self._run_step(self._manifest.pieces[STEP])
 
     def begin(self) -> None:
         """The residual stream of step 0; fills ``fresh``."""
@@ -143,9 +154,9 @@ class Workspace:
 
     def logits(self) -> FloatArray:
         """The pruner: float32 ``[B, K, blocks, 4]``. Reads condition values alone, so the loop may run meanwhile."""
-        piece = self._manifest.pieces["pruner"]
+        piece = self._manifest.pieces[PRUNER]
         feed = {name: self._values[name] for name in piece.inputs}
-        logits = run_named(self._sessions["pruner"], piece.outputs, feed)[piece.outputs[0]]
+        logits = run_named(self._sessions[PRUNER], piece.outputs, feed)[piece.outputs[0]]
         return np.asarray(logits, dtype=np.float32)
 
     def advance(self, k: int) -> None:
@@ -270,27 +281,26 @@ class Workspace:
         piece = self._manifest.pieces[ADVANCE]
         following = min(k + 1, self._steps - 1)  # after the last step there is no stream to make; it is not read
         inputs = {
-            "stream": self.stream,
-            "sample": self.sample[k % 2],
-            "offset": self._offset[k],
-            "history": self._history,
-            "update": update,
-            "sample_to_x0": self._sampler.sample_to_x0[k : k + 1],
-            "out_to_x0": self._sampler.out_to_x0[k : k + 1],
+            pieces.STREAM: self.stream,
+            pieces.SAMPLE: self.sample[k % 2],
+            pieces.OFFSET: self._offset[k],
+            pieces.HISTORY: self._history,
+            pieces.UPDATE: update,
+            **{name: getattr(self._sampler, name)[k : k + 1] for name in pieces.X0_COLUMNS},
         }
         if self._memory:
-            inputs["memory"] = self._memory[k % 2]
+            inputs[pieces.MEMORY] = self._memory[k % 2]
         for name in piece.inputs:
             if name not in inputs:
                 where, _, context = name.partition(".")
-                inputs[name] = self._value(context, k if where == "tail" else following)
+                inputs[name] = self._value(context, k if where == TAIL else following)
         outputs = {
-            "sample_next": self.sample[(k + 1) % 2],
-            "stream_next": self.fresh,
-            "prediction": self._prediction,
+            pieces.SAMPLE_NEXT: self.sample[(k + 1) % 2],
+            pieces.STREAM_NEXT: self.fresh,
+            pieces.PREDICTION: self._prediction,
         }
         if self._memory:
-            outputs["memory_next"] = self._memory[(k + 1) % 2]
+            outputs[pieces.MEMORY_NEXT] = self._memory[(k + 1) % 2]
         return Bound(self._sessions[ADVANCE], {name: inputs[name] for name in piece.inputs}, outputs)
 
     def _value(self, name: str, k: int) -> Array:
@@ -319,7 +329,7 @@ class Workspace:
                     )
                 self._step_inputs[name] = np.concatenate(list(self._values[name]), axis=axis)
             feed[name] = self._step_inputs[name]
-        for name, value in run_named(self._sessions["step"], piece.outputs, feed).items():
+        for name, value in run_named(self._sessions[STEP], piece.outputs, feed).items():
             np.copyto(self._values[name], self._by_step(name, value))
 
     def _by_step(self, name: str, value: Array) -> Array:

@@ -74,7 +74,7 @@ class ReferenceRuntime:
         cache = self._cache if self._cache is not None else self.model.empty_cache(streams)
         pruned = plan is None
         if plan is None:
-            if "pruner" not in self._manifest.pieces:
+            if PRUNER not in self._manifest.pieces:
                 raise no_pruner()
         else:
             plans, legalised = settle_plan(plan, self.model.groups, cache.written, repair)

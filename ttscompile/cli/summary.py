@@ -120,7 +120,7 @@ def _plans(artifact: Artifact) -> dict[str, dict[str, Any]]:
     }
     blocks = manifest.steps * sum(manifest.flops.blocks)
     for name, plan in manifest.plans.items():
-        pruned = plan.kind == "pruner"
+        pruned = plan.pruned
         # The fixed share is a call without one block; a pruner's blocks cost what was measured on average.
         computed = None if plan.flops_sparsity is None else blocks * (1 - plan.flops_sparsity)
         fixed = manifest.flops.call(artifact.schedule(DENSE), pruned=pruned) - blocks

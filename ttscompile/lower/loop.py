@@ -9,7 +9,8 @@
         for each step that follows without a computed block:                 Loop
             stream += the step's sum, made again if it is another;  advance
 
-Each block is in the model once. Weights lie in the branch that reads them, where onnxruntime packs them.
+Each block is in the model once, as the branch ``block_07`` beside the branch ``block_07_reused``. Weights lie in the
+branch that reads them, where onnxruntime packs them.
 """
 
 from __future__ import annotations
@@ -163,7 +164,9 @@ class DenoisingLoop:
             starts, _flags(w, w.op("Gather", plan.any_of_group, k), range(len(starts))), strict=True
         ):
             members = range(start, min(start + GROUP, len(self._groups)))
-            value, residuals = w.choose(flag, self._group(step, value, made, members), self._skipped(w, value))
+            value, residuals = w.choose(
+                flag, self._group(step, value, made, members), self._reused(w, value, f"group_{start}")
+            )
             made.append(residuals)
         last = w.op("Gather", step.sums, w.constant(-1))
         value = w.op("Add", value, w.op("Reshape", last, self._shape))
@@ -228,7 +231,9 @@ class DenoisingLoop:
         w = self._main.inner()
         value, made = stream, list[str]()
         for b, flag in zip(members, _flags(w, step.computed, members), strict=True):
-            value, residual = w.choose(flag, self._block(step, value, [*before, *made], b), self._skipped(w, value))
+            value, residual = w.choose(
+                flag, self._block(step, value, [*before, *made], b), self._reused(w, value, block_name(b))
+            )
             made.append(residual)
         return w.graph(f"group_{members.start}", [tensor(n, np.float32) for n in (value, _joined(w, made))])
 
@@ -244,11 +249,11 @@ class DenoisingLoop:
         row = w.op("Reshape", residual, w.constant([1, -1]))
         return w.graph(name, [tensor(n, np.float32) for n in (value, row)])
 
-    def _skipped(self, w: GraphWriter, stream: str) -> GraphProto:
-        """Nothing computed: the stream as it is, and no residuals."""
+    def _reused(self, w: GraphWriter, stream: str, name: str) -> GraphProto:
+        """The other branch: the stream as it is, and no residuals. What is reused is in the sums of the gaps."""
         inner = w.inner()
         results = [inner.op("Identity", value) for value in (stream, self._none)]
-        return inner.graph("skipped", [tensor(n, np.float32) for n in results])
+        return inner.graph(f"{name}_reused", [tensor(n, np.float32) for n in results])
 
     def _add_in_step(self, w: GraphWriter, step: _Step, stream: str, before: Sequence[str], b: int) -> str:
         """Add FORWARD reads, in the gap before block b, of residuals that the step itself has computed.

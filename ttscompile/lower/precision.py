@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from onnx import AttributeProto, ModelProto, NodeProto, TensorProto, helper
 
-from ..core.spec import BF16, FP32, INT8, PRECISIONS
+from ..core.spec import INT8, PRECISIONS
 from ..errors import LoweringError
 from ..ir.pieces import is_block
 from .onnx_model import live_nodes
@@ -96,14 +96,7 @@ def require_precision(precision: str) -> None:
     Raises:
         LoweringError: says why not.
     """
-    if precision == BF16:
-        raise LoweringError(
-            "precision 'bf16': expected an onnxruntime whose CPU provider multiplies bfloat16 matrices; found none:"
-            " on x86 it has no such kernel even where the processor has the instructions (avx512_bf16, amx_bf16), on"
-            " ARM ttscompile has not been tried with it, and storing bfloat16 to compute in float32 saves no time."
-            " Convert with precision 'int8', which is faster and whose action error is measured, or 'fp32'."
-        )
-    if precision not in (FP32, INT8):
+    if precision not in PRECISIONS:
         raise LoweringError(f"precision {precision!r}: expected one of {', '.join(map(repr, PRECISIONS))}.")
 
 

@@ -133,16 +133,16 @@ def plan_table(artifact: Artifact) -> Table:
     rows = []
     for name in (DENSE, *manifest.plans):
         own = manifest.plans.get(name)
-        kind = "schedule" if own is None else own.kind
+        pruned = own is not None and own.pruned
         cells, weighed = (0.0, 0.0) if own is None else (own.sparsity, own.flops_sparsity)
         cost = None
         if weighed is not None:
             every = manifest.steps * sum(record.blocks)
-            cost = record.call(artifact.schedule(DENSE), pruned=kind == "pruner") - weighed * every
+            cost = record.call(artifact.schedule(DENSE), pruned=pruned) - weighed * every
         rows.append(
             (
                 name + (" (default)" if name == manifest.default_plan else ""),
-                "for each observation" if kind == "pruner" else "schedule",
+                "for each observation" if pruned else "schedule",
                 share(cells),
                 share(weighed),
                 "" if cost is None else flops(cost),
@@ -223,7 +223,7 @@ def limits(artifact: Artifact) -> Section:
         points.append("Weights are in fp32. On processors with integer dot products, --precision int8 may be faster.")
     else:
         points.append(f"Blocks compute with {manifest.precision_name} weights: dense calls differ from fp32 as well.")
-    if any(plan.kind == "pruner" for plan in plans.values()):
+    if any(plan.pruned for plan in plans.values()):
         points.append("A plan that is made for each observation costs a different time each call.")
     needs = rollout_needs(artifact)
     if needs.read:
