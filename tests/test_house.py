@@ -138,6 +138,17 @@ def test_the_closure_sees_through_modules_and_parents_but_not_into_functions(tmp
     assert {"onnx", "diffusers"}.isdisjoint(chains)
 
 
+def test_every_pass_has_its_test_and_tests_import_helpers_not_each_other() -> None:
+    passes = {p.stem for p in (ROOT / "passes").glob("*.py")} - {"__init__", "base"}
+    assert {f"test_{name}.py" for name in passes} <= {p.name for p in (ROOT / "tests" / "passes").iterdir()}
+    found = {}
+    for path in (ROOT / "tests").rglob("*.py"):
+        lines = re.findall(r"^\s*(?:from|import) [\w.]*\btest_\w+.*", path.read_text(), re.MULTILINE)
+        own = [line for line in lines if f"{path.stem} import" not in line]  # in a process of its own
+        found |= {str(path.relative_to(ROOT)): own} if own else {}
+    assert found == {}
+
+
 def test_files_are_short() -> None:
     files = [p for top in (*PACKAGES, "tests", "examples") for p in (ROOT / top).rglob("*.py")]
     lengths = {str(p.relative_to(ROOT)): len(p.read_text().splitlines()) for p in files}

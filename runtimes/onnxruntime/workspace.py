@@ -21,19 +21,7 @@ from ttscompile.core.update import matrices
 from ttscompile.errors import ArtifactError, ObservationError
 from ttscompile.ir import pieces
 from ttscompile.ir.graph import TensorType
-from ttscompile.ir.pieces import (
-    ADVANCE,
-    CONDITION,
-    CONTEXT,
-    DENSE_STEP,
-    IDLE,
-    PRUNER,
-    STEM,
-    STEP,
-    STREAM,
-    TAIL,
-    block_name,
-)
+from ttscompile.ir.pieces import ADVANCE, CONTEXT, DENSE_STEP, IDLE, STEM, STREAM, block_name
 from ttscompile.ir.program import Binding
 from ttscompile.runtimes.inpainting import Known, MaskedUpdates
 
@@ -137,16 +125,16 @@ class Workspace:
             self._offset += correction.bias
         if known is not None:
             self._offset[:, known.channels, :, known.positions] = known.values[1:].transpose(0, 3, 1, 2)
-        piece = self._manifest.pieces[CONDITION]
+        piece = self._manifest.pieces[pieces.CONDITION]
         if piece.outputs:
             feed = {name: np.ascontiguousarray(obs[name]) for name in piece.inputs}
-            for name, value in run_named(self._sessions[CONDITION], piece.outputs, feed).items():
+            for name, value in run_named(self._sessions[pieces.CONDITION], piece.outputs, feed).items():
                 if name in self._values:
                     np.copyto(self._values[name], value)
                 else:
                     self._values[name] = value  # a feature, which only the pruner reads
-        if STEP in self._manifest.pieces:
-            self._run_step(self._manifest.pieces[STEP])
+        if pieces.STEP in self._manifest.pieces:
+            self._run_step(self._manifest.pieces[pieces.STEP])
 
     def begin(self) -> None:
         """The residual stream of step 0; fills ``fresh``."""
@@ -154,9 +142,9 @@ class Workspace:
 
     def logits(self) -> FloatArray:
         """The pruner: float32 ``[B, K, blocks, 4]``. Reads condition values alone, so the loop may run meanwhile."""
-        piece = self._manifest.pieces[PRUNER]
+        piece = self._manifest.pieces[pieces.PRUNER]
         feed = {name: self._values[name] for name in piece.inputs}
-        logits = run_named(self._sessions[PRUNER], piece.outputs, feed)[piece.outputs[0]]
+        logits = run_named(self._sessions[pieces.PRUNER], piece.outputs, feed)[piece.outputs[0]]
         return np.asarray(logits, dtype=np.float32)
 
     def advance(self, k: int) -> None:
@@ -293,7 +281,7 @@ class Workspace:
         for name in piece.inputs:
             if name not in inputs:
                 where, _, context = name.partition(".")
-                inputs[name] = self._value(context, k if where == TAIL else following)
+                inputs[name] = self._value(context, k if where == pieces.TAIL else following)
         outputs = {
             pieces.SAMPLE_NEXT: self.sample[(k + 1) % 2],
             pieces.STREAM_NEXT: self.fresh,
@@ -329,7 +317,7 @@ class Workspace:
                     )
                 self._step_inputs[name] = np.concatenate(list(self._values[name]), axis=axis)
             feed[name] = self._step_inputs[name]
-        for name, value in run_named(self._sessions[STEP], piece.outputs, feed).items():
+        for name, value in run_named(self._sessions[pieces.STEP], piece.outputs, feed).items():
             np.copyto(self._values[name], self._by_step(name, value))
 
     def _by_step(self, name: str, value: Array) -> Array:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,24 +10,11 @@ import pytest
 import torch
 from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 
+from tests.frontends.checkpoints import VARIANTS, Build, Save
 from ttscompile.errors import CheckpointError, SpecError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.diffusion_policy_weights import choose_weights
 from ttscompile.samplers.table import sampler_table
-
-Build = Callable[..., dict[str, Any]]
-Save = Callable[[dict[str, Any]], Path]
-
-VARIANTS: list[tuple[str, bool, dict[str, Any]]] = [
-    ("token-wise condition encoder", True, {}),
-    ("token-wise condition encoder", True, {"causal_attn": False, "n_layer": 2, "n_emb": 24, "n_head": 3}),
-    ("token-wise condition encoder", True, {"causal_attn": False, "n_obs_steps": None}),
-    ("transformer condition encoder", True, {"n_cond_layers": 2}),
-    ("inpainting", False, {}),
-    ("inpainting", False, {"n_cond_layers": 1, "causal_attn": False}),
-    ("encoder-only", False, {"time_as_cond": False}),
-    ("encoder-only", False, {"time_as_cond": False, "causal_attn": False}),
-]
 
 
 @pytest.mark.parametrize(("variant", "as_cond", "model"), VARIANTS)

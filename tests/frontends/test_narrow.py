@@ -13,8 +13,8 @@ import torch
 from click.testing import CliRunner
 
 import ttscompile
-from tests.families.test_vla import FAMILIES, loaded
-from tests.frontends.test_diffusion_policy import VARIANTS, Build, Save
+from tests.families.vla import FAMILIES, loaded
+from tests.frontends.checkpoints import VARIANTS, Build, Save
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.spec_json import spec_to_json
 from ttscompile.capture.narrow import narrow, unneeded

@@ -100,7 +100,7 @@ def _trajectories(folder: Path) -> None:
 
 def _recordings(folder: Path) -> None:
     """Data sets as users have them."""
-    from tests.calibration.test_recordings import as_hdf5, as_lerobot, as_zarr
+    from tests.calibration.recorded import as_hdf5, as_lerobot, as_zarr
     from tests.hostile import dataset_changes, hdf5_changes, zarr_changes
 
     zarr_changes.make(folder / "zarr", as_zarr)

@@ -17,7 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as parquet
 import pytest
 
-from tests.calibration.test_recordings import LOW, SOURCES, as_hdf5, as_lerobot, as_zarr, read_here
+from tests.calibration.recorded import LOW, SOURCES, as_hdf5, as_lerobot, as_zarr, read_here
 from tests.hostile.dataset_changes import declared_png
 from tests.hostile.hdf5_changes import SECRET
 from ttscompile.core.spec import ObservationSpec

@@ -18,7 +18,7 @@ from ttscompile.runtimes.onnxruntime.runtime import OnnxRuntime
 
 from .agreement import random_inputs
 from .conftest import MakeArtifact
-from .test_correction import random_correction
+from .plans import random_correction
 from .toys import toy_program
 
 STEPS, BLOCKS = 12, 4
