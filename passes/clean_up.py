@@ -11,6 +11,7 @@ import torch
 from ttscompile.ir.dataflow import reaching
 from ttscompile.ir.evaluate import Evaluator
 from ttscompile.ir.graph import Argument, Enum, Graph, Node, Ref, TensorType
+from ttscompile.ir.operations import Movement, operation
 from ttscompile.ir.program import Phase
 
 from .base import Pass, PassResult
@@ -18,13 +19,7 @@ from .base import Pass, PassResult
 AnyPhase = TypeVar("AnyPhase", bound=Phase)
 Weights = dict[str, npt.NDArray[Any]]
 
-_SAME = frozenset("aten.clone aten.alias aten.detach aten.contiguous aten.lift_fresh_copy".split())
-_SAME_IF_OFF = frozenset("aten.dropout aten.feature_dropout aten.alpha_dropout".split())
-_CONSTANT = {"zeros_like": 0, "ones_like": 1, "new_zeros": 0, "new_ones": 1}
-_VALUE = {"full_like": 1, "fill": 1, "new_full": 2}  # its place among the arguments
-_SAME_IF_TYPE_KEPT = frozenset(
-    "aten.reshape aten.flatten aten.expand aten.slice aten._to_copy aten.to aten.squeeze".split()
-)
+_CAST = "aten._to_copy.default"
 
 
 class CleanUp(Pass[AnyPhase, AnyPhase]):
@@ -68,14 +63,12 @@ def forget_examples(graph: Graph) -> Graph:
     """
     nodes = []
     for node in graph.nodes:
-        base, dtype = node.op.split(".")[1] if node.op.startswith("aten.") else "", node.type.dtype
-        kwargs: tuple[tuple[str, Argument], ...] = (("dtype", Enum("dtype", dtype)),)
-        if base == "type_as":
-            node = replace(node, op="aten._to_copy.default", args=node.args[:1], kwargs=kwargs)
-        elif base in _CONSTANT or base in _VALUE:
-            value = _CONSTANT[base] if base in _CONSTANT else node.args[_VALUE[base]]
-            if not isinstance(value, Ref):
-                node = replace(node, op="aten.full.default", args=(node.type.shape, value), kwargs=kwargs)
+        kwargs: tuple[tuple[str, Argument], ...] = (("dtype", Enum("dtype", node.type.dtype)),)
+        filled = operation(node.op).filled
+        if node.op == "aten.type_as.default":
+            node = replace(node, op=_CAST, args=node.args[:1], kwargs=kwargs)
+        elif filled is not None and any(node.refs()) and not isinstance(value := filled(node), Ref):
+            node = replace(node, op="aten.full.default", args=(node.type.shape, value), kwargs=kwargs)
         nodes.append(node)
     return replace(graph, nodes=tuple(nodes))
 
@@ -97,13 +90,11 @@ def drop_identities(graph: Graph) -> Graph:
 
 
 def _is_identity(node: Node, types: dict[str, TensorType]) -> bool:
-    base = node.op.rsplit(".", 1)[0]
+    """Whether it moves or casts numbers, and leaves all of them where and what they are."""
     source = node.args[0] if node.args else None
     if not isinstance(source, Ref) or len(node.types) != 1 or types.get(source.name) != node.type:
         return False
-    if base in _SAME_IF_OFF:
-        return node.args[2] is False
-    return base in _SAME or base in _SAME_IF_TYPE_KEPT
+    return node.op == _CAST or operation(node.op).movement not in (None, Movement.PERMUTE)
 
 
 def fold_constants(graph: Graph, weights: Weights) -> Graph:

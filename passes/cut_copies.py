@@ -11,7 +11,7 @@ from ttscompile.ir.program import Captured
 from .base import Pass, PassResult
 
 _RESHAPE = "aten.reshape.default"
-_SPLITS = ("aten.split.Tensor", "aten.split_with_sizes.default", "aten.chunk.default")
+_SPLITS = ("aten.split.Tensor", "aten.split_with_sizes.default")
 
 
 class CutCopies(Pass[Captured, Captured]):

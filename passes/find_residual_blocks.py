@@ -11,12 +11,12 @@ from ttscompile.errors import NoResidualBlocksError
 from ttscompile.ir.dataflow import between, dominators, reachable_from, reaching
 from ttscompile.ir.flops import node_flops
 from ttscompile.ir.graph import Graph, Node, Ref, TensorType
+from ttscompile.ir.operations import Linear, operation
 from ttscompile.ir.program import Block
 
 _ADD = "aten.add.Tensor"
-_SOFTMAX = ("aten.softmax.", "aten._softmax.", "aten._safe_softmax.")
-_SDPA = "aten.scaled_dot_product_attention."
-_MATMUL = ("aten.matmul.", "aten.bmm.", "aten.baddbmm.", "aten.einsum.")
+_SOFTMAX = "aten.softmax.int"
+_ATTENTION = "aten.scaled_dot_product_attention.default"
 
 
 @dataclass(frozen=True)
@@ -83,9 +83,7 @@ def find_residual_blocks(graph: Graph, sample: str) -> BlockTable:
             "no residual block found: between the sample and the output no value a is updated as a + f(a)."
             f" The search walked {len(points)} dominators and ended at {where}."
             + "".join(f"\n  declined: {reason}" for reason in declined)
-            + "\nWithout residuals there is nothing to cache; this network cannot be made sparse by ttscompile. If it"
-            " adds the sample to its output, as EDM's preconditioning does, compile what is inside: EDMDenoiser and"
-            " edm_table."
+            + "\nNothing can be reused then. If the output is the sample plus more, use EDMDenoiser and edm_table."
         )
     links = _main_stream(graph, links, declined)
     blocks = _chain(graph, points, links, declined)
@@ -212,14 +210,10 @@ def _kind(graph: Graph, nodes: Sequence[Node], stream: str, hides: bool) -> str:
     attentions = []
     around: set[str] = set()
     for node in nodes:
-        if node.op.startswith((_SDPA, *_SOFTMAX)):
-            around |= _around(graph, types, node)
-        if node.op.startswith(_SDPA):
-            keys = [a.name for a in node.args[1:2] if isinstance(a, Ref)]
-        elif node.op.startswith(_SOFTMAX):
-            keys = _key_operands(producers, node)
-        else:
+        if node.op not in (_ATTENTION, _SOFTMAX):
             continue
+        around |= _around(graph, types, node)
+        keys = list(node.refs())[1:2] if node.op == _ATTENTION else _key_operands(producers, node)
         attentions.append("self_attention" if any(k in inside for k in keys) else "cross_attention")
     contractions = [n.name for n in nodes if node_flops(n, types) > 0]
     convolves = any(_convolves(n, types) for n in nodes)
@@ -237,13 +231,13 @@ def _around(graph: Graph, types: dict[str, TensorType], attention: Node) -> set[
     """What is before or after an attention, of which a softmax alone is followed by the product with the values."""
     after = reachable_from(graph, [attention.name])
     products = [n.name for n in graph.nodes if n.name in after and node_flops(n, types) > 0]
-    product = attention.name if attention.op.startswith(_SDPA) or not products else products[0]
+    product = attention.name if attention.op == _ATTENTION or not products else products[0]
     return reaching(graph, [product]) | reachable_from(graph, [product])
 
 
 def _convolves(node: Node, types: dict[str, TensorType]) -> bool:
     """Whether a node mixes neighbours; a pointwise convolution is a linear layer of the channels."""
-    if not node.op.startswith("aten.conv"):
+    if not operation(node.op).name.startswith("conv"):
         return False
     weight = node.args[1]
     return not isinstance(weight, Ref) or any(size != 1 for size in types[weight.name].shape[2:])
@@ -256,7 +250,8 @@ def _key_operands(producers: dict[str, Node], softmax: Node) -> list[str]:
         node = producers.get(pending.pop())
         if node is None:
             continue
-        if node.op.startswith(_MATMUL):
+        row = operation(node.op)
+        if row.linear is Linear.IN_EACH and row.flops is not None:
             return list(node.refs())[-1:]
         pending.extend(node.refs())
     return []

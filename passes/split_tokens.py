@@ -5,18 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 
 from ttscompile.ir.binding import bindings, input_bindings, join
 from ttscompile.ir.graph import GETITEM, Argument, Batch, Graph, Node, Ref, Size, TensorType
+from ttscompile.ir.operations import Movement, axes_along, operation, permutation
 from ttscompile.ir.program import Binding, Cut
 
 from .base import Pass, PassResult
-
-_UNARY = frozenset(
-    "gelu relu silu mish tanh sigmoid softplus exp sin cos neg rsqrt sqrt abs erf elu leaky_relu hardswish hardtanh"
-    " clamp clone pow reciprocal _to_copy to contiguous dropout square log1p expm1".split()
-)
-_BINARY = frozenset("add sub mul div".split())
 
 
 @dataclass(frozen=True)
@@ -82,8 +78,7 @@ class _Splitter:
             return
         operands = [name for name in dict.fromkeys(node.refs()) if name in self.parts]
         if operands:
-            rule = _RULES.get(_base(node))
-            parts = rule(self, node) if rule is not None else None
+            parts = _parts(self, node)
             if parts is not None:
                 self.parts[node.name] = parts
                 return
@@ -113,11 +108,7 @@ class _Splitter:
         part = replace(node, name=name, args=args, types=types)
         self.nodes.append(part)
         self.types[name] = types[0]
-        read = [self.bindings[n] for n in part.refs()]
-        binding = Binding.CONSTANT
-        for other in read:
-            binding = join(binding, other)
-        self.bindings[name] = binding
+        self.bindings[name] = reduce(join, (self.bindings[n] for n in part.refs()), Binding.CONSTANT)
         return name
 
     def _split_cat(self, node: Node) -> bool:
@@ -169,217 +160,93 @@ class _Splitter:
         return part
 
 
-def _base(node: Node) -> str:
-    return node.op if node.op == GETITEM else node.op.split(".")[1]
-
-
 def _positive(axis: Argument, type_: TensorType) -> int:
     assert isinstance(axis, int)
     return axis % len(type_.shape)
 
 
 def _resized(type_: TensorType, axis: int, size: int) -> TensorType:
-    shape = list(type_.shape)
-    shape[axis] = size
-    return TensorType(tuple(shape), type_.dtype)
+    return replace(type_, shape=(*type_.shape[:axis], size, *type_.shape[axis + 1 :]))
 
 
-def _first(node: Node) -> str | None:
-    return node.args[0].name if node.args and isinstance(node.args[0], Ref) else None
+def _parts(splitter: _Splitter, node: Node) -> _Parts | None:
+    """The result of a node that treats tokens each for itself, a node a part; None if it mixes them or is not known."""
+    row = operation(node.op)
+    if row.elementwise:
+        return _elementwise(splitter, node)
+    split = [name for name in node.refs() if name in splitter.parts]
+    if split != list(node.refs())[:1] or node.args[0] != Ref(split[0]):
+        return None  # it reads more than one value in parts, or not in the first place
+    source, type_ = splitter.parts[split[0]], splitter.types[split[0]]
+    axis, rank, new = source.axis, len(type_.shape), node.type.shape
+    if row.movement is Movement.RESHAPE:
+        return _reshaped(splitter, node, source, type_)
+    if row.movement is Movement.PERMUTE:
+        return _per_part(splitter, node, source, permutation(node, rank).index(axis))
+    if row.name == "expand":
+        axis += len(new) - rank
+        return _per_part(splitter, node, source, axis, lambda size: (_resized(node.type, axis, size).shape,))
+    if row.along is not None and len(along := axes_along(node, rank)) == 1:
+        (across,) = along
+        # A selection leaves its axis out.
+        return None if across == axis else _per_part(splitter, node, source, axis - (len(new) < rank and across < axis))
+    if row.mixes is not None:
+        mixed = row.mixes(node, splitter.types)
+        return None if mixed is None or axis >= rank - mixed else _per_part(splitter, node, source, axis)
+    return _per_part(splitter, node, source, axis) if node.op == GETITEM else None
 
 
 def _per_part(
-    splitter: _Splitter, node: Node, source: _Parts, axis: int, args: Callable[[Ref, int], tuple[Argument, ...]]
+    splitter: _Splitter,
+    node: Node,
+    source: _Parts,
+    axis: int,
+    rest: Callable[[int], tuple[Argument, ...]] | None = None,
 ) -> _Parts:
-    """Emit ``node`` once a part; ``args`` gives its arguments for a part and that part's size."""
-    names = tuple(
-        splitter.emit(node, i, args(Ref(name), size), tuple(_resized(t, axis, size) for t in node.types))
-        for i, (name, size) in enumerate(zip(source.names, source.sizes, strict=True))
-    )
-    return _Parts(axis, names, source.sizes)
-
-
-def _only_first_is_split(splitter: _Splitter, node: Node) -> _Parts | None:
-    name = _first(node)
-    split = [n for n in node.refs() if n in splitter.parts]
-    return splitter.parts[name] if name is not None and split == [name] else None
-
-
-def _unary(splitter: _Splitter, node: Node) -> _Parts | None:
-    source = _only_first_is_split(splitter, node)
-    if source is None or len(list(node.refs())) != 1:
-        return None
-    return _per_part(splitter, node, source, source.axis, lambda part, _: (part, *node.args[1:]))
-
-
-def _binary(splitter: _Splitter, node: Node) -> _Parts | None:
-    rank = len(node.type.shape)
-    aligned: dict[str, _Parts] = {}
-    for name in node.refs():
-        if name in splitter.parts:
-            parts = splitter.parts[name]
-            shift = rank - len(splitter.types[name].shape)
-            aligned[name] = replace(parts, axis=parts.axis + shift)
-    axes = {(p.axis, p.sizes) for p in aligned.values()}
-    if len(axes) != 1:
-        return None
-    axis, sizes = next(iter(axes))
-    starts = [sum(sizes[:i]) for i in range(len(sizes))]
+    """Emit ``node`` once a part; ``rest`` gives its arguments after the first, for the size of a part."""
     names = []
-    for i, (start, size) in enumerate(zip(starts, sizes, strict=True)):
-        args: list[Argument] = []
-        for position, argument in enumerate(node.args):
-            if not isinstance(argument, Ref):
-                args.append(argument)
-            elif argument.name in aligned:
-                args.append(Ref(aligned[argument.name].names[i]))
-            else:
-                shape = splitter.types[argument.name].shape
-                own = axis - (rank - len(shape))
-                if own < 0 or shape[own] == 1:
-                    args.append(argument)
-                else:
-                    index = i * len(node.args) + position
-                    args.append(Ref(splitter.slice_part(node, argument.name, own, start, size, index)))
-        names.append(splitter.emit(node, i, tuple(args), (_resized(node.type, axis, size),)))
-    return _Parts(axis, tuple(names), sizes)
+    for i, (name, size) in enumerate(zip(source.names, source.sizes, strict=True)):
+        args = (Ref(name), *(node.args[1:] if rest is None else rest(size)))
+        names.append(splitter.emit(node, i, args, tuple(_resized(t, axis, size) for t in node.types)))
+    return _Parts(axis, tuple(names), source.sizes)
 
 
-def _linear(splitter: _Splitter, node: Node) -> _Parts | None:
-    source = _only_first_is_split(splitter, node)
-    if source is None or source.axis == len(node.type.shape) - 1:
+def _reshaped(splitter: _Splitter, node: Node, source: _Parts, type_: TensorType) -> _Parts | None:
+    """The split is kept if the token axis survives: the sizes before it, and itself, have the same product."""
+    new, before = node.type.shape, _factors(type_.shape[: source.axis])
+    kept = [a for a, size in enumerate(new) if size == type_.shape[source.axis] and _factors(new[:a]) == before]
+    if not kept:
         return None
-    return _per_part(splitter, node, source, source.axis, lambda part, _: (part, *node.args[1:]))
+    node = replace(node, op="aten.reshape.default", kwargs=())
+    return _per_part(splitter, node, source, kept[0], lambda size: (_resized(node.type, kept[0], size).shape,))
 
 
-def _matmul(splitter: _Splitter, node: Node) -> _Parts | None:
-    name, other = _first(node), node.args[1]
-    if name is None or not isinstance(other, Ref) or len(splitter.types[other.name].shape) != 2:
-        return None  # a batched right side may belong to the tokens, as in attention
-    return _linear(splitter, node)
-
-
-def _layer_norm(splitter: _Splitter, node: Node) -> _Parts | None:
-    source = _only_first_is_split(splitter, node)
-    normalized = node.args[1]
-    if source is None or not isinstance(normalized, tuple):
-        return None
-    if source.axis >= len(node.type.shape) - len(normalized):
-        return None
-    return _per_part(splitter, node, source, source.axis, lambda part, _: (part, *node.args[1:]))
-
-
-def _transpose(splitter: _Splitter, node: Node) -> _Parts | None:
-    source = _only_first_is_split(splitter, node)
-    if source is None:
-        return None
-    first, second = (_positive(a, node.type) for a in node.args[1:3])
-    axis = {first: second, second: first}.get(source.axis, source.axis)
-    return _per_part(splitter, node, source, axis, lambda part, _: (part, *node.args[1:]))
-
-
-def _permute(splitter: _Splitter, node: Node) -> _Parts | None:
-    source = _only_first_is_split(splitter, node)
-    if source is None or not isinstance(node.args[1], tuple):
-        return None
-    order = [_positive(a, node.type) for a in node.args[1]]
-    return _per_part(splitter, node, source, order.index(source.axis), lambda part, _: (part, *node.args[1:]))
-
-
-def _unsqueeze(splitter: _Splitter, node: Node) -> _Parts | None:
-    source = _only_first_is_split(splitter, node)
-    if source is None:
-        return None
-    new = _positive(node.args[1], node.type)
-    axis = source.axis + (new <= source.axis)
-    return _per_part(splitter, node, source, axis, lambda part, _: (part, *node.args[1:]))
-
-
-def _squeeze(splitter: _Splitter, node: Node) -> _Parts | None:
-    source, name = _only_first_is_split(splitter, node), _first(node)
-    if source is None or name is None or len(node.args) < 2 or not isinstance(node.args[1], int):
-        return None
-    type_ = splitter.types[name]
-    gone = _positive(node.args[1], type_)
-    if gone == source.axis or type_.shape[gone] != 1:
-        return None
-    axis = source.axis - (gone < source.axis)
-    return _per_part(splitter, node, source, axis, lambda part, _: (part, *node.args[1:]))
-
-
-def _select(splitter: _Splitter, node: Node) -> _Parts | None:
-    source, name = _only_first_is_split(splitter, node), _first(node)
-    if source is None or name is None:
-        return None
-    gone = _positive(node.args[1], splitter.types[name])
-    if gone == source.axis:
-        return None
-    axis = source.axis - (gone < source.axis)
-    return _per_part(splitter, node, source, axis, lambda part, _: (part, *node.args[1:]))
-
-
-def _along_other_axis(default: int) -> Callable[[_Splitter, Node], _Parts | None]:
-    """slice, chunk, split and softmax act on one axis; the others pass through. ``default`` is its position in args."""
-
-    def rule(splitter: _Splitter, node: Node) -> _Parts | None:
-        source, name = _only_first_is_split(splitter, node), _first(node)
-        if source is None or name is None:
-            return None
-        argument = node.args[default] if len(node.args) > default else dict(node.kwargs).get("dim", 0)
-        if _positive(argument, splitter.types[name]) == source.axis:
-            return None
-        return _per_part(splitter, node, source, source.axis, lambda part, _: (part, *node.args[1:]))
-
-    return rule
-
-
-def _getitem(splitter: _Splitter, node: Node) -> _Parts | None:
-    source = _only_first_is_split(splitter, node)
-    return (
-        None
-        if source is None
-        else _per_part(splitter, node, source, source.axis, lambda part, _: (part, *node.args[1:]))
-    )
-
-
-def _product(shape: Sequence[Size]) -> tuple[int, int]:
+def _factors(shape: Sequence[Size]) -> tuple[int, int]:
     """Numbers and batches in a product of sizes."""
     numbers = math.prod(n.multiple if isinstance(n, Batch) else n for n in shape)
     return numbers, sum(isinstance(n, Batch) for n in shape)
 
 
-def _view(splitter: _Splitter, node: Node) -> _Parts | None:
-    """A view keeps the split if the token axis survives: the sizes before it, and itself, have the same product."""
-    source, name = _only_first_is_split(splitter, node), _first(node)
-    if source is None or name is None:
+def _elementwise(splitter: _Splitter, node: Node) -> _Parts | None:
+    """Parts of all operands, the others of which are cut where they are not broadcast along the tokens."""
+    rank = len(node.type.shape)
+    places = {name: rank - len(splitter.types[name].shape) for name in node.refs()}
+    parts = {name: splitter.parts[name] for name in places if name in splitter.parts}
+    splits = {(part.axis + places[name], part.sizes) for name, part in parts.items()}
+    if len(splits) != 1:
         return None
-    shape, new = splitter.types[name].shape, node.type.shape
-    before = _product(shape[: source.axis])
-    kept = [a for a in range(len(new)) if _product(new[:a]) == before and new[a] == shape[source.axis]]
-    if not kept:
-        return None
-    axis = kept[0]
-    return _per_part(splitter, node, source, axis, lambda part, size: (part, (*new[:axis], size, *new[axis + 1 :])))
-
-
-def _expand(splitter: _Splitter, node: Node) -> _Parts | None:
-    source, name = _only_first_is_split(splitter, node), _first(node)
-    if source is None or name is None:
-        return None
-    new = node.type.shape
-    axis = source.axis + len(new) - len(splitter.types[name].shape)
-    return _per_part(splitter, node, source, axis, lambda part, size: (part, (*new[:axis], size, *new[axis + 1 :])))
-
-
-_RULES: dict[str, Callable[[_Splitter, Node], _Parts | None]] = {
-    **dict.fromkeys(_UNARY, _unary),
-    **dict.fromkeys(_BINARY, _binary),
-    "linear": _linear, "matmul": _matmul,
-    "layer_norm": _layer_norm, "rms_norm": _layer_norm,
-    "transpose": _transpose, "permute": _permute,
-    "unsqueeze": _unsqueeze, "squeeze": _squeeze, "select": _select,
-    "slice": _along_other_axis(1), "chunk": _along_other_axis(2), "split": _along_other_axis(2),
-    "split_with_sizes": _along_other_axis(2), "softmax": _along_other_axis(1),
-    GETITEM: _getitem,
-    "view": _view, "reshape": _view, "_unsafe_view": _view, "expand": _expand,
-}  # fmt: skip
+    ((axis, sizes),) = splits
+    names: list[str] = []
+    for i, size in enumerate(sizes):
+        args: list[Argument] = []
+        for position, argument in enumerate(node.args):
+            if isinstance(argument, Ref) and argument.name in parts:
+                argument = Ref(parts[argument.name].names[i])
+            elif isinstance(argument, Ref):
+                shape, own = splitter.types[argument.name].shape, axis - places[argument.name]
+                if own >= 0 and shape[own] != 1:
+                    index = i * len(node.args) + position
+                    argument = Ref(splitter.slice_part(node, argument.name, own, sum(sizes[:i]), size, index))
+            args.append(argument)
+        names.append(splitter.emit(node, i, tuple(args), (_resized(node.type, axis, size),)))
+    return _Parts(axis, tuple(names), sizes)

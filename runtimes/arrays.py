@@ -97,10 +97,10 @@ def _one(key: str, array: Array, spec: ObservationSpec) -> Array:
     found = f"{array.dtype} {list(array.shape)}"
     if array.shape[1:] != spec.shape or array.ndim != len(spec.shape) + 1 or len(array) < 1:
         remedy = " A single stream needs a first axis of 1: use obs[None]." if array.shape == spec.shape else ""
-        remedy = remedy or image_remedy(array, spec)
+        remedy = remedy or _image_remedy(array, spec)
         raise ObservationError(f"observation {key!r} has the wrong shape: expected {expected}; found {found}.{remedy}")
     if str(array.dtype) != spec.dtype:
-        remedy = image_remedy(array, spec) or (
+        remedy = _image_remedy(array, spec) or (
             f" Convert it with .astype(np.{spec.dtype}), after making sure that its units are those of the training"
             " data."
         )
@@ -145,7 +145,7 @@ def check_values(array: Array, key: str, spec: ObservationSpec) -> None:
         )
 
 
-def image_remedy(array: Array, spec: ObservationSpec) -> str:
+def _image_remedy(array: Array, spec: ObservationSpec) -> str:
     """What to do with an image of bytes, or with its channels last; nothing for other arrays."""
     if not spec.image:
         return ""

@@ -19,10 +19,12 @@ from ttscompile.errors import IllegalPlanError, ObservationError, RuntimeUnavail
 from ttscompile.ir.graph import TensorType
 
 from .arrays import check_noise, check_observation, check_seed, is_tensor, like
-from .base import CallReport, Runtime, open_runtime
 from .inpainting import check_prefix, known_samples, prefix_refusal
-from .onnxruntime.liveness import RolloutNeeds, rollout_needs
+from .liveness import RolloutNeeds, rollout_needs
+from .open import kind_of, open_runtime
 from .queues import Queues, is_window
+from .report import CallReport
+from .runtime import Runtime
 
 if TYPE_CHECKING:
     from ttscompile.artifact.load import Artifact
@@ -107,10 +109,10 @@ def load(
     """
     check_seed(seed)
     artifact = load_artifact(path)
-    if runtime == "reference":
+    if kind_of(runtime).fp32_only:
         if precision not in (None, FP32):
             raise RuntimeUnavailableError(
-                f"runtime 'reference' computes in {FP32!r} alone; found precision {precision!r}. Leave it out."
+                f"runtime {runtime!r} computes in {FP32!r} alone; found precision {precision!r}. Leave it out."
             )
         precision = FP32
     if precision is not None:
@@ -299,12 +301,11 @@ class CompiledPolicy:
         matrix, name, repair = self._plan(plan)
         correction = None if name is None else self._artifact.corrections.get(name)
         known = None if prefix is None else known_samples(spec, prefix, noise.initial)
-        normalized = {key: _normalized(array, spec.observations[key]) for key, array in obs.items()}
+        normalized = {key: spec.observations[key].normalized(array) for key, array in obs.items()}
         sample, self._report = self._runtime.predict(
             normalized, noise, matrix, plan_name=name, repair=repair, correction=correction, known=known
         )
-        predicted = sample[..., : spec.chunk.action_dim]
-        return predicted if spec.chunk.normalizer is None else spec.chunk.normalizer.unnormalize(predicted)
+        return spec.chunk.unnormalized(sample)
 
     def _draw(self, streams: int) -> Noise:
         """Noise of all steps of the original's horizon: a seed means the same however many are predicted."""
@@ -370,8 +371,3 @@ def _require_plan(artifact: Artifact, name: str) -> None:
 def _of_one_stream(type_: TensorType) -> tuple[int, ...]:
     axis = type_.batch_axis
     return tuple(n for i, n in enumerate(type_.at(1)) if i != axis)
-
-
-def _normalized(array: npt.NDArray[Any], spec: ObservationSpec) -> FloatArray:
-    """The observation as the network wants it; integer observations pass as they are."""
-    return array if spec.normalizer is None else spec.normalizer.normalize(array)

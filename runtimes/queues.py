@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ import numpy as np
 from ttscompile.core.spec import FloatArray, ObservationSpec
 from ttscompile.errors import ObservationError
 
-from .arrays import Array, as_array, check_values, image_remedy
+from .arrays import Array, check_observation
 
 Frame = dict[str, Array]
 Frames = dict[str, deque[Array]]
@@ -30,6 +31,10 @@ class Queues:
 
     def __init__(self, specs: Mapping[str, ObservationSpec]) -> None:
         self._specs = specs
+        self._frame_specs = {
+            key: spec if spec.frames is None else replace(spec, shape=spec.shape[1:], window=False)
+            for key, spec in specs.items()
+        }
         self._frames: Frames = {}
         self._actions: deque[FloatArray] = deque()
 
@@ -82,41 +87,16 @@ class Queues:
 
     def _checked(self, batch: Mapping[str, Any]) -> Frame:
         """The frame as arrays of its own, which the caller may not change any more."""
-        names = sorted(self._specs)
-        if not isinstance(batch, Mapping):
+        known = {k: batch[k] for k in self._frame_specs if k in batch} if isinstance(batch, Mapping) else batch
+        frame = check_observation(known, self._frame_specs)
+        streams = len(next(iter(frame.values())))
+        before = len(next(iter(self._frames.values()))[-1]) if self._frames else streams
+        if streams != before:
             raise ObservationError(
-                f"the batch is a {type(batch).__name__}; expected a dictionary with the keys {names}."
+                f"the frame holds {streams} streams, and the frames before {before}. The number of streams may change"
+                " only after reset()."
             )
-        missing = [key for key in names if key not in batch]
-        if missing:
-            raise ObservationError(
-                f"the batch lacks {missing}; expected the keys {names}, found {sorted(map(str, batch))}."
-            )
-        frame = {
-            key: self._one(key, as_array(batch[key], f"observation {key!r}"), self._specs[key]) for key in self._specs
-        }
-        counts = {key: len(value) for key, value in frame.items()}
-        if self._frames:
-            counts["the frames before"] = len(next(iter(self._frames.values()))[-1])
-        if len(set(counts.values())) > 1:
-            raise ObservationError(
-                f"different numbers of streams: {counts}. The first axis of all must be the same, and may change only"
-                " after reset()."
-            )
-        return frame
-
-    @staticmethod
-    def _one(key: str, array: Array, spec: ObservationSpec) -> Array:
-        shape = spec.shape if spec.frames is None else spec.shape[1:]
-        expected = f"{spec.dtype} [B, {', '.join(map(str, shape))}]"
-        if array.shape[1:] != shape or array.ndim != len(shape) + 1 or len(array) < 1 or array.dtype != spec.dtype:
-            raise ObservationError(
-                f"one frame of observation {key!r} must be {expected}; found {array.dtype} {list(array.shape)}."
-                + (" A single stream needs a first axis of 1." if array.shape == shape else "")
-                + image_remedy(array, spec)
-            )
-        check_values(array, key, spec)
-        return array.copy()
+        return {key: array.copy() for key, array in frame.items()}
 
 
 def is_window(batch: Mapping[str, Any], specs: Mapping[str, ObservationSpec]) -> bool:

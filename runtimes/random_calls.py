@@ -37,7 +37,4 @@ def random_noise(spec: PolicySpec, rng: np.random.Generator) -> Noise:
 
 def normalized(spec: PolicySpec, obs: Observation) -> Observation:
     """What the network is given of an observation as ``predict_action`` takes it."""
-    return {
-        key: obs[key] if one.normalizer is None else one.normalizer.normalize(obs[key])
-        for key, one in spec.observations.items()
-    }
+    return {key: one.normalized(obs[key]) for key, one in spec.observations.items()}

@@ -13,6 +13,7 @@ import pytest
 
 import ttscompile
 from ttscompile.ir.program import Program
+from ttscompile.measure.machine import has_integer_dot_product
 
 from .once import Once
 
@@ -25,8 +26,14 @@ DEEPER = re.compile(r"model\.decoder\.layers\.[1-9]")
 NO_SHARED = "NO GOLDEN FILES: no folder 'shared' with DESIGN.md and golden/ beside the repository or an ancestor of it"
 
 
-def pytest_configure() -> None:
-    """One thread for each of torch's operations: those of the tests are small, and wait for each other otherwise."""
+def pytest_configure(config: pytest.Config) -> None:
+    """One thread for each of torch's operations: those of the tests are small, and wait for each other otherwise.
+
+    Where the processor has no integer dot products, every policy with blocks of eight bits warns that it is slow there.
+    That is no error of the test that loads it; that it warns, a test of its own checks.
+    """
+    if not has_integer_dot_product():
+        config.addinivalue_line("filterwarnings", "ignore:precision 'int8' is fast on a processor:RuntimeWarning")
     if importlib.util.find_spec("torch") is not None:
         import torch
 

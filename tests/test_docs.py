@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -21,8 +22,13 @@ import pytest
 import zarr
 from click.testing import CliRunner
 
+from tests.calibration import policies, tasks
+from tests.once import Once
 from tests.passes.modules import MODULES, spec
+from ttscompile.calibration import strategies
 from ttscompile.cli import main
+from ttscompile.frontends import families
+from ttscompile.runtimes import open as open_module
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -58,7 +64,7 @@ NOT_RUN = {
     "ttscompile serve": "has no end; tests/executor/test_serve.py starts it",
     "ttscompile convert outputs/train": "a LeRobot policy: tests/frontends/test_lerobot_golden.py converts two",
     "ttscompile convert pretrained_model": "a LeRobot policy, with --task: tests/frontends/test_lerobot.py",
-    "ttscompile calibrate compiled/ --trajectories lerobot": "of LeRobot: tests/calibration/test_recordings.py",
+    "ttscompile calibrate compiled/ --trajectories lerobot": "of LeRobot: tests/trajectories/test_recordings.py",
 }
 """How the commands begin that are not run here, and why. Every other one is run; of these the options are checked."""
 
@@ -69,7 +75,7 @@ SHORTER = {
     "verify": "--calls 4",
     "report": "--runs 1",
     "bench": "--runs 1",
-    "plan": "--runs 1",
+    "realtime": "--runs 1",
     "record.py": "--episodes 2 --threads 1",
     "evaluate.py": "--episodes 1 --threads 1",
 }
@@ -296,24 +302,80 @@ def test_every_page_is_in_the_navigation() -> None:
     assert listed == {str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")}
 
 
+def guide(section: str) -> list[str]:
+    """The Python files that a section of the contributing guide shows, in order."""
+    page = ROOT / "CONTRIBUTING.md"
+    headings = [i for i, line in enumerate(page.read_text().splitlines()) if line.startswith("## ")]
+    start = page.read_text().splitlines().index(f"## {section}")
+    stop = headings[headings.index(start) + 1]
+    shown = [block for block in examples.blocks(page) if block.language == "python" and start < block.line < stop]
+    return ["\n".join(block.lines) + "\n" for block in shown]
+
+
+def contributed(text: str, name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """A file of the guide as a module, which is taken out again after the test."""
+    monkeypatch.setitem(sys.modules, name, None)
+    file = folder / f"{name}.py"
+    file.write_text(text)
+    return load(file, name)
+
+
 def test_the_pass_of_the_contributing_guide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Both files as they stand in the guide, in the place that it gives them."""
-    written = [block for block in examples.blocks(ROOT / "CONTRIBUTING.md") if block.language == "python"]
-    assert len(written) == 2
-    names = ("ttscompile.passes.drop_unit_scale", "contributed_test")
-    files = [tmp_path / "drop_unit_scale.py", tmp_path / "test_drop_unit_scale.py"]
-    for file, block in zip(files, written, strict=True):
-        file.write_text("\n".join(block.lines) + "\n")
-    for name in names:
-        monkeypatch.setitem(sys.modules, name, None)  # taken out again afterwards
-    load(files[0], names[0])
-    test = load(files[1], names[1])
+    written, its_test = guide("A pass")
+    contributed(written, "ttscompile.passes.drop_unit_scale", tmp_path, monkeypatch)
+    test = contributed(its_test, "contributed_test", tmp_path, monkeypatch)
     test.test_a_multiplication_by_one_is_gone_and_the_numbers_stay()
     near_misses = test.test_what_is_not_by_one_or_is_an_output_stays
     cases = near_misses.pytestmark[0].args[1]
     assert len(cases) == 2
     for graph in cases:
         near_misses(graph)
+
+
+def test_the_policy_family_of_the_contributing_guide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its module, its row and its test as they stand in the guide."""
+    module, row, its_test = guide("A policy family")
+    rows = eval(f"({row})", vars(families).copy())
+    monkeypatch.setattr(families, "FAMILIES", (*rows, *families.FAMILIES))
+    contributed(module, "ttscompile.frontends.action_dit", tmp_path, monkeypatch)
+    test = contributed(its_test, "contributed_test", tmp_path, monkeypatch)
+    for name in ("compiled", "options"):
+        (tmp_path / name).mkdir()
+    test.test_the_compiled_policy_is_the_network_that_was_saved(tmp_path / "compiled")
+    test.test_options_of_other_families_are_refused(tmp_path / "options")
+    refused = test.test_a_file_that_is_no_such_policy_is_refused
+    cases = refused.pytestmark[0].args[1]
+    assert len(cases) == 5
+    for changes, message in cases:
+        refused(tmp_path, changes, message)
+
+
+def test_the_strategy_of_the_contributing_guide(once: Once, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The module, its row and its test as they stand in the guide."""
+    written, row, its_test = guide("A strategy")
+    contributed(written, "ttscompile.calibration.published.ends", tmp_path, monkeypatch)
+    monkeypatch.setattr(strategies, "STRATEGIES", (*strategies.STRATEGIES, eval(row, vars(strategies))))
+    test = contributed(its_test, "contributed_test", tmp_path, monkeypatch)
+    make_task = partial(tasks.make_task, policies.compiled(once), policies.record(tmp_path / "calls.npz"))
+    test.test_whole_steps_are_at_both_ends_where_the_calls_want_them(make_task)
+    for budget in test.test_a_budget_of_one_step_leaves_step_0.pytestmark[0].args[1]:
+        test.test_a_budget_of_one_step_leaves_step_0(make_task, budget)
+
+
+def test_the_runtime_of_the_contributing_guide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its module, how it is opened, its row and its test as they stand in the guide."""
+    module, opening, row, its_test = guide("A runtime")
+    contributed(module, "ttscompile.runtimes.resolved", tmp_path, monkeypatch)
+    names = vars(open_module).copy()
+    exec(opening, names)
+    for name, kind in eval(f"{{{row}}}", names).items():
+        monkeypatch.setitem(open_module.RUNTIMES, name, kind)
+    test = contributed(its_test, "contributed_test", tmp_path, monkeypatch)
+    agrees = test.test_it_agrees_with_the_reference
+    for streams in agrees.pytestmark[0].args[1]:
+        agrees(tmp_path / str(streams), streams)
+    test.test_the_pruners_plan_and_reuse_over_calls(tmp_path / "pruned")
 
 
 def test_the_site_is_built_and_loads_nothing_from_elsewhere(tmp_path: Path) -> None:

@@ -10,75 +10,52 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from .measure.versions import VERSION as __version__
+
 if TYPE_CHECKING:
-    from .calibration import calibrate
-    from .core.lattice import Source, legalize
-    from .core.spec import Affine, ChunkSpec, Noise, ObservationSpec, PolicySpec, SamplerTable
-    from .driver import compile_denoiser, convert
-    from .errors import TtscompileError
-    from .runtimes.base import CallReport
-    from .runtimes.executor import AsyncExecutor, ExecutorSettings, GuardLimits
-    from .runtimes.policy import CompiledPolicy, PolicyInfo, load
-    from .samplers.edm import EDMDenoiser, edm_table
-    from .samplers.flow import flow_matching_table
-    from .verification import Verification, verify
-
-__version__ = "0.1.0"
-
-__all__ = [
-    "Affine",
-    "AsyncExecutor",
-    "CallReport",
-    "ChunkSpec",
-    "CompiledPolicy",
-    "EDMDenoiser",
-    "ExecutorSettings",
-    "GuardLimits",
-    "Noise",
-    "ObservationSpec",
-    "PolicyInfo",
-    "PolicySpec",
-    "SamplerTable",
-    "Source",
-    "TtscompileError",
-    "Verification",
-    "__version__",
-    "calibrate",
-    "compile_denoiser",
-    "convert",
-    "edm_table",
-    "flow_matching_table",
-    "legalize",
-    "load",
-    "verify",
-]
+    from .calibration.pipeline import calibrate as calibrate
+    from .core.lattice import Source as Source
+    from .core.lattice import legalize as legalize
+    from .core.spec import Affine as Affine
+    from .core.spec import ChunkSpec as ChunkSpec
+    from .core.spec import Noise as Noise
+    from .core.spec import ObservationSpec as ObservationSpec
+    from .core.spec import PolicySpec as PolicySpec
+    from .core.spec import SamplerTable as SamplerTable
+    from .driver import compile_denoiser as compile_denoiser
+    from .driver import convert as convert
+    from .errors import TtscompileError as TtscompileError
+    from .runtimes.executor import AsyncExecutor as AsyncExecutor
+    from .runtimes.executor import ExecutorSettings as ExecutorSettings
+    from .runtimes.executor import GuardLimits as GuardLimits
+    from .runtimes.policy import CompiledPolicy as CompiledPolicy
+    from .runtimes.policy import PolicyInfo as PolicyInfo
+    from .runtimes.policy import load as load
+    from .runtimes.report import CallReport as CallReport
+    from .samplers.edm import EDMDenoiser as EDMDenoiser
+    from .samplers.edm import edm_table as edm_table
+    from .samplers.flow import flow_matching_table as flow_matching_table
+    from .verification import Verification as Verification
+    from .verification import verify as verify
 
 _HOMES = {
-    "Affine": "core.spec",
-    "AsyncExecutor": "runtimes.executor",
-    "CallReport": "runtimes.base",
-    "ChunkSpec": "core.spec",
-    "CompiledPolicy": "runtimes.policy",
-    "EDMDenoiser": "samplers.edm",
-    "ExecutorSettings": "runtimes.executor",
-    "GuardLimits": "runtimes.executor",
-    "Noise": "core.spec",
-    "ObservationSpec": "core.spec",
-    "PolicyInfo": "runtimes.policy",
-    "PolicySpec": "core.spec",
-    "SamplerTable": "core.spec",
-    "Source": "core.lattice",
-    "TtscompileError": "errors",
-    "Verification": "verification",
-    "calibrate": "calibration",
-    "compile_denoiser": "driver",
-    "convert": "driver",
-    "edm_table": "samplers.edm",
-    "flow_matching_table": "samplers.flow",
-    "legalize": "core.lattice",
-    "load": "runtimes.policy",
-    "verify": "verification",
+    name: home
+    for home, names in {
+        "calibration.pipeline": ("calibrate",),
+        "core.lattice": ("Source", "legalize"),
+        "core.spec": ("Affine", "ChunkSpec", "Noise", "ObservationSpec", "PolicySpec", "SamplerTable"),
+        "driver": ("compile_denoiser", "convert"),
+        "errors": ("TtscompileError",),
+        "runtimes.report": ("CallReport",),
+        "runtimes.executor": ("AsyncExecutor", "ExecutorSettings", "GuardLimits"),
+        "runtimes.policy": ("CompiledPolicy", "PolicyInfo", "load"),
+        "samplers.edm": ("EDMDenoiser", "edm_table"),
+        "samplers.flow": ("flow_matching_table",),
+        "verification": ("Verification", "verify"),
+    }.items()
+    for name in names
 }
+__all__ = ["__version__", *sorted(_HOMES)]
 
 
 def __getattr__(name: str) -> Any:

@@ -20,7 +20,8 @@ from .capture.narrow import narrow, unneeded
 from .core.spec import FP32, PolicySpec
 from .errors import ArtifactError, PassError
 from .frontends import load_checkpoint_policy
-from .frontends.encoded import EncodedDenoiser
+from .frontends.encoded import parts
+from .frontends.families import LoadOptions
 from .ir.dataflow import reachable_from
 from .ir.flops import graph_flops, node_flops
 from .ir.graph import Graph
@@ -42,7 +43,7 @@ from .passes.split_features import SplitFeatures
 from .passes.split_tokens import SplitTokens
 from .passes.unfold_batch import UnfoldBatch
 from .passes.widen_attention import WidenAttention
-from .runtimes.precision import measure_precision
+from .verification.against_fp32 import measure_precision
 from .verification.record_golden import record_original
 
 if TYPE_CHECKING:
@@ -76,7 +77,7 @@ def convert(
     Args:
         checkpoint: a file or directory that the training code saved.
         directory: where the artifact goes; an artifact that is there is replaced, anything else is left alone.
-        format: ``auto``, ``diffusion_policy`` or ``lerobot``.
+        format: name of the policy's family, ``diffusion_policy`` or ``lerobot``; ``auto`` tells by what is there.
         sampler: ``ddpm``, ``ddim`` or ``dpmsolver++`` in place of a diffusion policy's own, ``euler`` or ``rk4`` in
             place of a flow-matching policy's; None keeps it.
         steps: number of denoising or integration steps; None keeps the checkpoint's. ``rk4`` evaluates the network four
@@ -100,9 +101,8 @@ def convert(
     if precision != FP32:
         require_precision(precision)  # before minutes of work
     require_replaceable(directory)
-    module, spec = load_checkpoint_policy(
-        checkpoint, format=format, sampler=sampler, steps=steps, spacing=spacing, task=task, encoders=encoders
-    )
+    options = LoadOptions(sampler=sampler, steps=steps, spacing=spacing, task=task, encoders=encoders)
+    module, spec = load_checkpoint_policy(checkpoint, format, options)
     return compile_denoiser(
         module,
         spec,
@@ -230,7 +230,7 @@ def transform(module: nn.Module, spec: PolicySpec, *, explain: Explain = _silent
 def _dense_flops(module: nn.Module, graph: Graph, spec: PolicySpec) -> int:
     """FLOPs of a call as the original makes it: the whole graph at every step, but an observation encoder once."""
     once = 0
-    if isinstance(module, EncodedDenoiser):
+    if parts(module).encoder is not None:
         types, loop = graph.types(), reachable_from(graph, [spec.sample_argument, spec.timestep_argument])
         once = sum(node_flops(node, types) for node in graph.nodes if node.name not in loop)
     return (graph_flops(graph) - once) * spec.sampler.steps + once

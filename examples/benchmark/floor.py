@@ -17,8 +17,8 @@ from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.cli.timing import Contestant, Measurement
 from ttscompile.core.lattice import PlanArray, plan_flops
 from ttscompile.ir.pieces import block_name
-from ttscompile.runtimes.onnxruntime.idle import WORTH
-from ttscompile.runtimes.onnxruntime.instructions import lower_plan
+from ttscompile.runtimes.onnxruntime.idle_steps import WORTH
+from ttscompile.runtimes.onnxruntime.instructions import instructions_of
 from ttscompile.runtimes.onnxruntime.sessions import Bound, open_sessions
 from ttscompile.runtimes.onnxruntime.workspace import Workspace
 from ttscompile.runtimes.random_calls import random_calls
@@ -50,10 +50,10 @@ def tails_contestant(directory: Path, threads: int, plan: PlanArray) -> Contesta
     work = Workspace(manifest, open_sessions(artifact, threads, blocks=False), artifact.tables, 1)
     ((obs, noise),) = random_calls(manifest.spec, 1, seed=0)
     for key, spec in manifest.spec.observations.items():
-        obs[key] = obs[key] if spec.normalizer is None else spec.normalizer.normalize(obs[key])
+        obs[key] = spec.normalized(obs[key])
     work.start(obs, noise, None)
 
-    lowered = lower_plan(plan, manifest.groups)
+    lowered = instructions_of(plan, manifest.groups)
 
     def call(*_: object) -> None:
         k = 0

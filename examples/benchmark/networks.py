@@ -16,6 +16,7 @@ from ttscompile.artifact.write import update_calibration
 from ttscompile.core.lattice import PlanArray, uniform_plan
 from ttscompile.core.spec import ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
 from ttscompile.frontends import load_checkpoint_policy
+from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.scheduler import configured_sampler
 from ttscompile.frontends.transformer_for_diffusion import (
     ConditionedDenoiser,
@@ -52,7 +53,7 @@ class Network:
 
 def pusht_network(sampler: str, steps: int) -> Network:
     """The policy of ``examples/pusht``."""
-    module, spec = load_checkpoint_policy(PUSHT, sampler=sampler, steps=steps)
+    module, spec = load_checkpoint_policy(PUSHT, options=LoadOptions(sampler=sampler, steps=steps))
     return Network("Push-T", PUSHT_WIDTH, module, spec)
 
 
@@ -90,7 +91,7 @@ def sampler_of(name: str, steps: int) -> SamplerTable:
         "clip_sample": True,
         "prediction_type": "epsilon",
     }
-    return configured_sampler(settings, steps, step_arguments={}, sampler=name)
+    return configured_sampler(settings, None, LoadOptions(sampler=name, steps=steps))
 
 
 def plan_at(steps: int, blocks: int, sparsity: float) -> PlanArray | None:

@@ -138,19 +138,19 @@ def time_calls(
     with TemporaryDirectory() as folder:
         announce(f"compiling with {GROWTH} times the steps", 1)
         longer = _compile_longer(of, Path(folder))
-        groups: dict[int, list[Contestant]] = {}
+        by_threads: dict[int, list[Contestant]] = {}
         for threads in sorted({1, *settings.threads}):
             policies = [ttscompile.load(of.directory, threads=threads) for _ in range(2)]  # their caches are their own
-            groups[threads] = [
+            by_threads[threads] = [
                 eager,
                 plan_contestant(DENSE, policies[0], "dense", spec),
                 plan_contestant(OURS, policies[1], of.plan_name, spec),
                 blocks_contestant(of.directory, threads),
                 tails_contestant(of.directory, threads, of.plan),
             ]
-        groups[1].append(longer)
-        on_round = announce("timing", rounds_of(groups, settings.effort))
-        measured = measure_in_passes(groups, settings.effort, on_round)
+        by_threads[1].append(longer)
+        on_round = announce("timing", rounds_of(by_threads, settings.effort))
+        measured = measure_in_passes(by_threads, settings.effort, on_round)
     return {threads: {m.label: m for m in measurements} for threads, measurements in measured.items()}
 
 

@@ -68,27 +68,27 @@ def torch_compile_contestant(network: Network, dense_flops: float, threads: int)
 
 
 def measure_in_passes(
-    groups: Mapping[int, Sequence[Contestant]],
+    by_threads: Mapping[int, Sequence[Contestant]],
     effort: Effort,
     on_round: Callable[[], None] = lambda: None,
 ) -> dict[int, list[Measurement]]:
-    """Time groups of contestants, one thread count after the other, and all of them in every pass.
+    """Time contestants, one thread count after the other, and all thread counts in every pass.
 
-    Within a group the contestants take turns call by call. Warm-up is not counted.
+    Contestants of one thread count take turns call by call. Warm-up is not counted.
 
     Args:
-        groups: by number of threads.
+        by_threads: the contestants of each number of threads.
         effort: see there.
-        on_round: called after each round of each group.
+        on_round: called after each round of each thread count.
 
     Returns:
         One measurement a contestant, by number of threads.
     """
-    seen: dict[int, list[list[Measurement]]] = {threads: [] for threads in groups}
+    seen: dict[int, list[list[Measurement]]] = {threads: [] for threads in by_threads}
     before = torch.get_num_threads()
     try:
         for number in range(effort.passes):
-            for threads, entered in groups.items():
+            for threads, entered in by_threads.items():
                 torch.set_num_threads(threads)
                 warm_up = effort.warm_up if number == 0 else 1
                 seen[threads].append(measure(entered, effort.runs, number, lambda *_: on_round(), warm_up))
@@ -97,9 +97,9 @@ def measure_in_passes(
     return {threads: [_pooled(one) for one in zip(*of, strict=True)] for threads, of in seen.items()}
 
 
-def rounds_of(groups: Mapping[int, Sequence[Contestant]], effort: Effort) -> int:
+def rounds_of(by_threads: Mapping[int, Sequence[Contestant]], effort: Effort) -> int:
     """How often ``on_round`` will be called."""
-    return len(groups) * (effort.warm_up + effort.passes - 1 + effort.passes * effort.runs)
+    return len(by_threads) * (effort.warm_up + effort.passes - 1 + effort.passes * effort.runs)
 
 
 def tenths(times_ms: Sequence[float]) -> tuple[float, float]:
@@ -110,12 +110,5 @@ def tenths(times_ms: Sequence[float]) -> tuple[float, float]:
 
 def _pooled(parts: Sequence[Measurement]) -> Measurement:
     """One measurement of all passes."""
-    times = [ms for part in parts for ms in part.times_ms]
-    low, high = np.percentile(times, [25, 75])
-    return replace(
-        parts[0],
-        times_ms=tuple(times),
-        median_ms=float(np.median(times)),
-        quartiles_ms=(float(low), float(high)),
-        legalised=sum(part.legalised for part in parts),
-    )
+    times = tuple(ms for part in parts for ms in part.times_ms)
+    return replace(parts[0], times_ms=times, legalised=sum(part.legalised for part in parts))

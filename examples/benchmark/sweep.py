@@ -131,13 +131,13 @@ def time_network(network: Network, settings: Settings, announce: Announce) -> tu
                 rivals.append(torch_compile_contestant(network, artifact.manifest.flops.dense, settings.threads[0]))
             except RuntimeUnavailableError as error:
                 left_out.append(f"{title}: {error}")
-        groups = {
+        by_threads = {
             threads: [*rivals, *_compiled(network, directory, threads, plans), blocks_contestant(directory, threads)]
             for threads in settings.threads
         }
         effort = settings.effort if network.width <= PUSHT_WIDTH else settings.wide_effort
-        on_round = announce(f"timing: {title}", rounds_of(groups, effort))
-        measured = measure_in_passes(groups, effort, on_round)
+        on_round = announce(f"timing: {title}", rounds_of(by_threads, effort))
+        measured = measure_in_passes(by_threads, effort, on_round)
     rows = []
     for threads, measurements in measured.items():
         blocks = next(m for m in measurements if m.label == FLOOR)

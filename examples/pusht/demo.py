@@ -24,7 +24,7 @@ from rollout import run_episodes
 from variants import Variant, first_seed_option, open_variant, results_console, run, threads_option
 
 import ttscompile
-from ttscompile.calibration import CalibrationResult
+from ttscompile.calibration.result import CalibrationResult
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.plots.plan import plot_plan
 

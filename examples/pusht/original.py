@@ -41,10 +41,7 @@ class EagerPolicy:
             raise ValueError(f"the eager policy needs its noise, and computes everything; found plan {plan!r}.")
         normalised = {}
         for key, spec in self._spec.observations.items():
-            array = np.asarray(obs_dict[key], dtype=spec.dtype)
-            normalised[key] = torch.from_numpy(spec.normalizer.normalize(array) if spec.normalizer else array)
+            normalised[key] = torch.from_numpy(spec.normalized(np.asarray(obs_dict[key], dtype=spec.dtype)))
         chunk = self._spec.chunk
-        actions: Any = np.asarray(self._run(normalised, noise))[..., : chunk.action_dim]
-        if chunk.normalizer is not None:
-            actions = chunk.normalizer.unnormalize(actions)
+        actions = chunk.unnormalized(self._run(normalised, noise).numpy())
         return {"action": actions[:, chunk.start : chunk.stop], "action_pred": actions}

@@ -24,15 +24,15 @@ import numpy as np
 import numpy.typing as npt
 
 from ttscompile.core.spec import FloatArray
-from ttscompile.errors import ExecutorClosedError, ExecutorError, InfeasibleError, WorkerDeadError
+from ttscompile.errors import ExecutorClosedError, ExecutorError, WorkerDeadError
 from ttscompile.runtimes.arrays import check_seed
 
 from .clock import Clock, MonotonicClock
-from .feasibility import Feasibility, LatencyWindow
+from .feasibility import Feasibility, LatencyWindow, fast_enough
 from .measure import measure_latencies, prefix_refusal
 from .pinning import pin
 from .settings import ExecutorSettings, Policy, resolve
-from .state import ExecutorState, Job, feasibility
+from .state import ExecutorState, Job
 from .statistics import ExecutorStatistics, statistics
 from .trace import CONTROL, Trace
 from .window import FrameSpec
@@ -107,7 +107,7 @@ class AsyncExecutor:
             self._closing = True
             raise ExecutorError(
                 f"the policy was not measured within {open_timeout:g} s: a call of it hangs, or is very slow. Look at"
-                " 'ttscompile plan DIR'."
+                " 'ttscompile realtime DIR'."
             )
         if self._failure is not None:
             self._thread.join()
@@ -148,30 +148,26 @@ class AsyncExecutor:
 
         Raises:
             DeadlineMissedError: there is none, and the last one was held for as long as it may be.
-            StaleObservationError: likewise, for want of recent observations.
+            StaleObservationError: the same, because no recent observation came.
             WorkerDeadError: the policy's thread has ended; ``__cause__`` says why.
             ExecutorClosedError: after ``close``.
         """
         with self._lock:
             state = self._checked()
             start = now = self._clock.now()
-            counts = state.recorder.counts
-            reserve = counts.reserve
-            action = state.play(now if t is None else t, now)
-            if action is None and timeout is not None:
-                until = now + timeout
-                while action is None and now < until:
-                    self._clock.wait(self._news, until - now)
-                    state, now = self._checked(), self._clock.now()
-                    action = state.play(now if t is None else t, now)
-            name = "tick" if counts.reserve == reserve else "reserve"
+            until = now if timeout is None else now + timeout
+            reserve = state.recorder.counts.reserve
+            while (action := state.play(now if t is None else t, now)) is None and now < until:
+                self._clock.wait(self._news, until - now)
+                state, now = self._checked(), self._clock.now()
+            name = "tick" if state.recorder.counts.reserve == reserve else "reserve"
             if action is None:
-                name, action = "hold", state.hold(now if t is None else t, now)
-            if action is None:
-                error = state.starved(now if t is None else t, now)
-        trace = self.trace
-        if trace.on:
-            trace.span(CONTROL, name if action is not None else "starved", start, self._clock.now() - start)
+                time = now if t is None else t
+                name, action = "hold", state.hold(time, now)
+                if action is None:
+                    name, error = "starved", state.starved(time, now)
+        if self.trace.on:
+            self.trace.span(CONTROL, name, start, self._clock.now() - start)
         if action is None:
             raise error
         return action
@@ -319,34 +315,26 @@ class AsyncExecutor:
         finally:
             self._ready.set()
 
+    def _measured(self) -> dict[str, list[float]]:
+        """Seconds of calls of each tier: as they were given, or measured now."""
+        given, tiers = self._given_latencies, self._resolved.tiers
+        if given is None:
+            self._policy.reset()
+            times = measure_latencies(self._policy, self._clock, self._settings, tiers)
+            return {name: [ms / 1e3 for ms in each.ms] for name, each in times.items()}
+        if missing := [name for name in tiers if name not in given]:
+            raise ExecutorError(f"latencies lacks the tier {missing[0]!r}; give one for each of {tiers}.")
+        return {name: [given[name]] for name in tiers}
+
     def _open(self) -> None:
         """Pin the thread, measure the tiers, refuse what is infeasible."""
         settings, resolved = self._settings, self._resolved
         if settings.cores is not None:
             pin(settings.cores)
-        if self._given_latencies is None:
-            self._policy.reset()
-            measured = measure_latencies(self._policy, self._clock, settings, resolved.tiers)
-        else:
-            missing = [name for name in resolved.tiers if name not in self._given_latencies]
-            if missing:
-                raise ExecutorError(f"latencies lacks the tier {missing[0]!r}; give one for each of {resolved.tiers}.")
-            measured = {name: [self._given_latencies[name]] for name in resolved.tiers}
-        latencies = {name: LatencyWindow(settings.latency_window) for name in resolved.tiers}
-        for name, values in measured.items():
-            for value in values:
-                latencies[name].add(value)
-        self._feasibility = {name: feasibility(settings, resolved, max(values)) for name, values in measured.items()}
-        possible = tuple(name for name, each in self._feasibility.items() if each.feasible)
-        if not possible and settings.refuse_infeasible:
-            sums = "; ".join(f"plan {name!r}: {each.explain()}" for name, each in self._feasibility.items())
-            longest = next(iter(self._feasibility.values())).max_latency
-            raise InfeasibleError(
-                f"no plan is fast enough for this loop. {sums}. Use a plan whose calls take at most"
-                f" {1e3 * longest:.4g} ms, a lower rate, or more of each chunk (ExecutorSettings.horizon and reserve);"
-                " 'ttscompile plan DIR' says what is feasible."
-            )
-        tiers = possible or resolved.tiers[-1:]
+        measured = self._measured()
+        latencies = {name: LatencyWindow(settings.latency_window, values) for name, values in measured.items()}
+        self._feasibility = {name: resolved.feasibility(max(values)) for name, values in measured.items()}
+        tiers = fast_enough(self._feasibility, settings.refuse_infeasible)
         with self._lock:
             self._state = ExecutorState(settings, resolved, self._normalizer, tiers, latencies)
         self._ready.set()
@@ -374,12 +362,8 @@ class AsyncExecutor:
         prefix = {} if job.prefix is None else {"prefix": job.prefix[None]}
         predicted = np.asarray(self._policy.predict_action(obs, plan=job.plan, **prefix)["action_pred"])
         last = resolved.first + resolved.horizon + resolved.reserve
-        if (
-            predicted.ndim != 3
-            or len(predicted) != 1
-            or predicted.shape[1] < last
-            or predicted.shape[2] != resolved.channels
-        ):
+        streams, steps, channels = predicted.shape if predicted.ndim == 3 else (0, 0, 0)
+        if streams != 1 or steps < last or channels != resolved.channels:
             raise ExecutorError(
                 f"the policy's action_pred has shape {list(predicted.shape)}; expected [1, T, Da] with T of at least"
                 f" {last} and Da = {resolved.channels}."

@@ -16,9 +16,12 @@ other without a gap in the actions if ``frame period + 2 * latency + margin <= p
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from statistics import median
 from typing import Any
+
+from ttscompile.errors import InfeasibleError
 
 
 def _ms(seconds: float) -> str:
@@ -112,19 +115,43 @@ class Feasibility:
         }
 
 
+def fast_enough(judged: Mapping[str, Feasibility], refuse: bool) -> tuple[str, ...]:
+    """The plans that keep up, in their order.
+
+    Args:
+        judged: by name of the plan, slowest first.
+        refuse: raise if none does; else the last is taken all the same.
+
+    Raises:
+        InfeasibleError: none keeps up; has the arithmetic of each.
+    """
+    possible = tuple(name for name, each in judged.items() if each.feasible)
+    if possible or not refuse:
+        return possible or tuple(judged)[-1:]
+    sums = "; ".join(f"plan {name!r}: {each.explain()}" for name, each in judged.items())
+    longest = next(iter(judged.values())).max_latency
+    raise InfeasibleError(
+        f"no plan is fast enough for this loop. {sums}. Use a plan whose calls take at most {1e3 * longest:.4g} ms, a"
+        " lower rate, or more of each chunk (ExecutorSettings.horizon and reserve)."
+    )
+
+
 class LatencyWindow:
     """What calls take, by the last ones. Warm-up calls are made, and left out, before there is one of these.
 
     Args:
         window: calls that count.
+        latencies: seconds of the first ones.
 
     Attributes:
         bound: the longest of them, in seconds.
     """
 
-    def __init__(self, window: int) -> None:
+    def __init__(self, window: int, latencies: Iterable[float] = ()) -> None:
         self._latencies: deque[float] = deque(maxlen=window)
         self.bound = self._typical = 0.0
+        for latency in latencies:
+            self.add(latency)
 
     def add(self, latency: float) -> None:
         """Take the latency of a call, in seconds."""

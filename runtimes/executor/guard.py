@@ -18,7 +18,7 @@ class GuardLimits:
 
     Attributes:
         low: least action; None for what the normaliser maps to -1, ``margin`` further out.
-        high: largest action; likewise.
+        high: largest action; None for what the normaliser maps to 1, ``margin`` further out.
         margin: share of the normaliser's range by which an action may be outside of it. A normaliser by mean and
             deviation, or by quantiles, has no range, and sets no bounds: give ``low`` and ``high``.
         max_step: largest change of an action from one control tick to the next, seams included; None for no limit. A
@@ -45,7 +45,7 @@ class Guard:
     """Checks chunks.
 
     Args:
-        limits: see there.
+        limits: what actions may be.
         normalizer: of the actions; None if the policy has none that knows their range (``ChunkSpec.ranged``), and so
             no bounds but the ones in ``limits``.
         channels: Da.

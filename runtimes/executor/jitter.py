@@ -16,9 +16,9 @@ class Jitter:
 
     Attributes:
         hz: rate of the loop.
-        ticks: that were measured.
+        ticks: how many ticks were measured.
         p50: median lateness.
-        p99: likewise.
+        p99: 99th percentile of the lateness.
         max: the latest tick.
         late: ticks that were later than half a period.
         work_us: median of the work of a tick, microseconds.
@@ -41,9 +41,9 @@ def measure_jitter(hz: float, seconds: float, work: Callable[[], object] = lambd
     """Run a loop in real time, sleeping between ticks, and measure how late it wakes.
 
     Args:
-        hz: of the loop.
-        seconds: for how long.
-        work: what a tick does.
+        hz: rate of the loop.
+        seconds: how long it runs.
+        work: called in every tick.
     """
     ticks = max(int(seconds * hz), 1)
     late, took = np.empty(ticks), np.empty(ticks)

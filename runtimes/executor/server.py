@@ -36,7 +36,7 @@ class ServerLimits:
 
     Attributes:
         clients: at a time.
-        message_bytes: of a request.
+        message_bytes: largest size of a request.
         handshake_timeout: seconds for the opening handshake.
         idle_timeout: seconds between two complete requests.
         send_timeout: seconds that a client may take to read an answer, once its socket's buffers are full.
@@ -60,8 +60,8 @@ class ExecutorServer:
     """Serves one executor; it is the caller's, and is not closed here.
 
     Args:
-        executor: that all clients share.
-        limits: of clients.
+        executor: shared by all clients.
+        limits: what clients may do; None for the defaults.
     """
 
     def __init__(self, executor: AsyncExecutor, limits: ServerLimits | None = None) -> None:

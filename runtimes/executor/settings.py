@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from ttscompile.core.spec import ChunkSpec, ObservationSpec
 from ttscompile.errors import ExecutorError
 
+from .feasibility import Feasibility
 from .guard import GuardLimits
 from .window import FrameSpec
 
@@ -147,9 +148,10 @@ class Resolved:
         reserve: actions after these that may be.
         first: index of the first of them in ``action_pred``.
         channels: Da.
-        frames: what a frame holds.
+        frames: shapes and dtypes of what one frame holds.
         max_age: seconds.
         tiers: plans, slowest first.
+        margin_ticks: control ticks that a chunk shall be there before it is needed.
     """
 
     control_hz: float
@@ -162,6 +164,11 @@ class Resolved:
     frames: FrameSpec
     max_age: float
     tiers: tuple[str, ...]
+    margin_ticks: int
+
+    def feasibility(self, latency: float) -> Feasibility:
+        """The arithmetic of calls of so many seconds."""
+        return Feasibility(latency, self.control_hz, self.policy_hz, self.horizon, self.margin_ticks, self.reserve)
 
 
 def resolve(settings: ExecutorSettings, info: PolicyFacts, control_hz: float) -> Resolved:
@@ -209,4 +216,5 @@ def resolve(settings: ExecutorSettings, info: PolicyFacts, control_hz: float) ->
         frames=FrameSpec.of(info.observation, settings.n_obs_steps or chunk.start + 1),
         max_age=settings.max_age or 3 / policy_hz,
         tiers=tiers,
+        margin_ticks=settings.margin_ticks,
     )

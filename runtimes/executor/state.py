@@ -5,25 +5,20 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
-
 from ttscompile.core.spec import Affine, FloatArray
-from ttscompile.errors import DeadlineMissedError, ExecutorError, ObservationError, StaleObservationError
+from ttscompile.errors import DeadlineMissedError, ObservationError, StaleObservationError
 
-from .feasibility import Feasibility, LatencyWindow
+from .feasibility import LatencyWindow
 from .guard import Guard
+from .schedule import Schedule
 from .settings import ExecutorSettings, Resolved
 from .statistics import Recorder
 from .tiers import Tiers
-from .timeline import TickGrid, Timeline, expand, splice
 from .window import Frame, ObservationWindow
 
-FAR = 1e6
-"""Seconds from now that a time may be at most; what is further is of another clock."""
 SAME_TIME = 1e-6
 """Seconds; what is meant to happen at one time is not told apart by rounding."""
 
@@ -59,9 +54,9 @@ class ExecutorState:
     Args:
         settings: as given.
         resolved: what follows from them and the policy.
-        normalizer: of the actions.
+        normalizer: maps actions to their normalised range; None if the policy has none with a range.
         tiers: plans that are fast enough.
-        latencies: of each tier.
+        latencies: what calls of each tier took so far.
     """
 
     def __init__(
@@ -75,48 +70,38 @@ class ExecutorState:
         self._settings, self._resolved = settings, resolved
         self._guard = Guard(settings.guard, normalizer, resolved.channels)
         self._tiers = Tiers(tiers, settings.down_after, settings.up_after)
-        self._coverable = feasibility(settings, resolved, 0.0).max_latency
+        self._coverable = resolved.feasibility(0.0).max_latency
         self._latencies = latencies
-        period = 1 / resolved.policy_hz
-        self._window = ObservationWindow(resolved.frames.steps, period, settings.rate_tolerance, resolved.max_age)
-        self._grid = TickGrid(resolved.control_hz)
-        self._played: deque[tuple[int, FloatArray]] = deque(
-            maxlen=max((resolved.horizon + resolved.reserve) * resolved.ticks_per_step, 3)
-        )
         self.recorder = Recorder(settings.statistics_window)
         self.epoch = 0
         self._job: Job | None = None
-        self._forget()
+        self._begin_episode()
 
-    def _forget(self) -> None:
-        """Everything that belongs to an episode."""
-        self._window.clear()
-        self._grid.clear()
-        self._played.clear()
-        self._timeline: Timeline | None = None
-        self._due = 0  # first tick that the next chunk is needed for; what is scheduled after that is in reserve
-        self._last: tuple[int, FloatArray] | None = None  # tick and action that were given out last
+    def _begin_episode(self) -> None:
+        settings, resolved = self._settings, self._resolved
+        period = 1 / resolved.policy_hz
+        self._window = ObservationWindow(resolved.frames.steps, period, settings.rate_tolerance, resolved.max_age)
+        self._schedule = Schedule(settings, resolved, self._guard)
         self._used = float("-inf")  # time of the newest frame that a call was made from
         self._holds = 0
         self._gap = False
-        self._refusal: str | None = None
 
     @property
     def plan(self) -> str:
-        """Of the next call."""
+        """Name of the plan that the next call runs."""
         return self._tiers.plan
 
     @property
     def ready(self) -> bool:
         """Whether a chunk of this episode has been scheduled."""
-        return self._timeline is not None
+        return self._schedule.timeline is not None
 
     def reset(self) -> None:
         """A new episode: nothing from before is given out any more."""
         self.epoch += 1
         self.recorder.counts.resets += 1
         self.recorder.pause()
-        self._forget()
+        self._begin_episode()
 
     # Observations
 
@@ -139,7 +124,7 @@ class ExecutorState:
             counts.frames_late += 1
             return
         counts.frames_replaced += added == "replaced"
-        self._grid.tick(time)
+        self._schedule.grid.tick(time)
 
     # Actions
 
@@ -149,49 +134,45 @@ class ExecutorState:
         Raises:
             ExecutorError: an action for a later time was given out before, or the time is of another clock.
         """
-        tick = self._tick(time, now)
-        if self._last is not None and tick == self._last[0]:
-            self.recorder.tick(now)
-            return self._last[1].copy()
-        timeline = self._timeline
+        schedule, recorder = self._schedule, self.recorder
+        tick, last, timeline = schedule.tick(time, now), schedule.last, schedule.timeline
+        if last is not None and tick == last[0]:
+            recorder.tick(now)
+            return last[1].copy()
         row = None if timeline is None else timeline.at(tick)
         if row is None or timeline is None:
             return None
-        recorder, late = self.recorder, tick >= self._due
+        late = tick >= schedule.due
         if late:
             recorder.counts.reserve += 1
             self._miss()
-        recorder.queue_depth.add(max(self._due - tick - 1, 0))
+        recorder.queue_depth.add(max(schedule.due - tick - 1, 0))
         recorder.action_age_ms.add(1e3 * (time - float(timeline.observed[tick - timeline.start])))
         recorder.tick(now)
         self._holds, self._gap = 0, late
-        self._give(tick, row, time)
+        schedule.give(tick, row, time)
         return row.copy()
 
     def hold(self, time: float, now: float) -> FloatArray | None:
         """The last action once more; None if there is none, or it was held long enough."""
-        tick = self._tick(time, now)
-        counts = self.recorder.counts
-        if self._timeline is not None:
+        schedule, counts = self._schedule, self.recorder.counts
+        tick, last = schedule.tick(time, now), schedule.last
+        if self.ready:
             self._miss()
-        if self._last is None:
-            counts.starved += 1
-            return None
-        last, action = self._last
-        held = self._holds + tick - last
-        if held > self._settings.max_hold:
+        held = 0 if last is None else self._holds + tick - last[0]
+        if last is None or held > self._settings.max_hold:
             counts.starved += 1
             return None
         self._holds = held
         counts.holds += 1
         self.recorder.tick(now)
-        self._give(tick, action, time)
-        return action.copy()
+        schedule.give(tick, last[1], time)
+        return last[1].copy()
 
     def starved(self, time: float, now: float) -> DeadlineMissedError:
         """Why there is no action for a time, as an error to raise."""
         reason, stale = self._reason(now)
-        since = "" if self._last is None else f", and the last one was held for {self._holds} ticks"
+        since = "" if self._schedule.last is None else f", and the last one was held for {self._holds} ticks"
         remedy = "call reset(), or observe() and wait for the next chunk with action(timeout=...)"
         message = f"no action for time {time:.6f}{since}: {reason}. Stop the robot safely; then {remedy}."
         return (StaleObservationError if stale else DeadlineMissedError)(message)
@@ -202,29 +183,10 @@ class ExecutorState:
             self._gap = True
             self.recorder.counts.deadlines_missed += 1
 
-    def _tick(self, time: float, now: float) -> int:
-        if not abs(time - now) < FAR:
-            raise ExecutorError(
-                f"an action was asked for {time - now:.6g} s from now. Give times of time.monotonic(), or of the clock"
-                " that the executor was given."
-            )
-        tick = self._grid.tick(time)
-        if self._last is not None and tick < self._last[0]:
-            raise ExecutorError(
-                f"an action was asked for {self._last[0] - tick} ticks before the last one that was given out. Times"
-                " must not go backwards within an episode; one control loop asks for actions."
-            )
-        return tick
-
-    def _give(self, tick: int, action: FloatArray, time: float) -> None:
-        self._grid.follow(time, tick)
-        self._last = (tick, action)
-        self._played.append(self._last)
-
     def _reason(self, now: float) -> tuple[str, bool]:
         """Why nothing is scheduled, and whether observations are to blame."""
-        if self._refusal is not None:
-            return f"the guard refused the last chunk: {self._refusal}", False
+        if self._schedule.refusal is not None:
+            return f"the guard refused the last chunk: {self._schedule.refusal}", False
         if self._job is not None:
             bound = self._latencies[self._job.plan].bound
             before = " for the episode before" if self._job.epoch != self.epoch else ""
@@ -249,11 +211,11 @@ class ExecutorState:
         It starts when a frame comes: the one as many actions after that of the chunk before as the policy executes, or
         the last that is to be expected early enough, if that is sooner. If that does not come, with the one before.
         """
-        window, timeline = self._window.complete, self._timeline
+        window, schedule = self._window.complete, self._schedule
         if window is None or window.time <= self._used or now - window.time > self._resolved.max_age:
             return None
-        runs_out = self._runs_out(now)
-        if timeline is None or runs_out is None or window.time + self._window.interval / 2 > self._executed(timeline):
+        runs_out = schedule.runs_out(now)
+        if runs_out is None or window.time + self._window.interval / 2 > schedule.executed:
             return now
         latest = runs_out - self._takes
         comes = window.time + self._window.interval + self._window.delay
@@ -265,8 +227,10 @@ class ExecutorState:
         assert window is not None  # next_start said so
         self._used = window.time
         self.recorder.observation_age_ms.add(1e3 * (now - window.time))
-        prefix = self._committed(window.time, now) if self._settings.seam == "prefix" else None
-        self._job = Job(self.epoch, window.frames, window.time, self.plan, now, self._runs_out(now), prefix)
+        schedule, prefix = self._schedule, None
+        if self._settings.seam == "prefix":
+            prefix = schedule.committed(window.time, now + self._latency)
+        self._job = Job(self.epoch, window.frames, window.time, self.plan, now, schedule.runs_out(now), prefix)
         return self._job
 
     def finish(self, job: Job, actions: FloatArray, now: float) -> str:
@@ -288,12 +252,12 @@ class ExecutorState:
         if job.epoch != self.epoch:
             counts.chunks_discarded += 1
             return "discarded"
-        outcome = self._schedule(job, actions, now)
+        outcome = self._schedule.add(job.observed, actions, now)
+        if outcome == "scheduled":
+            self._plan_ahead()
         refused = outcome == "refused"
         if refused:
-            self.recorder.last_refusal = self._refusal
-        else:
-            self._refusal = None
+            self.recorder.last_refusal = self._schedule.refusal
         counts.chunks_refused += refused
         counts.chunks += outcome == "scheduled"
         counts.chunks_overdue += outcome == "overdue"
@@ -302,7 +266,7 @@ class ExecutorState:
         late = job.deadline is not None and now > job.deadline
         if refused and not late:  # a faster plan is no remedy for what was refused in time, nor has it kept up
             return outcome
-        switched = self._tiers.after_call(missed=late or self._runs_out(now) is None)
+        switched = self._tiers.after_call(missed=late or self._schedule.runs_out(now) is None)
         counts.switches_down += switched == 1
         counts.switches_up += switched == -1
         if switched:
@@ -313,82 +277,20 @@ class ExecutorState:
         """The call under way came to nothing."""
         self._job = None
 
-    def _schedule(self, job: Job, actions: FloatArray, now: float) -> str:
-        settings, resolved = self._settings, self._resolved
-        self._refusal = self._guard.refuse(actions[: resolved.horizon])
-        if self._refusal is not None:
-            return "refused"
-        if self._guard.refuse(actions[resolved.horizon :]) is not None:
-            actions = actions[: resolved.horizon]
-        rows = expand(actions, resolved.ticks_per_step, settings.interpolation)
-        start = self._grid.tick(job.observed)
-        judged = resolved.horizon * resolved.ticks_per_step
-        new = Timeline(start, rows, np.full(len(rows), job.observed))
-        seam = start if self._last is None else self._last[0] + 1
-        spliced = splice(self._timeline, new, seam, settings.blend_steps if settings.seam == "blend" else 0)
-        if spliced is None or new.end <= self._grid.tick(now):
-            return "overdue"
-        played = [action for _, action in list(self._played)[-3:]]
-        past = np.stack(played) if played else np.empty((0, resolved.channels), np.float32)
-        refusal = self._guard.refuse_motion(past, spliced.rows)
-        if refusal is not None:  # without its reserve it may do, if anything is left then
-            spliced = spliced.until(start + judged)
-            self._refusal = self._guard.refuse_motion(past, spliced.rows) if len(spliced.rows) else refusal
-            if self._refusal is not None:
-                return "refused"
-        self._timeline = spliced
-        self._plan_ahead()
-        return "scheduled"
+    @property
+    def _latency(self) -> float:
+        """Seconds that the next call is reckoned to take."""
+        return self._latencies[self.plan].reckoned(self._coverable)
 
     @property
     def _takes(self) -> float:
         """Seconds that the next call has to start before its chunk is needed."""
         return self._latency + self._settings.margin_ticks / self._resolved.control_hz
 
-    @property
-    def _latency(self) -> float:
-        """Seconds that the next call is reckoned to take."""
-        return self._latencies[self.plan].reckoned(self._coverable)
-
-    def _executed(self, timeline: Timeline) -> float:
-        """When the policy would have executed the newest chunk, and so observes again."""
-        return float(timeline.observed[-1]) + self._resolved.horizon / self._resolved.policy_hz
-
     def _plan_ahead(self) -> None:
         """Say what of the schedule is in reserve: what goes on for longer than the next call has to take.
 
         At least half a tick is left between the two, so that a frame which comes so late still starts its call.
         """
-        if self._timeline is not None:
-            done = self._executed(self._timeline) + self._window.delay + self._takes
-            self._due = min(self._grid.tick(done) + 1, self._timeline.end)
-
-    def _runs_out(self, now: float) -> float | None:
-        """When the first tick comes for which nothing is scheduled; None if that is so already."""
-        if self._timeline is None:
-            return None
-        end = self._grid.time(self._due)
-        return end if end > now else None
-
-    def _committed(self, observed: float, now: float) -> FloatArray:
-        """Actions from the observation to when this call will be done, one a step of the policy, ``[N, Da]``."""
-        tick, step = self._grid.tick(observed), self._resolved.ticks_per_step
-        until = self._grid.tick(now + self._latency)
-        played = dict(self._played)
-        rows: list[FloatArray] = []
-        while tick <= until and len(rows) < self._resolved.horizon:
-            row = played.get(tick)
-            if row is None and self._timeline is not None:
-                row = self._timeline.at(tick)
-            if row is None:
-                break
-            rows.append(row)
-            tick += step
-        return np.stack(rows) if rows else np.empty((0, self._resolved.channels), np.float32)
-
-
-def feasibility(settings: ExecutorSettings, resolved: Resolved, latency: float) -> Feasibility:
-    """The arithmetic of one latency with these settings."""
-    return Feasibility(
-        latency, resolved.control_hz, resolved.policy_hz, resolved.horizon, settings.margin_ticks, resolved.reserve
-    )
+        if self.ready:
+            self._schedule.need_by(self._schedule.executed + self._window.delay + self._takes)

@@ -42,9 +42,9 @@ class Summary:
 
     Attributes:
         count: measurements since the executor was made.
-        min: of all of them.
+        min: the least of all of them.
         p50: of the last ones, see ``ExecutorSettings.statistics_window``; so are the other percentiles.
-        max: of all of them.
+        max: the largest of all of them.
     """
 
     count: int
@@ -90,7 +90,7 @@ class ExecutorStatistics:
     """What an executor did so far.
 
     Attributes:
-        plan: that the next call runs.
+        plan: name of the plan that the next call runs.
         identity: of the artifact; empty for a policy that is none.
         ticks: actions that were given out, those in reserve and held ones included.
         reserve: of these, actions beyond what was planned with, because the next chunk was late.
@@ -102,16 +102,16 @@ class ExecutorStatistics:
         frames_replaced: of these, of the same time as one that was there.
         calls: of the policy, finished; those that measured its latency at the start are not counted.
         chunks: of these, scheduled.
-        chunks_refused: by the guard.
+        chunks_refused: of these, refused by the guard.
         chunks_overdue: wholly in the past when they came.
         chunks_discarded: computed from observations before a reset.
         deadlines_missed: times that the scheduled actions, without those in reserve, had run out before the next chunk
             came.
         switches_down: to a faster plan.
         switches_up: back to a slower one.
-        resets: of the executor.
+        resets: how often the executor was reset.
         last_refusal: why the guard refused the last chunk that it refused; None if it refused none.
-        latency_ms: of calls.
+        latency_ms: time that calls took.
         observation_age_ms: of the newest frame when a call starts.
         action_age_ms: of the newest frame that an action was computed from, when it is given out.
         slack_ms: from the end of a call to when its chunk is needed; negative: it came late.

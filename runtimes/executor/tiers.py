@@ -31,7 +31,7 @@ class Tiers:
 
     @property
     def plan(self) -> str:
-        """Of the next call."""
+        """Name of the plan that the next call runs."""
         return self.plans[self._current]
 
     def after_call(self, missed: bool) -> int:

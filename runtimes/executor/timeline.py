@@ -44,10 +44,6 @@ class TickGrid:
         self._origin: float | None = None
         self._anchored = False
 
-    def clear(self) -> None:
-        """Forget where tick 0 is."""
-        self._origin, self._anchored = None, False
-
     def tick(self, time: float) -> int:
         """The nearest tick; makes this time tick 0 if there is none."""
         if self._origin is None:

@@ -1,7 +1,6 @@
 """What happened when, in Chrome's trace event format; https://ui.perfetto.dev opens the file.
 
-Format: "Trace Event Format", Google, 2016. Complete events (``X``) and instants (``i``); times in
-microseconds.
+Format: "Trace Event Format", Google, 2016. Complete events (``X``) and instants (``i``); times in microseconds.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 if TYPE_CHECKING:
-    from ttscompile.runtimes.base import Timings
+    from ttscompile.runtimes.report import Timings
 
 Event: TypeAlias = tuple[str, str, int, float, float, Mapping[str, Any] | None]
 """Phase, name, thread, start and duration in seconds, arguments."""

@@ -96,7 +96,7 @@ class Window:
     """A complete window.
 
     Attributes:
-        time: of its newest frame.
+        time: when its newest frame was taken, in seconds.
         frames: To of them, oldest first.
     """
 
@@ -112,6 +112,10 @@ class ObservationWindow:
         period: seconds between the frames of a window.
         tolerance: how far from its place a frame may be, as a share of the period.
         max_age: seconds that the newest frame of a window may be old.
+
+    Attributes:
+        complete: the newest complete window; None if there is none.
+        delay: seconds from when the newest frame was taken to when it came.
     """
 
     def __init__(self, steps: int, period: float, tolerance: float, max_age: float) -> None:
@@ -119,28 +123,14 @@ class ObservationWindow:
         self._keep = max_age + (steps - 1) * period + self._slack
         self._times: list[float] = []
         self._frames: list[Frame] = []
-        self._complete: Window | None = None
-        self._delay = 0.0
-
-    def clear(self) -> None:
-        """A new episode."""
-        self._times, self._frames, self._complete, self._delay = [], [], None, 0.0
-
-    @property
-    def complete(self) -> Window | None:
-        """The newest complete window; None if there is none."""
-        return self._complete
+        self.complete: Window | None = None
+        self.delay = 0.0
 
     @property
     def interval(self) -> float:
         """Seconds until the next frame is to be expected: what the last two were apart, the policy's period at most."""
         times = self._times
         return min(times[-1] - times[-2], self._period) if len(times) > 1 else self._period
-
-    @property
-    def delay(self) -> float:
-        """Seconds from when the newest frame was taken to when it came."""
-        return self._delay
 
     def add(self, time: float, frame: Frame, now: float) -> str:
         """Take a frame.
@@ -158,18 +148,18 @@ class ObservationWindow:
         place = bisect_left(times, time)
         if place < len(times) and times[place] == time:
             frames[place] = frame
-            self._complete = self._find()
+            self.complete = self._find()
             return "replaced"
         if time < self._oldest(now):
             return "late"
         if place == len(times):
-            self._delay = max(now - time, 0.0)
+            self.delay = max(now - time, 0.0)
         times.insert(place, time)
         frames.insert(place, frame)
         keep = max(bisect_left(times, self._oldest(times[-1])), len(times) - MOST_FRAMES)
         if keep:
             del times[:keep], frames[:keep]
-        self._complete = self._find()
+        self.complete = self._find()
         return "added"
 
     def why_incomplete(self) -> str:

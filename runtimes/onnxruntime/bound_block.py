@@ -3,50 +3,62 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
+from ttscompile.artifact.manifest import PieceRecord
 from ttscompile.ir.program import Binding
 
-from .sessions import Array
-
-if TYPE_CHECKING:
-    from .workspace import Workspace
+from .contexts import ContextValues
+from .sessions import Array, Bound
 
 
 class BoundBlock:
-    """A block bound to arrays for n of the streams, and how the contexts of a step get there.
+    """A block bound to arrays for all streams, or for n of them.
 
     Args:
-        work: has the values of the contexts.
-        b: the block.
-        count: n.
+        session: of the block.
+        piece: of the block.
+        contexts: values for all streams.
+        axis: of the streams in the residual stream.
         stream: what it reads.
         residual: what it writes.
+        count: n.
+        whole: whether these are all streams.
     """
 
-    def __init__(self, work: Workspace, b: int, count: int, stream: Array, residual: Array) -> None:
-        self._stream, self._axis = stream, work.axis  # not the workspace: that has us
-        self.rows = np.moveaxis(residual, work.axis, 0) if work.streams > 1 else residual
+    def __init__(
+        self,
+        session: Any,
+        piece: PieceRecord,
+        contexts: ContextValues,
+        axis: int,
+        stream: Array,
+        residual: Array,
+        count: int,
+        whole: bool,
+    ) -> None:
+        self._stream, self._axis = stream, axis
+        self.rows = np.moveaxis(residual, axis, 0)
         self._by_step: list[tuple[Array, Array]] = []  # where it is read from, and one value a step
         self._gathered: list[tuple[Array, Array, int, bool]] = []  # where, value, axis of the streams, one a step
-        whole = count == work.streams
         arrays: dict[str, Array] = {}
-        for name, (context, value) in work.contexts_of(b).items():
-            axis, stepwise = context.type.batch_axis, context.binding is not Binding.CONDITION
-            if not stepwise and (whole or axis is None):
+        for name, (context, value) in contexts.of_piece(piece).items():
+            batch, stepwise = context.type.batch_axis, context.binding is not Binding.CONDITION
+            if not stepwise and (whole or batch is None):
                 arrays[name] = value
                 continue
             arrays[name] = np.zeros(context.type.at(count), context.type.dtype)
-            if whole or axis is None:
+            if whole or batch is None:
                 self._by_step.append((arrays[name], value))
             elif context.binding is Binding.TABLE:  # the same for every stream
-                self._by_step.append((arrays[name], value.take(np.arange(count), axis=axis + 1)))
+                self._by_step.append((arrays[name], value.take(np.arange(count), axis=batch + 1)))
             else:
-                self._gathered.append((arrays[name], value, axis, stepwise))
+                self._gathered.append((arrays[name], value, batch, stepwise))
         self._own = (*arrays.values(), stream, residual) if not whole else tuple(to for to, _ in self._by_step)
-        self._bound = work.bound_block(b, stream, residual, arrays)
+        inputs = {name: stream if name == piece.stream else arrays[name] for name in piece.inputs}
+        self._bound = Bound(session, inputs, {piece.outputs[0]: residual})
 
     @property
     def nbytes(self) -> int:

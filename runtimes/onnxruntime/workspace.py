@@ -14,21 +14,21 @@ from typing import Any
 
 import numpy as np
 
-from ttscompile.artifact.manifest import ContextRecord, Manifest, PieceRecord
-from ttscompile.core.correction import HISTORY, Correction, no_correction
+from ttscompile.artifact.manifest import Manifest
+from ttscompile.core.correction import HISTORY, Correction, no_correction, remember
 from ttscompile.core.spec import FloatArray, Noise
 from ttscompile.core.update import matrices
 from ttscompile.errors import ArtifactError, ObservationError
 from ttscompile.ir import pieces
 from ttscompile.ir.graph import TensorType
-from ttscompile.ir.pieces import ADVANCE, CONTEXT, DENSE_STEP, IDLE, STEM, STREAM, block_name
-from ttscompile.ir.program import Binding
+from ttscompile.ir.pieces import ADVANCE, CONTEXT, DENSE_STEP, IDLE, PRUNER, STEM, STREAM, block_name
 from ttscompile.runtimes.inpainting import Known, MaskedUpdates
 
 from .bound_block import BoundBlock
-from .idle import IdleSteps
+from .contexts import ContextValues
+from .idle_steps import IdleSteps
 from .rollout_store import RolloutStore
-from .sessions import Array, Bound, repeat_streams, run_named
+from .sessions import Array, Bound, run_named
 
 
 class Workspace:
@@ -74,16 +74,10 @@ class Workspace:
         self._sums = np.zeros((0, *shape), np.float32)
         self._sampler = manifest.spec.sampler
         self._offset = np.zeros((self._steps, dimensions, streams, horizon), np.float32)
-        self._step_inputs: dict[str, Array] = {}
-        self._values: dict[str, Array] = {  # condition values; step and table values [K, ...]
-            name: repeat_streams(tables[name], _row_axis(context), streams)
-            if context.binding is Binding.TABLE
-            else np.zeros(_shape(context, self._steps, streams), context.type.dtype)
-            for name, context in manifest.contexts.items()
-        }
+        self._contexts = ContextValues(manifest, sessions, tables, streams)
         stem = manifest.pieces[STEM]
         assert stem.stream is not None
-        at_first = {name: self._value(name, 0) for name in stem.inputs if name != stem.stream}
+        at_first = {name: self._contexts.at(name, 0) for name in stem.contexts}
         self._stem = Bound(sessions[STEM], {stem.stream: self._initial, **at_first}, {stem.outputs[0]: self.fresh})
         self._history = np.zeros((dimensions, streams, HISTORY * horizon), np.float32)
         size = self._sampler.memories * horizon
@@ -125,16 +119,7 @@ class Workspace:
             self._offset += correction.bias
         if known is not None:
             self._offset[:, known.channels, :, known.positions] = known.values[1:].transpose(0, 3, 1, 2)
-        piece = self._manifest.pieces[pieces.CONDITION]
-        if piece.outputs:
-            feed = {name: np.ascontiguousarray(obs[name]) for name in piece.inputs}
-            for name, value in run_named(self._sessions[pieces.CONDITION], piece.outputs, feed).items():
-                if name in self._values:
-                    np.copyto(self._values[name], value)
-                else:
-                    self._values[name] = value  # a feature, which only the pruner reads
-        if pieces.STEP in self._manifest.pieces:
-            self._run_step(self._manifest.pieces[pieces.STEP])
+        self._contexts.fill(obs)
 
     def begin(self) -> None:
         """The residual stream of step 0; fills ``fresh``."""
@@ -142,19 +127,15 @@ class Workspace:
 
     def logits(self) -> FloatArray:
         """The pruner: float32 ``[B, K, blocks, 4]``. Reads condition values alone, so the loop may run meanwhile."""
-        piece = self._manifest.pieces[pieces.PRUNER]
-        feed = {name: self._values[name] for name in piece.inputs}
-        logits = run_named(self._sessions[pieces.PRUNER], piece.outputs, feed)[piece.outputs[0]]
-        return np.asarray(logits, dtype=np.float32)
+        piece = self._manifest.pieces[PRUNER]
+        made = run_named(self._sessions[PRUNER], piece.outputs, self._contexts.of_call(piece))
+        return np.asarray(made[piece.outputs[0]], dtype=np.float32)
 
     def advance(self, k: int) -> None:
         """Tail, sampler, correction, and the next step's stem: reads ``stream``, writes ``fresh`` and a sample."""
         self._advance.steps[k].run()
         if self._advance.anchors[k]:
-            half, horizon = self._history.shape[2] // 2, self._prediction.shape[2]
-            self._history[:, :, half:] = self._history[:, :, :half]
-            self._history[:, :, :horizon] = self.sample[k % 2]
-            self._history[:, :, horizon:half] = self._prediction
+            remember(self._history, self.sample[k % 2], self._prediction)
 
     def enter_idle(self, k: int) -> None:
         """Hand the state of step k over to ``idle``."""
@@ -184,14 +165,14 @@ class Workspace:
 
     def bind_blocks(self) -> None:
         """Make what running a single block would have to make; ``sessions`` has those of single blocks."""
-        self._blocks = [BoundBlock(self, b, self.streams, self.stream, row) for b, row in enumerate(self.current)]
+        self._blocks = [self._bound_block(b, self.stream, row, self.streams) for b, row in enumerate(self.current)]
 
     def bind_dense(self, k: int) -> Bound:
         """What runs all blocks at step k; made once."""
         bound = self._dense.get(k)
         if bound is None:
             piece = self._manifest.pieces[DENSE_STEP]
-            inputs = {CONTEXT + name: self._value(name, k) for name in piece.contexts} | {STREAM: self.fresh}
+            inputs = {CONTEXT + name: self._contexts.at(name, k) for name in piece.contexts} | {STREAM: self.fresh}
             outputs = dict(zip(piece.outputs, (self.stream, *self.current), strict=True))
             bound = self._dense[k] = Bound(self._sessions[DENSE_STEP], inputs, outputs)
         return bound
@@ -209,7 +190,7 @@ class Workspace:
         piece = self._manifest.pieces[DENSE_STEP]
         feed = {STREAM: np.take(self.fresh, streams, axis=self.axis)}
         for name in piece.contexts:
-            axis, value = self._manifest.contexts[name].type.batch_axis, self._value(name, k)
+            axis, value = self._manifest.contexts[name].type.batch_axis, self._contexts.at(name, k)
             feed[CONTEXT + name] = value if axis is None else np.take(value, streams, axis=axis)
         made = run_named(self._sessions[DENSE_STEP], piece.outputs, feed)
         return [np.moveaxis(value, self.axis, 0) for value in made.values()]
@@ -230,9 +211,15 @@ class Workspace:
             assert self._manifest.blocks[b].type.batch_axis is not None
             shape = self._manifest.blocks[b].type.at(len(streams))
             stream, residual = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-            some = self._some[key] = BoundBlock(self, b, len(streams), stream, residual)
+            some = self._some[key] = self._bound_block(b, stream, residual, len(streams))
         some.gather(k, streams, self.stream)
         return some.rows
+
+    def _bound_block(self, b: int, stream: Array, residual: Array, count: int) -> BoundBlock:
+        """The session of block b on these arrays, which are of so many streams."""
+        name, whole = block_name(b), stream is self.stream
+        piece = self._manifest.pieces[name]
+        return BoundBlock(self._sessions[name], piece, self._contexts, self.axis, stream, residual, count, whole)
 
     def sums(self, count: int) -> Array:
         """Room for sums, float32 ``[>= count, *stream]``; what was in it is lost when it grows."""
@@ -243,12 +230,12 @@ class Workspace:
     @property
     def nbytes(self) -> int:
         """Memory of all buffers, the rollout cache included."""
-        own = (*self.sample, self.fresh, self.stream, self.current, self.table, self._sums, self._offset, self._history)
-        idle = 0 if self.idle is None else self.idle.nbytes
-        kept = (self._initial, self._prediction, *self._memory, *self._values.values(), *self._step_inputs.values())
+        arrays = [*self.sample, self.fresh, self.stream, self.current, self.table, self._sums, self._offset]
+        arrays += [self._history, self._initial, self._prediction, *self._memory]
+        arrays += [advances.updates for advances in self._advances.values()]
         bound = sum(block.nbytes for block in (*self._blocks, *self._some.values()))
-        updates = sum(advances.updates.nbytes for advances in self._advances.values())
-        return sum(array.nbytes for array in (*own, *kept)) + updates + bound + idle + self.rollout.nbytes
+        idle = 0 if self.idle is None else self.idle.nbytes
+        return sum(array.nbytes for array in arrays) + self._contexts.nbytes + self.rollout.nbytes + bound + idle
 
     def _advances_with(self, correction: Correction, known: Known | None = None) -> _Advances:
         """Bindings of all steps to the rows of a correction; made once for each, and once for its prefixes."""
@@ -281,7 +268,7 @@ class Workspace:
         for name in piece.inputs:
             if name not in inputs:
                 where, _, context = name.partition(".")
-                inputs[name] = self._value(context, k if where == pieces.TAIL else following)
+                inputs[name] = self._contexts.at(context, k if where == pieces.TAIL else following)
         outputs = {
             pieces.SAMPLE_NEXT: self.sample[(k + 1) % 2],
             pieces.STREAM_NEXT: self.fresh,
@@ -290,56 +277,6 @@ class Workspace:
         if self._memory:
             outputs[pieces.MEMORY_NEXT] = self._memory[(k + 1) % 2]
         return Bound(self._sessions[ADVANCE], {name: inputs[name] for name in piece.inputs}, outputs)
-
-    def _value(self, name: str, k: int) -> Array:
-        """The value of a context at step k."""
-        value = self._values[name]
-        if self._manifest.contexts[name].binding is Binding.CONDITION:
-            return value
-        row: Array = value[k, ...]  # an array still where it is one number
-        return row
-
-    def _run_step(self, piece: PieceRecord) -> None:
-        """The step values of all steps in one batch of K * B, step-major."""
-        feed = {}
-        for name in piece.inputs:
-            context = self._manifest.contexts[name]
-            axis = context.type.batch_axis
-            if context.binding is Binding.CONDITION:
-                value = self._values[name]
-                feed[name] = value if axis is None else np.concatenate([value] * self._steps, axis=axis)
-                continue
-            if name not in self._step_inputs:
-                if axis is None:
-                    raise ArtifactError(
-                        f"table {name!r} : {context.type} of the step piece has no axis for the streams, so that the"
-                        " steps cannot run as one batch. Convert the checkpoint again."
-                    )
-                self._step_inputs[name] = np.concatenate(list(self._values[name]), axis=axis)
-            feed[name] = self._step_inputs[name]
-        for name, value in run_named(self._sessions[pieces.STEP], piece.outputs, feed).items():
-            np.copyto(self._values[name], self._by_step(name, value))
-
-    def _by_step(self, name: str, value: Array) -> Array:
-        """``[..., K * B, ...]`` as ``[K, ..., B, ...]``."""
-        axis = self._manifest.contexts[name].type.batch_axis
-        if axis is None:
-            raise ArtifactError(f"step value {name!r} has no axis for the streams. Convert the checkpoint again.")
-        front = np.moveaxis(value, axis, 0)
-        split = front.reshape(self._steps, self.streams, *front.shape[1:])
-        return np.moveaxis(split, 1, axis + 1)
-
-    def bound_block(self, b: int, stream: Array, residual: Array, contexts: Mapping[str, Array]) -> Bound:
-        """The session of block b on these arrays."""
-        piece = self._manifest.pieces[block_name(b)]
-        assert piece.stream is not None
-        inputs = {name: stream if name == piece.stream else contexts[name] for name in piece.inputs}
-        return Bound(self._sessions[block_name(b)], inputs, {piece.outputs[0]: residual})
-
-    def contexts_of(self, b: int) -> dict[str, tuple[ContextRecord, Array]]:
-        """Contexts that block b reads, and their values: ``[K, ...]`` unless they are of the condition."""
-        piece = self._manifest.pieces[block_name(b)]
-        return {n: (self._manifest.contexts[n], self._values[n]) for n in piece.inputs if n != piece.stream}
 
 
 @dataclass(frozen=True)
@@ -378,14 +315,3 @@ def stream_type(manifest: Manifest, streams: int) -> TensorType:
             " streams. Call it with one stream at a time."
         )
     return kind
-
-
-def _row_axis(context: ContextRecord) -> int | None:
-    """Batch axis of a whole table, whose first axis is the step."""
-    axis = context.type.batch_axis
-    return None if axis is None else axis + 1
-
-
-def _shape(context: ContextRecord, steps: int, streams: int) -> tuple[int, ...]:
-    one = context.type.at(streams)
-    return one if context.binding is Binding.CONDITION else (steps, *one)

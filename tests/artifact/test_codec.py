@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from tests.artifact.tiny import tiny_spec
 from ttscompile.artifact import codec
 from ttscompile.artifact.manifest import Manifest, PlanRecord
-from ttscompile.artifact.spec_json import spec_from_json, spec_to_json, type_from_json, type_to_json
 from ttscompile.artifact.strict_json import Value, dump, parse
+from ttscompile.artifact.typed_json import from_json, to_json
 from ttscompile.core.spec import Affine, ObservationSpec, PolicySpec, SamplerTable
 from ttscompile.errors import ArtifactError
 from ttscompile.ir.graph import Batch, TensorType
@@ -29,7 +29,7 @@ def manifest(written: Path) -> Manifest:
 
 
 def through_json(spec: PolicySpec) -> PolicySpec:
-    return spec_from_json(parse(dump(spec_to_json(spec)), "spec"))
+    return from_json(PolicySpec, parse(dump(to_json(spec)), "spec"))
 
 
 @given(st.lists(finite.filter(bool), min_size=1, max_size=8), st.data())
@@ -59,7 +59,7 @@ def test_spec_comes_back_with_its_order() -> None:
     spec = tiny_spec()
     found = through_json(spec)
     assert list(found.observations) == ["obs", "goal"]
-    assert spec_to_json(found) == spec_to_json(spec)
+    assert to_json(found) == to_json(spec)
     assert found.sampler.timesteps.dtype == np.int64
 
 
@@ -68,13 +68,13 @@ def test_spec_comes_back_with_its_order() -> None:
     [TensorType((Batch(), 16, 64), "float32"), TensorType((Batch(12), 0), "int64"), TensorType((), "bool")],
 )
 def test_types_come_back(kind: TensorType) -> None:
-    assert type_from_json(Value(type_to_json(kind), "t")) == kind
+    assert from_json(TensorType, Value(to_json(kind), "t")) == kind
 
 
 @pytest.mark.parametrize("size", ["b", "1*B", "0*B", "-2*B", "B*2", "", " B", -1, 1.5, None, True])
 def test_sizes_that_are_none(size: object) -> None:
     with pytest.raises(ArtifactError, match=r"t\.shape\[1\]"):
-        type_from_json(Value({"dtype": "float32", "shape": ["B", size]}, "t"))
+        from_json(TensorType, Value({"dtype": "float32", "shape": ["B", size]}, "t"))
 
 
 def test_manifest_comes_back(manifest: Manifest) -> None:
@@ -135,11 +135,11 @@ def change(manifest: Manifest, edit: Change) -> bytes:
     [
         (lambda d: d.pop("spec"), r"missing: \['spec'\]"),
         (lambda d: d.update(more=1), r"unknown: \['more'\]"),
-        (lambda d: d["spec"]["sampler"]["out_to_x0"].pop(), "spec: sampler column out_to_x0 must hold 3"),
+        (lambda d: d["spec"]["sampler"]["out_to_x0"].pop(), "spec.sampler: sampler column out_to_x0 must hold 3"),
         (lambda d: d["spec"]["sampler"]["out_to_x0"].__setitem__(1, 0.1), r"out_to_x0\[1\]: .*float32 holds exactly"),
         (lambda d: d["spec"]["sampler"]["out_to_x0"].__setitem__(1, 1e300), r"out_to_x0\[1\]: .*float32"),
         (lambda d: d["spec"]["chunk"].update(stop=99), "does not fit a sample"),
-        (lambda d: d["spec"].update(sample=[1, 2, 3]), r"spec\.sample: expected two sizes"),
+        (lambda d: d["spec"].update(sample=[1, 2, 3]), r"spec\.sample: expected a list of 2"),
         (lambda d: d["spec"]["observations"].clear(), "at least one observation"),
         (lambda d: d["spec"]["observations"]["obs"].update(dtype="object"), r"observations\.obs\.dtype"),
         (lambda d: d["spec"]["observations"]["obs"]["normalizer"]["scale"].__setitem__(0, 0), "scale is zero"),
@@ -172,7 +172,7 @@ def test_contents_that_are_refused(manifest: Manifest, edit: Change, message: st
         codec.decode(change(manifest, edit))
 
 
-@pytest.mark.parametrize("version", [0, 1, 2, 99, "2", 2.0, True, None])
+@pytest.mark.parametrize("version", [0, 1, 2, 3, 99, "2", 2.0, True, None])
 def test_another_schema_version_says_what_to_do(manifest: Manifest, version: object) -> None:
     content = change(manifest, lambda d: d.update(schema_version=version, ttscompile_version="7.8.9"))
     with pytest.raises(ArtifactError, match=r"Convert the checkpoint again .* install ttscompile==7\.8\.9"):

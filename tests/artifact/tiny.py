@@ -124,7 +124,7 @@ def tiny_program(seed: int = 0) -> Program:
             (
                 linear("flat", "memory", "pruner.weight", f32(B, 1, STEPS * 8)),
                 add("biased", "flat", "pruner.bias", f32(B, 1, STEPS * 8)),
-                Node("logits", "aten.view.default", (Ref("biased"), (B, STEPS, 2, 4)), (), (LOGITS,)),
+                Node("logits", "aten.reshape.default", (Ref("biased"), (B, STEPS, 2, 4)), (), (LOGITS,)),
             ),
             ("logits",),
         ),

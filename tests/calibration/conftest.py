@@ -11,7 +11,7 @@ import pytest
 
 import ttscompile
 from tests.once import Once
-from ttscompile.calibration.strategies import tts
+from ttscompile.calibration import tts
 
 from . import policies, tasks
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from ttscompile.artifact.load import load_artifact
-from ttscompile.calibration.calls import Actions, prepare_calls, sample_calls
+from ttscompile.calibration.calls import prepare_calls, sample_calls
 from ttscompile.calibration.execute import Executor
-from ttscompile.calibration.strategies import Task
+from ttscompile.calibration.task import Task
 from ttscompile.trajectories import load_trajectories
 
 MakeTask = Callable[..., Task]
@@ -24,6 +25,5 @@ def make_task(
     recorded = load_trajectories([recording], spec.observations, 4)
     chosen = sample_calls(recorded, episodes, calls, seed=0, repeats=100)
     prepared = prepare_calls(executor.model, spec, recorded, chosen, (0, episodes.start))
-    prepared = prepared.answered(executor.run_dense(prepared))
-    kinds = tuple(block.kind for block in artifact.manifest.blocks)
-    return Task(executor, Actions(spec), prepared, budget, seed, artifact.pruner, kinds)
+    prepared = replace(prepared, path=executor.run_dense(prepared))
+    return Task.of(artifact, executor, prepared, budget, seed)

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from ttscompile.artifact.load import load_artifact
-from ttscompile.calibration import CalibrationResult, calibrate, latency, pipeline
+from ttscompile.calibration import latency, pipeline
 from ttscompile.calibration.budget import Goal, cells_of, goal_of
 from ttscompile.calibration.clock import Clock
-from ttscompile.calibration.families import Families, budget_of_error
+from ttscompile.calibration.crowded import CrowdedSchedules, budget_of_error
 from ttscompile.calibration.latency import measure_budget
+from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.progress import Bar
+from ttscompile.calibration.result import CalibrationResult
 from ttscompile.calibration.state import FILE, StateFile
 from ttscompile.calibration.whole_steps import Errors, WholeSteps
 from ttscompile.core.lattice import Source
@@ -160,7 +162,9 @@ def test_the_latency_is_measured_once(artifact: Path, recording: Path, monkeypat
 
 
 class _Judged(WholeSteps):
-    """Schedules whose error is one over the number of their steps."""
+    """Schedules of 100 steps, whose error is one over the number of those that they compute."""
+
+    steps = 100
 
     def __init__(self) -> None:
         self.asked: list[tuple[int, ...]] = []
@@ -172,28 +176,25 @@ class _Judged(WholeSteps):
         self.asked.append(tuple(steps))
         return Errors(1 / len(steps), 10 / len(steps))
 
-    def crowded(self, full_steps: int, crowding: Any = (1.0,)) -> list[tuple[int, ...]]:
-        return [tuple(range(full_steps))]
-
 
 @pytest.mark.parametrize(("limit", "full"), [(10.0, 1), (4.9, 3), (1.0, 10), (0.85, 12), (0.2, 50)])
 def test_an_error_is_as_few_steps_as_do(tmp_path: Path, limit: float, full: int) -> None:
     whole, state = _Judged(), StateFile(tmp_path, {})
     with Bar(shown=False) as bar:
-        families = Families(whole, state, Clock(), bar)
-        budget = budget_of_error(families, Goal("max_action_error", limit), 100, BLOCKS)
+        crowded = CrowdedSchedules(whole, state, Clock(), bar)
+        budget = budget_of_error(crowded, Goal("max_action_error", limit), 100, BLOCKS)
         assert budget.cells == full * BLOCKS
         asked = len(whole.asked)
-        assert budget_of_error(families, Goal("max_action_error", limit), 100, BLOCKS) == budget
+        assert budget_of_error(crowded, Goal("max_action_error", limit), 100, BLOCKS) == budget
         assert len(whole.asked) == asked  # remembered
 
 
 def test_an_error_out_of_reach_and_one_out_of_time_are_failures(tmp_path: Path) -> None:
     with Bar(shown=False) as bar:
-        families = Families(_Judged(), StateFile(tmp_path, {}), Clock(), bar)
+        crowded = CrowdedSchedules(_Judged(), StateFile(tmp_path, {}), Clock(), bar)
         with pytest.raises(CalibrationFailedError, match="at least half of the cells: 10 with 1 of .*, 0.2 with 50 of"):
-            budget_of_error(families, Goal("max_action_error", 0.1), 100, BLOCKS)
-        late = Families(_Judged(), StateFile(tmp_path, {}), Clock(0.0), bar)
+            budget_of_error(crowded, Goal("max_action_error", 0.1), 100, BLOCKS)
+        late = CrowdedSchedules(_Judged(), StateFile(tmp_path, {}), Clock(0.0), bar)
         with pytest.raises(CalibrationFailedError, match="time limit ended the search .*: none tried"):
             budget_of_error(late, Goal("max_action_error", 0.1), 100, BLOCKS)
 

@@ -13,9 +13,11 @@ import pytest
 
 import ttscompile
 from ttscompile.artifact.load import load_artifact
-from ttscompile.calibration import CalibrationResult, calibrate, strategies
 from ttscompile.calibration.calls import split_episodes
 from ttscompile.calibration.execute import Executor
+from ttscompile.calibration.pipeline import calibrate
+from ttscompile.calibration.published import bac, interval
+from ttscompile.calibration.result import CalibrationResult
 from ttscompile.calibration.state import FILE
 from ttscompile.core.lattice import Source, uniform_plan
 from ttscompile.errors import ArtifactError, CalibrationError, CalibrationFailedError
@@ -177,7 +179,7 @@ def test_the_interval_strategy_is_the_uniform_schedule(artifact: Path, recording
     loaded = load_artifact(artifact)
     np.testing.assert_array_equal(loaded.schedule("schedule"), loaded.schedule("uniform"))
     assert result.default_plan == "schedule"
-    assert "tts" not in loaded.manifest.plans
+    assert "pruner" not in loaded.manifest.plans
 
 
 def test_no_better_than_uniform_is_a_failure_that_changes_nothing(
@@ -185,7 +187,7 @@ def test_no_better_than_uniform_is_a_failure_that_changes_nothing(
 ) -> None:
     before = contents(artifact)
 
-    monkeypatch.setattr(strategies, "bac", strategies.interval)
+    monkeypatch.setattr(bac, "bac", interval.interval)
     with pytest.raises(CalibrationFailedError, match="no better than the uniform schedule"):
         quick(artifact, recording, strategy="bac")
     assert {n: c for n, c in contents(artifact).items() if n != FILE} == before

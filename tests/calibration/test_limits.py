@@ -15,21 +15,21 @@ import torch
 
 from ttscompile import ObservationSpec
 from ttscompile.artifact.load import load_artifact
-from ttscompile.calibration import calibrate, targets
+from ttscompile.calibration import targets
 from ttscompile.calibration.calls import LARGEST, Actions, split_episodes
 from ttscompile.calibration.clock import Clock
+from ttscompile.calibration.compare import compare
 from ttscompile.calibration.contest import _error
+from ttscompile.calibration.crowded import CrowdedSchedules
 from ttscompile.calibration.execute import Executor
-from ttscompile.calibration.families import Families
-from ttscompile.calibration.frontier import compare
 from ttscompile.calibration.latency import _pruner_ms
+from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.progress import Bar
-from ttscompile.calibration.search import search_plan
+from ttscompile.calibration.search import open_search, search_plan
 from ttscompile.calibration.state import FILE, StateFile
-from ttscompile.calibration.strategies import NAMES, open_strategy
-from ttscompile.calibration.strategies.tts import Tts
+from ttscompile.calibration.strategies import NAMES
 from ttscompile.calibration.targets import draw_calls, with_targets
-from ttscompile.calibration.whole_steps import WholeSteps
+from ttscompile.calibration.tts import Tts
 from ttscompile.core.lattice import PlanArray, Source, uniform_plan
 from ttscompile.errors import CalibrationError, CalibrationFailedError
 from ttscompile.runtimes.reference.model import Contexts, ReferenceModel
@@ -83,7 +83,7 @@ def test_a_limit_holds_within_an_interval(
         return block(self, b, k, stream, contexts, *streams)
 
     monkeypatch.setattr(ReferenceModel, "block", slow)
-    search = open_strategy(name, replace(task, clock=clock))
+    search = open_search(name, replace(task, clock=clock))
     if name in ("teacache", "dbcache") and limit == 0:
         with pytest.raises(CalibrationFailedError, match="time limit ended the search for a threshold of"):
             search_plan(search, clock)
@@ -96,7 +96,7 @@ def test_a_limit_holds_within_an_interval(
 
 def test_a_family_is_not_begun_that_cannot_be_finished(make_task: MakeTask, tmp_path: Path) -> None:
     """Compared, then fitted on all calls and judged."""
-    whole = WholeSteps(make_task(20, calls=24))
+    whole = make_task(20, calls=24).whole
     assert whole.comparing(3) == whole.correcting(3) == 0.0  # nothing is known yet
     begun = time.monotonic()
     whole.errors((0, 4, 8))
@@ -106,8 +106,8 @@ def test_a_family_is_not_begun_that_cannot_be_finished(make_task: MakeTask, tmp_
     needed = 2 * whole.comparing(4) + whole.correcting(4)
     with Bar(shown=False) as bar:
         for limit, made in ((0.9 * needed, False), (1.1 * needed, True)):
-            families = Families(whole, StateFile(tmp_path, {}), _Hand(limit), bar)
-            assert (families.best(4, "", (2.0,)) is not None) == made
+            crowded = CrowdedSchedules(whole, StateFile(tmp_path, {}), _Hand(limit), bar)
+            assert (crowded.best(4, "", (2.0,)) is not None) == made
 
 
 def test_when_half_of_the_time_is_over_no_more_targets_are_made_than_needed(
@@ -140,7 +140,7 @@ def test_only_corrections_need_many_calls(artifact: Path, recording: Path) -> No
 
 def test_without_a_pruner_no_time_is_kept_for_it(make_task: MakeTask) -> None:
     task = make_task(20, calls=4)
-    with_head, without = (Tts(one, WholeSteps(one)) for one in (task, replace(task, pruner={})))
+    with_head, without = (Tts(one) for one in (task, replace(task, pruner={})))
     assert (with_head.closing, without.closing) == (5 if task.pruner else 0, 0)
 
 

@@ -12,6 +12,7 @@ from networks import plan_at, plan_name, random_network, sampler_of
 from torch import nn
 
 import ttscompile
+from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile import Source
 from ttscompile.artifact import load_artifact
 from ttscompile.cli.timing import Contestant, Measurement
@@ -69,7 +70,7 @@ def test_the_floor_runs_every_block_as_often_as_it_says(
     flops = artifact.manifest.flops.blocks
     assert contestant.dense_flops == floor.SEQUENCES * sum(flops)
     # At 5 sequences in 20 ms, the eight steps of a dense call take 32 ms, and half of its cells half of that.
-    blocks = Measurement("", "", (20.0,), 20.0, (20.0, 20.0), None, None, contestant.dense_flops, 0.0, 0)
+    blocks = Measurement("", "", (20.0,), flops=contestant.dense_flops)
     assert floor.floor_ms(plans[0.0], artifact, blocks) == pytest.approx(32.0)
     assert floor.floor_ms(plans[0.5], artifact, blocks) == pytest.approx(16.0)
 
@@ -126,9 +127,10 @@ def test_passes_are_pooled_and_every_group_has_its_threads() -> None:
 def test_eager_and_compiled_agree(tiny: tuple[Path, dict[float, np.ndarray]]) -> None:
     network = random_network(16, "ddim", 8, layers=1)
     ((obs, noise),) = random_calls(network.spec, 1, seed=0)
-    eager = rounds.eager_contestant(network, 1.0).call(obs, noise)
+    with Counted() as counted:
+        eager = rounds.eager_contestant(network, 1.0).call(obs, noise)
     found = ttscompile.load(tiny[0]).predict_action(obs, noise=noise, plan="dense")["action_pred"]
-    np.testing.assert_allclose(np.asarray(eager), found, atol=1e-4)
+    assert_equal_but_for_rounding(np.asarray(eager), found, counted.terms, counted.angle)
 
 
 def test_without_torch_compile_the_reason_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -164,4 +166,6 @@ def test_torch_compile_computes_the_same() -> None:
     except RuntimeUnavailableError as error:
         pytest.skip(str(error))
     found = contestant.call(obs, noise)
-    np.testing.assert_allclose(found, rounds.eager_contestant(network, 1.0).call(obs, noise), atol=1e-4)
+    with Counted() as counted:
+        expected = rounds.eager_contestant(network, 1.0).call(obs, noise)
+    assert_equal_but_for_rounding(found, expected, counted.terms)

@@ -13,6 +13,8 @@ from original import EagerPolicy
 from rollout import seeded_noise
 from variants import noise_shape, open_variant
 
+from tests.rounding import PROMISED
+
 SCRIPTS = Path(__file__).parents[2] / "examples" / "pusht"
 
 
@@ -38,7 +40,7 @@ def test_dense_compiled_is_the_eager_policy(compiled_pusht, pusht_checkpoint, wi
     found = dense.policy.predict_action({"obs": windows}, noise=noise, plan="dense")
     assert found["action"].shape == (2, 8, 2)
     for key in ("action", "action_pred"):
-        np.testing.assert_allclose(found[key], expected[key], atol=1e-4 * 512)
+        np.testing.assert_allclose(found[key], expected[key], rtol=0, atol=PROMISED * 512)
 
 
 def test_eager_policy_has_no_plans(pusht_checkpoint, windows):

@@ -12,7 +12,7 @@ from evaluate import summarise
 from rich.console import Console
 from rollout import Episode, Rollout
 
-from ttscompile.calibration import CalibrationResult, PlanScore
+from ttscompile.calibration.result import CalibrationResult, PlanScore
 
 
 def printed(table):

@@ -17,7 +17,7 @@ from ttscompile import ChunkSpec, ObservationSpec
 from ttscompile.runtimes.executor import ExecutorSettings, Feasibility
 from ttscompile.runtimes.executor.feasibility import LatencyWindow
 from ttscompile.runtimes.executor.settings import resolve
-from ttscompile.runtimes.executor.state import ExecutorState, Job, feasibility
+from ttscompile.runtimes.executor.state import ExecutorState, Job
 from ttscompile.runtimes.executor.statistics import Counts
 
 from .simulation import Facts, World
@@ -105,7 +105,7 @@ class Loop:
         while events[0][0] < 1000 + seconds:
             when, _, what = heappop(events)
             what(when)
-        return calls, state.recorder.counts, feasibility(given, resolved, max(self.latency.values()))
+        return calls, state.recorder.counts, resolved.feasibility(max(self.latency.values()))
 
 
 def apart(calls: list[Job]) -> list[float]:

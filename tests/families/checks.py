@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.runtimes.agreement import largest_difference
+from tests.rounding import amplified, bound
+from tests.runtimes.agreement import call_terms, largest_difference
 from ttscompile.artifact import load_artifact
 from ttscompile.ir.flops import graph_flops
 from ttscompile.ir.program import Program
@@ -42,5 +43,6 @@ def assert_runtimes_agree(folder: Path, streams: tuple[int, ...] = (1, 3)) -> No
     artifact = load_artifact(folder)
     left, right = open_runtime(artifact, "onnxruntime"), open_runtime(artifact, "reference")
     rng = np.random.default_rng(0)
+    allowed = bound(amplified(call_terms(artifact), artifact.manifest.spec.sampler))
     for count in streams:
-        assert largest_difference(artifact, left, right, rng, count, calls=3) < 1e-5
+        assert largest_difference(artifact, left, right, rng, count, calls=3) < allowed

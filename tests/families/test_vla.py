@@ -4,16 +4,28 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
+from torch import nn
 
 import ttscompile
-from tests.families.checks import assert_runtimes_agree, in_loop, kinds
+from tests.families.checks import Arrays, assert_runtimes_agree, in_loop, kinds
+from tests.families.heads import FAMILIES, Family, loaded
 from tests.families.support import record
-from tests.families.vla import FAMILIES, Family, loaded
+from tests.rounding import Counted, amplified, assert_equal_but_for_rounding
+from ttscompile import PolicySpec
 from ttscompile.driver import transform
 from ttscompile.ir.program import Program
+
+
+def rounded(module: nn.Module, conditions: Arrays, spec: PolicySpec) -> tuple[float, float]:
+    """Terms and largest angle of a whole call, as ``tests.rounding`` counts them."""
+    inputs = {key: torch.from_numpy(value) for key, value in conditions.items()}
+    largest = torch.tensor(spec.sampler.timesteps).max().expand(len(next(iter(inputs.values()))))
+    with torch.no_grad(), Counted() as counted:
+        module(torch.zeros(len(largest), *spec.sample), largest, **inputs)
+    return amplified(spec.sampler.steps * counted.terms, spec.sampler), counted.angle
+
 
 LOWERED = ("smolvla", "rdt")
 """Run through both runtimes every time; the others with ``-m soak``, for the sake of time."""
@@ -32,10 +44,10 @@ def test_a_head_computes_what_the_original_computes(name: str) -> None:
     family = FAMILIES[name]()
     module, arrays, _ = loaded(family, name)
     inputs = {key: torch.from_numpy(arrays[key]) for key in family.conditions}
-    with torch.no_grad():
+    with torch.no_grad(), Counted() as counted:
         timesteps = torch.from_numpy(arrays["timesteps"]) / family.scale
         made = module(torch.from_numpy(arrays["noise"]), timesteps, **inputs)
-    np.testing.assert_allclose(made.numpy(), arrays[family.prediction], rtol=1e-5, atol=2e-6)
+    assert_equal_but_for_rounding(made, arrays[family.prediction], counted.terms, counted.angle)
 
 
 @pytest.mark.parametrize("name", [name for name in FAMILIES if name not in LOWERED])
@@ -51,10 +63,11 @@ def test_a_compiled_head_acts_as_the_original(name: str, tmp_path: Path) -> None
     module, arrays, spec = loaded(family, name)
     conditions = {key: arrays[key] for key in family.conditions}
     assert_found(family, ttscompile.compile_denoiser(module, spec, tmp_path / "compiled"))
+    terms, angle = rounded(module, conditions, spec)
     for runtime in ("reference", "onnxruntime"):
         policy = ttscompile.load(tmp_path / "compiled", runtime=runtime)
         noise = ttscompile.Noise(arrays["noise"])
         action = policy.predict_action(conditions, noise=noise, plan="dense")["action_pred"]
         action = action * conditions["action_mask"] if family.masks else action
-        np.testing.assert_allclose(action, arrays["actions"], rtol=1e-4, atol=1e-5)
+        assert_equal_but_for_rounding(action, arrays["actions"], terms, angle)
     assert_runtimes_agree(tmp_path / "compiled")

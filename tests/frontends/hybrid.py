@@ -119,9 +119,11 @@ def state_dict(variant: str, seed: int = 0) -> dict[str, torch.Tensor]:
 def _encoder(config: Mapping[str, Any]) -> ObservationEncoder:
     obs = config["shape_meta"]["obs"]
     crop = None if config["crop_shape"] is None else tuple(config["crop_shape"])
-    cameras = {k: Camera(tuple(v["shape"]), crop) for k, v in obs.items() if v.get("type") == "rgb"}
-    low_dim = {key: math.prod(each["shape"]) for key, each in obs.items() if key not in cameras}
-    return ObservationEncoder(cameras, low_dim, tuple(obs), config.get("obs_encoder_group_norm", False))
+    inputs = {
+        key: Camera(tuple(each["shape"]), crop) if each.get("type") == "rgb" else math.prod(each["shape"])
+        for key, each in obs.items()
+    }
+    return ObservationEncoder(inputs, config.get("obs_encoder_group_norm", False))
 
 
 def fill(shapes: Mapping[str, torch.Tensor], seed: int) -> dict[str, torch.Tensor]:

@@ -10,9 +10,8 @@ import torch
 from safetensors.torch import save_file
 
 from ttscompile.frontends.clip_config import TextConfig, VisionConfig
-from ttscompile.frontends.lerobot import build_module
 from ttscompile.frontends.lerobot_config import read_lerobot_config
-from ttscompile.frontends.lerobot_processors import read_processors
+from ttscompile.frontends.lerobot_weights import Network
 
 TO, DS, DA, SIDE = 2, 5, 3, 24
 
@@ -136,18 +135,14 @@ def _statistics(generator: torch.Generator, images: list[str]) -> dict[str, torc
 def _weights(directory: Path, generator: torch.Generator) -> dict[str, torch.Tensor]:
     """Random weights under the names that lerobot with transformers 4 saves."""
     config = read_lerobot_config_without_weights(directory)
-    processors = read_processors(directory, config.features)
     vision = VisionConfig(**VISION) if config.cameras else None
-    module = build_module(config, processors, vision, TextConfig(**TEXT), None)
-    parts = {"noise_predictor.": module.denoiser, "observation_encoder.": module.encoder.observation_encoder}
     found = {}
-    for prefix, part in parts.items():
-        for name, value in part.state_dict().items():
-            key = f"{prefix}{name}".replace("encoder.model.", "encoder.model.vision_model.")
-            key = key.replace(".text_encoder.text_encoder.", ".text_encoder.text_encoder.text_model.")
-            for i in range(9):
-                key = key.replace(f"vision_encoders.{i}.model.", f"vision_encoders.{i}.model.vision_model.")
-            found[key] = torch.randn(value.shape, generator=generator) * 0.4
+    for name, value in Network(config, vision, TextConfig(**TEXT)).state_dict().items():
+        key = name.replace("encoder.model.", "encoder.model.vision_model.")
+        key = key.replace(".text_encoder.text_encoder.", ".text_encoder.text_encoder.text_model.")
+        for i in range(9):
+            key = key.replace(f"vision_encoders.{i}.model.", f"vision_encoders.{i}.model.vision_model.")
+        found[key] = torch.randn(value.shape, generator=generator) * 0.4
     return found
 
 

@@ -19,6 +19,7 @@ from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.refusals import (
     DIRECTORIES,
     ENTRIES,
+    LEROBOT,
     POLICIES,
     STATES,
     refuse_directory,
@@ -83,6 +84,8 @@ def test_other_policies(payload: Callable[..., Any], save: Callable[..., Path], 
     with pytest.raises(CheckpointError, match=rf"the policy is {name}: {message}"):
         load_checkpoint_policy(save(built))
 
+
+LEROBOT_TYPES = ["diffusion", "act", "vqbet", "pi0_fast", "tdmpc", "sac", "smolvla", "wall_x", "something_new"]
 
 DIRECTORY_FILES: list[tuple[list[str], str]] = [
     (["adapter_config.json", "adapter_model.safetensors"], "PEFT adapter.*adapter_config.json.*Merge"),
@@ -155,7 +158,8 @@ def test_every_row_is_reached(tmp_path: Path) -> None:
         (tmp_path / str(i)).mkdir()
         make(tmp_path / str(i), files)
         told.append(said(refuse_directory, tmp_path / str(i)))
-    for row in (*POLICIES, *DIRECTORIES, *ENTRIES, *STATES):
+    told += [said(lambda name: refuse_policy(name, LEROBOT), name) for name in LEROBOT_TYPES]
+    for row in (*POLICIES, *DIRECTORIES, *ENTRIES, *STATES, *LEROBOT):
         assert any(f"{row.what}. {row.remedy}" in each or f"{row.what} (told by " in each for each in told), row.what
         assert row.remedy.endswith(".")
 

@@ -11,6 +11,7 @@ import torch
 from torch import nn
 
 import ttscompile
+from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile import EDMDenoiser, edm_table
 from ttscompile.core.spec import ChunkSpec, Noise, ObservationSpec, PolicySpec
 from ttscompile.errors import NoResidualBlocksError, SpecError
@@ -73,10 +74,11 @@ def test_the_loop_is_the_original(sigmas: list[float], clip: float | None) -> No
     rng = np.random.default_rng(0)
     noise, state = rng.standard_normal((3, *SAMPLE), dtype=np.float32), torch.from_numpy(rng.standard_normal((3, 3)))
     run = eager_policy(EDMDenoiser(Network(), sigmas, DATA).eval(), spec(sigmas, clip))
-    found = run({"state": state.float()}, Noise(noise))
+    with Counted() as counted:
+        found = run({"state": state.float()}, Noise(noise))
     with torch.no_grad():
         expected = original(Network(), sigmas, torch.from_numpy(noise), state.float(), np.inf if clip is None else clip)
-    torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=1e-5)
+    assert_equal_but_for_rounding(found, expected, counted.terms, counted.angle)
 
 
 def test_its_blocks_are_found_and_the_artifact_acts_as_the_original(tmp_path: Path) -> None:
@@ -87,9 +89,9 @@ def test_its_blocks_are_found_and_the_artifact_acts_as_the_original(tmp_path: Pa
     rng = np.random.default_rng(1)
     noise, state = rng.standard_normal((1, *SAMPLE), dtype=np.float32), rng.standard_normal((1, 3), dtype=np.float32)
     found = ttscompile.load(tmp_path).predict_action({"state": state}, noise=Noise(noise))["action_pred"]
-    with torch.no_grad():
+    with torch.no_grad(), Counted() as counted:
         expected = original(Network(), SIGMAS, torch.from_numpy(noise), torch.from_numpy(state), np.inf)
-    np.testing.assert_allclose(found, expected.numpy(), rtol=1e-5, atol=1e-5)
+    assert_equal_but_for_rounding(found, expected, counted.terms, counted.angle)
 
 
 @pytest.mark.parametrize(

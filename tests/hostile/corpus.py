@@ -100,8 +100,8 @@ def _trajectories(folder: Path) -> None:
 
 def _recordings(folder: Path) -> None:
     """Data sets as users have them."""
-    from tests.calibration.recorded import as_hdf5, as_lerobot, as_zarr
     from tests.hostile import dataset_changes, hdf5_changes, zarr_changes
+    from tests.trajectories.data_sets import as_hdf5, as_lerobot, as_zarr
 
     zarr_changes.make(folder / "zarr", as_zarr)
     hdf5_changes.make(folder / "hdf5", as_hdf5)

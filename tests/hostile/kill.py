@@ -101,8 +101,8 @@ class Prepared:
 
     def calibrate(self, path: Path, resume: bool = False) -> None:
         """Calibrate an artifact; the end depends on a number of intervals, not on time."""
-        from ttscompile.calibration import calibrate
-        from ttscompile.calibration.strategies import tts
+        from ttscompile.calibration import tts
+        from ttscompile.calibration.pipeline import calibrate
 
         tts.DISTANCES = (1,)  # type: ignore[misc]  # this process is forked, and ends with it
         arguments: dict[str, Any] = {"target_sparsity": 0.7, "max_intervals": 4, "progress": False, "max_minutes": 60}

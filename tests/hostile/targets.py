@@ -129,7 +129,7 @@ def recording(kind: str, write_bad: Callable[[random.Random, Path, Path], Path])
     """A data set in a format of others, of which two arrays are joined, or its images taken."""
 
     def make(rng: random.Random, corpus: Path, folder: Path) -> Callable[[], None]:
-        from tests.calibration.recorded import read_here
+        from tests.trajectories.data_sets import read_here
         from ttscompile.core.spec import ObservationSpec
         from ttscompile.trajectories import apart, load_trajectories
 

@@ -17,9 +17,9 @@ import pyarrow as pa
 import pyarrow.parquet as parquet
 import pytest
 
-from tests.calibration.recorded import LOW, SOURCES, as_hdf5, as_lerobot, as_zarr, read_here
 from tests.hostile.dataset_changes import declared_png
 from tests.hostile.hdf5_changes import SECRET
+from tests.trajectories.data_sets import LOW, SOURCES, as_hdf5, as_lerobot, as_zarr, read_here
 from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import TrajectoryError
 from ttscompile.trajectories import apart, load_trajectories

@@ -14,7 +14,7 @@ import torch
 from tests.calibration import policies
 from tests.lower.modules import captured
 from ttscompile import compile_denoiser
-from ttscompile.calibration import calibrate
+from ttscompile.calibration.pipeline import calibrate
 from ttscompile.lower.program import lower_graph
 
 ROOT = Path(__file__).resolve().parents[2]

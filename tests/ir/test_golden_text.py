@@ -87,7 +87,7 @@ def test_clean_up_reads_like_this() -> None:
     b = Builder()
     x = b.input("x", B, 4, 8)
     same = b.op("same", "clone.default", (B, 4, 8), x)
-    off = b.op("off", "dropout.default", (B, 4, 8), same, 0.1, False)
+    off = b.op("off", "detach.default", (B, 4, 8), same)
     one, two = b.op("one", "sin.default", (B, 4, 8), off), b.op("two", "sin.default", (B, 4, 8), x)
     b.op("dead", "cos.default", (B, 4, 8), one)
     graph = b.graph(b.op("y", "mul.Tensor", (B, 4, 8), one, two))
@@ -106,7 +106,7 @@ def test_clean_up_reads_like_this() -> None:
 def test_clean_up_keeps_what_only_looks_like_nothing() -> None:
     b = Builder()
     x = b.input("x", B, 4, 8)
-    on = b.op("on", "dropout.default", (B, 4, 8), x, 0.1, True)  # training mode: random
+    on = b.op("on", "flip.default", (B, 4, 8), x, (1,))  # of the same type, in another order
     reshaped = b.op("reshaped", "reshape.default", (B, 32), on, (B, 32))
     ones = b.op("ones", "mul.Tensor", (B, 32), reshaped, 1)
     floats = b.op("floats", "mul.Tensor", (B, 32), reshaped, 1.0)  # 1 == 1.0 in Python, not in a graph

@@ -6,13 +6,13 @@ import re
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
 from tests.lower.modules import ALL, TOKENS, WIDTH, captured, random_values, spec, table
 from tests.lower.sessions import run, session
 from tests.passes.graphs import Builder
+from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile.errors import LoweringError
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Batch, Graph, Node, Ref, TensorType
@@ -31,8 +31,10 @@ def assert_parity(graph: Graph, weights: dict[str, torch.Tensor]) -> None:
     for streams in (1, 2, 5):
         inputs = random_values(graph.inputs, streams)
         results = running.run(list(graph.outputs), {n: v.numpy() for n, v in inputs.items()})
-        for result, expected in zip(results, evaluate(graph, weights, inputs), strict=True):
-            np.testing.assert_allclose(result, expected.numpy(), rtol=1e-5, atol=1e-5)
+        with Counted() as counted:
+            wanted = evaluate(graph, weights, inputs)
+        for result, expected in zip(results, wanted, strict=True):
+            assert_equal_but_for_rounding(result, expected, counted.terms)
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -166,8 +168,10 @@ def test_program(monkeypatch: pytest.MonkeyPatch) -> None:
         assert models[name].graph.name == name
         weights = random_values(graph.constants, 1, seed=len(name))
         inputs = random_values(graph.inputs, 2)
-        for result, expected in zip(run(models[name], weights, inputs), evaluate(graph, weights, inputs), strict=True):
-            np.testing.assert_allclose(result, expected.numpy(), rtol=1e-5, atol=1e-5)
+        with Counted() as counted:
+            wanted = evaluate(graph, weights, inputs)
+        for result, expected in zip(run(models[name], weights, inputs), wanted, strict=True):
+            assert_equal_but_for_rounding(result, expected, counted.terms)
 
 
 def test_structure_is_all_but_names() -> None:

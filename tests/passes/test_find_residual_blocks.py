@@ -42,7 +42,7 @@ def test_a_split_is_no_stream() -> None:
     b = Builder()
     wide = b.op("wide", "linear.default", (B, 4, 16), b.input("x", B, 4, 2), b.constant("w", 16, 2))
     part = TensorType((B, 4, 8), "float32")
-    b.nodes.append(Node("split", "aten.chunk.default", (wide, 2, -1), (), (part, part)))
+    b.nodes.append(Node("split", "aten.split.Tensor", (wide, 8, -1), (), (part, part)))
     b.nodes += [Node(f"part{i}", GETITEM, (Ref("split"), i), (), (part,)) for i in range(2)]
     h = b.residual("a", b.op("sum", "add.Tensor", (B, 4, 8), Ref("part0"), Ref("part1")))
     (block,) = find_residual_blocks(b.graph(h), "x").blocks

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from tests.rounding import Counted
 from ttscompile import Noise
 from ttscompile.artifact import Artifact
 from ttscompile.core.lattice import Source
-from ttscompile.runtimes import Runtime
+from ttscompile.runtimes import Runtime, open_runtime
 
 from .plans import random_plan
 
@@ -26,6 +27,16 @@ def random_inputs(artifact: Artifact, rng: np.random.Generator, streams: int) ->
     }
     initial = rng.standard_normal(shape, dtype=np.float32)
     return obs, Noise(initial, rng.standard_normal((spec.sampler.steps, *shape), dtype=np.float32))
+
+
+def call_terms(artifact: Artifact) -> int:
+    """Terms of a dense call of one stream, for ``tests.rounding.bound``; a sparse call has no more."""
+    spec, manifest = artifact.manifest.spec, artifact.manifest
+    obs, noise = random_inputs(artifact, np.random.default_rng(0), 1)
+    runtime = open_runtime(artifact, "reference")
+    with Counted() as counted:
+        runtime.predict(obs, noise, np.zeros((spec.sampler.steps, len(manifest.groups)), np.int8))
+    return counted.terms
 
 
 def largest_difference(

@@ -15,6 +15,7 @@ from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
 from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultistepScheduler
 
 import ttscompile
+from tests.rounding import assert_equal_but_for_rounding
 from ttscompile import Affine, ChunkSpec, SamplerTable, Source
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.write import write_artifact
@@ -24,12 +25,12 @@ from ttscompile.ir.program import Program
 from ttscompile.lower.program import lower_program
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.inpainting import MaskedUpdates, known_samples, noise_levels, prefix_refusal
-from ttscompile.runtimes.reference.runtime import ReferenceRuntime
+from ttscompile.runtimes.reference.model import ReferenceModel
 from ttscompile.samplers.flow import flow_matching_table
 from ttscompile.samplers.multistep import set_timesteps
 from ttscompile.samplers.table import sampler_table
 
-from .agreement import random_inputs
+from .agreement import call_terms, random_inputs
 from .conftest import MakeArtifact
 from .plans import random_correction, random_plan
 from .toys import toy_program
@@ -135,6 +136,7 @@ def test_both_runtimes_agree_on_prefixes(artifacts: dict[str, Artifact], name: s
     rng = np.random.default_rng(streams)
     corrections = [None, random_correction(artifact, rng), random_correction(artifact, rng)]
     written = np.zeros((streams, STEPS, BLOCKS), np.bool_)
+    terms = call_terms(artifact) + STEPS * 6 * HORIZON  # a correction adds six numbers for each action of the chunk
     for call, length in enumerate((2, 5, None, 1, 3, 4, 0, 2, 5)):
         plans = np.stack([random_plan(rng, STEPS, artifact.manifest.groups, cells) for cells in written])
         obs, noise = random_inputs(artifact, rng, streams)
@@ -142,7 +144,7 @@ def test_both_runtimes_agree_on_prefixes(artifacts: dict[str, Artifact], name: s
         correction = corrections[call % 3]
         known = None if prefix is None else known_samples(artifact.manifest.spec, prefix, noise.initial)
         ours, theirs = (r.predict(obs, noise, plans, correction=correction, known=known)[0] for r in runtimes)
-        np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-5 * np.abs(theirs).max())
+        assert_equal_but_for_rounding(ours, theirs, terms)
         if prefix is not None:
             np.testing.assert_array_equal(ours[:, START : START + prefix.shape[1]], prefix)
         written |= plans == Source.COMPUTE
@@ -150,21 +152,21 @@ def test_both_runtimes_agree_on_prefixes(artifacts: dict[str, Artifact], name: s
 
 def test_between_steps_the_committed_actions_have_the_noise_of_the_step(artifact: Artifact) -> None:
     table, made = diffusion(DDPMScheduler)
-    model = ReferenceRuntime(artifact).model
+    model = ReferenceModel.from_artifact(artifact)
     obs, noise = random_inputs(artifact, np.random.default_rng(0), 2)
     prefix = np.random.default_rng(1).uniform(-1, 1, (2, 3, 2)).astype(np.float32)
     known = known_samples(artifact.manifest.spec, prefix, noise.initial)
     contexts = model.prologue({key: torch.from_numpy(value) for key, value in obs.items()})
     initial, draws = torch.from_numpy(noise.initial), torch.from_numpy(noise.steps)
     plan = dense_plan(STEPS, BLOCKS)
-    result = model.rollout(contexts, initial, draws, plan, known=known, keep_samples=True)
+    result = model.denoise(contexts, initial, draws, plan, known=known)
     here = slice(START, START + 3)
     for k, sample in enumerate(result.samples[:-1]):
         expected = made.add_noise(torch.from_numpy(prefix), initial[:, here], torch.tensor(int(table.timesteps[k + 1])))
-        torch.testing.assert_close(sample[:, here], expected, atol=1e-5, rtol=1e-5)
+        assert_equal_but_for_rounding(sample[:, here], expected, terms=4)  # two products and their sum
     assert known is not None
     first = made.add_noise(torch.from_numpy(prefix), initial[:, here], torch.tensor(int(table.timesteps[0])))
-    np.testing.assert_allclose(known.values[0], first, atol=1e-5)
+    assert_equal_but_for_rounding(known.values[0], first, terms=4)
 
 
 def test_a_network_inpaints_as_the_loop_of_its_scheduler(make_artifact: MakeArtifact) -> None:
@@ -179,7 +181,7 @@ def test_a_network_inpaints_as_the_loop_of_its_scheduler(make_artifact: MakeArti
     program = toy(table)
     program = replace(program, spec=replace(program.spec, chunk=ChunkSpec(1, START, HORIZON - 1, normalizer)))
     artifact = make_artifact(program)
-    model = ReferenceRuntime(artifact).model
+    model = ReferenceModel.from_artifact(artifact)
     rng = np.random.default_rng(0)
     obs, noise = random_inputs(artifact, rng, 2)
     committed = rng.uniform(-1, 1, (2, 3, 1)).astype(np.float32)
@@ -200,17 +202,18 @@ def test_a_network_inpaints_as_the_loop_of_its_scheduler(make_artifact: MakeArti
     held = known_samples(program.spec, prefix, noise.initial)
     given = program.spec.observations["obs"].normalizer
     assert given is not None
+    terms = call_terms(artifact)
     for name in ("reference", "onnxruntime"):
         runtime = open_runtime(artifact, name)
         found, _ = runtime.predict(obs, noise, dense_plan(STEPS, BLOCKS), known=held)
-        np.testing.assert_allclose(found, sample, rtol=1e-4, atol=1e-5)
+        assert_equal_but_for_rounding(found, sample, terms)
         plain, _ = runtime.predict(obs, noise, dense_plan(STEPS, BLOCKS))
         assert np.abs(found - plain)[:, START : START + 3, 1].max() > 1e-2  # the other channel saw it
         policy = ttscompile.load(artifact.path, runtime=name)
         assert policy.info.prefix_refusal is None
         out = policy.predict_action({"obs": given.unnormalize(obs["obs"])}, noise, prefix=committed)
-        np.testing.assert_allclose(out["action"][:, :3], committed, atol=1e-5)
-        np.testing.assert_allclose(out["action_pred"], normalizer.unnormalize(found[..., :1]), rtol=1e-3, atol=1e-4)
+        assert_equal_but_for_rounding(out["action"][:, :3], committed, terms=4)  # normalised and back
+        assert_equal_but_for_rounding(out["action_pred"], normalizer.unnormalize(found[..., :1]), terms)
 
 
 @pytest.mark.parametrize(("groups", "actions"), [(1, 3), (3, 3), (3, 2)])

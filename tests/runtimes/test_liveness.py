@@ -7,17 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.rounding import assert_equal_but_for_rounding
 from ttscompile import Source
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.write import update_calibration
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import IllegalPlanError
-from ttscompile.runtimes.onnxruntime.liveness import readable_rollout, rollout_needs
-from ttscompile.runtimes.onnxruntime.runtime import OnnxRuntime
+from ttscompile.runtimes import open_runtime
+from ttscompile.runtimes.liveness import readable_rollout, rollout_needs
 from ttscompile.runtimes.policy import load
-from ttscompile.runtimes.reference.runtime import ReferenceRuntime
 
-from .agreement import random_inputs
+from .agreement import call_terms, random_inputs
 
 C, T, R = Source.COMPUTE, Source.TIMESTEP, Source.ROLLOUT
 ENTRY = 3 * 4 * 4
@@ -71,25 +71,25 @@ def test_a_pruner_is_known_by_the_bounds_of_its_logits(
 
 
 def test_calls_with_the_artifacts_plans_keep_what_these_read(scheduled: Artifact) -> None:
-    runtime, reference = OnnxRuntime(scheduled), ReferenceRuntime(scheduled)
+    runtime, reference = open_runtime(scheduled), open_runtime(scheduled, "reference")
     rng = np.random.default_rng(0)
-    assert runtime.rollout_nbytes == 2 * ENTRY
+    assert runtime.backend.rollout_nbytes == 2 * ENTRY
     for name in ("plain", "reads", "dense", "plain", "reads"):
         obs, noise = random_inputs(scheduled, rng, 1)
         plan = scheduled.schedule(name)
         found, report = runtime.predict(obs, noise, plan, plan_name=name, repair=True)
         expected, wanted = reference.predict(obs, noise, plan, plan_name=name, repair=True)
-        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+        assert_equal_but_for_rounding(found, expected, call_terms(scheduled))
         assert report.legalised == wanted.legalised
         if name == "plain":
-            kept = runtime.rollout_nbytes
+            kept = runtime.backend.rollout_nbytes
             assert kept in (2 * ENTRY, 25 * ENTRY)
     assert report.legalised == (0,)
-    assert runtime.rollout_nbytes == 25 * ENTRY  # the dense call kept all
+    assert runtime.backend.rollout_nbytes == 25 * ENTRY  # the dense call kept all
 
 
 def test_a_matrix_may_read_what_dense_calls_and_matrices_computed(scheduled: Artifact) -> None:
-    runtime = OnnxRuntime(scheduled)
+    runtime = open_runtime(scheduled)
     obs, noise = random_inputs(scheduled, np.random.default_rng(0), 1)
     reads = uniform_plan(5, 5, 2)
     reads[1] = R
@@ -102,7 +102,7 @@ def test_a_matrix_may_read_what_dense_calls_and_matrices_computed(scheduled: Art
 
 def test_a_matrix_reads_no_older_residual_than_the_last_computed(scheduled: Artifact) -> None:
     """A dense call keeps all; a plan of the artifact then computes cells anew, and does not keep them."""
-    runtime, reference = OnnxRuntime(scheduled), ReferenceRuntime(scheduled)
+    runtime, reference = open_runtime(scheduled), open_runtime(scheduled, "reference")
     rng = np.random.default_rng(0)
     plain = scheduled.schedule("plain")
     for name in ("dense", "plain"):
@@ -115,13 +115,13 @@ def test_a_matrix_reads_no_older_residual_than_the_last_computed(scheduled: Arti
     with pytest.raises(IllegalPlanError, match=rf"step {k}, block 0, .* did not keep"):
         runtime.predict(obs, noise, gone)
     found, expected = (each.predict(obs, noise, there)[0] for each in (runtime, reference))
-    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+    assert_equal_but_for_rounding(found, expected, call_terms(scheduled))
     with pytest.raises(IllegalPlanError, match=rf"step {k}, block 0, .* did not keep"):  # that call computed none of it
         runtime.predict(obs, noise, gone)
 
 
 def test_a_first_matrix_after_a_plan_of_the_artifact_is_told_what_was_not_kept(scheduled: Artifact) -> None:
-    runtime = OnnxRuntime(scheduled)
+    runtime = open_runtime(scheduled)
     obs, noise = random_inputs(scheduled, np.random.default_rng(0), 1)
     plain = scheduled.schedule("plain")
     (k,) = np.flatnonzero((plain == C).all(axis=1))[1:]

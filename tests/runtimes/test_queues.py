@@ -72,10 +72,10 @@ def test_actions_come_one_by_one() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"tokens": None}, r"lacks \['tokens'\]"),
+        ({"tokens": None}, r"missing: \['tokens'\]"),
         (
             {"observation.state": np.zeros((1, 3, 2), np.float32)},
-            r"must be float32 \[B, 2\]; found float32 \[1, 3, 2\]",
+            r"expected float32 \[B, 2\]; found float32 \[1, 3, 2\]",
         ),
         ({"observation.state": np.zeros(2, np.float32)}, "needs a first axis of 1"),
         ({"observation.state": np.zeros((1, 2))}, "found float64"),

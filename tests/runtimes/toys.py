@@ -192,7 +192,7 @@ def toy_program(
                 node("feature", "squeeze.dim", squeezed, Ref("cond"), axis),
                 node("flat", "linear.default", flat, Ref("feature"), Ref("pruner.w"), Ref("pruner.b")),
                 node("masked", "add.Tensor", flat, Ref("flat"), Ref("pruner.mask")),
-                node("logits", "view.default", logits, Ref("masked"), (B, steps, blocks, 4)),
+                node("logits", "reshape.default", logits, Ref("masked"), (B, steps, blocks, 4)),
             ),
             ("logits",),
         )

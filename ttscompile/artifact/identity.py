@@ -15,10 +15,10 @@ from .strict_json import dump_compact
 def identities(manifest: Manifest) -> tuple[str, str]:
     """Identity and model identity of what a manifest describes; its own two fields are not read.
 
-    The model identity covers weights, tables, graphs, sampler, normalisers, observations, chunk and block table.
-    The identity covers that, the pruner's weights, all plans, which of them is the default, and blocks of
-    another precision: a calibration, which computes in fp32, belongs to the model with or without them. Neither covers
-    what people are told: source, FLOPs, reasons, sparsities, errors, calibration record, versions.
+    The model identity covers weights, tables, graphs, sampler, normalisers, observations, chunk and block table. The
+    identity covers that, the pruner's weights, all plans, which of them is the default, and blocks of another
+    precision: a calibration, which computes in fp32, belongs to the model with or without them. Neither covers what
+    people are told: source, FLOPs, reasons, sparsities, errors, calibration record, versions.
 
     Returns:
         Two sha256 of 64 digits.

@@ -5,14 +5,16 @@ Frozen records; ``codec`` writes and reads them. ``docs/design.md`` section 5.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any, Literal
 
 from ..core.lattice import PlanArray, plan_flops
+from ..core.rules import NotNegative, Positive, Rule, Sha256, Share
 from ..core.spec import FP32, PolicySpec
 from ..ir.graph import TensorType
-from ..ir.pieces import PRUNER
+from ..ir.pieces import OF_ALL_BLOCKS, PRUNER
 from ..ir.program import Binding
 
 FORMAT = "ttscompile artifact"
@@ -24,6 +26,18 @@ UNIFORM = "uniform"
 """The plan that calibration adds for comparisons alone: as many steps computed, evenly spaced. Not for a robot."""
 
 _SHOWN = 12
+
+FileName = Annotated[
+    str,
+    Rule(
+        "a plain file name: no folder, no leading dot, not manifest.json",
+        lambda name: re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}", name) and name != MANIFEST,
+    ),
+]
+Version = Annotated[str, Rule("a version like 1.23", re.compile(r"[0-9]+(\.[0-9]+)*").fullmatch)]
+OfContext = Annotated[
+    Binding, Rule("table, condition or step", (Binding.TABLE, Binding.CONDITION, Binding.STEP).__contains__)
+]
 
 
 @dataclass(frozen=True)
@@ -59,7 +73,7 @@ class PieceRecord:
         outputs: names of its outputs, in order.
     """
 
-    file: str
+    file: FileName
     inputs: tuple[str, ...]
     stream: str | None
     contexts: tuple[str, ...]
@@ -70,7 +84,7 @@ class PieceRecord:
 class ContextRecord:
     """A value that the loop reads beside the stream: when it is known, and what it is for one step."""
 
-    binding: Binding
+    binding: OfContext
     type: TensorType
 
 
@@ -125,9 +139,9 @@ class PlanRecord:
         flops_sparsity: the same with each cell weighed by its FLOPs.
     """
 
-    kind: str
-    sparsity: float | None
-    flops_sparsity: float | None
+    kind: Literal["schedule", "pruner"]
+    sparsity: Share | None
+    flops_sparsity: Share | None
 
     @property
     def pruned(self) -> bool:
@@ -139,7 +153,7 @@ class PlanRecord:
 class FileRecord:
     """What a file of the artifact must be."""
 
-    sha256: str
+    sha256: Sha256
     bytes: int
 
 
@@ -156,20 +170,20 @@ class Stores:
         golden_plans: what the reference runtime made of the plans when they were calibrated.
     """
 
-    program: str
-    weights: str
-    pruner: str | None
-    plans: str | None
-    golden: str | None = None
-    golden_plans: str | None = None
+    program: FileName
+    weights: FileName
+    pruner: FileName | None
+    plans: FileName | None
+    golden: FileName | None = None
+    golden_plans: FileName | None = None
 
 
 @dataclass(frozen=True)
 class Requires:
     """What the ONNX graphs need: the least onnxruntime, and their opset."""
 
-    onnxruntime: str
-    opset: int
+    onnxruntime: Version
+    opset: Positive
 
 
 @dataclass(frozen=True)
@@ -188,11 +202,11 @@ class PrecisionError:
             reference runtime's, as a share of its largest value.
     """
 
-    calls: int
-    mean: float
-    p90: float
-    largest: float
-    tolerance: float
+    calls: Positive
+    mean: NotNegative
+    p90: NotNegative
+    largest: NotNegative
+    tolerance: NotNegative
 
 
 @dataclass(frozen=True)
@@ -207,10 +221,15 @@ class PrecisionRecord:
         error: what it does to the actions; None before it is measured.
     """
 
-    name: str
-    weights: str
-    models: Mapping[str, str]
+    name: Annotated[str, Rule("one of 'int8'", "int8".__eq__)]
+    weights: FileName
+    models: Mapping[str, FileName]
     error: PrecisionError | None
+
+    @property
+    def blocks(self) -> int:
+        """How many residual blocks have such weights."""
+        return len(set(self.models) - set(OF_ALL_BLOCKS))
 
 
 @dataclass(frozen=True)
@@ -240,8 +259,8 @@ class Manifest:
 
     schema_version: int
     ttscompile_version: str
-    identity: str
-    model_identity: str
+    identity: Sha256
+    model_identity: Sha256
     spec: PolicySpec
     blocks: tuple[BlockRecord, ...]
     pieces: Mapping[str, PieceRecord]
@@ -253,7 +272,7 @@ class Manifest:
     calibration: Mapping[str, Any] | None
     stores: Stores
     requires: Requires
-    files: Mapping[str, FileRecord]
+    files: Mapping[FileName, FileRecord]
     precision: PrecisionRecord | None = None
 
     @property
@@ -280,3 +299,8 @@ class Manifest:
 def abbreviated(identity: str) -> str:
     """The first 12 digits of an identity, for people; JSON has all 64."""
     return identity[:_SHOWN]
+
+
+def marked(plan: str) -> str:
+    """The name of a plan in a table: the baseline, which no robot should run, is called so."""
+    return plan + " (baseline)" * (plan == UNIFORM)

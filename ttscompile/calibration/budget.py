@@ -13,7 +13,7 @@ from ..core.lattice import dense_plan
 from ..errors import CalibrationError
 
 SPARSITY, FLOPS, LATENCY, ERROR = "target_sparsity", "target_flops", "latency_ms", "max_action_error"
-"""The ways to ask."""
+"""The ways to ask for a plan: the names of the arguments of ``calibrate``."""
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,8 @@ class Goal:
         kind: ``target_sparsity``: share of the cells to reuse. ``target_flops``: share of the FLOPs of a dense call of
             the policy as it was to save, prologue and pruner counted. ``latency_ms``: a call with onnxruntime on this
             machine. ``max_action_error``: on held-out episodes, in the units of the actions.
-        value: in that unit.
-        threads: of the calls that are timed; for ``latency_ms`` alone.
+        value: the figure that was asked for, in the unit of its kind.
+        threads: how many threads the timed calls have; for ``latency_ms`` alone.
     """
 
     kind: str
@@ -101,7 +101,7 @@ def cells_of(goal: Goal, manifest: Manifest, pruned: bool) -> int:
 
     Args:
         goal: one of the two.
-        manifest: of the artifact.
+        manifest: the manifest of the artifact.
         pruned: whether the pruner may run.
 
     Raises:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -13,8 +14,9 @@ from torch import Tensor
 from ..core.spec import PolicySpec
 from ..errors import CalibrationError
 from ..ir.graph import Graph
+from ..runtimes.random_calls import normalized
 from ..runtimes.reference.model import Contexts, ReferenceModel
-from ..trajectories.episodes import Episode
+from ..trajectories.episodes import Episode, load_trajectories
 
 IntArray = npt.NDArray[np.int64]
 FloatArray = npt.NDArray[np.float32]
@@ -51,9 +53,9 @@ def split_episodes(count: int, fraction: float, seed: int) -> Split:
     """Divide episodes at random.
 
     Args:
-        count: number of episodes, at least two.
+        count: the number of episodes, at least two.
         fraction: of them for validation; at least one, and at least one is left to learn from.
-        seed: of the division.
+        seed: the seed of the division.
     """
     order = np.random.default_rng((seed, 0)).permutation(count)
     held_out = min(max(round(count * fraction), 1), count - 1)
@@ -61,6 +63,26 @@ def split_episodes(count: int, fraction: float, seed: int) -> Split:
         calibration=tuple(sorted(int(i) for i in order[held_out:])),
         validation=tuple(sorted(int(i) for i in order[:held_out])),
     )
+
+
+def load_episodes(
+    spec: PolicySpec,
+    trajectories: Sequence[str | os.PathLike[str]],
+    observation: Mapping[str, Sequence[str]] | None,
+) -> list[Episode]:
+    """The recorded episodes, as the policy observes them; see ``load_trajectories``.
+
+    Raises:
+        CalibrationError: there is only one.
+        TrajectoryError: the recordings do not fit the policy.
+    """
+    episodes = load_trajectories(trajectories, spec.observations, spec.chunk.stop - spec.chunk.start, observation)
+    if len(episodes) < 2:
+        raise CalibrationError(
+            "the trajectories hold one episode; expected at least two: a plan is judged on episodes that it was not"
+            " learned from. Record more; about sixteen are enough."
+        )
+    return episodes
 
 
 @dataclass(frozen=True)
@@ -71,16 +93,14 @@ class Calls:
         contexts: what the loop reads beside the stream.
         initial: the sample at step 0, ``[N, T, D]``.
         noise: the draw used at each step, ``[K, N, T, D]``; None if the sampler is deterministic.
-        targets: the denoised sample of the dense policy with the same noise, ``[N, T, D]``; empty before it is known.
-        episodes: number of the episode that each call is from, ``[N]``.
-        path: the sample of the dense policy after each step, ``[N, K, T, D]``; its last are the targets. None before
-            it is known.
+        episodes: the number of the episode that each call is from, ``[N]``.
+        path: the sample of the dense policy after each step with the same noise, ``[N, K, T, D]``; None before it is
+            known.
     """
 
     contexts: Contexts
     initial: Tensor
     noise: Tensor | None
-    targets: Tensor
     episodes: IntArray
     path: Tensor | None = None
 
@@ -89,9 +109,11 @@ class Calls:
         """N."""
         return len(self.initial)
 
-    def answered(self, path: Tensor) -> Calls:
-        """These calls with what the dense policy makes of them, ``[N, K, T, D]``."""
-        return replace(self, targets=path[:, -1], path=path)
+    @property
+    def targets(self) -> Tensor:
+        """The denoised sample of the dense policy, ``[N, T, D]``."""
+        assert self.path is not None
+        return self.path[:, -1]
 
 
 def sample_calls(
@@ -100,10 +122,10 @@ def sample_calls(
     """At most ``limit`` calls, drawn at random from some episodes: number of the episode, and row in it.
 
     Args:
-        episodes: all of them.
+        episodes: all recorded episodes.
         numbers: which to draw from.
         limit: number of calls.
-        seed: of the draw.
+        seed: the seed of the draw.
         repeats: how often a call may be drawn (it will have another noise each time), after all the others were.
     """
     draw = np.random.default_rng((seed, 1, *numbers))
@@ -122,11 +144,11 @@ def prepare_calls(
     """Draw the noise of calls and run the prologue.
 
     Args:
-        model: of the policy.
-        spec: of the policy.
-        episodes: all of them.
+        model: the reference model of the policy.
+        spec: the specification of the policy.
+        episodes: all recorded episodes.
         chosen: number of the episode, and row in it, of each call.
-        seed: of the noise.
+        seed: the seed of the noise.
 
     Returns:
         The calls, without targets.
@@ -137,14 +159,10 @@ def prepare_calls(
     noise = None
     if spec.sampler.stochastic:
         noise = torch.from_numpy(draw.standard_normal((spec.sampler.steps, *shape), dtype=np.float32))
-    normalized = {}
-    for key, one in spec.observations.items():
-        array = np.stack([episodes[n].observations[key][row] for n, row in chosen])
-        normalized[key] = torch.from_numpy(array if one.normalizer is None else one.normalizer.normalize(array))
+    observed = {key: np.stack([episodes[n].observations[key][row] for n, row in chosen]) for key in spec.observations}
     with torch.no_grad():
-        contexts = model.prologue(normalized)
-    numbers = np.array([n for n, _ in chosen], np.int64)
-    return Calls(contexts, initial, noise, torch.empty(0, *spec.sample), numbers)
+        contexts = model.prologue({key: torch.from_numpy(one) for key, one in normalized(spec, observed).items()})
+    return Calls(contexts, initial, noise, np.array([n for n, _ in chosen], np.int64))
 
 
 class Selector:
@@ -165,7 +183,6 @@ class Selector:
             contexts=Contexts(len(index), self._take(contexts.condition, index), steps),
             initial=calls.initial[index],
             noise=None if calls.noise is None else calls.noise[:, index],
-            targets=calls.targets[index] if len(calls.targets) else calls.targets,
             episodes=calls.episodes[index.numpy()],
             path=None if calls.path is None else calls.path[index],
         )
@@ -179,10 +196,10 @@ class Selector:
 
 
 class Actions:
-    """From denoised samples to what is executed, and how far two of them are apart.
+    """Finds what is executed of denoised samples, and how far two of them are apart.
 
     Args:
-        spec: of the policy.
+        spec: the specification of the policy.
 
     Attributes:
         size: number of executed action numbers of a call.

@@ -20,7 +20,7 @@ class Clock:
         begun: reading of ``time.monotonic`` when this part began; None for now.
 
     Attributes:
-        limit: see above.
+        limit: the argument of this name.
         cut: whether anything was left out for want of time.
     """
 
@@ -29,7 +29,7 @@ class Clock:
         self._zero = (time.monotonic() if begun is None else begun) - before
 
     def elapsed(self) -> float:
-        """Seconds so far."""
+        """Seconds of work so far."""
         return time.monotonic() - self._zero
 
     def left(self) -> float:

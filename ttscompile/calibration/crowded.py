@@ -1,21 +1,38 @@
-"""Where a search starts: whole steps, crowded where the policy needs them."""
+"""Whole steps, crowded where the policy needs them: where a search starts, and the best for a number of steps.
+
+The best are for an error budget, and for plans beside the target.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+
+from ..errors import CalibrationFailedError
+from .budget import Budget, Goal
+from .clock import Clock
+from .progress import Bar
+from .state import StateFile
+from .whole_steps import Errors, WholeSteps
 
 CROWDING = (2.0, 3.0, 1.5, 4.0, 1.0, 2.5, 3.5, 5.0, 0.6, 0.4)
 """1 is even, above it the steps crowd towards the end, below it towards the start. In the order in which they are
 tried: late steps mattered most wherever it was measured, and time may end the search."""
+
+COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
+"""Numbers of computed steps that an error budget is tried with, before bisection between two of them."""
+
+TRIED = (1.0, 2.0, 3.0, 4.0)
+"""Those of ``CROWDING`` that are tried while only the number of steps is in question."""
 
 
 def crowded_steps(steps: int, full_steps: int, crowding: float) -> tuple[int, ...]:
     """Which steps to compute, in order.
 
     Args:
-        steps: K.
+        steps: K, the number of denoising steps.
         full_steps: how many steps are computed; step 0 is one of them.
         crowding: the i-th of m is at ``K * (1 - (1 - i/m) ** crowding)``.
     """
@@ -30,3 +47,114 @@ def crowded_steps(steps: int, full_steps: int, crowding: float) -> tuple[int, ..
 def crowded_family(steps: int, full_steps: int, crowding: Sequence[float] = CROWDING) -> list[tuple[int, ...]]:
     """The different schedules that compute ``full_steps`` of the steps."""
     return list(dict.fromkeys(crowded_steps(steps, full_steps, one) for one in crowding))
+
+
+@dataclass(frozen=True)
+class Best:
+    """The best of a family.
+
+    Attributes:
+        steps: that are computed.
+        error: on calls that its correction was not fitted on, in the units of the actions.
+    """
+
+    steps: tuple[int, ...]
+    error: float
+
+
+class CrowdedSchedules:
+    """Compares crowded schedules, and remembers every comparison in the state.
+
+    Args:
+        whole: compares schedules of whole steps.
+        state: the state of the calibration.
+        clock: nothing is begun that would end, with the correction and the judgement that follow, after its limit.
+        bar: shows the progress.
+    """
+
+    KEY = "crowded"
+
+    def __init__(self, whole: WholeSteps, state: StateFile, clock: Clock, bar: Bar) -> None:
+        self._whole, self._state, self._clock, self._bar = whole, state, clock, bar
+
+    def best(self, full_steps: int, what: str, crowding: Sequence[float] = CROWDING) -> Best | None:
+        """The best of the family of ``full_steps`` computed steps, of those that there was time for; None if of none.
+
+        Args:
+            full_steps: how many steps are computed, at least one.
+            what: what the schedule is for, as the bar shows it.
+            crowding: the crowdings of the members of the family.
+        """
+        found: tuple[Errors, tuple[int, ...]] | None = None
+        members = crowded_family(self._whole.steps, full_steps, crowding)
+        self._bar.stage(what, len(members))
+        for number, steps in enumerate(members):
+            errors = self._errors(steps)
+            if errors is None:
+                break
+            if found is None or errors.normalised < found[0].normalised:
+                found = errors, steps
+            self._bar.update(number + 1, f"error {found[0].units:.4g}", self._clock.left())
+        return None if found is None else Best(found[1], found[0].units)
+
+    def _errors(self, steps: tuple[int, ...]) -> Errors | None:
+        """The errors of a schedule; None if they are not known and there is no time."""
+        known = self._state.progress.setdefault(self.KEY, {})
+        key = ",".join(map(str, steps))
+        if key not in known:
+            # All plans together are judged on fewer calls than one is compared on: that takes no longer.
+            if 2 * self._whole.comparing(len(steps)) + self._whole.correcting(len(steps)) > self._clock.left():
+                return None
+            errors = self._whole.errors(steps)
+            known[key] = [errors.normalised, errors.units]
+            self._state.progress["seconds"] = self._clock.elapsed()
+            self._state.save()
+        with self._state.reading():
+            normalised, units = known[key]
+            return Errors(float(normalised), float(units))
+
+
+def budget_of_error(crowded: CrowdedSchedules, goal: Goal, steps: int, blocks: int) -> Budget:
+    """The fewest whole steps with which a crowded schedule is as good as was asked for.
+
+    Judged on calls to learn from that its correction was not fitted on: the held-out episodes stay out of it.
+
+    Args:
+        crowded: compares crowded schedules.
+        goal: of kind ``max_action_error``.
+        steps: K, the number of denoising steps.
+        blocks: number of residual blocks.
+
+    Raises:
+        CalibrationFailedError: no plan that reuses at least half of the cells is, or the time is up before one is.
+    """
+    tried: dict[int, float] = {}
+
+    def enough(full: int) -> bool:
+        best = crowded.best(full, f"{full} steps", TRIED)
+        if best is None:
+            raise CalibrationFailedError(
+                f"the time limit ended the search for a plan with an action error of at most {goal.value:g}:"
+                f" {_told(tried)}. The artifact is as it was. Allow more time, or a larger error."
+            )
+        tried[full] = best.error
+        return best.error <= goal.value
+
+    most, low = max(1, steps // 2), 0
+    for high in [count for count in COUNTS if count < most] + [most]:
+        if enough(high):
+            break
+        low = high
+    else:
+        raise CalibrationFailedError(
+            f"max action error {goal.value:g} cannot be reached by a plan that reuses at least half of the cells:"
+            f" {_told(tried)}. The artifact is as it was. Allow a larger error, or use the dense plan."
+        )
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if enough(middle) else (middle, high)
+    return Budget(goal, high * blocks, {"errors": {str(full): error for full, error in sorted(tried.items())}})
+
+
+def _told(tried: dict[int, float]) -> str:
+    return ", ".join(f"{error:.4g} with {full} of the steps computed" for full, error in tried.items()) or "none tried"

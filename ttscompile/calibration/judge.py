@@ -8,59 +8,53 @@ from ..artifact.load import Artifact
 from ..artifact.manifest import UNIFORM, Manifest
 from ..core.lattice import PlanArray, uniform_plan
 from ..errors import CalibrationFailedError
-from ..runtimes.base import pruner_plan
+from ..ir.pieces import PRUNER
+from ..runtimes.settle import pruner_plan
 from .budget import ERROR, FLOPS, Goal
-from .calls import LARGEST, Actions, Calls
+from .calls import LARGEST, Actions, Calls, FloatArray
 from .execute import Executor
-from .named import Named
 from .result import CalibrationResult, PlanScore
-from .strategies import Found
+from .strategies import FITTED, strategy_of
+from .task import Found
 
-PRUNED, SCHEDULE = "tts", "schedule"
-"""Names of plans in the artifact: the pruner's, and the best that does not depend on the observation."""
-
-BASELINE = "interval"
-"""The strategy that is no better than the uniform schedule, and need not be."""
+SCHEDULE = "schedule"
+"""Name in the artifact of the best plan that does not depend on the observation."""
 
 BETTER = 0.9
 """A plan has to bring the error below this share of the uniform schedule's."""
 
 
-def uniform_of(artifact: Artifact, budget: int) -> PlanArray:
+def uniform_of(manifest: Manifest, budget: int) -> Found:
     """The baseline: whole steps, evenly spaced; the last cells of the budget are rounded up to one, in its favour."""
-    manifest = artifact.manifest
     blocks = len(manifest.blocks)
-    return uniform_plan(manifest.steps, blocks, -(-budget // blocks))
+    return Found(uniform_plan(manifest.steps, blocks, -(-budget // blocks)))
 
 
-def judge(
-    artifact: Artifact, executor: Executor, found: Found, named: Named, calls: Calls, budget: int
-) -> dict[str, PlanScore]:
-    """Scores of the plans that a strategy found, of those beside it, and of the baseline.
+def judge(artifact: Artifact, executor: Executor, plans: Mapping[str, Found], calls: Calls) -> dict[str, PlanScore]:
+    """Scores of plans, and of those of the pruner that belongs to the one that is called ``schedule``.
 
     Args:
-        artifact: the policy.
-        executor: of the policy.
-        found: by the strategy.
-        named: plans beside the target.
-        calls: of episodes that it did not learn from, with targets.
-        budget: computed cells.
+        artifact: the artifact of the policy.
+        executor: runs the policy.
+        plans: the plans by name.
+        calls: of episodes that nothing was learned from, with targets.
 
     Returns:
         By the name of the plan.
     """
-    manifest, actions = artifact.manifest, Actions(artifact.manifest.spec)
-    scores = {}
-    corrected, plain = executor.corrected(found.correction), executor.corrected(None)
-    judged = [(SCHEDULE, found.schedule, corrected), (UNIFORM, uniform_of(artifact, budget), plain)]
-    judged += [(name, one.plan, executor.corrected(one.correction)) for name, one in named.plans.items()]
-    for name, plan, runs in judged:
-        errors = actions.errors(runs.run(plan, calls), calls.targets, units=True)
-        scores[name] = PlanScore.of(errors, plan[None], manifest.flops, pruned=False)
+    flops, actions = artifact.manifest.flops, Actions(artifact.manifest.spec)
+
+    def errors(found: Found, plan: PlanArray) -> FloatArray:
+        return actions.errors(executor.corrected(found.correction).run(plan, calls), calls.targets, units=True)
+
+    scores = {
+        name: PlanScore.of(errors(found, found.schedule), found.schedule[None], flops, pruned=False)
+        for name, found in plans.items()
+    }
+    found = plans[SCHEDULE]
     if found.pruner is not None:
-        plans = pruner_plan(executor.logits(calls, found.pruner))
-        errors = actions.errors(corrected.run(plans, calls), calls.targets, units=True)
-        scores[PRUNED] = PlanScore.of(errors, plans, manifest.flops, pruned=True)
+        made = pruner_plan(executor.logits(calls, found.pruner))
+        scores[PRUNER] = PlanScore.of(errors(found, made), made, flops, pruned=True)
     return scores
 
 
@@ -68,23 +62,23 @@ def default_of(scores: Mapping[str, PlanScore], goal: Goal, cells: int, manifest
     """The pruner's plans if they are no worse than the schedule on held-out calls, and keep the budget as it does.
 
     Args:
-        scores: of all plans.
+        scores: the scores of all plans.
         goal: what was asked for.
-        cells: what it comes to.
-        manifest: of the artifact.
+        cells: how many computed cells the goal comes to.
+        manifest: the manifest of the artifact.
     """
-    pruned = scores.get(PRUNED)
+    pruned = scores.get(PRUNER)
     if pruned is None or pruned.sparsity < goal.sparsity(cells, manifest) - 1e-9:
         return SCHEDULE
     saves = goal.kind != FLOPS or pruned.flops_saved >= goal.value - 1e-9
-    return PRUNED if saves and pruned.error <= scores[SCHEDULE].error else SCHEDULE
+    return PRUNER if saves and pruned.error <= scores[SCHEDULE].error else SCHEDULE
 
 
 def require_success(result: CalibrationResult, goal: Goal) -> None:
     """Raise unless the default plan is what was asked for.
 
     Args:
-        result: of the calibration.
+        result: the result of the calibration.
         goal: what was asked for.
 
     Raises:
@@ -103,7 +97,7 @@ def require_success(result: CalibrationResult, goal: Goal) -> None:
         raise CalibrationFailedError(
             f"{what} saves {chosen.flops_saved:.4f} of the FLOPs of a dense call; the target is {goal.value:g}: its"
             " blocks cost more than the average. The artifact is as it was. Raise the target a little, or take strategy"
-            " 'tts', which computes whole steps."
+            f" {' or '.join(map(repr, FITTED))}, which computes whole steps."
         )
     if goal.kind == ERROR and not chosen.error <= goal.value:
         raise CalibrationFailedError(
@@ -111,7 +105,7 @@ def require_success(result: CalibrationResult, goal: Goal) -> None:
             f" validation calls; at most {goal.value:g} was asked for. The artifact is as it was. Allow a larger error,"
             " more time, or calibrate with more episodes."
         )
-    if result.strategy != BASELINE and not chosen.error < BETTER * baseline.error:
+    if not strategy_of(result.strategy).baseline and not chosen.error < BETTER * baseline.error:
         raise CalibrationFailedError(
             f"{what} is no better than the uniform schedule: on the validation calls its actions are {chosen.error:.4g}"
             f" off on average, the uniform schedule's {baseline.error:.4g} (expected below {BETTER:.0%} of that). The"

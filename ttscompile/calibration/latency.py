@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
@@ -10,34 +9,34 @@ import numpy as np
 
 from ..artifact.load import Artifact
 from ..artifact.manifest import PlanRecord
-from ..core.correction import Correction
-from ..core.lattice import PlanArray, sparsity, uniform_plan
+from ..core.lattice import sparsity, uniform_plan
 from ..core.spec import Noise
 from ..errors import CalibrationError
-from ..runtimes.base import Runtime, open_runtime
+from ..measure.timer import Timer
+from ..runtimes.open import open_runtime
 from ..runtimes.policy import CompiledPolicy
+from ..runtimes.runtime import Runtime
 from .budget import LATENCY, Budget, Goal
+from .task import Found
 
 WARM_UP, FEWEST, MOST, SECONDS = 2, 5, 25, 2.0
 """Calls of a plan that are not counted; that are, at least and at most; and after how long no more are made."""
 
 
-def with_plans(
-    artifact: Artifact, plans: Mapping[str, PlanArray], corrections: Mapping[str, Correction] | None = None
-) -> Artifact:
+def with_plans(artifact: Artifact, plans: Mapping[str, Found]) -> Artifact:
     """The artifact, in memory, with more schedules: a runtime treats them as it does those of the file.
 
     Args:
-        artifact: loaded.
-        plans: int8 ``[K, blocks]`` by name.
-        corrections: by the name of their plan.
+        artifact: a loaded artifact.
+        plans: the plans by name.
     """
-    records = {name: PlanRecord("schedule", sparsity(plan), None) for name, plan in plans.items()}
+    records = {name: PlanRecord("schedule", sparsity(one.schedule), None) for name, one in plans.items()}
+    corrections = {name: one.correction for name, one in plans.items() if one.correction is not None}
     return replace(
         artifact,
         manifest=replace(artifact.manifest, plans={**artifact.manifest.plans, **records}),
-        schedules={**artifact.schedules, **plans},
-        corrections={**artifact.corrections, **(corrections or {})},
+        schedules={**artifact.schedules, **{name: one.schedule for name, one in plans.items()}},
+        corrections={**artifact.corrections, **corrections},
     )
 
 
@@ -48,7 +47,7 @@ def measure_budget(artifact: Artifact, goal: Goal, pruned: bool) -> Budget:
     run, what the loop waits for it is added.
 
     Args:
-        artifact: the policy.
+        artifact: the artifact of the policy.
         goal: of kind ``latency_ms``.
         pruned: whether the pruner may run.
 
@@ -58,8 +57,7 @@ def measure_budget(artifact: Artifact, goal: Goal, pruned: bool) -> Budget:
     assert goal.kind == LATENCY
     steps, blocks = artifact.manifest.steps, len(artifact.manifest.blocks)
     names = {full: f"{full} steps" for full in range(1, steps + 1)}
-    plans = {name: uniform_plan(steps, blocks, full) for full, name in names.items()}
-    whole = with_plans(artifact, plans)
+    whole = with_plans(artifact, {name: Found(uniform_plan(steps, blocks, full)) for full, name in names.items()})
     runtime = open_runtime(whole, "onnxruntime", goal.threads)
     policy = CompiledPolicy(whole, runtime, seed=0)
     obs = {key: np.zeros((1, *one.shape), one.dtype) for key, one in artifact.manifest.spec.observations.items()}
@@ -92,15 +90,11 @@ def measure_budget(artifact: Artifact, goal: Goal, pruned: bool) -> Budget:
 
 def median_ms(call: Callable[[], object]) -> float:
     """Median wall time of a call, in milliseconds."""
-    for _ in range(WARM_UP):
-        call()
-    times: list[float] = []
-    begun = time.perf_counter()
-    while len(times) < FEWEST or (len(times) < MOST and time.perf_counter() - begun < SECONDS):
-        start = time.perf_counter()
-        call()
-        times.append(1000 * (time.perf_counter() - start))
-    return float(np.median(times))
+    timer = Timer(1, WARM_UP)
+    while timer.counted < FEWEST or (timer.counted < MOST and timer.seconds < SECONDS):
+        timer.round()
+        timer.time(0, call)
+    return timer.times[0].median
 
 
 def _pruner_ms(artifact: Artifact, runtime: Runtime) -> float:

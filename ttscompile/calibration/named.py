@@ -5,67 +5,33 @@ Both are whole steps, the best of the crowded family, with a correction fitted o
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-
-from ..core.correction import Correction
-from ..core.lattice import PlanArray
-from .families import Families
-from .strategies import Task
-from .whole_steps import WholeSteps
+from .crowded import CrowdedSchedules
+from .strategies import Strategy
+from .task import Found, Task
 
 SAFE, FAST = "safe", "fast"
 
 SHARE = 0.2
-"""Of the time that is kept from the search, for these plans."""
+"""Share of the time limit that is kept from the search for these plans."""
 
 
-@dataclass(frozen=True)
-class NamedPlan:
-    """A plan beside the target.
-
-    Attributes:
-        steps: that it computes.
-        plan: int8 ``[K, blocks]``.
-        correction: None where it is better without.
-    """
-
-    steps: tuple[int, ...]
-    plan: PlanArray
-    correction: Correction | None
-
-
-@dataclass(frozen=True)
-class Named:
-    """Plans beside the target.
-
-    Attributes:
-        plans: by name.
-        skipped: why a name has no plan.
-    """
-
-    plans: Mapping[str, NamedPlan] = field(default_factory=dict)
-    skipped: Mapping[str, str] = field(default_factory=dict)
-
-    def without(self, name: str, reason: str) -> Named:
-        """The same without one of the plans, and why."""
-        kept = {other: plan for other, plan in self.plans.items() if other != name}
-        return Named(kept, {**self.skipped, name: reason})
-
-
-def named_plans(families: Families, whole: WholeSteps, task: Task, strategy: str, cells: int) -> Named:
-    """Those of ``safe`` and ``fast`` that can be made.
+def named_plans(
+    crowded: CrowdedSchedules, task: Task, strategy: Strategy, cells: int
+) -> tuple[dict[str, Found], dict[str, str]]:
+    """Make ``safe`` and ``fast``, where they can be made.
 
     Args:
-        families: compares schedules.
-        whole: makes them.
-        task: with the calls that corrections are fitted on.
-        strategy: that found the target's plan; only ``tts`` has corrections.
-        cells: computed by the target's plan.
+        crowded: compares crowded schedules.
+        task: has the calls that corrections are fitted on.
+        strategy: the strategy that found the target's plan.
+        cells: how many cells the target's plan computes.
+
+    Returns:
+        Plans by name, with the computed steps in their notes; and by name why there is no plan.
     """
-    if strategy != "tts":
-        reason = f"strategy {strategy!r} fits no correction"
-        return Named(skipped={SAFE: reason, FAST: reason})
+    if not strategy.fits_correction:
+        reason = f"strategy {strategy.name!r} fits no correction"
+        return {}, {SAFE: reason, FAST: reason}
     model = task.executor.model
     target = max(1, cells // model.blocks)
     skipped: dict[str, str] = {}
@@ -78,11 +44,11 @@ def named_plans(families: Families, whole: WholeSteps, task: Task, strategy: str
         counts[FAST] = max(2, target // 2)
     else:
         skipped[FAST] = f"the target computes {target} whole step{'s' * (target > 1)}: half of that is too little"
-    plans: dict[str, NamedPlan] = {}
+    plans: dict[str, Found] = {}
     for name, count in counts.items():
-        best = families.best(count, f"plan {name}")
+        best = crowded.best(count, f"plan {name}")
         if best is None:
             skipped[name] = "the time limit left none for it"
         else:
-            plans[name] = NamedPlan(best.steps, whole.plan(best.steps), whole.correction(best.steps))
-    return Named(plans, skipped)
+            plans[name] = task.whole_steps(best.steps)
+    return plans, skipped

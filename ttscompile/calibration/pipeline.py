@@ -8,6 +8,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,25 +20,25 @@ from ..core.correction import FEATURES
 from ..core.lattice import sparsity
 from ..errors import CalibrationError
 from ..ir.pieces import PRUNER
-from ..trajectories.episodes import Episode, load_trajectories
+from ..trajectories.episodes import Episode
 from ..verification.record_golden import record_plans
 from .budget import ERROR, LATENCY, Budget, Goal, cells_of, goal_of
-from .calls import Actions, Calls, require_seed, split_episodes
+from .calls import Calls, load_episodes, require_seed, split_episodes
 from .clock import Clock
+from .crowded import CrowdedSchedules, budget_of_error
 from .execute import Executor
-from .families import Families, budget_of_error
-from .head import has_head
-from .judge import PRUNED, SCHEDULE, default_of, judge, require_success, uniform_of
+from .judge import SCHEDULE, default_of, judge, require_success, uniform_of
 from .latency import measure_budget
-from .named import SAFE, SHARE, Named, named_plans
-from .precision import precision_record
+from .named import SAFE, SHARE, named_plans
+from .precision_error import precision_record
 from .progress import Bar
+from .pruner.head import has_head
 from .result import CalibrationResult
-from .search import search_plan
+from .search import open_search, search_plan
 from .state import StateFile
-from .strategies import Found, Strategy, Task, open_strategy, require_reach, require_strategy
+from .strategies import DEFAULT, FITTED, Strategy, strategy_of
 from .targets import draw_calls, with_targets
-from .whole_steps import WholeSteps
+from .task import Found, Search, Task
 
 CALLS_A_MINUTE = 64
 """Calls to learn from, for each minute of the time limit."""
@@ -56,7 +57,7 @@ def calibrate(
     path: str | os.PathLike[str],
     trajectories: Sequence[str | os.PathLike[str]],
     target_sparsity: float | None = None,
-    strategy: str = "tts",
+    strategy: str = DEFAULT,
     seed: int = 0,
     resume: bool = False,
     *,
@@ -78,22 +79,22 @@ def calibrate(
     same bytes, unless the time limit cuts something short, or the budget is a latency, which is measured.
 
     At most one budget: ``target_sparsity``, ``target_flops``, ``latency_ms`` or ``max_action_error``. Beside the plan
-    that keeps it, ``schedule``, the artifact gets ``uniform``, the baseline; and with strategy ``tts`` ``safe``, which
-    computes twice as many cells, and ``fast``, which computes half as many.
+    that keeps it, ``schedule``, the artifact gets ``uniform``, the baseline. A strategy that fits corrections adds
+    ``safe``, which computes twice as many cells, and ``fast``, which computes half as many.
 
     Args:
         path: the artifact's directory.
         trajectories: recordings: ``.npz``, zarr, HDF5 or LeRobot data sets, see ``ttscompile.trajectories``.
         target_sparsity: share of the cells to reuse; if no budget is given, 0.95, or what leaves five whole steps.
         strategy: how the plan is found, see ``ttscompile.calibration.strategies``.
-        seed: of the split, the noise and the search.
+        seed: the seed of the split, the noise and the search.
         resume: go on where a calibration with the same arguments was interrupted, with the same calls whatever
             ``max_minutes`` is now; begins anew if none was.
         target_flops: share of the FLOPs of a dense call to save, prologue and pruner counted.
         latency_ms: of a call with onnxruntime on this machine. Measured once, for as many whole steps as fit.
         max_action_error: mean absolute error of the executed actions on held-out episodes, in their units; the plan is
-            the sparsest that was found below it. Strategy ``tts`` only.
-        threads: of the calls that are timed for ``latency_ms``.
+            the sparsest that was found below it. Only with a strategy that fits corrections.
+        threads: how many threads the calls have that are timed for ``latency_ms``.
         max_minutes: the best plan so far is taken in time to be finished by then, as far as what was done before lets
             it be known; what has to be done at least is done. Also decides how many calls are used.
         validation_fraction: of the episodes.
@@ -116,21 +117,16 @@ def calibrate(
     goal_of(*asked)  # what cannot be is refused before anything is read
     artifact = load_artifact(Path(path))
     goal = goal_of(*asked, usual=usual_sparsity(artifact.manifest.steps))
-    spec = artifact.manifest.spec
+    spec, chosen = artifact.manifest.spec, strategy_of(strategy)
     if not Path(path).is_dir():
         raise CalibrationError(
             f"{path}: only a directory can be calibrated. Unzip the artifact and give the directory."
         )
-    budget = _known_budget(artifact, goal, strategy, validation_fraction, max_minutes, seed)
-    episodes = load_trajectories(trajectories, spec.observations, spec.chunk.stop - spec.chunk.start, observation)
-    if len(episodes) < 2:
-        raise CalibrationError(
-            "the trajectories hold one episode; expected at least two: a plan is judged on episodes that it was not"
-            " learned from. Record more; about sixteen are enough."
-        )
+    budget = _known_budget(artifact, goal, chosen, validation_fraction, max_minutes, seed)
+    episodes = load_episodes(spec, trajectories, observation)
     split = split_episodes(len(episodes), validation_fraction, seed)
     features = FEATURES * spec.sample[0] + 1
-    fewest = min(CALLS_A_FEATURE * features, MOST_CALLS) if strategy == "tts" else FEWEST_CALLS
+    fewest = min(CALLS_A_FEATURE * features, MOST_CALLS) if chosen.fits_correction else FEWEST_CALLS
     limit = int(np.clip(CALLS_A_MINUTE * max_minutes, fewest, MOST_CALLS))
     state = StateFile(
         Path(path),
@@ -149,7 +145,7 @@ def calibrate(
     limit = state.progress.setdefault("calls", limit)  # whatever time there is to go on
     clock = Clock(60 * max_minutes, float(state.progress.get("seconds", 0.0)), begun)
     if goal.kind == LATENCY:
-        budget = _timed_budget(artifact, goal, strategy, state, clock)
+        budget = _timed_budget(artifact, goal, chosen, state, clock)
     executor = Executor(artifact)
     sets = draw_calls(executor, spec, episodes, split, limit, min(JUDGED, limit // 2), seed)
     with Bar(progress) as bar:
@@ -164,21 +160,20 @@ def calibrate(
                 f"{max_minutes:g} minutes were over when the dense policy had answered the calls to learn from:"
                 f" strategy {strategy!r} needs {fewest}. Its search is the shortest there is; allow more time."
             )
-        kinds = tuple(block.kind for block in artifact.manifest.blocks)
-        task = Task(executor, Actions(spec), sets["calibration"], len(kinds), seed, artifact.pruner, kinds)
-        whole = WholeSteps(task)
-        families = Families(whole, state, clock, bar)
+        task = Task.of(artifact, executor, sets["calibration"], 0, seed)
+        crowded = CrowdedSchedules(task.whole, state, clock, bar)
         if budget is None:
-            budget = budget_of_error(families, goal, artifact.manifest.steps, len(kinds))
-        task = replace(task, budget=budget.cells, clock=clock.until(1 - SHARE) if strategy == "tts" else clock)
-        found, intervals, stopped = _search(open_strategy(strategy, task, whole), state, task.clock, bar, max_intervals)
+            budget = budget_of_error(crowded, goal, artifact.manifest.steps, len(artifact.manifest.blocks))
+        task = replace(task, budget=budget.cells, clock=clock.until(1 - SHARE) if chosen.fits_correction else clock)
+        found, intervals, stopped = _search(open_search(strategy, task), state, task.clock, bar, max_intervals)
         if goal.kind == ERROR:
-            found, budget = _relax(artifact, families, whole, task, found, budget, sets["validation"])
-        named = named_plans(families, whole, task, strategy, budget.cells)
-    scores = judge(artifact, executor, found, named, sets["validation"], budget.cells)
+            found, budget = _relax(artifact, crowded, task, found, budget, sets["validation"])
+        named, skipped = named_plans(crowded, task, chosen, budget.cells)
+    plans = {SCHEDULE: found, UNIFORM: uniform_of(artifact.manifest, budget.cells), **named}
+    scores = judge(artifact, executor, plans, sets["validation"])
     if SAFE in scores and not scores[SAFE].error < scores[SCHEDULE].error:
-        error = scores.pop(SAFE).error
-        named = named.without(SAFE, f"{error:.4g} off, no safer than {SCHEDULE}: its search was cut short")
+        del plans[SAFE]
+        skipped[SAFE] = f"{scores.pop(SAFE).error:.4g} off, no safer than {SCHEDULE}: its search was cut short"
     result = CalibrationResult(
         strategy=strategy,
         seed=seed,
@@ -186,7 +181,7 @@ def calibrate(
         budget=budget.record(),
         default_plan=default_of(scores, goal, budget.cells, artifact.manifest),
         plans=scores,
-        skipped=named.skipped,
+        skipped=skipped,
         episodes={"calibration": split.calibration, "validation": split.validation},
         calls={name: calls.count for name, calls in sets.items()},
         intervals=intervals,
@@ -195,27 +190,26 @@ def calibrate(
     )
     require_success(result, goal)
     precision = precision_record(artifact, episodes, split.validation, SCHEDULE, found.schedule, found.correction, seed)
-    _write(Path(path), artifact, result, found, named, {**found.notes, **precision})
+    _write(Path(path), artifact, result, plans, precision)
     state.remove()
     return result
 
 
 def _write(
-    path: Path, artifact: Artifact, result: CalibrationResult, found: Found, named: Named, notes: dict[str, object]
+    path: Path, artifact: Artifact, result: CalibrationResult, plans: Mapping[str, Found], precision: Mapping[str, Any]
 ) -> None:
     """Put the plans into the artifact."""
-    corrections = {name: one.correction for name, one in named.plans.items() if one.correction is not None}
-    if found.correction is not None:
-        corrections[SCHEDULE] = found.correction
-        if found.pruner is not None:
-            corrections[PRUNED if result.default_plan == PRUNED else PRUNER] = found.correction
-    uniform = uniform_of(artifact, int(result.budget["cells"]))
+    found = plans[SCHEDULE]
+    corrections = {name: one.correction for name, one in plans.items() if one.correction is not None}
+    if found.pruner is not None and found.correction is not None:
+        corrections[PRUNER] = found.correction
+    steps = {name: one.notes["steps"] for name, one in plans.items() if name not in (SCHEDULE, UNIFORM)}
     update_calibration(
         path,
         found.pruner,
-        {SCHEDULE: found.schedule, UNIFORM: uniform, **{name: one.plan for name, one in named.plans.items()}},
+        {name: one.schedule for name, one in plans.items()},
         result.default_plan,
-        {**result.record(), **notes, "named_steps": {name: list(one.steps) for name, one in named.plans.items()}},
+        {**result.record(), **found.notes, **precision, "named_steps": steps},
         corrections=corrections,
         model_identity=artifact.manifest.model_identity,
         golden=record_plans,
@@ -223,28 +217,27 @@ def _write(
 
 
 def _known_budget(
-    artifact: Artifact, goal: Goal, strategy: str, fraction: float, minutes: float, seed: int
+    artifact: Artifact, goal: Goal, strategy: Strategy, fraction: float, minutes: float, seed: int
 ) -> Budget | None:
     """The budget where nothing has to be run for it; refuses what cannot be satisfied before any work."""
-    require_strategy(strategy)
     if not 0 < fraction < 1 or not minutes > 0:
         raise CalibrationError(
             f"expected validation_fraction between 0 and 1 and max_minutes above 0; found {fraction} and {minutes}."
         )
     require_seed(seed)
-    if goal.kind == ERROR and strategy != "tts":
+    if goal.kind == ERROR and not strategy.fits_correction:
         raise CalibrationError(
-            f"max_action_error needs strategy 'tts'; found {strategy!r}. Give this strategy a target_sparsity, a"
-            " target_flops or a latency_ms."
+            f"max_action_error needs strategy {' or '.join(map(repr, FITTED))}; found {strategy.name!r}. Give this"
+            " strategy a target_sparsity, a target_flops or a latency_ms."
         )
     if goal.kind in (LATENCY, ERROR):
         return None
     cells = cells_of(goal, artifact.manifest, _may_prune(artifact, strategy))
-    require_reach(strategy, artifact.manifest.steps, len(artifact.manifest.blocks), cells)
+    strategy.require_reach(artifact.manifest.steps, len(artifact.manifest.blocks), cells)
     return Budget(goal, cells)
 
 
-def _timed_budget(artifact: Artifact, goal: Goal, strategy: str, state: StateFile, clock: Clock) -> Budget:
+def _timed_budget(artifact: Artifact, goal: Goal, strategy: Strategy, state: StateFile, clock: Clock) -> Budget:
     """The budget of a latency: measured, or what was measured before an interruption."""
     known = state.progress.get("latency")
     if known is None:
@@ -253,16 +246,16 @@ def _timed_budget(artifact: Artifact, goal: Goal, strategy: str, state: StateFil
         state.save()
     else:
         budget = Budget(goal, known["cells"], known["measured"])
-    require_reach(strategy, artifact.manifest.steps, len(artifact.manifest.blocks), budget.cells)
+    strategy.require_reach(artifact.manifest.steps, len(artifact.manifest.blocks), budget.cells)
     return budget
 
 
-def _may_prune(artifact: Artifact, strategy: str) -> bool:
+def _may_prune(artifact: Artifact, strategy: Strategy) -> bool:
     """Whether plans may be made by the pruner, whose cost then counts."""
-    return strategy == "tts" and has_head(artifact.pruner)
+    return strategy.uses_pruner and has_head(artifact.pruner)
 
 
-def _search(search: Strategy, state: StateFile, clock: Clock, bar: Bar, most: int | None) -> tuple[Found, int, str]:
+def _search(search: Search, state: StateFile, clock: Clock, bar: Bar, most: int | None) -> tuple[Found, int, str]:
     """``search_plan`` from where the state is; saved after every interval."""
     first = int(state.progress.get("intervals", 0))
     count = search.intervals if most is None else min(most, search.intervals)
@@ -282,24 +275,22 @@ def _search(search: Strategy, state: StateFile, clock: Clock, bar: Bar, most: in
 
 
 def _relax(
-    artifact: Artifact, families: Families, whole: WholeSteps, task: Task, found: Found, budget: Budget, held_out: Calls
+    artifact: Artifact, crowded: CrowdedSchedules, task: Task, found: Found, budget: Budget, held_out: Calls
 ) -> tuple[Found, Budget]:
     """More steps, as long as the held-out error is above what was asked for and at least half of them are left out."""
     steps, blocks = artifact.manifest.steps, len(artifact.manifest.blocks)
 
     def misses(one: Found, cells: int) -> bool:
-        scores = judge(artifact, task.executor, one, Named(), held_out, cells)
+        scores = judge(artifact, task.executor, {SCHEDULE: one}, held_out)
         return not scores[default_of(scores, budget.goal, cells, artifact.manifest)].error <= budget.goal.value
 
     while misses(found, budget.cells):
         full = budget.cells // blocks
         more = full + max(1, full // 4)
-        best = families.best(more, f"{more} steps") if more <= steps // 2 else None
+        best = crowded.best(more, f"{more} steps") if more <= steps // 2 else None
         if best is None:
             break
-        notes = {**found.notes, "steps": list(best.steps), "switches": 0}
-        found = Found(whole.plan(best.steps), None, notes, correction=whole.correction(best.steps))
-        budget = replace(budget, cells=more * blocks)
+        found, budget = task.whole_steps(best.steps, switches=0), replace(budget, cells=more * blocks)
     return found, budget
 
 

@@ -35,12 +35,12 @@ class PlanScore:
 
     @classmethod
     def of(cls, errors: FloatArray, plans: PlanArray, flops: FlopsRecord, pruned: bool) -> PlanScore:
-        """From the error of each call and its plan.
+        """Make a score of the error of each call and its plan.
 
         Args:
             errors: ``[N]``.
             plans: ``[N, K, blocks]``, or ``[1, K, blocks]`` for all calls.
-            flops: of the policy.
+            flops: the FLOPs of the policy's parts.
             pruned: whether the pruner makes the plan.
         """
         total = plans.shape[1] * sum(flops.blocks)
@@ -59,7 +59,7 @@ class CalibrationResult:
 
     Attributes:
         strategy: how the plan was found.
-        seed: of everything random.
+        seed: the seed of everything random.
         target_sparsity: what was asked for, or what the budget comes to.
         default_plan: the plan that the artifact now uses; a key of ``plans``.
         plans: every plan that was judged, by name; ``uniform`` is the baseline that computes as much.
@@ -87,17 +87,17 @@ class CalibrationResult:
 
     @property
     def sparsity(self) -> float:
-        """Of the default plan."""
+        """Share of the cells that the default plan reuses."""
         return self.plans[self.default_plan].sparsity
 
     @property
     def flops_sparsity(self) -> float:
-        """Of the default plan."""
+        """The same share with each cell weighed by its FLOPs."""
         return self.plans[self.default_plan].flops_sparsity
 
     @property
     def validation_error(self) -> float:
-        """Of the default plan, in the units of the actions."""
+        """Error of the default plan, in the units of the actions."""
         return self.plans[self.default_plan].error
 
     def record(self) -> dict[str, Any]:

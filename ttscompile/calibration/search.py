@@ -1,28 +1,60 @@
-"""A strategy, interval by interval, as long as there is time."""
+"""A strategy at work, interval by interval, as long as there is time."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from dataclasses import replace
 
 from .clock import Clock
-
-if TYPE_CHECKING:
-    from .strategies.base import Found, Strategy
+from .strategies import strategy_of
+from .task import Found, Search, Task
 
 CLOSING_SHARE = 0.3
-"""What a strategy does at the end is left out where it would take more than this share of the time: on Push-T an
-interval of search lowers the error by 3 to 30 %, the switches by a few."""
+"""What a search does at the end is left out where it would take more than this share of the time: on Push-T an interval
+of search lowers the error by 3 to 30 %, the switches by a few."""
+
+
+def open_search(name: str, task: Task) -> Search:
+    """The search of the strategy of this name, ready to begin.
+
+    Raises:
+        CalibrationError: there is no such strategy, or it cannot keep the budget.
+    """
+    strategy, model = strategy_of(name), task.executor.model
+    strategy.require_reach(model.steps, model.blocks, task.budget)
+    return strategy.make()(task)
+
+
+def plan_of(name: str, task: Task, intervals: int | None = None, seconds: float = math.inf) -> tuple[Found, bool]:
+    """What a strategy finds, whether or not it is any better than the uniform schedule: for comparisons.
+
+    Args:
+        name: the name of the strategy.
+        task: see ``Task``; its clock is not used.
+        intervals: how many at most; None for the strategy's own number.
+        seconds: after which nothing more is begun that can be left out.
+
+    Returns:
+        What was found, and whether the time cut the search short.
+
+    Raises:
+        CalibrationError: there is no such strategy, or it cannot keep the budget.
+        CalibrationFailedError: the time was up before there was a plan within the budget.
+    """
+    clock = Clock(seconds)
+    found, _, stopped = search_plan(open_search(name, replace(task, clock=clock)), clock, intervals)
+    return found, stopped == "time limit"
 
 
 def search_plan(
-    search: Strategy,
+    search: Search,
     clock: Clock,
     most: int | None = None,
     first: int = 0,
     after: Callable[[int, float], None] = lambda done, longest: None,
 ) -> tuple[Found, int, str]:
-    """Intervals until the strategy is done, or the time is up; one at least.
+    """Intervals until the search is done, or the time is up; one at least.
 
     Args:
         search: after its first ``first`` intervals.

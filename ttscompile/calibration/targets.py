@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -20,7 +21,7 @@ REPEATS = 8
 """How often an observation may be learned from, each time with another noise."""
 
 SHARE = 0.5
-"""Of the time limit: when it is over, no more targets are made than there have to be."""
+"""Share of the time limit after which no more targets are made than there have to be."""
 
 TARGETS_AT_ONCE = 16
 """Dense calls that go through the loop together, on one core; after a round of these the state is saved."""
@@ -32,9 +33,9 @@ def with_targets(
     """The calls with what the dense policy answers to them; the first of them where the time does not do for all.
 
     Args:
-        executor: of the policy.
-        name: of the calls in the state.
-        calls: without targets.
+        executor: runs the policy.
+        name: what the calls are called in the state.
+        calls: calls whose targets are not known yet.
         least: as many are needed whatever the time.
         state: remembers what was computed.
         clock: with the limit of the calibration.
@@ -59,7 +60,7 @@ def with_targets(
     state.progress[key] = len(path)
     if len(path) < calls.count:
         calls = executor.selector.calls(calls, np.arange(len(path)))
-    return calls.answered(path)
+    return replace(calls, path=path)
 
 
 def dense_rounds(executor: Executor, calls: Calls, begin: int = 0) -> Iterator[torch.Tensor]:
@@ -83,13 +84,13 @@ def draw_calls(
     """The calls to learn from and those that plans are judged on, without targets.
 
     Args:
-        executor: of the policy.
-        spec: of the policy.
-        episodes: all of them.
-        split: of the episodes.
+        executor: runs the policy.
+        spec: the specification of the policy.
+        episodes: all recorded episodes.
+        split: which episodes are for what.
         limit: calls to learn from, at most.
         judged: calls to judge on, at most.
-        seed: of calls and noise.
+        seed: the seed of the choice of calls and of their noise.
 
     Returns:
         ``calibration`` and ``validation``.

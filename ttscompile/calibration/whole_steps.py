@@ -5,15 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+
+import numpy as np
 
 from ..core.correction import Correction
 from ..core.lattice import PlanArray, whole_steps_plan
-from .correction import fit_correction
-from .crowded import CROWDING, crowded_family
-
-if TYPE_CHECKING:
-    from .strategies.base import Task
+from .calls import Actions, Calls
+from .execute import Executor
+from .fit_correction import fit_correction
 
 FITTED, COMPARED = 384, 128
 """Calls on which a candidate's correction is fitted, and others on which its error is measured; fewer if there are
@@ -37,24 +36,31 @@ class WholeSteps:
     """Compares schedules of whole steps.
 
     Args:
-        task: see ``Task``; its budget is not used.
+        executor: runs the policy.
+        actions: which part of the sample counts.
+        calls: with what the dense policy answers to them.
+        seed: decides which of the calls corrections are fitted on, and which schedules are compared on.
     """
 
     _pace = 0.0
     """Seconds that a comparison took, for each step that its schedule computes; the most so far."""
 
-    def __init__(self, task: Task) -> None:
-        self._task = task
-        order = task.draw(0).permutation(task.calls.count)
-        compared = max(1, min(COMPARED, task.calls.count // 4))
-        select = task.executor.selector.calls
-        self._compared = select(task.calls, order[:compared])
-        self._fitted = select(task.calls, order[compared:][:FITTED]) if task.calls.count > 1 else self._compared
+    def __init__(self, executor: Executor, actions: Actions, calls: Calls, seed: int) -> None:
+        self._executor, self._actions, self._calls = executor, actions, calls
+        order = np.random.default_rng((seed, 3, 0)).permutation(calls.count)
+        compared = max(1, min(COMPARED, calls.count // 4))
+        select = executor.selector.calls
+        self._compared = select(calls, order[:compared])
+        self._fitted = select(calls, order[compared:][:FITTED]) if calls.count > 1 else self._compared
+
+    @property
+    def steps(self) -> int:
+        """K."""
+        return self._executor.model.steps
 
     def plan(self, steps: Sequence[int]) -> PlanArray:
         """The schedule that computes these steps and reads TIMESTEP elsewhere, int8 ``[K, blocks]``."""
-        model = self._task.executor.model
-        return whole_steps_plan(model.steps, model.blocks, steps)
+        return whole_steps_plan(self.steps, self._executor.model.blocks, steps)
 
     def errors(self, steps: Sequence[int]) -> Errors:
         """Errors of a schedule, with a correction of its own, on calls that this was not fitted on.
@@ -68,30 +74,26 @@ class WholeSteps:
         corrected, plain = self._with_and_without(steps)
         if plain.normalised <= corrected.normalised:
             return None
-        return fit_correction(self._task.executor, self.plan(steps), self._task.calls)
+        return fit_correction(self._executor, self.plan(steps), self._calls)
 
     def comparing(self, full_steps: int) -> float:
         """Seconds that ``errors`` of a schedule takes, by those so far; 0 before any."""
         return self._pace * full_steps
 
     def correcting(self, full_steps: int) -> float:
-        """Seconds that ``correction`` of a schedule takes, likewise."""
-        share = self._task.calls.count / (self._fitted.count + 2 * self._compared.count)
+        """Seconds that ``correction`` of a schedule takes, by the comparisons so far; 0 before any."""
+        share = self._calls.count / (self._fitted.count + 2 * self._compared.count)
         return (1 + share) * self.comparing(full_steps)
 
     def _with_and_without(self, steps: Sequence[int]) -> tuple[Errors, Errors]:
         begun = time.monotonic()
-        fitted = fit_correction(self._task.executor, self.plan(steps), self._fitted)
+        fitted = fit_correction(self._executor, self.plan(steps), self._fitted)
         errors = self._errors(steps, fitted), self._errors(steps, None)
         self._pace = max(self._pace, (time.monotonic() - begun) / len(steps))
         return errors
 
     def _errors(self, steps: Sequence[int], correction: Correction | None) -> Errors:
-        task, calls = self._task, self._compared
-        samples = task.executor.corrected(correction).run(self.plan(steps), calls)
-        normalised, units = (task.actions.errors(samples, calls.targets, units=u).mean() for u in (False, True))
+        calls = self._compared
+        samples = self._executor.corrected(correction).run(self.plan(steps), calls)
+        normalised, units = (self._actions.errors(samples, calls.targets, units=u).mean() for u in (False, True))
         return Errors(float(normalised), float(units))
-
-    def crowded(self, full_steps: int, crowding: Sequence[float] = CROWDING) -> list[tuple[int, ...]]:
-        """The family of schedules that a search starts with: the different ones of ``full_steps`` steps."""
-        return crowded_family(self._task.executor.model.steps, full_steps, crowding)

@@ -8,6 +8,7 @@ import click
 
 from ttscompile.cli.output import (
     artifact_argument,
+    count_option,
     identity_of,
     json_option,
     ms,
@@ -35,18 +36,23 @@ def _rivals(_: click.Context, __: click.Parameter, value: str) -> tuple[str, ...
 
 @click.command()
 @artifact_argument
-@click.option("--threads", type=click.IntRange(min=1), default=1, show_default=True, help="Of each contestant.")
-@click.option("--runs", type=click.IntRange(min=1), default=20, show_default=True, help="Counted calls of each.")
-@click.option("--plan", help="Of the compiled policy; the artifact's default plan if not given.")
+@count_option("--threads", "Threads that each contestant computes with.")
+@count_option("--runs", "Calls of each contestant that are counted.", default=20)
+@click.option("--plan", help="Plan of the compiled policy. Without this option its default plan runs.")
 @click.option(
     "--against",
     default="onnxruntime-dense",
     show_default=True,
     callback=_rivals,
-    help=f"{', '.join(RIVALS)}; the first two are eager PyTorch.",
+    help=f"What the compiled policy is timed against, any of {', '.join(RIVALS)}. The first two run the original"
+    " network in PyTorch.",
 )
-@click.option("--checkpoint", type=click.Path(path_type=Path), help="For 'original' and 'eager'.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of observations and noise.")
+@click.option(
+    "--checkpoint",
+    type=click.Path(path_type=Path),
+    help="The checkpoint that DIRECTORY was made from. The rivals 'original' and 'eager' need it.",
+)
+@count_option("--seed", "Seed of the observations and the noise.", default=0, least=0)
 @json_option
 def bench(
     directory: Path,
@@ -58,9 +64,9 @@ def bench(
     seed: int,
     as_json: bool,
 ) -> None:
-    """Time calls of the artifact DIRECTORY on one stream, in turn with its rivals, on random observations.
+    """Time calls of the artifact DIRECTORY and of its rivals, which take turns on the same random observations.
 
-    Every figure is of whole calls: prologue, pruner and all. Warm-up calls are not counted.
+    Every figure is of whole calls, for one robot at a time. Warm-up calls are not counted.
     """
     if {"eager", "original"}.intersection(against) and checkpoint is None:
         raise click.UsageError("--against eager or original runs the original network: give --checkpoint FILE too.")

@@ -7,6 +7,8 @@ from pathlib import Path
 import click
 
 import ttscompile
+from ttscompile.artifact.load import load_artifact
+from ttscompile.calibration.strategies import DEFAULT, NAMES, STRATEGIES
 from ttscompile.cli.output import (
     artifact_argument,
     json_option,
@@ -16,22 +18,8 @@ from ttscompile.cli.output import (
     results,
 )
 from ttscompile.cli.recordings import FilesCommand, Sources, require_recordings, trajectories_options
-from ttscompile.cli.summary import document, print_summary
-
-STRATEGIES = (
-    "tts",
-    "interval",
-    "bac",
-    "delta-dit",
-    "deepcache",
-    "sag",
-    "dip-go",
-    "l2c",
-    "evo",
-    "teacache",
-    "dbcache",
-)
-"""``calibration.strategies.NAMES``; written again, since importing that takes torch and a second."""
+from ttscompile.cli.summary import print_summary
+from ttscompile.report.summary import document
 
 
 @click.command(cls=FilesCommand)
@@ -61,11 +49,10 @@ STRATEGIES = (
 @click.option("--threads", type=click.IntRange(min=1), default=1, show_default=True, help="Of calls for --latency-ms.")
 @click.option(
     "--strategy",
-    type=click.Choice(STRATEGIES),
-    default="tts",
+    type=click.Choice(NAMES),
+    default=DEFAULT,
     show_default=True,
-    help="How the plan is found; tts is this project's own. The others are published methods: interval (FORA), bac,"
-    " delta-dit, deepcache, sag, dip-go, l2c, evo, teacache, dbcache.",
+    help=f"How the plan is found. {'; '.join(f'{one.name}: {one.source}' for one in STRATEGIES)}.",
 )
 @click.option(
     "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the split, the noise and the training."
@@ -117,8 +104,8 @@ def calibrate(
             threads=threads,
             max_minutes=max_minutes,
         )
-    summary = document(directory)
+    artifact = load_artifact(directory)
     if as_json:
-        print_json(summary)
+        print_json(document(artifact))
     else:
-        print_summary(summary, results())
+        print_summary(artifact, results())

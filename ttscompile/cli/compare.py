@@ -9,7 +9,7 @@ import click
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from ttscompile.artifact.manifest import abbreviated
-from ttscompile.cli.calibrate import STRATEGIES
+from ttscompile.calibration.strategies import NAMES
 from ttscompile.cli.output import (
     artifact_argument,
     identity_of,
@@ -36,9 +36,9 @@ if TYPE_CHECKING:
 
 def _strategies(_: click.Context, __: click.Parameter, value: str) -> tuple[str, ...]:
     names = tuple(dict.fromkeys(name.strip() for name in value.split(",") if name.strip()))
-    unknown = [name for name in names if name not in STRATEGIES]
+    unknown = [name for name in names if name not in NAMES]
     if unknown:
-        raise click.BadParameter(f"{unknown[0]!r} is not one of {', '.join(STRATEGIES)}.")
+        raise click.BadParameter(f"{unknown[0]!r} is not one of {', '.join(NAMES)}.")
     return names
 
 
@@ -130,7 +130,7 @@ def compare(
     identities = {path: identity_of(path) for path in (directory, *others)}  # of what is measured now
     require_recordings(trajectories)
     try:
-        from ttscompile.calibration.frontier import compare as measure
+        from ttscompile.calibration.compare import compare as measure
     except ModuleNotFoundError as error:
         raise RuntimeUnavailableError(
             f"compare needs {error.name}, which is not installed. Run: pip install 'ttscompile[compile]'."

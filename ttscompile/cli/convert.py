@@ -12,9 +12,11 @@ from ttscompile.artifact.ceiling import few_steps, many_steps
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import require_replaceable
 from ttscompile.cli.output import json_option, only_results_on_stdout, print_json, progress, results
-from ttscompile.cli.summary import document, print_summary
+from ttscompile.cli.summary import print_summary
 from ttscompile.core.spec import FP32, PRECISIONS
 from ttscompile.errors import CheckpointError
+from ttscompile.frontends.families import FAMILIES, FORMATS, SAMPLERS, SPACINGS
+from ttscompile.report.summary import document
 
 
 @click.command()
@@ -22,14 +24,14 @@ from ttscompile.errors import CheckpointError
 @click.option("-o", "--output", "directory", required=True, type=click.Path(path_type=Path), help="The artifact.")
 @click.option(
     "--format",
-    type=click.Choice(["auto", "diffusion_policy", "lerobot"]),
+    type=click.Choice(FORMATS),
     default="auto",
     show_default=True,
-    help="Of CHECKPOINT; auto finds out.",
+    help=" ".join(["Of CHECKPOINT; auto finds out.", *(f"{each.name}: {each.reads}." for each in FAMILIES)]),
 )
 @click.option(
     "--sampler",
-    type=click.Choice(["ddpm", "ddim", "dpmsolver++", "euler", "rk4"]),
+    type=click.Choice(SAMPLERS),
     help="In place of the checkpoint's own: ddpm, ddim or dpmsolver++ of a diffusion policy, euler or rk4 of one"
     " trained with flow matching.",
 )
@@ -41,7 +43,7 @@ from ttscompile.errors import CheckpointError
 )
 @click.option(
     "--spacing",
-    type=click.Choice(["leading", "trailing", "linspace"]),
+    type=click.Choice(SPACINGS),
     help="Timesteps that fewer steps visit, in place of the checkpoint's own. leading starts below the last one, where"
     " pure noise is not what the network expects; trailing and linspace start at it, which needs a bound on the sample."
     " Left out, dpmsolver++ in place of another sampler takes trailing; ddim takes leading.",
@@ -75,26 +77,20 @@ from ttscompile.errors import CheckpointError
 def convert(
     checkpoint: Path,
     directory: Path,
-    format: str,
-    sampler: str | None,
-    steps: int | None,
-    spacing: str | None,
-    task: str | None,
-    encoders: Path | None,
     prediction_horizon: int | None,
     precision: str,
     single_file: Path | None,
     explain: bool,
     as_json: bool,
+    **of_checkpoint: Any,  # the format and the options of families: ttscompile.convert takes them by the same names
 ) -> None:
-    """Compile CHECKPOINT, a trained policy: a .ckpt file of Diffusion Policy, or the directory of a LeRobot policy.
-
-    Nothing in it is executed.
+    """Compile CHECKPOINT, a trained policy of one of the formats below. Nothing in it is executed.
 
     The artifact computes everything until 'ttscompile calibrate' gives it a plan.
     """
     if not checkpoint.exists():  # told now: importing the compiler, and with it torch, takes seconds
-        raise CheckpointError(f"{checkpoint}: does not exist. Give a .ckpt file, or the directory of a LeRobot policy.")
+        expected = " or ".join(each.reads for each in FAMILIES)
+        raise CheckpointError(f"{checkpoint}: does not exist. Give {expected}.")
     require_replaceable(directory)
     stages: list[dict[str, Any]] = []
     console = progress()
@@ -110,31 +106,25 @@ def convert(
         ttscompile.convert(
             checkpoint,
             directory,
-            format=format,
-            sampler=sampler,
-            steps=steps,
-            spacing=spacing,
-            task=task,
-            encoders=encoders,
             prediction_horizon=prediction_horizon,
             precision=precision,
             single_file=single_file,
             explain=on_stage,
+            **of_checkpoint,
         )
     artifact = load_artifact(directory)
-    summary = document(directory, artifact)
     if (warning := few_steps(artifact.manifest)) is not None:
         console.print(f"warning: {warning}", soft_wrap=True)
     for stage in stages:
         if stage["stage"] == "narrow" and prediction_horizon is None:
             console.print("hint:", *stage["notes"], soft_wrap=True)
-    if sampler is None and (hint := many_steps(artifact.manifest)) is not None:
+    if of_checkpoint["sampler"] is None and (hint := many_steps(artifact.manifest)) is not None:
         console.print(f"hint: {hint}", soft_wrap=True)
     if as_json:
-        print_json(summary | {"stages": stages})
+        print_json(document(artifact) | {"stages": stages})
     else:
         console = results()
-        print_summary(summary, console)
+        print_summary(artifact, console)
         if single_file is not None:
             megabytes = single_file.stat().st_size / 1e6
             console.print(f"single file: {single_file}, {megabytes:.1f} MB", soft_wrap=True, highlight=False)

@@ -17,8 +17,8 @@ from ttscompile.doctor import diagnosis as examination
 def doctor(context: click.Context, directory: Path | None, as_json: bool) -> None:
     """Look at Python, packages, processor, cores, memory and clock; with DIRECTORY, also try that artifact here.
 
-    Every warning and problem comes with its remedy. Exit status 1: something stops artifacts from running. Where the
-    command line itself does not start, python -m ttscompile.doctor says why.
+    Every warning and problem comes with its remedy. The exit status is 1 if something stops artifacts from running.
+    Where the command line itself does not start, python -m ttscompile.doctor says why.
     """
     found = examination.examine(directory)
     if as_json:

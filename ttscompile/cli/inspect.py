@@ -12,10 +12,11 @@ import ttscompile
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import DENSE
 from ttscompile.cli.output import artifact_argument, json_option, print_json, progress, results
-from ttscompile.cli.summary import document, print_summary
+from ttscompile.cli.summary import print_summary
 from ttscompile.core.lattice import PlanArray
 from ttscompile.errors import ArtifactError, ObservationError
 from ttscompile.plots.plan import plot_plan
+from ttscompile.report.summary import document
 from ttscompile.trajectories import read_npz
 
 SCHEDULE = "schedule"
@@ -25,14 +26,14 @@ SCHEDULE = "schedule"
 @click.command()
 @artifact_argument
 @click.option(
-    "--plot", "picture", type=click.Path(path_type=Path), help="Draw a plan into this file (.png, .svg, .pdf)."
+    "--plot", "picture", type=click.Path(path_type=Path), help="Draw a plan into this file (.png, .svg or .pdf)."
 )
-@click.option("--plan", "name", help="Which plan to draw; the artifact's default plan if not given.")
+@click.option("--plan", "name", help="The plan to draw. Without this option it is the artifact's default plan.")
 @click.option(
     "--observation",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="For a plan that depends on the observation: an .npz with an array a key, one observation or, of the calls of"
-    " one episode, [N, ...]. The plan of the last call is drawn.",
+    help="An .npz file with an array for each key of the observation, of one call or of the calls of one episode. It is"
+    " needed for plans that depend on the observation; the plan of its last call is drawn.",
 )
 @json_option
 def inspect(directory: Path, picture: Path | None, name: str | None, observation: Path | None, as_json: bool) -> None:
@@ -40,16 +41,15 @@ def inspect(directory: Path, picture: Path | None, name: str | None, observation
     if picture is None and (name is not None or observation is not None):
         raise click.UsageError("--plan and --observation choose what --plot draws; give --plot FILE too.")
     artifact = load_artifact(directory)
-    summary = document(directory, artifact)
     if picture is not None:
         name = name or _drawn_by_default(artifact, observation)
         plan = _plan(artifact, name, observation)
         plot_plan(plan, [block.kind for block in artifact.manifest.blocks], picture, f"plan {name!r}")
         progress().print(f"wrote {picture}", soft_wrap=True)
     if as_json:
-        print_json(summary)
+        print_json(document(artifact))
     else:
-        print_summary(summary, results())
+        print_summary(artifact, results())
 
 
 def _drawn_by_default(artifact: Artifact, observation: Path | None) -> str:

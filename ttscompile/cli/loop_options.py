@@ -7,33 +7,36 @@ from typing import Any
 
 import click
 
+from ttscompile.cli.output import count_option
+
 _OPTIONS = (
     click.option(
-        "--control-hz", type=click.FloatRange(min=0, min_open=True), required=True, help="Of the control loop."
+        "--control-hz",
+        type=click.FloatRange(min=0, min_open=True),
+        required=True,
+        help="Rate of the control loop in Hz.",
     ),
     click.option(
         "--policy-hz",
         type=click.FloatRange(min=0, min_open=True),
-        help="Of frames and actions in training; the control rate if not given.",
+        help="Rate in Hz of the frames and actions that the policy was trained with. Without this option it is the"
+        " control rate.",
     ),
-    click.option(
+    count_option(
         "--horizon",
-        type=click.IntRange(min=1),
-        help="Actions from one call to the next; as many as the policy executes, if not given.",
+        "Actions that are executed from one call to the next. Without this option it is as many as the policy executes"
+        " of a chunk.",
+        default=None,
     ),
-    click.option(
+    count_option(
         "--reserve",
-        type=click.IntRange(min=0),
-        help="Actions after these that may be played; all predicted, if not given.",
+        "Further actions of a chunk that may be executed while the next chunk is late. Without this option it is all"
+        " that the policy predicts.",
+        default=None,
+        least=0,
     ),
-    click.option(
-        "--margin-ticks",
-        type=click.IntRange(min=0),
-        default=1,
-        show_default=True,
-        help="That a chunk is to be early by.",
-    ),
-    click.option("--threads", type=click.IntRange(min=1), default=1, show_default=True, help="Of the policy."),
+    count_option("--margin-ticks", "Control ticks by which a chunk has to come before it is needed.", least=0),
+    count_option("--threads", "Threads that the policy computes with."),
 )
 
 

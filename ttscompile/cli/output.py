@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import click
 from rich import box
@@ -16,16 +16,26 @@ from rich.console import Console
 from rich.table import Table
 
 from ttscompile.artifact.load import load_artifact, read_manifest
-from ttscompile.artifact.manifest import UNIFORM, Manifest, abbreviated
+from ttscompile.artifact.manifest import Manifest, abbreviated
 from ttscompile.errors import TtscompileError
 from ttscompile.measure.units import flops as flops
 from ttscompile.measure.units import ms as ms
 from ttscompile.measure.units import share as share
+from ttscompile.report.page import Table as Made
+
+Command = TypeVar("Command", bound=Callable[..., Any])
 
 artifact_argument = click.argument("directory", type=click.Path(path_type=Path))
 json_option = click.option(
-    "--json", "as_json", is_flag=True, help="One JSON document on standard output, nothing else."
+    "--json", "as_json", is_flag=True, help="Print one JSON document on standard output, and nothing else."
 )
+
+
+def count_option(name: str, help: str, *, default: int | None = 1, least: int = 1) -> Callable[[Command], Command]:
+    """An option that takes a whole number of at least ``least``."""
+    kind = click.IntRange(min=least)
+    return click.option(name, type=kind, default=default, show_default=default is not None, help=help)
+
 
 _WIDTH = 110
 """Columns of a table that goes to a file or a pipe; a terminal's own width is used where there is one."""
@@ -86,9 +96,13 @@ def table(*columns: str) -> Table:
     return made
 
 
-def marked(plan: str) -> str:
-    """The name of a plan in a table: the baseline, which no robot should run, is called so."""
-    return plan + " (baseline)" * (plan == UNIFORM)
+def print_table(made: Made, console: Console) -> None:
+    """A table of a report, if it has any rows."""
+    if made.rows:
+        shown = table(*made.head)
+        for row in made.rows:
+            shown.add_row(*row)
+        console.print(shown)
 
 
 def manifest_of(path: Path) -> Manifest:

@@ -65,8 +65,8 @@ def trajectories_options(required: bool = True) -> Callable[[Callable[..., Any]]
             multiple=True,
             type=click.Path(path_type=Path),
             metavar="FILE...",
-            help="Recordings of episodes: .npz, a zarr replay buffer of Diffusion Policy, an HDF5 file of robomimic, a"
-            " LeRobot data set; every word up to the next option.",
+            help="Recordings of episodes: .npz files, zarr replay buffers of Diffusion Policy, HDF5 files of robomimic,"
+            " or LeRobot data sets. Every word up to the next option is one.",
         )
         observation = click.option(
             "--observation",
@@ -74,8 +74,8 @@ def trajectories_options(required: bool = True) -> Callable[[Callable[..., Any]]
             multiple=True,
             callback=_sources,
             metavar="KEY=NAME,NAME:N",
-            help="What a key of the observation is made of, where the arrays of a recording of frames are called"
-            " otherwise: joined in this order; NAME:N are the first N numbers of one.",
+            help="The arrays that a key of the observation is made of, where a recording of frames names them"
+            " otherwise. They are joined in this order; NAME:N takes the first N numbers of an array.",
         )
         return files(observation(command))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,31 +11,44 @@ import click
 import ttscompile
 from ttscompile.artifact.files import replace_file
 from ttscompile.artifact.load import load_artifact
-from ttscompile.cli.output import artifact_argument, only_results_on_stdout, progress, results
+from ttscompile.cli.output import artifact_argument, count_option, only_results_on_stdout, progress, results
 from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
+from ttscompile.core.untrusted_json import parse_json
 from ttscompile.errors import ArtifactError, OutputError, ReportError
 from ttscompile.report import Given, Section, build, refused, render, verified
-from ttscompile.report.frontier import from_comparison
+from ttscompile.report.comparison import from_comparison
 from ttscompile.report.page import require_packages
 from ttscompile.report.verified import NOT_RUN
 from ttscompile.trajectories import Episode, load_trajectories
 
+MAX_COMPARISON = 16 * 2**20
+"""Bytes of what ``compare --json`` printed."""
+
 
 @click.command(cls=FilesCommand)
 @artifact_argument
-@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="The page to write, .html.")
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), required=True, help="The page to write; its name ends in .html."
+)
 @trajectories_options(required=False)
-@click.option("--episode", "number", type=click.IntRange(min=0), default=0, show_default=True, help="Which, from 0.")
+@click.option(
+    "--episode",
+    "number",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help="Number of the recorded episode that is run, from 0.",
+)
 @click.option(
     "--comparison",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="What 'ttscompile compare --json' printed, for the frontier.",
+    help="A file with the output of 'ttscompile compare --json', whose points are drawn.",
 )
-@click.option("--verify", "verifies", is_flag=True, help="Also do what 'ttscompile verify' does; it takes minutes.")
 @click.option(
-    "--threads", type=click.IntRange(min=1), default=1, show_default=True, help="Of the calls that are timed."
+    "--verify", "verifies", is_flag=True, help="Also run the checks of 'ttscompile verify', which take minutes."
 )
-@click.option("--runs", type=click.IntRange(min=1), default=10, show_default=True, help="Counted calls of each plan.")
+@count_option("--threads", "Threads that the timed calls compute with.")
+@count_option("--runs", "Calls of each plan that are counted.", default=10)
 @click.pass_context
 def report(
     context: click.Context,
@@ -52,9 +64,9 @@ def report(
 ) -> None:
     """Write a page about the artifact DIRECTORY: what it is, its plans, its times now, its errors, its limits.
 
-    One HTML file without scripts that needs nothing beside it. Times are measured while it is made. With recordings, an
-    episode of them is run, to show what the default plan does from call to call. Exit status 1: with --verify, a check
-    failed; the page is written all the same.
+    The page is one HTML file without scripts, which needs no other file. Times are measured while it is made. With
+    recordings, one episode is run, to show what the default plan does from call to call. The exit status is 1 if a
+    check of --verify failed; the page is written all the same.
     """
     if not output.absolute().parent.is_dir():
         raise OutputError(f"{output}: the report cannot be written: no such folder. Give one that exists.")
@@ -124,10 +136,10 @@ def _document(path: Path) -> dict[str, Any]:
         ReportError: it is none.
     """
     try:
-        document = json.loads(path.read_text())
-    except (OSError, ValueError, RecursionError) as error:
+        document = parse_json(path.read_bytes(), MAX_COMPARISON)
+    except (OSError, ValueError) as error:
         raise ReportError(
-            f"{path}: no JSON document ({error}). Give what 'ttscompile compare ... --json' printed."
+            f"{path}: no JSON document: {error}. Give what 'ttscompile compare ... --json' printed."
         ) from error
     if not isinstance(document, dict):
         raise ReportError(f"{path}: expected a JSON object; found another value. Give what compare --json printed.")

@@ -6,12 +6,13 @@ import asyncio
 import json
 import signal
 from pathlib import Path
+from typing import Any
 
 import click
 
 import ttscompile
 from ttscompile.cli.loop_options import loop_options
-from ttscompile.cli.output import artifact_argument, progress
+from ttscompile.cli.output import artifact_argument, count_option, progress
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
 from ttscompile.runtimes.executor.server import ExecutorServer, ServerLimits
 
@@ -19,52 +20,56 @@ from ttscompile.runtimes.executor.server import ExecutorServer, ServerLimits
 @click.command()
 @artifact_argument
 @loop_options
-@click.option("--host", default="127.0.0.1", show_default=True, help="To listen on. There is no authentication.")
-@click.option("--port", type=click.IntRange(0, 65535), default=8765, show_default=True, help="0: any that is free.")
 @click.option(
-    "--tier", "tiers", multiple=True, help="A plan, slowest first; may be repeated. The default plan, if none."
+    "--host", default="127.0.0.1", show_default=True, help="Address to listen on. There is no authentication."
+)
+@click.option(
+    "--port",
+    type=click.IntRange(0, 65535),
+    default=8765,
+    show_default=True,
+    help="Port to listen on; 0 takes any that is free.",
+)
+@click.option(
+    "--tier",
+    "tiers",
+    multiple=True,
+    help="A plan to run; may be repeated, from the slowest to the fastest, which are fallen back to when calls are"
+    " late. Without this option it is the default plan.",
 )
 @click.option(
     "--seam",
     type=click.Choice(["replace", "blend", "prefix"]),
     default="replace",
     show_default=True,
-    help="How a chunk joins the one before.",
+    help="How a chunk of actions joins the one before it.",
 )
 @click.option(
     "--interpolation",
     type=click.Choice(["hold", "linear"]),
     default="hold",
     show_default=True,
-    help="Between actions, if the loop is faster than the policy.",
+    help="What is between two actions where the control loop is faster than the policy.",
 )
-@click.option(
-    "--max-hold",
-    type=click.IntRange(min=0),
-    default=3,
-    show_default=True,
-    help="Ticks to repeat the last action for, when there is no other.",
+@count_option(
+    "--max-hold", "Control ticks for which the last action is repeated when there is no other.", default=3, least=0
 )
-@click.option("--max-clients", type=click.IntRange(min=1), default=8, show_default=True)
-@click.option("--max-message-bytes", type=click.IntRange(min=128), default=1 << 20, show_default=True)
-@click.option("--seed", type=click.IntRange(min=0), help="Of the policy's noise.")
+@count_option("--max-clients", "Clients that may be connected.", default=8)
+@count_option("--max-message-bytes", "Size of a message that is still read.", default=1 << 20, least=128)
+@count_option(
+    "--seed", "Seed of the policy's noise. Without this option each run draws other noise.", default=None, least=0
+)
 def serve(
     directory: Path,
     control_hz: float,
-    policy_hz: float | None,
-    horizon: int | None,
     host: str,
     port: int,
-    margin_ticks: int,
     threads: int,
     tiers: tuple[str, ...],
-    seam: str,
-    interpolation: str,
-    reserve: int | None,
-    max_hold: int,
     max_clients: int,
     max_message_bytes: int,
     seed: int | None,
+    **settings: Any,
 ) -> None:
     """Serve the artifact DIRECTORY on a local WebSocket until it is interrupted; docs/serve.md has the protocol.
 
@@ -72,19 +77,9 @@ def serve(
     the end.
     """
     console = progress()
-    settings = ExecutorSettings(
-        policy_hz=policy_hz,
-        horizon=horizon,
-        tiers=tiers or None,
-        seam=seam,
-        interpolation=interpolation,
-        reserve=reserve,
-        max_hold=max_hold,
-        margin_ticks=margin_ticks,
-    )
     with console.status("loading and measuring"):
         policy = ttscompile.load(directory, threads=threads, seed=seed)
-        executor = AsyncExecutor(policy, control_hz, settings)
+        executor = AsyncExecutor(policy, control_hz, ExecutorSettings(tiers=tiers or None, **settings))
     limits = ServerLimits(clients=max_clients, message_bytes=max_message_bytes)
     if host not in ("127.0.0.1", "::1", "localhost"):
         console.print(

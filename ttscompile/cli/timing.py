@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.core.lattice import Source
 from ttscompile.core.spec import FP32, Affine, Noise, PolicySpec
 from ttscompile.errors import RuntimeUnavailableError, SpecError
+from ttscompile.measure.timer import Timer, Times
 from ttscompile.runtimes.random_calls import Observation, normalized, random_calls
 
 if TYPE_CHECKING:
@@ -33,11 +34,11 @@ class Contestant:
     """One way to make a call.
 
     Attributes:
-        label: for people.
+        label: name of the contestant, for people.
         plan: that it runs; for people and the warning about a dense one.
         call: one call, given an observation of one stream and noise.
         report: the report of the last call; None if there is none, and everything was computed.
-        spec: of the policy.
+        spec: specification of the policy.
         dense_flops: of a call without a report; None where they are not known.
     """
 
@@ -54,13 +55,11 @@ class Measurement:
     """What the counted calls of one contestant took.
 
     Attributes:
-        label: of the contestant.
-        plan: that it ran.
+        label: name of the contestant, for people.
+        plan: name of the plan that it ran.
         times_ms: wall time of each call.
-        median_ms: their median.
-        quartiles_ms: their first and third quartile.
         prologue_ms: median of the report's timing; None without reports.
-        pruner_ms: likewise.
+        pruner_ms: median of the pruner's own time; None without reports.
         flops: median over the calls; None where they are not known.
         sparsity: mean share of reused cells.
         legalised: cells that had to be replaced because they were never computed, all calls together.
@@ -69,17 +68,25 @@ class Measurement:
     label: str
     plan: str
     times_ms: tuple[float, ...]
-    median_ms: float
-    quartiles_ms: tuple[float, float]
-    prologue_ms: float | None
-    pruner_ms: float | None
-    flops: float | None
-    sparsity: float
-    legalised: int
+    prologue_ms: float | None = None
+    pruner_ms: float | None = None
+    flops: float | None = None
+    sparsity: float = 0.0
+    legalised: int = 0
+
+    @property
+    def median_ms(self) -> float:
+        """Median of the times."""
+        return Times(self.times_ms).median
+
+    @property
+    def quartiles_ms(self) -> tuple[float, float]:
+        """First and third quartile of the times."""
+        return Times(self.times_ms).quartiles
 
     def to_json(self) -> dict[str, Any]:
         """As plain JSON values."""
-        return asdict(self)
+        return asdict(self) | {"median_ms": self.median_ms, "quartiles_ms": self.quartiles_ms}
 
 
 def contestants(
@@ -89,7 +96,7 @@ def contestants(
 
     Args:
         directory: the artifact.
-        threads: of each.
+        threads: threads that each computes with.
         plan: of the compiled policy; None for the artifact's default.
         against: ``original``, ``eager``, ``onnxruntime-dense``.
         checkpoint: for ``original`` and ``eager``.
@@ -130,22 +137,18 @@ def measure(
     Returns:
         One measurement a contestant.
     """
-    times: list[list[float]] = [[] for _ in entered]
+    timer = Timer(len(entered), warm_up)
     reports: list[list[Any]] = [[] for _ in entered]
     specs = {id(one.spec): one.spec for one in entered}
     calls = {name: random_calls(spec, warm_up + runs, seed) for name, spec in specs.items()}
     for number in range(warm_up + runs):
-        for turn in range(len(entered)):
-            i = (turn + number) % len(entered)  # nobody always runs after the same one
-            obs, noise = calls[id(entered[i].spec)][number]
-            started = perf_counter()
-            entered[i].call(obs, noise)
-            elapsed = 1000 * (perf_counter() - started)
-            if number >= warm_up:
-                times[i].append(elapsed)
-                reports[i].append(entered[i].report())
+        for i in timer.round():
+            one = entered[i]
+            timer.time(i, partial(one.call, *calls[id(one.spec)][number]))
+            if timer.counted:
+                reports[i].append(one.report())
         on_round(number + 1, warm_up + runs)
-    return [_summary(*one) for one in zip(entered, times, reports, strict=True)]
+    return [_summary(*one) for one in zip(entered, timer.times, reports, strict=True)]
 
 
 def _compiled(label: str, directory: Path, threads: int, plan: str, spec: PolicySpec, precision: str) -> Contestant:
@@ -158,10 +161,10 @@ def plan_contestant(label: str, policy: CompiledPolicy, plan: str, spec: PolicyS
     """A plan of a compiled policy.
 
     Args:
-        label: for people.
+        label: name of the contestant, for people.
         policy: loaded; contestants may share one if their plans read nothing of earlier calls.
         plan: its name.
-        spec: of the policy.
+        spec: specification of the policy.
     """
     return Contestant(
         label=label,
@@ -179,7 +182,7 @@ def _eager(checkpoint: Path, threads: int, manifest: Manifest, as_saved: bool) -
         import torch
 
         from ttscompile.frontends.eager import eager_policy
-        from ttscompile.frontends.encoded import EncodedDenoiser
+        from ttscompile.frontends.encoded import parts
     except ModuleNotFoundError as error:
         raise RuntimeUnavailableError(
             f"the original network needs {error.name}, which is not installed. Run: pip install 'ttscompile[compile]',"
@@ -192,7 +195,7 @@ def _eager(checkpoint: Path, threads: int, manifest: Manifest, as_saved: bool) -
         return network_contestant("eager PyTorch", eager_policy(module, whole), whole, manifest.flops.dense)
     sampler, dense = original.sampler, manifest.flops.dense
     # An encoder runs once a call, whatever the sampler: what it takes is not known apart.
-    flops = None if isinstance(module, EncodedDenoiser) else dense / manifest.steps * sampler.steps
+    flops = dense / manifest.steps * sampler.steps if parts(module).encoder is None else None
     label = f"original, {sampler.name} {sampler.steps}"
     return network_contestant(label, eager_policy(module, original), original, flops)
 
@@ -202,7 +205,7 @@ def original_policy(checkpoint: Path, spec: PolicySpec) -> tuple[nn.Module, Poli
 
     Args:
         checkpoint: as ``convert`` took it.
-        spec: of the artifact.
+        spec: specification of the policy in the artifact.
 
     Raises:
         SpecError: the checkpoint is of another policy.
@@ -227,9 +230,9 @@ def network_contestant(label: str, run: EagerPolicy, spec: PolicySpec, dense_flo
     """The whole network in PyTorch, once a step.
 
     Args:
-        label: for people.
+        label: name of the contestant, for people.
         run: of ``ttscompile.frontends.eager``.
-        spec: of the policy.
+        spec: specification of the policy.
         dense_flops: of a call; None where they are not known.
     """
     import torch
@@ -260,18 +263,16 @@ def _same(left: Affine | None, right: Affine | None) -> bool:
     return np.array_equal(left.scale, right.scale) and np.array_equal(left.offset, right.offset)
 
 
-def _summary(contestant: Contestant, times: Sequence[float], reports: Sequence[Any]) -> Measurement:
-    reported = reports[0] is not None
-    low, high = np.percentile(times, [25, 75])
+def _summary(contestant: Contestant, times: Times, reports: Sequence[Any]) -> Measurement:
+    if reports[0] is None:
+        return Measurement(contestant.label, contestant.plan, times.ms, flops=contestant.dense_flops)
     return Measurement(
         label=contestant.label,
         plan=contestant.plan,
-        times_ms=tuple(times),
-        median_ms=float(np.median(times)),
-        quartiles_ms=(float(low), float(high)),
-        prologue_ms=float(np.median([r.timings.prologue for r in reports])) if reported else None,
-        pruner_ms=float(np.median([r.timings.pruner for r in reports])) if reported else None,
-        flops=float(np.median([r.flops[0] for r in reports])) if reported else contestant.dense_flops,
-        sparsity=float(np.mean([np.mean(r.plan != Source.COMPUTE) for r in reports])) if reported else 0.0,
-        legalised=sum(sum(r.legalised) for r in reports) if reported else 0,
+        times_ms=times.ms,
+        prologue_ms=float(np.median([r.timings.prologue for r in reports])),
+        pruner_ms=float(np.median([r.timings.pruner for r in reports])),
+        flops=float(np.median([r.flops[0] for r in reports])),
+        sparsity=float(np.mean([np.mean(r.plan != Source.COMPUTE) for r in reports])),
+        legalised=sum(sum(r.legalised) for r in reports),
     )

@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import IllegalPlanError
+from .spec import FloatArray
 
 FEATURES = 6
 """Samples and predictions that the correction reads: of the step, and of the last two anchors."""
@@ -79,6 +80,20 @@ class Correction:
             raise IllegalPlanError(
                 f"the correction has weights {list(self.weights.shape)}; this policy needs {list(expected)}."
             )
+
+
+def remember(history: FloatArray, sample: FloatArray, prediction: FloatArray) -> None:
+    """Enter an anchor into the history, in place.
+
+    Args:
+        history: ``[D, B, 4 T]``.
+        sample: of the anchor, ``[D, B, T]``.
+        prediction: of the anchor, ``[D, B, T]``.
+    """
+    horizon = sample.shape[2]
+    history[:, :, 2 * horizon :] = history[:, :, : 2 * horizon]
+    history[:, :, :horizon] = sample
+    history[:, :, horizon : 2 * horizon] = prediction
 
 
 def correction_flops(sample: tuple[int, int]) -> int:

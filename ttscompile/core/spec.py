@@ -7,11 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ..errors import SpecError
+from .rules import DType, Positive
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -142,14 +144,14 @@ class ObservationSpec:
         dtype: numpy name of the dtype that callers must give.
         window: whether the first axis, where there are several, is time: the last To frames. A key without frames, such
             as an instruction, is what it is at the time of the call.
-        bounds: the smallest and largest value that there can be, each a number or one for each entry of the last axis;
-            None if that is not known. Integers outside them are refused: they are rows of an embedding. So are images
-            (``image``). Random observations are drawn within them. Kept as tuples.
+        bounds: the range of the values that random observations are drawn from, low and high, each a number or one for
+            each entry of the last axis; None if that is not known. Integers outside it are refused: they are rows of an
+            embedding. So are images (``image``). A vector may stray from it. Kept as tuples.
     """
 
-    shape: tuple[int, ...]
+    shape: tuple[Positive, ...]
     normalizer: Affine | None = None
-    dtype: str = "float32"
+    dtype: DType = "float32"
     window: bool = True
     bounds: tuple[float | tuple[float, ...], float | tuple[float, ...]] | None = None
 
@@ -200,10 +202,13 @@ class ObservationSpec:
             drawn = self.normalizer.unnormalize(drawn)
         return drawn.astype(self.dtype)
 
-    def draw_normalized(self, rng: np.random.Generator, streams: int) -> npt.NDArray[np.generic]:
+    def draw_normalized(self, rng: np.random.Generator, streams: int) -> npt.NDArray[Any]:
         """Random observations ``[streams, *shape]`` as the network is given them."""
-        raw = np.concatenate([self.draw(rng) for _ in range(streams)])
-        return raw if self.normalizer is None else self.normalizer.normalize(raw.astype(np.float32))
+        return self.normalized(np.concatenate([self.draw(rng) for _ in range(streams)]))
+
+    def normalized(self, array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """What the network is given of observations ``[..., *shape]``; the array itself without a normaliser."""
+        return array if self.normalizer is None else self.normalizer.normalize(array)
 
 
 @dataclass(frozen=True)
@@ -229,6 +234,11 @@ class ChunkSpec:
         if not 0 <= self.start < self.stop or self.action_dim < 1:
             raise SpecError(f"chunk [{self.start}:{self.stop}] of {self.action_dim} channels is empty.")
 
+    def unnormalized(self, sample: FloatArray) -> FloatArray:
+        """The actions ``[..., Da]`` of denoised samples ``[..., D]``, in their own units."""
+        actions = sample[..., : self.action_dim]
+        return actions if self.normalizer is None else self.normalizer.unnormalize(actions)
+
 
 @dataclass(frozen=True)
 class PolicySpec:
@@ -246,7 +256,7 @@ class PolicySpec:
         left_out: steps that the original predicts after the last one of the sample (``ttscompile.capture.narrow``).
     """
 
-    sample: tuple[int, int]
+    sample: tuple[Positive, Positive]
     observations: Mapping[str, ObservationSpec]
     sampler: SamplerTable
     chunk: ChunkSpec

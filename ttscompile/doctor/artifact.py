@@ -42,7 +42,7 @@ def artifact_findings(directory: Path) -> list[Finding]:
 
 def _needs(artifact: Artifact) -> list[Finding]:
     from ..measure.machine import has_integer_dot_product
-    from ..runtimes.onnxruntime.liveness import rollout_needs
+    from ..runtimes.liveness import rollout_needs
 
     manifest = artifact.manifest
     needs = manifest.requires

@@ -22,7 +22,7 @@ class Finding:
     Attributes:
         part: heading under which it stands.
         what: was looked at.
-        found: what it is.
+        found: what was found, for people.
         level: how much it matters.
         remedy: what to do; every warning and problem has one.
     """

@@ -74,15 +74,9 @@ def _load_type(name: str) -> type:
 
 
 _STAND_INS: list[Callable[..., Any] | tuple[Callable[..., Any], str]] = [
-    (_Container, "omegaconf.dictconfig.DictConfig"),
-    (_Container, "omegaconf.listconfig.ListConfig"),
-    (_Node, "omegaconf.nodes.AnyNode"),
-    (_Node, "omegaconf.nodes.BooleanNode"),
-    (_Node, "omegaconf.nodes.FloatNode"),
-    (_Node, "omegaconf.nodes.IntegerNode"),
-    (_Node, "omegaconf.nodes.StringNode"),
-    (_Metadata, "omegaconf.base.Metadata"),
-    (_Metadata, "omegaconf.base.ContainerMetadata"),
+    *((_Container, f"omegaconf.{kind.lower()}.{kind}") for kind in ("DictConfig", "ListConfig")),
+    *((_Node, f"omegaconf.nodes.{kind}Node") for kind in ("Any", "Boolean", "Float", "Integer", "String")),
+    *((_Metadata, f"omegaconf.base.{kind}") for kind in ("Metadata", "ContainerMetadata")),
     (_Defaults, "collections.defaultdict"),
     (_AnyType, "typing.Any"),
     (_load_type, "dill._dill._load_type"),

@@ -9,8 +9,8 @@ from typing import Any, TypeVar
 
 from ..errors import CheckpointError
 from .json_files import read_json
+from .settings import Settings
 
-_ACTIVATIONS = ("quick_gelu", "gelu")
 _MOST = {"num_hidden_layers": 512, "image_size": 4096, "patch_size": 4096}
 _MOST_OTHERWISE = 2**20
 _MOST_LETTERS = 200
@@ -37,22 +37,18 @@ class TowerConfig:
     layer_norm_eps: float = 1e-5
 
     def __post_init__(self) -> None:
+        settings = Settings(vars(self), "CLIP's ")
         for field in fields(self):
-            value = getattr(self, field.name)
-            most = _MOST.get(field.name, _MOST_OTHERWISE)
-            if field.type == "int" and (type(value) is not int or not 1 <= value <= most):
-                raise CheckpointError(f"CLIP's {field.name} is {value!r:.80}; expected a whole number of 1 to {most}.")
+            if field.type == "int":
+                settings.number(field.name, most=_MOST.get(field.name, _MOST_OTHERWISE))
+        settings.choice("hidden_act", "quick_gelu", "gelu")
         if self.hidden_size % self.num_attention_heads:
             raise CheckpointError(
                 f"CLIP's hidden_size = {self.hidden_size} is no multiple of num_attention_heads ="
                 f" {self.num_attention_heads}."
             )
-        if self.hidden_act not in _ACTIVATIONS:
-            raise CheckpointError(f"CLIP's hidden_act is {self.hidden_act!r:.80}; expected one of {_ACTIVATIONS}.")
         if not isinstance(self.layer_norm_eps, float) or not 0 < self.layer_norm_eps < 1:
-            raise CheckpointError(
-                f"CLIP's layer_norm_eps is {self.layer_norm_eps!r:.80}; expected a small positive number."
-            )
+            raise settings.refusal("layer_norm_eps", "a small positive number")
 
 
 @dataclass(frozen=True)
@@ -97,36 +93,21 @@ class TextConfig(TowerConfig):
     eos_token_id: int = 49407
 
 
-def _openai(image: tuple[int, int, int, int], text: tuple[int, int], patch: int, size: int = 224) -> dict[str, Any]:
-    """Sizes of a released model: image layers, width, heads, pixels; text width and heads, always 12 layers."""
-    layers, width, heads, _ = image
-    return {
-        "vision_config": {
-            "hidden_size": width,
-            "intermediate_size": 4 * width,
-            "num_hidden_layers": layers,
-            "num_attention_heads": heads,
-            "image_size": size,
-            "patch_size": patch,
-        },
-        "text_config": {
-            "hidden_size": text[0],
-            "intermediate_size": 4 * text[0],
-            "num_hidden_layers": 12,
-            "num_attention_heads": text[1],
-            # What their configurations say; the end token, 49407, is the largest there is.
-            "eos_token_id": 2,
-        },
-    }
+def _openai(layers: int, width: int, text: int, patch: int, size: int = 224) -> dict[str, Any]:
+    """A released model: layers and width of the image encoder, width of the text encoder, pixels of patch and image."""
+    vision = {"hidden_size": width, "num_hidden_layers": layers, "image_size": size, "patch_size": patch}
+    # The end token is 2 in their configurations; the real one, 49407, is the largest there is.
+    parts = {"vision_config": vision, "text_config": {"hidden_size": text, "eos_token_id": 2}}
+    for part in parts.values():
+        part |= {"intermediate_size": 4 * part["hidden_size"], "num_attention_heads": part["hidden_size"] // 64}
+    return parts
 
-
-_BASE, _LARGE = (12, 768, 12, 224), (24, 1024, 16, 224)
 
 RELEASED: Mapping[str, Mapping[str, Any]] = {
-    "openai/clip-vit-base-patch16": _openai(_BASE, (512, 8), 16),
-    "openai/clip-vit-base-patch32": _openai(_BASE, (512, 8), 32),
-    "openai/clip-vit-large-patch14": _openai(_LARGE, (768, 12), 14),
-    "openai/clip-vit-large-patch14-336": _openai(_LARGE, (768, 12), 14, 336),
+    "openai/clip-vit-base-patch16": _openai(12, 768, 512, 16),
+    "openai/clip-vit-base-patch32": _openai(12, 768, 512, 32),
+    "openai/clip-vit-large-patch14": _openai(24, 1024, 768, 14),
+    "openai/clip-vit-large-patch14-336": _openai(24, 1024, 768, 14, 336),
 }
 """Configurations of the released models: with these names nothing but the policy's own weights is needed."""
 

@@ -7,7 +7,6 @@ real-stanford/diffusion_policy trains and saves them. The policy is rebuilt from
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -21,9 +20,11 @@ from ..frontends import diffusion_policy_hybrid as hybrid
 from .checkpoint import plain_config, read_checkpoint
 from .diffusion_policy_weights import affine, build_network, choose_weights, load_network
 from .encoded import EncodedDenoiser
+from .families import LoadOptions
 from .interpolation import Config
 from .refusals import refuse_file, refuse_payload, refuse_policy
 from .scheduler import configured_sampler
+from .settings import Settings
 from .transformer_for_diffusion import (
     ConditionedDenoiser,
     InpaintingDenoiser,
@@ -32,43 +33,27 @@ from .transformer_for_diffusion import (
 
 _POLICY = "DiffusionTransformerLowdimPolicy"
 _NETWORK = "TransformerForDiffusion"
-_POLICY_KEYS = frozenset(
-    {
-        "_target_",
-        "model",
-        "noise_scheduler",
-        "horizon",
-        "obs_dim",
-        "action_dim",
-        "n_action_steps",
-        "n_obs_steps",
-        "num_inference_steps",
-        "obs_as_cond",
-        "pred_action_steps_only",
-    }
-)
+_SIZES = ("horizon", "obs_dim", "action_dim", "n_action_steps", "n_obs_steps")
+_SWITCHES = ("obs_as_cond", "pred_action_steps_only")
+_POLICY_KEYS = frozenset({*_SIZES, *_SWITCHES, "_target_", "model", "noise_scheduler", "num_inference_steps"})
 
 
-def load_diffusion_policy(
-    path: str | os.PathLike[str], sampler: str | None = None, steps: int | None = None, spacing: str | None = None
-) -> tuple[nn.Module, PolicySpec]:
-    """Rebuild a policy from a ``.ckpt``; arguments and errors as ``load_checkpoint_policy``.
+def load(path: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
+    """Rebuild a policy from a ``.ckpt``; see ``Family.load``.
 
     Source: ``predict_action`` of ``DiffusionTransformerLowdimPolicy`` and ``DiffusionTransformerHybridImagePolicy`` of
     real-stanford/diffusion_policy.
     """
-    refuse_file(Path(path))
+    refuse_file(path)
     payload = read_checkpoint(path)
     try:
-        return build(payload, sampler, steps, spacing)
+        return build(payload, options)
     except CheckpointError as error:
         raise CheckpointError(f"{path}: {error}") from error
 
 
-def build(
-    payload: Mapping[str, Any], sampler: str | None, steps: int | None, spacing: str | None
-) -> tuple[nn.Module, PolicySpec]:
-    """Module and specification of what ``read_checkpoint`` gave; the rest as ``load_checkpoint_policy``."""
+def build(payload: Mapping[str, Any], options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
+    """Module and specification of what ``read_checkpoint`` gave; the rest as ``load``."""
     refuse_payload(payload)
     tree = plain_config(payload["cfg"])
     if not isinstance(tree, dict):
@@ -82,11 +67,11 @@ def build(
     policy = config.require("policy")
     encoder = None
     if name == hybrid.POLICY:
-        observed = hybrid.read_shape_meta(policy)
+        action_dim, observed = hybrid.read_shape_meta(policy)
         encoder = hybrid.build_encoder(policy, observed, weights)
-        policy |= {"obs_dim": encoder.width, "action_dim": observed.action_dim}
+        policy |= {"obs_dim": encoder.width, "action_dim": action_dim}
         policy["obs_as_cond"] = policy.get("obs_as_cond", True)
-        network = build_network(hybrid.network_config(policy, observed, encoder.width), weights)
+        network = build_network(hybrid.network_config(policy, action_dim, encoder.width), weights)
         known = _POLICY_KEYS | hybrid.ENCODER_KEYS | hybrid.NETWORK_KEYS
     else:
         network = build_network(_network_config(config), weights)
@@ -108,10 +93,9 @@ def build(
     start = 0 if policy["pred_action_steps_only"] else n_obs_steps - 1
     table = configured_sampler(
         policy["noise_scheduler"],
-        policy["num_inference_steps"] if steps is None else steps,
+        policy["num_inference_steps"],
+        options,
         step_arguments={key: policy[key] for key in policy if key not in known},
-        sampler=sampler,
-        spacing=spacing,
     )
     spec = PolicySpec(
         sample=(horizon, network.config.input_dim),
@@ -156,17 +140,14 @@ def _network_config(config: Config) -> TransformerConfig:
 
 def _check_policy(policy: dict[str, Any], network: TransformerConfig) -> tuple[int, str]:
     """Check sizes against each other and fill in defaults; gives T of the sample and the name of the variant."""
-    policy["obs_as_cond"] = policy.get("obs_as_cond", False)
-    policy["pred_action_steps_only"] = policy.get("pred_action_steps_only", False)
-    for name in ("obs_as_cond", "pred_action_steps_only"):
-        if type(policy[name]) is not bool:
-            raise CheckpointError(f"cfg.policy.{name} is {policy[name]!r}; expected true or false.")
+    settings = Settings(policy, "cfg.policy.")
+    for name in _SWITCHES:
+        policy[name] = settings.flag(name, False)
     policy["num_inference_steps"] = policy.get("num_inference_steps")
     if not isinstance(policy.get("noise_scheduler"), dict):
         raise CheckpointError("cfg.policy.noise_scheduler is missing; expected the settings of a diffusers scheduler.")
-    for name in ("horizon", "obs_dim", "action_dim", "n_action_steps", "n_obs_steps"):
-        if type(policy.get(name)) is not int or policy[name] < 1:
-            raise CheckpointError(f"cfg.policy.{name} is {policy.get(name)!r}; expected a positive whole number.")
+    for name in _SIZES:
+        settings.number(name)
 
     as_cond, only_steps = policy["obs_as_cond"], policy["pred_action_steps_only"]
     if only_steps and not as_cond:

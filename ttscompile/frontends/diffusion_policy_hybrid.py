@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -18,7 +17,8 @@ from ..core.spec import ObservationSpec
 from ..errors import CheckpointError
 from .diffusion_policy_weights import Weights, affine
 from .robomimic_encoder import Camera, ObservationEncoder
-from .saved_weights import names_of, require_finite, require_names, require_shape
+from .saved_weights import names_of, require_weights
+from .settings import Settings, is_shape
 from .transformer_for_diffusion import TransformerConfig
 
 POLICY = "DiffusionTransformerHybridImagePolicy"
@@ -40,25 +40,12 @@ _GRID = ("pool.pos_x", "pool.pos_y")
 _ROUNDING = 2**-8  # of numbers up to 1 that were saved as bfloat16; the grid itself is known exactly
 
 
-@dataclass(frozen=True)
-class Observed:
-    """What ``shape_meta`` says, checked.
-
-    Attributes:
-        action_dim: Da.
-        cameras: size of the images of each key that is an image.
-        low_dim: shape of each other key.
-        order: all keys, as the encoder concatenates their features.
-    """
-
-    action_dim: int
-    cameras: Mapping[str, tuple[int, int, int]]
-    low_dim: Mapping[str, tuple[int, ...]]
-    order: tuple[str, ...]
+Observed = Mapping[str, tuple[str, tuple[int, ...]]]
+"""Type (``rgb`` or ``low_dim``) and shape by key, in the order in which the encoder concatenates their features."""
 
 
-def read_shape_meta(policy: Mapping[str, Any]) -> Observed:
-    """``cfg.policy.shape_meta`` as a record.
+def read_shape_meta(policy: Mapping[str, Any]) -> tuple[int, Observed]:
+    """Channels of the action, and the observations, of ``cfg.policy.shape_meta``.
 
     Raises:
         CheckpointError: malformed, or observations that the original's encoder does not take either.
@@ -66,32 +53,23 @@ def read_shape_meta(policy: Mapping[str, Any]) -> Observed:
     meta = policy.get("shape_meta")
     if not isinstance(meta, dict) or not isinstance(meta.get("obs"), dict) or not isinstance(meta.get("action"), dict):
         raise CheckpointError("cfg.policy.shape_meta is missing or malformed; expected {obs: {...}, action: {shape}}.")
-    action = _shape(meta["action"], "action")
-    if len(action) != 1:
-        raise CheckpointError(f"cfg.policy.shape_meta.action.shape is {list(action)}; expected one number.")
-    cameras: dict[str, tuple[int, int, int]] = {}
-    low_dim: dict[str, tuple[int, ...]] = {}
-    for key, attributes in meta["obs"].items():
-        shape = _shape(attributes, f"obs.{key}")
-        kind = attributes.get("type", "low_dim")
-        if kind not in ("rgb", "low_dim"):
-            raise CheckpointError(f"cfg.policy.shape_meta.obs.{key}.type is {kind!r}; expected rgb or low_dim.")
-        if kind == "low_dim":
-            low_dim[key] = shape
-        elif len(shape) == 3:
-            cameras[key] = (shape[0], shape[1], shape[2])
-        else:
-            raise CheckpointError(f"cfg.policy.shape_meta.obs.{key}.shape is {list(shape)}; expected [C, H, W].")
-    if not cameras and not low_dim:
+    observed = {}
+    entries = {"action": meta["action"]} | {f"obs.{key}": each for key, each in meta["obs"].items()}
+    for key, attributes in entries.items():
+        settings = Settings(attributes if isinstance(attributes, dict) else {}, f"cfg.policy.shape_meta.{key}.")
+        shape: Any = settings.values.get("shape")
+        if not is_shape(shape):
+            raise settings.refusal("shape", "positive whole numbers")
+        kind = "low_dim" if key == "action" else settings.choice("type", "low_dim", "rgb")
+        if key == "action" and len(shape) != 1:
+            raise settings.refusal("shape", "one number")
+        if kind == "rgb" and len(shape) != 3:
+            raise settings.refusal("shape", "[C, H, W]")
+        observed[key] = (kind, tuple(shape))
+    _, (action_dim, *_) = observed.pop("action")
+    if not observed:
         raise CheckpointError("cfg.policy.shape_meta.obs names no observation.")
-    return Observed(action[0], cameras, low_dim, tuple(meta["obs"]))
-
-
-def _shape(attributes: Any, where: str) -> tuple[int, ...]:
-    shape = attributes.get("shape") if isinstance(attributes, dict) else None
-    if not isinstance(shape, list) or not shape or not all(type(n) is int and n > 0 for n in shape):
-        raise CheckpointError(f"cfg.policy.shape_meta.{where}.shape is {shape!r}; expected positive whole numbers.")
-    return tuple(shape)
+    return action_dim, {key.removeprefix("obs."): each for key, each in observed.items()}
 
 
 def build_encoder(policy: Mapping[str, Any], observed: Observed, weights: Weights) -> ObservationEncoder:
@@ -105,50 +83,39 @@ def build_encoder(policy: Mapping[str, Any], observed: Observed, weights: Weight
     Raises:
         CheckpointError: settings, weights or normalisers that do not fit.
     """
-    switches = {name: policy.get(name, False) for name in ("obs_encoder_group_norm", "eval_fixed_crop")}
-    for name, value in switches.items():
-        if type(value) is not bool:
-            raise CheckpointError(f"cfg.policy.{name} is {value!r}; expected true or false.")
-    crop = _crop(policy, observed)
-    if crop is not None and not switches["eval_fixed_crop"] and observed.cameras:
+    settings = Settings(policy, "cfg.policy.")
+    group_norm, fixed = (settings.flag(name, False) for name in ("obs_encoder_group_norm", "eval_fixed_crop"))
+    crop = settings.size("crop_shape", [76, 76])
+    inputs: dict[str, Camera | int] = {}
+    for key, (kind, shape) in observed.items():
+        if kind == "low_dim":
+            inputs[key] = math.prod(shape)
+            continue
+        channels, height, width = shape
+        if crop is not None and (crop[0] >= height or crop[1] >= width):
+            raise CheckpointError(
+                f"cfg.policy.crop_shape is {list(crop)}, and the images of {key!r} are {height} x {width}; expected a"
+                " crop that is smaller; the original refuses this, too."
+            )
+        inputs[key] = Camera((channels, height, width), crop, *_image_normalizer(weights, key))
+    encoder = ObservationEncoder(inputs, group_norm)
+    if crop is not None and not fixed and encoder.position:
         warnings.warn(
             "eval_fixed_crop is false: the original crops its images at random even in evaluation. The compiled policy"
             " always takes the centre, as the original does with eval_fixed_crop = true.",
             stacklevel=2,
         )
-    cameras = {}
-    for key, shape in observed.cameras.items():
-        scale, offset = _image_normalizer(weights, key)
-        cameras[key] = Camera(shape, crop, scale, offset)
-    low_dim = {key: math.prod(shape) for key, shape in observed.low_dim.items()}
-    encoder = ObservationEncoder(cameras, low_dim, observed.order, switches["obs_encoder_group_norm"])
     for key, position in encoder.position.items():
         _load_camera(encoder.cameras[position], weights, key)
-    known = tuple(f"{_PREFIX}{key}." for key in cameras)
+    known = tuple(f"{_PREFIX}{key}." for key in encoder.position)
     extra = [key for key in weights if key.startswith("obs_encoder.") and not key.startswith(known)]
     if extra:
         raise CheckpointError(
             f"the weights hold {names_of(extra)}, which belong to no image of cfg.policy.shape_meta.obs"
-            f" ({', '.join(cameras) or 'there are none'}). The policy has another observation encoder; use"
+            f" ({', '.join(encoder.position) or 'there are none'}). The policy has another observation encoder; use"
             " ttscompile.compile_denoiser(module, spec)."
         )
     return encoder
-
-
-def _crop(policy: Mapping[str, Any], observed: Observed) -> tuple[int, int] | None:
-    """``crop_shape``, which must be smaller than every image; the original's default is 76 x 76."""
-    crop = policy.get("crop_shape", [76, 76])
-    if crop is None:
-        return None
-    if not isinstance(crop, list) or len(crop) != 2 or not all(type(n) is int and n > 0 for n in crop):
-        raise CheckpointError(f"cfg.policy.crop_shape is {crop!r}; expected [height, width] or null.")
-    for key, (_, height, width) in observed.cameras.items():
-        if crop[0] >= height or crop[1] >= width:
-            raise CheckpointError(
-                f"cfg.policy.crop_shape is {crop}, and the images of {key!r} are {height} x {width}; expected a crop"
-                " that is smaller; the original refuses this, too."
-            )
-    return crop[0], crop[1]
 
 
 def _image_normalizer(weights: Weights, key: str) -> tuple[float, float]:
@@ -182,33 +149,28 @@ def _load_camera(module: torch.nn.Module, weights: Weights, key: str) -> None:
         found[name] = value
         saved[name] = saved.get(name, full)
     expected = {name: value for name, value in module.state_dict().items() if not name.endswith("num_batches_tracked")}
-    missing = [prefix + name for name in expected if name not in found]
-    extra = [saved[name] for name in found if name not in expected]
-    require_names(
-        missing,
-        extra,
-        "the weights of the image encoder are not those of robomimic's ResNet-18 with spatial softmax and"
-        " obs_encoder_group_norm as configured",
-        "Use ttscompile.compile_denoiser(module, spec) for another encoder.",
+    require_weights(
+        {saved.get(name, prefix + name): value for name, value in expected.items()},
+        {saved[name]: value for name, value in found.items()},
+        "cfg.policy (shape_meta, crop_shape, obs_encoder_group_norm)",
+        what="the weights of the image encoder are not those of robomimic's ResNet-18 with spatial softmax",
     )
-    for name, value in found.items():
-        require_shape(saved[name], value, expected[name].shape, "cfg.policy.shape_meta and crop_shape")
-        require_finite(saved[name], value)
-        if name in _GRID and not torch.allclose(value, expected[name], atol=_ROUNDING):
+    for name in _GRID:
+        if not torch.allclose(found[name], expected[name], atol=_ROUNDING):
             raise CheckpointError(f"{saved[name]} is not the grid from -1 to 1 of a spatial softmax; it was changed.")
     module.load_state_dict({name: value for name, value in found.items() if name not in _GRID}, strict=False)
 
 
-def network_config(policy: Mapping[str, Any], observed: Observed, encoded: int) -> TransformerConfig:
+def network_config(policy: Mapping[str, Any], action_dim: int, encoded: int) -> TransformerConfig:
     """The transformer's sizes, which this policy has among its own settings.
 
     Args:
         policy: ``cfg.policy``, with ``obs_as_cond``.
-        observed: of the same.
+        action_dim: channels of the action.
         encoded: length of what the encoder gives for one step.
     """
     as_cond = policy["obs_as_cond"] is True
-    channels = observed.action_dim + (0 if as_cond else encoded)
+    channels = action_dim + (0 if as_cond else encoded)
     values = {name: policy.get(name, default) for name, default in _NETWORK_DEFAULTS.items()}
     values |= {name: policy.get(name) for name in ("horizon", "n_obs_steps")}
     try:
@@ -219,11 +181,9 @@ def network_config(policy: Mapping[str, Any], observed: Observed, encoded: int) 
 
 def observation_specs(observed: Observed, steps: int, weights: Weights) -> dict[str, ObservationSpec]:
     """What callers give, by key: images in 0..1, normalised by the module; the rest as the normaliser says."""
-    specs = {}
-    for key in observed.order:
-        if key in observed.cameras:
-            specs[key] = ObservationSpec((steps, *observed.cameras[key]), bounds=(0.0, 1.0))
-        else:
-            shape = observed.low_dim[key]
-            specs[key] = ObservationSpec((steps, *shape), affine(weights, key, shape[-1]))
-    return specs
+    return {
+        key: ObservationSpec((steps, *shape), bounds=(0.0, 1.0))
+        if kind == "rgb"
+        else ObservationSpec((steps, *shape), affine(weights, key, shape[-1]))
+        for key, (kind, shape) in observed.items()
+    }

@@ -11,11 +11,13 @@ import torch
 
 from ..core.spec import Affine
 from ..errors import CheckpointError
-from .saved_weights import require_finite, require_names, require_shape, unwrapped
+from .saved_weights import as_float32, require_weights
 from .transformer_for_diffusion import TransformerConfig, TransformerForDiffusion
 
-_NORMALIZER_KEY = re.compile(r"normalizer\.params_dict\.\w+\.(scale|offset|input_stats\.\w+)")
-_OTHER_KEY = re.compile(r"(model\.)?_dummy_variable|mask_generator\..*")
+_OTHER_KEY = re.compile(
+    r"(model\.)?_dummy_variable|mask_generator\..*|normalizer\.params_dict\.\w+\.(scale|offset|input_stats\.\w+)"
+)
+_MASKS = frozenset({"model.mask", "model.memory_mask"})
 _COUNTERS = ".num_batches_tracked"  # of batch norm, whole numbers, used by training only
 
 Weights = Mapping[str, torch.Tensor]
@@ -44,12 +46,7 @@ def choose_weights(state_dicts: Any, use_ema: Any) -> tuple[Weights, str]:
     weights = state_dicts[found]
     if not isinstance(weights, dict):
         raise CheckpointError(f"state_dicts.{found} is a {type(weights).__name__}; expected a dictionary of tensors.")
-    weights = {unwrapped(str(key)): value for key, value in weights.items() if not str(key).endswith(_COUNTERS)}
-    for key, value in weights.items():
-        if not isinstance(value, torch.Tensor) or value.layout != torch.strided or not value.is_floating_point():
-            what = f"{value.dtype} tensor" if isinstance(value, torch.Tensor) else type(value).__name__
-            raise CheckpointError(f"weight {key} is a {what}; expected a dense floating-point tensor.")
-    return {key: value.detach().to(torch.float32) for key, value in weights.items()}, found
+    return as_float32({key: value for key, value in weights.items() if not str(key).endswith(_COUNTERS)}), found
 
 
 def build_network(config: TransformerConfig, weights: Weights) -> TransformerForDiffusion:
@@ -79,30 +76,13 @@ def build_network(config: TransformerConfig, weights: Weights) -> TransformerFor
 
 def load_network(network: TransformerForDiffusion, weights: Weights) -> None:
     """Fill the network; every weight must be there, of the right shape, finite, and nothing else may be there."""
-    expected = network.state_dict()
-    found = {key.removeprefix("model."): value for key, value in weights.items() if key.startswith("model.")}
-    found.pop("_dummy_variable", None)
-    missing = [f"model.{key}" for key in expected if key not in found]
-    extra = [f"model.{key}" for key in found if key not in expected]
-    extra += [
-        key
-        for key in weights
-        if not (key.startswith("model.") or _OTHER_KEY.fullmatch(key) or _NORMALIZER_KEY.fullmatch(key))
-    ]
-    require_names(
-        missing,
-        extra,
-        "the weights do not fit the configuration",
-        "cfg.policy.model describes another network than the one that was saved, or the file is incomplete.",
-    )
-    for key, value in found.items():
-        require_shape(f"model.{key}", value, expected[key].shape, "cfg.policy.model")
-        if key in ("mask", "memory_mask"):
-            if not torch.equal(value, expected[key]):
-                raise CheckpointError(f"model.{key} is not the causal mask of the original; the network was changed.")
-        else:
-            require_finite(f"model.{key}", value)
-    network.load_state_dict(found, strict=True)
+    expected = {f"model.{key}": value for key, value in network.state_dict().items()}
+    found = {key: value for key, value in weights.items() if not _OTHER_KEY.fullmatch(key)}
+    require_weights(expected, found, "cfg.policy.model", _MASKS)
+    for key in _MASKS & found.keys():
+        if not torch.equal(found[key], expected[key]):
+            raise CheckpointError(f"{key} is not the causal mask of the original; the network was changed.")
+    network.load_state_dict({key.removeprefix("model."): value for key, value in found.items()})
 
 
 def affine(weights: Weights, key: str, width: int | None) -> Affine:

@@ -1,4 +1,7 @@
-"""The policy's denoising loop in plain PyTorch: what a compiled policy is measured against."""
+"""The policy's denoising loop in plain PyTorch: what a compiled policy is measured against.
+
+It shares nothing with the loop of the reference runtime on purpose: what it gives is the record that this is held to.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from torch import nn
 
 from ..core.spec import Noise, PolicySpec
 from ..errors import ObservationError
-from .encoded import EncodedDenoiser
+from .encoded import parts
 
 EagerPolicy = Callable[[Mapping[str, torch.Tensor], Noise], torch.Tensor]
 
@@ -66,7 +69,8 @@ def evaluation(
 ) -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor]:
     """One evaluation of the denoiser, a function of sample and timesteps, for these observations."""
     named = {spec.arguments[key]: value for key, value in observations.items()}
-    if isinstance(module, EncodedDenoiser):
-        encoded, denoiser = module.encoder(named), module.denoiser
+    encoder, denoiser = parts(module)
+    if encoder is not None:
+        encoded = encoder(named)
         return lambda sample, timestep: denoiser(sample, timestep, encoded)
     return lambda sample, timestep: module(**{spec.sample_argument: sample, spec.timestep_argument: timestep}, **named)

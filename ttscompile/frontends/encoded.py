@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import nn
 
@@ -10,7 +12,7 @@ class EncodedDenoiser(nn.Module):
     """A denoiser whose observations go through an encoder that the original evaluates once a call, not once a step.
 
     Captured as one module; the encoder depends on the observation alone, so hoisting takes it out of the loop. What
-    measures the original, its FLOPs and its time, asks for this class, and counts the encoder once.
+    runs or measures the original asks ``parts`` for it, and evaluates or counts it once.
 
     Args:
         encoder: ``encoder(observations)``, a dictionary by key to what the denoiser takes.
@@ -26,3 +28,20 @@ class EncodedDenoiser(nn.Module):
         """``[B, T, D]``, ``[B]`` and the observations by key -> ``[B, T, D]``."""
         prediction: torch.Tensor = self.denoiser(sample, timestep, self.encoder(observations))
         return prediction
+
+
+class Parts(NamedTuple):
+    """What the original evaluates of a policy's network, and how often.
+
+    Attributes:
+        encoder: once a call, on the observations alone; None where there is none.
+        denoiser: at every step.
+    """
+
+    encoder: nn.Module | None
+    denoiser: nn.Module
+
+
+def parts(module: nn.Module) -> Parts:
+    """The parts of a network as a frontend or a user gives it: the one place that asks of which class it is."""
+    return Parts(module.encoder, module.denoiser) if isinstance(module, EncodedDenoiser) else Parts(None, module)

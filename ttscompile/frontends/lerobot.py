@@ -6,7 +6,6 @@ preprocessing and CLIP are part of the module, so that the compiled policy takes
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -15,21 +14,22 @@ from torch import nn
 
 from ..core.spec import ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
 from ..errors import CheckpointError, SpecError
-from ..samplers.flow import flow_matching_table
+from ..samplers.flow import METHODS, flow_matching_table
 from .clip_config import TextConfig, VisionConfig, encoder_config, find_encoder
 from .encoded import EncodedDenoiser
+from .families import LoadOptions
 from .image_geometry import ResizeCrop
 from .lerobot_config import CONFIG, POLICY, STATE, WEIGHTS, LeRobotConfig, read_lerobot_config
-from .lerobot_processors import PREPROCESSOR, Normalizer, Processors, read_processors
-from .lerobot_weights import fill, network_parts, parts_without_memory, read_weights, require_weights
-from .multi_task_dit import ConditionEncoder, Inputs, ObservationEncoder
+from .lerobot_processors import PREPROCESSOR, Processors, read_processors
+from .lerobot_statistics import Normalizer
+from .lerobot_weights import Network, read_weights, require_lerobot_weights
+from .multi_task_dit import ConditionEncoder
 from .scheduler import MOST_STEPS, configured_sampler
 
 _MOST_TOKENIZER_BYTES = 16 * 2**20
 """Of one file; CLIP's own tokenizer.json has 2 MB."""
 
 TOKENS, MASK = "observation.language.tokens", "observation.language.attention_mask"
-_SCHEDULERS = {"DDPM": "DDPMScheduler", "DDIM": "DDIMScheduler"}
 _SCHEDULER_SETTINGS = {
     "num_train_timesteps": 100,
     "beta_start": 0.0001,
@@ -37,26 +37,17 @@ _SCHEDULER_SETTINGS = {
     "beta_schedule": "squaredcos_cap_v2",
     "clip_sample": True,
     "clip_sample_range": 1.0,
-    "prediction_type": "epsilon",
 }
 
 
-def load_lerobot(
-    path: str | os.PathLike[str],
-    sampler: str | None = None,
-    steps: int | None = None,
-    spacing: str | None = None,
-    task: str | None = None,
-    encoders: str | os.PathLike[str] | None = None,
-) -> tuple[nn.Module, PolicySpec]:
-    """Rebuild a policy from its directory; arguments and errors as ``load_checkpoint_policy``.
+def load(directory: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
+    """Rebuild a policy from its directory; see ``Family.load``.
 
     Source: ``MultiTaskDiTPolicy.predict_action_chunk`` of huggingface/lerobot 0.6, and its processors.
     """
-    directory = Path(path)
     config = read_lerobot_config(directory)
     processors = read_processors(directory, config.features)
-    folders = [*([Path(encoders)] if encoders is not None else []), directory, directory.resolve().parent]
+    folders = [*([] if options.encoders is None else [Path(options.encoders)]), directory, directory.resolve().parent]
     text = encoder_config(config.text_encoder_name, "text_config", TextConfig, folders)
     vision = None
     if config.cameras:
@@ -72,17 +63,17 @@ def load_lerobot(
             f"{directory}: the tokenizer's max_length is {length!r:.80}, and tokenizer_max_length of {CONFIG} is"
             f" {config.tokens}; expected the same number."
         )
-    compiled_in = None if task is None else _tokens(task, config, processors, folders, text)
+    compiled_in = None if options.task is None else _tokens(options.task, config, processors, folders, text)
     weights = read_weights(directory / WEIGHTS)
     try:
         # Compared before anything of the configured sizes is made, so that no more memory is taken than the file has.
-        require_weights(parts_without_memory(config, vision, text), weights)
-        module = build_module(config, processors, vision, text, compiled_in)
+        require_lerobot_weights(config, vision, text, weights)
+        network = Network(config, vision, text)
+        network.load_state_dict(weights)
+        module = with_inputs(network, config, processors, vision, compiled_in)
     except CheckpointError as error:
         raise CheckpointError(f"{directory}: {error}") from error
-    observer = module.encoder.get_submodule("observation_encoder")
-    fill({"noise_predictor.": module.denoiser, "observation_encoder.": observer}, weights)
-    table = _sampler(config, str(directory / CONFIG), sampler, steps, spacing)
+    table = _sampler(config, str(directory / CONFIG), options)
     chunk = ChunkSpec(
         action_dim=config.network.action_dim,
         start=config.n_obs_steps - 1,
@@ -100,7 +91,7 @@ def load_lerobot(
             "policy": POLICY,
             "variant": "flow matching" if config.flow else "diffusion",
             "positions": "rotary" if config.network.use_rope else "learned",
-            **({"task": task} if task is not None else {}),
+            **({} if options.task is None else {"task": options.task}),
         },
     )
     return module.eval(), spec
@@ -112,8 +103,8 @@ def _observations(
     """What the robot gives, under its own names; images as float32 of 0..1, channels first."""
     frames = config.n_obs_steps
     state = processors.normalizers.get(STATE)
-    bounds = None if state is None else state.bounds
-    specs = {processors.renamed.get(STATE, STATE): ObservationSpec((frames, config.state_dim), bounds=bounds)}
+    usual = None if state is None else state.usual_range
+    specs = {processors.renamed.get(STATE, STATE): ObservationSpec((frames, config.state_dim), bounds=usual)}
     for key, shape in config.cameras.items():
         specs[processors.renamed.get(key, key)] = ObservationSpec((frames, *shape), bounds=(0.0, 1.0))
     if tokens:
@@ -123,14 +114,14 @@ def _observations(
     return specs
 
 
-def build_module(
+def with_inputs(
+    network: Network,
     config: LeRobotConfig,
     processors: Processors,
     vision: VisionConfig | None,
-    text: TextConfig,
     task: tuple[torch.Tensor, torch.Tensor] | None,
 ) -> EncodedDenoiser:
-    """The network without its weights."""
+    """The network behind what lerobot does to observations: it takes what the robot measures."""
     cameras = config.cameras
     geometry = None
     if vision is not None:
@@ -141,41 +132,25 @@ def build_module(
                 f"images reach the vision encoder as {geometry.size}, and it takes {vision.image_size} pixels square."
                 " Check image_resize_shape and image_crop_shape, and that the encoder found is the policy's own."
             )
-    parts = network_parts(config, vision, text)
-    encoder = parts["observation_encoder."]
-    assert isinstance(encoder, ObservationEncoder)
     names = [key.replace(".", "_") for key in (processors.renamed.get(k, k) for k in (STATE, *cameras))]
-    tokens = (TOKENS.replace(".", "_"), MASK.replace(".", "_")) if task is None else None
+    tokens = TOKENS.replace(".", "_"), MASK.replace(".", "_")
     normalizers = [Normalizer(processors.normalizers.get(key)) for key in (STATE, *cameras)]
-    condition = ConditionEncoder(encoder, Inputs(names[0], tuple(names[1:]), tokens), geometry, normalizers, task)
-    return EncodedDenoiser(condition, parts["noise_predictor."])
+    condition = ConditionEncoder(network.observation_encoder, names, tokens, geometry, normalizers, task)
+    return EncodedDenoiser(condition, network.noise_predictor)
 
 
-def _sampler(
-    config: LeRobotConfig, where: str, sampler: str | None, steps: int | None, spacing: str | None
-) -> SamplerTable:
+def _sampler(config: LeRobotConfig, where: str, options: LoadOptions) -> SamplerTable:
     """The denoising loop of the policy's objective; ``where`` is the configuration, for messages."""
-    settings = config.settings
+    settings = config.settings.values
     if not config.flow:
-        name = settings.get("noise_scheduler_type", "DDPM")
-        if not isinstance(name, str) or name not in _SCHEDULERS:
-            known = ", ".join(_SCHEDULERS)
-            raise CheckpointError(f"{where}: noise_scheduler_type is {name!r:.80}; expected one of {known}.")
-        own = {key: settings.get(key, default) for key, default in _SCHEDULER_SETTINGS.items()}
-        if own["prediction_type"] not in ("epsilon", "sample"):
-            found = f"{own['prediction_type']!r:.80}"
-            raise CheckpointError(f"{where}: prediction_type is {found}; expected epsilon or sample.")
-        if steps is None:
-            steps = settings.get("num_inference_steps")
-        scheduler = {"_target_": _SCHEDULERS[name], **own}
-        return configured_sampler(scheduler, steps, step_arguments={}, sampler=sampler, spacing=spacing, where=where)
-    if spacing is not None:
+        scheduler = {key: settings.get(key, default) for key, default in _SCHEDULER_SETTINGS.items()}
+        scheduler["_target_"] = f"{config.settings.choice('noise_scheduler_type', 'DDPM', 'DDIM')}Scheduler"
+        scheduler["prediction_type"] = config.settings.choice("prediction_type", "epsilon", "sample")
+        return configured_sampler(scheduler, settings.get("num_inference_steps"), options, where=where)
+    if options.spacing is not None:
         raise SpecError("spacing is of the timesteps of diffusion; this policy's objective is flow matching.")
-    own_method = settings.get("integration_method", "euler")
-    if not isinstance(own_method, str):
-        raise CheckpointError(f"{where}: integration_method is {own_method!r:.80}; expected euler or rk4.")
-    method: Any = sampler or own_method
-    count = steps if steps is not None else settings.get("num_integration_steps", 100)
+    method: Any = options.sampler or config.settings.choice("integration_method", *METHODS)
+    count = options.steps if options.steps is not None else settings.get("num_integration_steps", 100)
     if type(count) is not int or not 1 <= count <= MOST_STEPS:
         raise SpecError(
             f"{where}: {count!r:.80} integration steps are not possible (num_integration_steps, or steps= and --steps);"
@@ -193,10 +168,10 @@ def _tokens(
     found = find_encoder(str(name), folders)
     if found is None or not any((found / file).is_file() for file in ("tokenizer.json", "vocab.json")):
         raise CheckpointError(
-            f"the tokenizer {str(name)!r:.200} is not on this machine, and nothing is ever downloaded; it is needed to"
-            " compile the policy for one task. Put config.json and the tokenizer's files (tokenizer.json, or vocab.json"
-            " and merges.txt) of the text encoder into one folder, and name it: encoders= in Python, --encoders on the"
-            " command line. Or leave the task out: the policy then takes tokens as an observation."
+            f"the tokenizer {str(name)!r:.200} is not on this machine, and nothing is ever downloaded. Put config.json"
+            " and tokenizer.json (or vocab.json and merges.txt) of the text encoder into one folder, and name it:"
+            " encoders= in Python, --encoders on the command line. Or leave the task out: the policy then takes tokens"
+            " as an observation."
         )
     files = [file for file in sorted(found.iterdir()) if file.suffix in (".json", ".txt")]
     large = [file.name for file in files if file.stat().st_size > _MOST_TOKENIZER_BYTES]

@@ -1,6 +1,6 @@
 """LeRobot's processors: what is done to observations before the policy, and to actions after it.
 
-Source: ``lerobot.processor`` of huggingface/lerobot 0.6, of which only the arithmetic of its normalisers matters here.
+Source: ``lerobot.processor`` of huggingface/lerobot 0.6; the arithmetic is in ``lerobot_statistics``.
 """
 
 from __future__ import annotations
@@ -11,24 +11,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from safetensors.torch import load_file
-from torch import nn
 
-from ..core.spec import Affine
 from ..errors import CheckpointError
 from .json_files import read_json
+from .lerobot_statistics import STATISTICS, Features, Statistics
+from .saved_weights import read_tensors
+from .settings import Settings
 
 ACTION = "action"
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
 
-_STATISTICS = {
-    "MEAN_STD": ("mean", "std"),
-    "MIN_MAX": ("min", "max"),
-    "QUANTILES": ("q01", "q99"),
-    "QUANTILE10": ("q10", "q90"),
-}
 _RENAME, _TOKENIZE, _NORMALIZE = "rename_observations_processor", "tokenizer_processor", "normalizer_processor"
 _UNNORMALIZE, _BATCH, _DEVICE = "unnormalizer_processor", "to_batch_processor", "device_processor"
 _KNOWN_STEPS: Mapping[str, frozenset[str]] = {
@@ -36,80 +29,6 @@ _KNOWN_STEPS: Mapping[str, frozenset[str]] = {
     POSTPROCESSOR: frozenset({_BATCH, _DEVICE, _UNNORMALIZE}),
 }
 _ONCE = frozenset({_RENAME, _TOKENIZE, _NORMALIZE, _UNNORMALIZE})
-_LEAST_STD = 1e-30
-"""Stands for a standard deviation of zero, which gives the mean whatever the network says."""
-
-
-@dataclass(frozen=True)
-class Statistics:
-    """How one feature is normalised: its mode, and the two statistics that the mode names, float32.
-
-    Attributes:
-        mode: ``MEAN_STD``, ``MIN_MAX``, ``QUANTILES`` or ``QUANTILE10``.
-        first: mean, or the lower end of the range.
-        second: standard deviation, or the upper end.
-        eps: of the processor's configuration.
-    """
-
-    mode: str
-    first: torch.Tensor
-    second: torch.Tensor
-    eps: float
-
-    @property
-    def width(self) -> torch.Tensor:
-        """What is divided by: ``std + eps``; or the range, and ``eps`` where that is zero."""
-        if self.mode == "MEAN_STD":
-            return self.second + self.eps
-        width = self.second - self.first
-        return torch.where(width == 0, torch.tensor(self.eps, dtype=width.dtype), width)
-
-    @property
-    def bounds(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Of a vector: the range that the statistics speak of; of MEAN_STD two deviations to each side."""
-        low, high = self.first, self.second
-        if self.mode == "MEAN_STD":
-            low, high = self.first - 2 * self.second, self.first + 2 * self.second
-        low, high = torch.minimum(low, high), torch.maximum(low, high)
-        return tuple(low.tolist()), tuple(high.tolist())
-
-    def inverse(self) -> Affine:
-        """The inverse as an ``Affine``, for vectors. MEAN_STD inverts with the bare standard deviation."""
-        first = self.first.double().numpy()
-        if self.mode == "MEAN_STD":
-            scale = 1 / np.maximum(self.second.double().numpy(), _LEAST_STD)
-            return Affine(scale=scale.astype(np.float32), offset=(-first * scale).astype(np.float32))
-        scale = 2 / self.width.double().numpy()
-        return Affine(scale=scale.astype(np.float32), offset=(-first * scale - 1).astype(np.float32))
-
-
-class Normalizer(nn.Module):
-    """``(x - mean) / (std + eps)``, or ``2 (x - low) / range - 1``, as LeRobot writes it.
-
-    It is part of the compiled network rather than an ``Affine`` of the observation: images are normalised by channel,
-    and a channel that never changed in training is divided by 1e-8, which only this order of operations survives.
-
-    Args:
-        statistics: of a feature, broadcast against its values; None leaves them as they are.
-    """
-
-    first: torch.Tensor
-    width: torch.Tensor
-
-    def __init__(self, statistics: Statistics | None) -> None:
-        super().__init__()
-        self.mode = None if statistics is None else statistics.mode
-        if statistics is not None:
-            self.register_buffer("first", statistics.first, persistent=False)
-            self.register_buffer("width", statistics.width, persistent=False)
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """``[B, To, ...]`` -> the same."""
-        if self.mode is None:
-            return x
-        if self.mode == "MEAN_STD":
-            return (x - self.first) / self.width
-        return 2 * (x - self.first) / self.width - 1
 
 
 @dataclass(frozen=True)
@@ -129,12 +48,12 @@ class Processors:
     tokenizer: Mapping[str, Any] | None
 
 
-def read_processors(directory: Path, features: Mapping[str, tuple[str, tuple[int, ...]]]) -> Processors:
+def read_processors(directory: Path, features: Features) -> Processors:
     """The pipelines of a directory that LeRobot saved.
 
     Args:
         directory: of the policy.
-        features: of the policy: type (``STATE``, ``VISUAL``, ``ACTION``) and shape by name.
+        features: of the policy.
 
     Raises:
         CheckpointError: a file is missing or damaged; a step is not known, there twice, or out of order.
@@ -150,23 +69,6 @@ def read_processors(directory: Path, features: Mapping[str, tuple[str, tuple[int
         renamed=renamed,
         tokenizer=tokenizers[0] if tokenizers else None,
     )
-
-
-def read_tensors(path: Path) -> dict[str, torch.Tensor]:
-    """The tensors of a safetensors file on the CPU; the format holds nothing that could run.
-
-    Raises:
-        CheckpointError: missing or damaged.
-    """
-    if not path.is_file():
-        raise CheckpointError(f"{path}: no such file. Copy the policy's directory whole.")
-    try:
-        tensors: dict[str, torch.Tensor] = load_file(path, device="cpu")
-    except Exception as error:  # what the reader raises depends on where the file is damaged
-        raise CheckpointError(
-            f"{path}: not a safetensors file, or a truncated one: {error!s:.300}. Copy it again."
-        ) from error
-    return tensors
 
 
 def _steps(directory: Path, name: str) -> list[dict[str, Any]]:
@@ -211,12 +113,10 @@ def _steps(directory: Path, name: str) -> list[dict[str, Any]]:
     return steps
 
 
-def _renamed(
-    directory: Path, steps: list[dict[str, Any]], features: Mapping[str, tuple[str, tuple[int, ...]]]
-) -> dict[str, str]:
+def _renamed(directory: Path, steps: list[dict[str, Any]], features: Features) -> dict[str, str]:
     """The policy's name of each renamed observation -> the robot's."""
     step = next((step for step in steps if step["registry_name"] == _RENAME), None)
-    names = {} if step is None else _mapping(step, directory, "rename_map")
+    names = {} if step is None else Settings(step["config"], f"{directory}: {_RENAME}.").names("rename_map")
     renamed = {new: old for old, new in names.items()}
     given = [renamed.get(key, key) for key, (kind, _) in features.items() if kind != "ACTION"]
     if len(renamed) < len(names) or len(set(given)) < len(given):
@@ -227,36 +127,24 @@ def _renamed(
     return renamed
 
 
-def _mapping(step: Mapping[str, Any], directory: Path, key: str) -> dict[str, str]:
-    value = step["config"].get(key, {})
-    if not isinstance(value, dict) or not all(isinstance(item, str) for item in value.values()):
-        raise CheckpointError(f"{directory}: {step['registry_name']}.{key} is {value!r:.80}; expected names by name.")
-    return value
-
-
 def _statistics(
-    directory: Path,
-    steps: list[dict[str, Any]],
-    registered: str,
-    features: Mapping[str, tuple[str, tuple[int, ...]]],
+    directory: Path, steps: list[dict[str, Any]], registered: str, features: Features
 ) -> dict[str, Statistics]:
     """Statistics of each feature that a normalising step changes."""
     found = [step for step in steps if step["registry_name"] == registered]
     if len(found) != 1:
         raise CheckpointError(f"{directory}: expected one step {registered}; found {len(found)}.")
     (step,) = found
-    config, modes = step["config"], _mapping(step, directory, "norm_map")
-    eps = config.get("eps", 1e-8)
+    settings = Settings(step["config"], f"{directory}: {registered}.")
+    modes, eps = settings.names("norm_map"), settings.values.get("eps", 1e-8)
     if not isinstance(eps, float) or not eps > 0:
-        raise CheckpointError(f"{directory}: {registered}.eps is {eps!r:.80}; expected a positive number.")
+        raise settings.refusal("eps", "a positive number")
     tensors = _state(directory, step)
-    only, own = config.get("normalize_observation_keys"), config.get("features", {})
+    only, own = settings.values.get("normalize_observation_keys"), settings.values.get("features", {})
     if not isinstance(own, dict):
-        raise CheckpointError(f"{directory}: {registered}.features is {own!r:.80}; expected type and shape by name.")
+        raise settings.refusal("features", "type and shape by name")
     if only is not None and not (isinstance(only, list) and all(isinstance(key, str) for key in only)):
-        raise CheckpointError(
-            f"{directory}: {registered}.normalize_observation_keys is {only!r:.80}; expected a list of names, or null."
-        )
+        raise settings.refusal("normalize_observation_keys", "a list of names, or null")
     result = {}
     for key, (kind, shape) in features.items():
         mode = modes.get(kind, "IDENTITY")
@@ -264,24 +152,19 @@ def _statistics(
         skipped = kind != "ACTION" and (key not in own or (only is not None and key not in only))
         if mode == "IDENTITY" or skipped:
             continue
-        if mode not in _STATISTICS:
-            known = ", ".join(("IDENTITY", *_STATISTICS))
-            raise CheckpointError(
-                f"{directory}: {registered} normalises {kind} by {mode!r:.80}; expected one of {known}."
-            )
-        names = [f"{key}.{name}" for name in _STATISTICS[mode]]
+        if mode not in STATISTICS:
+            raise settings.refusal("norm_map", f"one of IDENTITY, {', '.join(STATISTICS)} for {kind}")
+        names = [f"{key}.{name}" for name in STATISTICS[mode]]
         if not any(name.rpartition(".")[0] == key for name in tensors):
             warnings.warn(
                 f"{directory}: {registered} has no statistics of {key}, so it is not normalised ({mode} is configured);"
                 " lerobot does the same.",
-                stacklevel=5,
+                stacklevel=6,
             )
             continue
         missing = [name for name in names if name not in tensors]
         if missing:
-            raise CheckpointError(
-                f"{directory}: {registered} needs {', '.join(missing)} for {mode}; its file has none."
-            )
+            raise CheckpointError(f"{directory}: {registered} needs {', '.join(missing)} for {mode}; there is none.")
         first, second = (_broadcast(directory, name, tensors[name], kind, shape) for name in names)
         result[key] = Statistics(mode, first, second, eps)
     return result

@@ -19,7 +19,7 @@ from torch.nn import functional
 from .clip import ClipText, ClipVision
 from .clip_config import TextConfig, VisionConfig
 from .image_geometry import ResizeCrop
-from .lerobot_processors import Normalizer
+from .lerobot_statistics import Normalizer
 from .transformer_for_diffusion import SinusoidalEmbedding
 
 
@@ -222,27 +222,13 @@ class ObservationEncoder(nn.Module):
         return seen.reshape(-1, self.frames, self.cameras * seen.shape[-1])  # type: ignore[no-any-return]
 
 
-@dataclass(frozen=True)
-class Inputs:
-    """The names by which ``ConditionEncoder`` is given its observations.
-
-    Attributes:
-        state: of the robot's state.
-        images: of the cameras, in the order of the policy.
-        tokens: of the instruction's tokens, and their mask; None where the instruction is compiled in.
-    """
-
-    state: str
-    images: tuple[str, ...]
-    tokens: tuple[str, str] | None
-
-
 class ConditionEncoder(nn.Module):
     """Raw observations to the condition vector: normalised, cropped and encoded.
 
     Args:
         observation_encoder: CLIP and the projection.
-        inputs: names of the observations.
+        names: by which the state and the images of each camera are given, in the order of the policy.
+        tokens: the names of the instruction's tokens and of their mask.
         geometry: resizes and crops the frames of all cameras; None without cameras.
         normalizers: of the state, and of each camera.
         task: tokens int64 ``[1, L]`` and mask bool ``[1, L]`` of the one instruction that is compiled in; None where it
@@ -255,29 +241,30 @@ class ConditionEncoder(nn.Module):
     def __init__(
         self,
         observation_encoder: ObservationEncoder,
-        inputs: Inputs,
+        names: Sequence[str],
+        tokens: tuple[str, str],
         geometry: ResizeCrop | None,
         normalizers: Sequence[Normalizer],
         task: tuple[torch.Tensor, torch.Tensor] | None = None,
     ) -> None:
         super().__init__()
         self.observation_encoder = observation_encoder
-        self.inputs, self.geometry = inputs, geometry
+        self.names, self.tokens, self.geometry, self.has_task = tuple(names), tokens, geometry, task is not None
         self.normalizers = nn.ModuleList(normalizers)
         if task is not None:
             self.register_buffer("task_tokens", task[0], persistent=False)
             self.register_buffer("task_mask", task[1], persistent=False)
 
     def forward(self, observations: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        """Observations ``[B, ...]`` by the names of ``inputs`` -> ``[B, C]``."""
-        state = self.normalizers[0](observations[self.inputs.state])
+        """Observations ``[B, ...]`` by name -> ``[B, C]``."""
+        state = self.normalizers[0](observations[self.names[0]])
         images = []
-        for name, normalizer in zip(self.inputs.images, self.normalizers[1:], strict=True):
+        for name, normalizer in zip(self.names[1:], self.normalizers[1:], strict=True):
             assert self.geometry is not None
             # Normalised after the crop: pixels that nobody sees need no arithmetic.
             images.append(normalizer(self.geometry(observations[name].flatten(0, 1))))
-        if self.inputs.tokens is None:
+        if self.has_task:
             tokens, mask = self.task_tokens, self.task_mask
         else:
-            tokens, mask = (observations[name] for name in self.inputs.tokens)
+            tokens, mask = (observations[name] for name in self.tokens)
         return self.observation_encoder(state, images, tokens, mask)  # type: ignore[no-any-return]

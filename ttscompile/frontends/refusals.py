@@ -65,6 +65,7 @@ DIRECTORIES = (
     Refusal(
         r"^manifest\.json$", "an artifact that is compiled already", "Load it with ttscompile.load, or calibrate it."
     ),
+    Refusal(r"^adapter_config\.json$", "a PEFT adapter without the weights that it adapts", _MERGE),
     Refusal(
         r"^(example_batch|octo[^/]*)\.msgpack$",
         "an Octo model",
@@ -91,6 +92,17 @@ ENTRIES = (
     Refusal(r"^parameter$", "a checkpoint of Dita", f"{_HEAD} For Dita the prefix of its Llama, as a KV cache."),
 )
 """By an entry of a torch checkpoint."""
+
+LEROBOT = (
+    Refusal(r"^diffusion$", "a U-Net", _U_NET),
+    Refusal(r"^act$", "a transformer that predicts actions in one evaluation", _NO_LOOP),
+    Refusal(r"^(vqbet|pi0_fast)$", "autoregressive over codes of actions", _NO_LOOP),
+    Refusal(r"^tdmpc$", "a world model with a planner", _NO_LOOP),
+    Refusal(r"^sac$", "an actor of reinforcement learning", _NO_LOOP),
+    Refusal(r"^(smolvla|pi0|pi05|groot|xvla|wall_x)$", "a vision-language model with an action head", _HEAD),
+    Refusal(r"", "not known", f"Expected multi_task_dit. If its denoiser is a transformer: {_BUILD}."),
+)
+"""By the type of a LeRobot policy, in lower case."""
 
 STATES = (
     Refusal(
@@ -120,14 +132,20 @@ STATES = (
 """By the name of a weight; the first row that matches any of them. The last matches every checkpoint."""
 
 
-def refuse_policy(name: str) -> NoReturn:
-    """Refuse a Diffusion Policy checkpoint whose policy is another class.
+def refuse_policy(name: str, rows: Iterable[Refusal] = POLICIES, where: str = "") -> NoReturn:
+    """Refuse a checkpoint whose policy is another one than its project's that are read.
+
+    Args:
+        name: of the policy's class or type.
+        rows: of the project; the last one matches every name.
+        where: begins the message.
 
     Raises:
         CheckpointError: always.
     """
-    row = _first(POLICIES, [name.lower()])
-    raise CheckpointError(f"the policy is {name}: {row.what}. {row.remedy}")
+    row = _first(rows, [name.lower()])
+    shown = f"{name!a:.80}".strip("'\"")
+    raise CheckpointError(f"{where}the policy is {shown}: {row.what}. {row.remedy}")
 
 
 def refuse_payload(payload: Mapping[str, Any]) -> None:
@@ -192,7 +210,7 @@ def refuse_file(path: Path) -> None:
 
 
 def refuse_directory(path: Path) -> NoReturn:
-    """Refuse a directory that no frontend reads; LeRobot's own policies have their say in ``lerobot_config``.
+    """Refuse a directory that no frontend reads; ``LEROBOT`` has LeRobot's own policies.
 
     Raises:
         CheckpointError: always.

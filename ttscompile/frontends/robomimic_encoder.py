@@ -147,26 +147,19 @@ class ObservationEncoder(nn.Module):
     """All keys of the observation to one vector for each observed step.
 
     Args:
-        cameras: by key, those that are images.
-        low_dim: by key, the length of those that are not, flattened.
-        order: of all keys: of the features in the vector.
+        inputs: by key, in the order of their features in the vector: a camera, or the length of what is no image.
         group_norm_in_place_of_batch_norm: which of the two the ResNets hold.
     """
 
-    def __init__(
-        self,
-        cameras: Mapping[str, Camera],
-        low_dim: Mapping[str, int],
-        order: tuple[str, ...],
-        group_norm_in_place_of_batch_norm: bool,
-    ) -> None:
+    def __init__(self, inputs: Mapping[str, Camera | int], group_norm_in_place_of_batch_norm: bool) -> None:
         super().__init__()
-        self.order = order
-        self.width = FEATURES * len(cameras) + sum(low_dim.values())
+        cameras = {key: each for key, each in inputs.items() if isinstance(each, Camera)}
+        self.order = tuple(inputs)
+        self.width = sum(FEATURES if isinstance(each, Camera) else each for each in inputs.values())
         norm = group_norm if group_norm_in_place_of_batch_norm else nn.BatchNorm2d
         # A list, because a key may be any text and the name of a submodule may not.
-        self.cameras = nn.ModuleList(CameraEncoder(cameras[key], norm) for key in order if key in cameras)
-        self.position = {key: i for i, key in enumerate(key for key in order if key in cameras)}
+        self.cameras = nn.ModuleList(CameraEncoder(each, norm) for each in cameras.values())
+        self.position = {key: i for i, key in enumerate(cameras)}
 
     def forward(self, observations: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """By key ``[B, To, ...]``, low-dimensional ones normalised -> ``[B, To, width]``."""

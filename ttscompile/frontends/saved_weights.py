@@ -1,15 +1,35 @@
-"""Whether saved weights are those of a network; said in the same words, whoever saved them."""
+"""Saved weights: reading them, and whether they are those of a network; said in the same words, whoever saved them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import torch
+from safetensors.torch import load_file
 
 from ..errors import CheckpointError
 
 SHOWN = 6
 """Names that a message holds; it counts the others."""
+
+
+def read_tensors(path: Path) -> dict[str, torch.Tensor]:
+    """The tensors of a safetensors file on the CPU; the format holds nothing that could run.
+
+    Raises:
+        CheckpointError: missing or damaged.
+    """
+    if not path.is_file():
+        raise CheckpointError(f"{path}: no such file. Copy the policy's directory whole.")
+    try:
+        tensors: dict[str, torch.Tensor] = load_file(path, device="cpu")
+    except Exception as error:  # what the reader raises depends on where the file is damaged
+        raise CheckpointError(
+            f"{path}: not a safetensors file, or a truncated one: {error!s:.300}. Copy it again."
+        ) from error
+    return tensors
 
 
 def names_of(keys: Sequence[str]) -> str:
@@ -23,39 +43,54 @@ def unwrapped(name: str) -> str:
     return ".".join(part for part in name.split(".") if part not in ("_orig_mod", "module"))
 
 
-def require_names(missing: Sequence[str], extra: Sequence[str], what: str, remedy: str) -> None:
-    """Refuse weights some of which are missing, or of something else.
+def as_float32(weights: Mapping[str, Any], where: str = "") -> dict[str, torch.Tensor]:
+    """Weights of any floating-point type, under the names that a network without wrappers gives them.
 
     Args:
-        missing: names that the network has and the file has not.
-        extra: names that the file has and the network has not.
-        what: is wrong then; begins the message.
-        remedy: ends it.
+        weights: by name, as they were saved.
+        where: begins the message.
 
     Raises:
-        CheckpointError: there are such names.
+        CheckpointError: one is no dense tensor of floating-point numbers.
     """
+    for name, value in weights.items():
+        if not isinstance(value, torch.Tensor) or value.layout != torch.strided or not value.is_floating_point():
+            what = f"{value.dtype} tensor" if isinstance(value, torch.Tensor) else type(value).__name__
+            raise CheckpointError(f"{where}weight {name} is a {what}; expected a dense floating-point tensor.")
+    return {unwrapped(str(name)): value.detach().to(torch.float32) for name, value in weights.items()}
+
+
+def require_weights(
+    expected: Mapping[str, torch.Tensor],
+    found: Mapping[str, torch.Tensor],
+    source: str,
+    masks: Collection[str] = (),
+    what: str = "the weights do not fit the configuration",
+) -> None:
+    """Raise unless every weight is there, of the right shape and finite, and nothing else is there.
+
+    Args:
+        expected: by name, on any device: only shapes are looked at.
+        found: what the file has, under the same names.
+        source: of the expected shapes, for messages; the configuration or a part of it.
+        masks: names of what may hold infinity.
+        what: is wrong where names are missing or unknown; begins the message.
+
+    Raises:
+        CheckpointError: names what does not fit.
+    """
+    missing, extra = [name for name in expected if name not in found], [name for name in found if name not in expected]
     if missing or extra:
         parts = [f"missing {names_of(missing)}"] * bool(missing) + [f"unexpected {names_of(extra)}"] * bool(extra)
-        raise CheckpointError(f"{what}: {'; '.join(parts)}. {remedy}")
-
-
-def require_shape(name: str, value: torch.Tensor, shape: torch.Size, source: str) -> None:
-    """Refuse a weight of another shape than ``source`` asks for.
-
-    Raises:
-        CheckpointError: names both.
-    """
-    if value.shape != shape:
-        raise CheckpointError(f"weight {name} has shape {tuple(value.shape)}; expected {tuple(shape)} from {source}.")
-
-
-def require_finite(name: str, value: torch.Tensor) -> None:
-    """Refuse a weight with NaN or infinity.
-
-    Raises:
-        CheckpointError: counts them.
-    """
-    if not torch.isfinite(value).all():
-        count = int((~torch.isfinite(value)).sum())
-        raise CheckpointError(f"weight {name} holds {count} values that are not finite; training diverged.")
+        raise CheckpointError(
+            f"{what}: {'; '.join(parts)}. {source} describes another network than the one that was saved, or the file"
+            " is incomplete; ttscompile.compile_denoiser(module, spec) takes any network."
+        )
+    for name, value in found.items():
+        if value.shape != expected[name].shape:
+            raise CheckpointError(
+                f"weight {name} has shape {tuple(value.shape)}; expected {tuple(expected[name].shape)} from {source}."
+            )
+        if name not in masks and not torch.isfinite(value).all():
+            count = int((~torch.isfinite(value)).sum())
+            raise CheckpointError(f"weight {name} holds {count} values that are not finite; training diverged.")

@@ -24,23 +24,20 @@ from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultist
 
 from ..core.spec import SamplerTable
 from ..errors import CheckpointError, SpecError, TtscompileError
+from ..samplers.flow import METHODS
 from ..samplers.table import sampler_table
+from .families import DIFFUSION_SAMPLERS, SPACINGS, LoadOptions
 
-SPACINGS = ("leading", "trailing", "linspace")
-SAMPLERS = ("ddpm", "ddim", "dpmsolver++")
-"""Names of the samplers that can be asked for in place of a checkpoint's own."""
 MOST_TIMESTEPS = 10_000
 """Of the training; in use are 50 to 1000. diffusers computes each in Python."""
 MOST_STEPS = 1000
 """Of a call; in use are 4 to 100. Each is evaluated with diffusers to make the table, which takes some milliseconds."""
 DPM = "dpmsolver++"
 
-_CLASSES: Mapping[str, type[Any]] = {
-    "DDPMScheduler": DDPMScheduler,
-    "DDIMScheduler": DDIMScheduler,
-    "DPMSolverMultistepScheduler": DPMSolverMultistepScheduler,
-}
-_NAMES = dict(zip(_CLASSES, SAMPLERS, strict=True))
+_CLASSES: Mapping[str, type[Any]] = dict(
+    zip(DIFFUSION_SAMPLERS, (DDPMScheduler, DDIMScheduler, DPMSolverMultistepScheduler), strict=True)
+)
+_NAMES = {each.__name__: name for name, each in _CLASSES.items()}
 
 
 def _settings(scheduler: type[Any]) -> frozenset[str]:
@@ -50,21 +47,19 @@ def _settings(scheduler: type[Any]) -> frozenset[str]:
 
 def configured_sampler(
     settings: Mapping[str, Any],
-    steps: int | None,
+    own_steps: int | None,
+    options: LoadOptions,
     *,
-    step_arguments: Mapping[str, Any],
-    sampler: str | None = None,
-    spacing: str | None = None,
+    step_arguments: Mapping[str, Any] | None = None,
     where: str = "cfg.policy.noise_scheduler",
 ) -> SamplerTable:
     """The denoising loop that a checkpoint's ``noise_scheduler`` describes.
 
     Args:
         settings: of the scheduler, with its class in ``_target_``.
-        steps: K; None for the number of training timesteps.
+        own_steps: K of the policy; None for the number of training timesteps.
+        options: sampler, steps and spacing in place of the configured ones.
         step_arguments: what the policy hands to every ``step`` of its own scheduler (``eta``).
-        sampler: one of ``SAMPLERS`` in place of the scheduler's own class, on the same betas.
-        spacing: of the timesteps, in place of the configured one.
         where: the settings stand, for messages.
 
     Returns:
@@ -74,12 +69,14 @@ def configured_sampler(
         CheckpointError: the configured scheduler is of another class, or has settings that diffusers does not know.
         SpecError: the sampler, spacing or number of steps asked for is not possible.
     """
+    sampler, spacing = options.sampler, options.spacing
+    steps = own_steps if options.steps is None else options.steps
     own = str(settings.get("_target_", "")).rpartition(".")[2]
     own_name = _NAMES.get(own)
-    if sampler is not None and sampler not in SAMPLERS:
+    if sampler is not None and sampler not in DIFFUSION_SAMPLERS:
         raise SpecError(
             f"sampler {sampler!r} is none of a policy that was trained with diffusion; expected one of"
-            f" {', '.join(SAMPLERS)}. Those of flow matching, euler and rk4, are for policies trained with that."
+            f" {', '.join(DIFFUSION_SAMPLERS)}. {' and '.join(METHODS)} are for policies trained with flow matching."
         )
     if spacing is not None and spacing not in SPACINGS:
         raise SpecError(f"timestep spacing {spacing!r} is not known; expected one of {', '.join(SPACINGS)}.")
@@ -91,10 +88,10 @@ def configured_sampler(
     name = sampler or own_name
     if name is None:
         raise CheckpointError(
-            f"{where} is {own or 'of no class'}; expected one of {', '.join(_CLASSES)}. To run on"
-            f" its betas with another sampler, ask for sampler={' or '.join(map(repr, SAMPLERS))}."
+            f"{where} is {own or 'of no class'}; expected one of {', '.join(_NAMES)}. To run on"
+            f" its betas with another sampler, ask for sampler={' or '.join(map(repr, DIFFUSION_SAMPLERS))}."
         )
-    scheduler_class = next(each for key, each in _CLASSES.items() if _NAMES[key] == name)
+    scheduler_class = _CLASSES[name]
     given = {key: value for key, value in settings.items() if key != "_target_"}
     old = given.pop("predict_epsilon", None)  # what diffusers before 0.11 called it
     if old is not None:
@@ -128,7 +125,7 @@ def configured_sampler(
             scheduler,
             trained if steps is None else steps,
             name=name,
-            step_arguments=_step_arguments(step_arguments, given, own_name, name),
+            step_arguments=_step_arguments(step_arguments or {}, given, own_name, name),
         )
     except TtscompileError:
         raise

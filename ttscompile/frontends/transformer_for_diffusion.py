@@ -94,59 +94,25 @@ class SinusoidalEmbedding(nn.Module):
         return torch.cat((angles.sin(), angles.cos()), dim=-1)
 
 
-class EncoderLayers(nn.Module):
-    """Pre-norm self-attention layers, one after the other."""
+class Layers(nn.Module):
+    """Pre-norm layers of PyTorch, one after the other.
 
-    def __init__(self, config: TransformerConfig, count: int) -> None:
+    Args:
+        layer: ``nn.TransformerEncoderLayer`` or ``nn.TransformerDecoderLayer``.
+        config: sizes.
+        count: number of layers.
+    """
+
+    def __init__(self, layer: type[nn.Module], config: TransformerConfig, count: int) -> None:
         super().__init__()
-        self.layers = nn.ModuleList(
-            nn.TransformerEncoderLayer(
-                config.n_emb,
-                config.n_head,
-                4 * config.n_emb,
-                dropout=0.0,
-                activation="gelu",
-                batch_first=True,
-                norm_first=True,
-            )
-            for _ in range(count)
-        )
+        settings = {"dropout": 0.0, "activation": "gelu", "batch_first": True, "norm_first": True}
+        width = config.n_emb
+        self.layers = nn.ModuleList(layer(width, config.n_head, 4 * width, **settings) for _ in range(count))
 
-    def forward(self, x: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
-        """``[B, tokens, n_emb]`` -> the same; ``mask [tokens, tokens]`` is added to the attention logits."""
+    def forward(self, x: torch.Tensor, *memory: torch.Tensor, **masks: torch.Tensor | None) -> torch.Tensor:
+        """``[B, tokens, n_emb]`` -> the same; a mask ``[tokens, tokens]`` is added to the attention logits."""
         for layer in self.layers:
-            x = layer(x, src_mask=mask)
-        return x
-
-
-class DecoderLayers(nn.Module):
-    """Pre-norm layers of self-attention, cross-attention and feed-forward, one after the other."""
-
-    def __init__(self, config: TransformerConfig) -> None:
-        super().__init__()
-        self.layers = nn.ModuleList(
-            nn.TransformerDecoderLayer(
-                config.n_emb,
-                config.n_head,
-                4 * config.n_emb,
-                dropout=0.0,
-                activation="gelu",
-                batch_first=True,
-                norm_first=True,
-            )
-            for _ in range(config.n_layer)
-        )
-
-    def forward(
-        self,
-        x: torch.Tensor,
-        memory: torch.Tensor,
-        mask: torch.Tensor | None = None,
-        memory_mask: torch.Tensor | None = None,
-    ) -> torch.Tensor:
-        """``[B, T, n_emb]`` and memory ``[B, tokens, n_emb]`` -> ``[B, T, n_emb]``."""
-        for layer in self.layers:
-            x = layer(x, memory, tgt_mask=mask, memory_mask=memory_mask)
+            x = layer(x, *memory, **masks)
         return x
 
 
@@ -174,16 +140,16 @@ class TransformerForDiffusion(nn.Module):
         self.time_emb = SinusoidalEmbedding(width)
         self.cond_obs_emb = nn.Linear(config.cond_dim, width) if config.cond_dim else None
         self.encoder: nn.Module
-        self.decoder: DecoderLayers | None = None
+        self.decoder: Layers | None = None
         if config.time_as_cond:
             self.cond_pos_emb = nn.Parameter(torch.zeros(1, config.memory_tokens, width))
             if config.n_cond_layers:
-                self.encoder = EncoderLayers(config, config.n_cond_layers)
+                self.encoder = Layers(nn.TransformerEncoderLayer, config, config.n_cond_layers)
             else:
                 self.encoder = nn.Sequential(nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
-            self.decoder = DecoderLayers(config)
+            self.decoder = Layers(nn.TransformerDecoderLayer, config, config.n_layer)
         else:
-            self.encoder = EncoderLayers(config, config.n_layer)
+            self.encoder = Layers(nn.TransformerEncoderLayer, config, config.n_layer)
 
         self.register_buffer("mask", None)
         self.register_buffer("memory_mask", None)
@@ -215,7 +181,7 @@ class TransformerForDiffusion(nn.Module):
         count = tokens.shape[1]  # fewer than the horizon's, where only the first steps are predicted
         mask = None if self.mask is None else self.mask[:count, :count]
         if self.decoder is None:
-            x = self.encoder(tokens + self.pos_emb[:, :count], mask=mask)
+            x = self.encoder(tokens + self.pos_emb[:, :count], src_mask=mask)
             x = x[:, 1:]
         else:
             memory = time
@@ -223,7 +189,8 @@ class TransformerForDiffusion(nn.Module):
                 memory = torch.cat((time, self.cond_obs_emb(cond)), dim=1)
             memory = self.encoder(memory + self.cond_pos_emb[:, : memory.shape[1]])
             memory_mask = None if self.memory_mask is None else self.memory_mask[:count]
-            x = self.decoder(tokens + self.pos_emb[:, :count], memory, mask, memory_mask)
+            tokens = tokens + self.pos_emb[:, :count]
+            x = self.decoder(tokens, memory, tgt_mask=mask, memory_mask=memory_mask)
         prediction: torch.Tensor = self.head(self.ln_f(x))
         return prediction
 

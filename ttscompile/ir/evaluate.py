@@ -17,20 +17,10 @@ import torch.fx.config
 from ttscompile.errors import CaptureError, ObservationError
 
 from .graph import GETITEM, Argument, Batch, Enum, Graph, Node, Ref, TensorType
+from .operations import find_operation, operation
 
 Frame: TypeAlias = list[Any]
 Getter: TypeAlias = Callable[[Frame, int], Any]
-
-# Functional by their schema, and yet not functions of their arguments: they read the machine.
-_REFUSED = frozenset({"aten.from_file.default"})
-
-# Tagged as random for the sake of their dropout argument, which is checked to be off.
-_RANDOM_ONLY_WITH_DROPOUT = {
-    "aten.scaled_dot_product_attention.default": (4, "dropout_p"),
-    "aten.dropout.default": (2, "train"),
-    "aten.gru.input": (6, "train"),
-    "aten.lstm.input": (6, "train"),
-}
 
 _ENUM_TYPES = {"dtype": torch.dtype, "memory_format": torch.memory_format, "layout": torch.layout}
 
@@ -42,7 +32,8 @@ def resolve_op(node: Node) -> Callable[..., Any]:
         node: its ``op`` is looked up below ``torch.ops.aten`` and nowhere else.
 
     Raises:
-        CaptureError: no such operation, or one that changes its arguments, draws random numbers or reads files.
+        CaptureError: no such operation; one that changes its arguments, draws random numbers or reads files; or one
+            that has no row in the table of operations.
     """
     if node.op == GETITEM:
         return operator.getitem
@@ -59,7 +50,7 @@ def resolve_op(node: Node) -> Callable[..., Any]:
             f"operation {node.op!r} of {_where(node)} does not exist in torch {torch.__version__}."
             " Compile the policy again with this version of torch, or install the version it was compiled with."
         )
-    if overload._schema.is_mutable or node.op in _REFUSED:
+    if overload._schema.is_mutable or packet_name == "from_file":  # which reads the machine
         raise CaptureError(
             f"operation {node.op!r} of {_where(node)} is not a pure function of its arguments"
             f" ({overload._schema}). Graphs hold functional operations only: capture the module again."
@@ -69,6 +60,7 @@ def resolve_op(node: Node) -> Callable[..., Any]:
             f"operation {node.op!r} of {_where(node)} draws random numbers. All randomness of a policy must come from"
             " its noise argument: call eval() on the module, and remove dropout and sampling inside the denoiser."
         )
+    operation(node.op, _where(node))
     return overload
 
 
@@ -282,9 +274,11 @@ def _dead_after(graph: Graph) -> dict[str, list[str]]:
 
 
 def _dropout_is_off(node: Node) -> bool:
-    if node.op not in _RANDOM_ONLY_WITH_DROPOUT:
+    """Of an operation that counts as random for the sake of its dropout argument."""
+    row = find_operation(node.op)
+    if row is None or row.dropout is None:
         return False
-    position, name = _RANDOM_ONLY_WITH_DROPOUT[node.op]
+    position, name = row.dropout
     value = node.args[position] if len(node.args) > position else dict(node.kwargs).get(name, 0)
     return value in (0, 0.0, False)
 

@@ -8,6 +8,7 @@ inputs and outputs that no denoiser has are named here.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 from ..core.spec import SamplerTable
 from .graph import Graph, TensorType
@@ -18,7 +19,7 @@ CONDITION = "condition"
 STEP = "step"
 """Condition values and table rows -> step values, for all K steps in one batch."""
 
-PRUNER = "pruner"
+PRUNER: Final = "pruner"
 """Condition values -> logits of the plan, once a call."""
 
 STEM = "stem"

@@ -13,11 +13,10 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from ..errors import PassError
-from .graph import GETITEM, Batch, Graph, Node, Ref, Size, TensorType
+from .graph import Batch, Graph, Node, Ref, Size, TensorType
+from .operations import Movement, axes_along, operation
 
-_RESHAPE = "aten.reshape.default"
-_ALIKE = frozenset(f"aten.{op}.default" for op in ("zeros", "ones", "full", "expand"))
-_MOVING = {"flip": 1, "roll": 2}  # the place of the axes among the arguments
+_RESHAPE, _EXPAND = "aten.reshape.default", "aten.expand.default"
 
 
 class _Layout(NamedTuple):
@@ -93,7 +92,7 @@ def _layouts(graph: Graph, types: Mapping[str, TensorType]) -> dict[str, _Layout
         if axis is None or node.name in known or not all(name in known for name in read):
             continue
         if not read:
-            if node.op in _ALIKE:
+            if operation(node.op).filled is not None or node.op == _EXPAND:
                 alike.add(node.name)
             continue
         layout = _made(node, axis, [types[name] for name in read], [known[name] for name in read])
@@ -111,12 +110,12 @@ def _made(node: Node, axis: int, read: Sequence[TensorType], layouts: Sequence[_
     """The layout that an operation gives to an axis ``m * B`` of its result; None if it cannot be seen."""
     size, (copies, rows) = node.type.shape[axis], layouts[0]
     assert isinstance(size, Batch)
-    base = node.op if node.op == GETITEM else node.op.split(".")[1]
-    if base in ("repeat", "tile"):
+    row = operation(node.op)
+    if row.name in ("repeat", "tile"):
         copies = size.multiple // rows
-    elif base == "repeat_interleave":
+    elif row.name == "repeat_interleave":
         rows = size.multiple // copies
-    elif base in ("reshape", "view", "_unsafe_view", "flatten"):
+    elif row.movement is Movement.RESHAPE:
         # What lies behind a stream in memory stays behind it.
         before, after = _axis(read[0]), _numbers(node.type.shape[axis + 1 :])
         assert before is not None
@@ -124,18 +123,11 @@ def _made(node: Node, axis: int, read: Sequence[TensorType], layouts: Sequence[_
         if rest or not after or not rows:
             return None
         copies = size.multiple // rows
-    elif base == "cat" and _joined(node) == axis and len({layout.rows for layout in layouts}) == 1:
+    elif row.name == "cat" and _joined(node) == axis and len({layout.rows for layout in layouts}) == 1:
         copies = sum(layout.copies for layout in layouts)
-    elif len(set(layouts)) > 1 or _moves_rows(node, base, axis):
-        return None
+    elif len(set(layouts)) > 1 or (row.movement is None and axis in axes_along(node, len(node.type.shape))):
+        return None  # rows of several kinds, or rows that change places
     return _Layout(copies, rows) if copies * rows == size.multiple else None
-
-
-def _moves_rows(node: Node, base: str, axis: int) -> bool:
-    """Whether rows come to lie in another order; without axes ``roll`` moves all there are."""
-    axes = node.args[_MOVING[base]] if base in _MOVING and len(node.args) > _MOVING[base] else None
-    found = axes if isinstance(axes, tuple) else ()
-    return base in _MOVING and (not found or axis in [a % len(node.type.shape) for a in found if isinstance(a, int)])
 
 
 def _joined(node: Node) -> int:

@@ -27,6 +27,7 @@ from onnx import ModelProto, helper
 
 from ..ir.evaluate import evaluate
 from ..ir.graph import Argument, Batch, Graph, Node, Ref, TensorType
+from ..ir.operations import Linear, operation
 from ..ir.pieces import BASE, IDLE, PRODUCT, SHIFT, TOTAL
 from ..ir.program import Pieces
 from .graph_writer import GraphWriter, tensor
@@ -34,18 +35,6 @@ from .onnx_model import IR_VERSION
 
 Wide = npt.NDArray[np.float64]
 Weights = Mapping[str, npt.NDArray[np.generic]]
-
-_SUMS = frozenset({"aten.add.Tensor", "aten.sub.Tensor"})
-_PRODUCTS = frozenset({"aten.mul.Tensor", "aten.matmul.default", "aten.mm.default", "aten.bmm.default"})
-_OF_THE_FIRST = frozenset(
-    f"aten.{op}"
-    for op in (
-        *("linear.default", "div.Tensor", "neg.default", "clone.default", "contiguous.default", "reshape.default"),
-        *("view.default", "_unsafe_view.default", "permute.default", "transpose.int", "t.default", "unsqueeze.default"),
-        *("squeeze.dim", "expand.default", "slice.Tensor", "select.int"),
-    )
-)
-"""Linear in their first argument if nothing else depends on the input."""
 
 _NORM = "aten.layer_norm.default"
 
@@ -183,9 +172,9 @@ def _require_affine(graph: Graph) -> None:
         moved = [name for name in node.refs() if name in moving]
         if not moved:
             continue
-        of_first = isinstance(node.args[0], Ref) and moved == [node.args[0].name]
-        product = node.op in _PRODUCTS and len(moved) == 1
-        if not (node.op in _SUMS or product or (node.op in _OF_THE_FIRST and of_first)):
+        linear = operation(node.op).linear
+        of_first = linear is Linear.IN_FIRST and node.args[0] == Ref(moved[0])
+        if linear is not Linear.JOINTLY and (len(moved) > 1 or not (of_first or linear is Linear.IN_EACH)):
             raise _Declined(f"{node} is not known to be affine")
         moving.add(node.name)
     if graph.outputs[0] not in moving:

@@ -26,54 +26,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from ..ir.graph import Argument, Batch, Graph, Node, Ref, Size, TensorType
-
-_RESHAPES = frozenset(
-    {
-        "aten.reshape.default",
-        "aten.view.default",
-        "aten._unsafe_view.default",
-        "aten.unsqueeze.default",
-        "aten.squeeze.default",
-        "aten.squeeze.dim",
-        "aten.squeeze.dims",
-        "aten.flatten.using_ints",
-        "aten.unflatten.int",
-        "aten.clone.default",
-        "aten.alias.default",
-        "aten.contiguous.default",
-    }
-)
-_ELEMENTWISE = frozenset(
-    {
-        "aten.gelu.default",
-        "aten.relu.default",
-        "aten.silu.default",
-        "aten.mish.default",
-        "aten.tanh.default",
-        "aten.sigmoid.default",
-        "aten.elu.default",
-        "aten.leaky_relu.default",
-        "aten.softplus.default",
-        "aten.hardtanh.default",
-        "aten.neg.default",
-        "aten.exp.default",
-        "aten.sin.default",
-        "aten.cos.default",
-        "aten.sqrt.default",
-        "aten.rsqrt.default",
-        "aten.abs.default",
-        "aten.clamp.default",
-        "aten.pow.Tensor_Scalar",
-        "aten.add.Tensor",
-        "aten.add.Scalar",
-        "aten.sub.Tensor",
-        "aten.sub.Scalar",
-        "aten.mul.Tensor",
-        "aten.mul.Scalar",
-        "aten.div.Tensor",
-        "aten.div.Scalar",
-    }
-)
+from ..ir.operations import Movement, operation, permutation
 
 
 @dataclass(frozen=True)
@@ -140,18 +93,13 @@ class _Sinker:
         if not node.args or not isinstance(node.args[0], Ref) or len(node.types) != 1:
             return None
         name, rank = node.args[0].name, len(self.type_of(node.args[0].name).shape)
-        if node.op in _RESHAPES and node.type.dtype == self.type_of(name).dtype:
-            return self.regrouped(self.view(name), node.type.shape)
-        match node.op, node.args:
-            case "aten.permute.default", (_, tuple(axes)):
-                return _permuted(self.view(name), [a % rank for a in axes if isinstance(a, int)])
-            case "aten.transpose.int", (_, int(a), int(b)):
-                order = list(range(rank))
-                order[a % rank], order[b % rank] = order[b % rank], order[a % rank]
-                return _permuted(self.view(name), order)
-            case "aten.t.default", _:
-                return _permuted(self.view(name), list(reversed(range(rank))))
-            case "aten.select.int", (_, int(axis), int(index)):
+        match operation(node.op).movement, node.args:
+            case Movement.RESHAPE, _:
+                return self.regrouped(self.view(name), node.type.shape)
+            case Movement.PERMUTE, _:
+                view = self.view(name)
+                return replace(view, dims=tuple(view.dims[a] for a in permutation(node, rank)))
+            case Movement.PART, (_, int(axis), int(index)) if node.op == "aten.select.int":
                 return _selected(self.view(name), axis % rank, index)
         return None
 
@@ -161,12 +109,12 @@ class _Sinker:
         if not refs or not isinstance(node.args[0], Ref) or refs[0] != node.args[0].name or len(node.types) != 1:
             return None
         view = self.view(refs[0])
-        if node.op == "aten.linear.default" and len(view.dims) > 1 and refs[0] not in self.graph.constants:
-            return self.tokenwise(node, view)
-        if node.op == "aten.layer_norm.default" and not self.is_plain(view):
-            shape = node.args[1]
-            return self.tokenwise(node, view) if isinstance(shape, tuple) and len(shape) == 1 else None
-        if node.op in _ELEMENTWISE and not view.picks and not self.is_plain(view):
+        row = operation(node.op)
+        if row.mixes is not None and len(view.dims) > 1 and refs[0] not in self.graph.constants:
+            alone = row.mixes(node, {name: self.type_of(name) for name in refs}) == 1
+            worth = row.name == "linear" or not self.is_plain(view)  # a linear layer wants two dimensions in any case
+            return self.tokenwise(node, view) if alone and worth else None
+        if row.elementwise and not view.picks and not self.is_plain(view):
             views = [self.view(name) for name in refs]
             if any(self.arrangement(v) != self.arrangement(view) for v in views):
                 return None
@@ -335,10 +283,6 @@ def ratio(a: Size, b: Size) -> Size | None:
     if isinstance(a, Batch):
         return numerator // denominator if isinstance(b, Batch) else Batch(numerator // denominator)
     return None if isinstance(b, Batch) else numerator // denominator
-
-
-def _permuted(view: _View, axes: Sequence[int]) -> _View:
-    return replace(view, dims=tuple(view.dims[a] for a in axes))
 
 
 def _selected(view: _View, axis: int, index: int) -> _View | None:

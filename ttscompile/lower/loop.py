@@ -10,7 +10,8 @@
             stream += the step's sum, made again if it is another;  advance
 
 Each block is in the model once, as the branch ``block_07`` beside the branch ``block_07_reused``. Weights lie in the
-branch that reads them, where onnxruntime packs them.
+branch that reads them, where onnxruntime packs them. The loop is written anew here on purpose: the file runs without
+the package, and its tests hold it against the runtimes.
 """
 
 from __future__ import annotations

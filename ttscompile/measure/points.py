@@ -63,7 +63,7 @@ class Frontier:
         points: in the order of the series.
         calls: held-out calls that each point was measured on.
         episodes: numbers of the held-out episodes.
-        threads: of onnxruntime.
+        threads: threads that onnxruntime computed with.
         yardsticks: mean error of a dense call with other noise: ``steps``: the same initial sample and other draws (of
             stochastic samplers alone); ``all``: everything else.
         skipped: why a strategy has no plan at a sparsity.

@@ -14,7 +14,7 @@ from ..measure.units import flops, ms, share
 from ..report import facts, pictures
 from ..runtimes.policy import CompiledPolicy
 from ..trajectories.episodes import Episode
-from .frontier import Compared, from_record
+from .comparison import Compared, from_record
 from .measure import Course, Latency, measure_parts, run_episode
 from .page import Page, Picture, Section, Table, require_packages
 from .verified import NOT_RUN
@@ -52,7 +52,7 @@ def build(
     Args:
         artifact: loaded.
         policy: the same, with its default runtime and a seed.
-        given: what else is shown.
+        given: what the report shows beside the artifact.
         progress: told what is under way.
 
     Raises:
@@ -119,7 +119,6 @@ def _plans(artifact: Artifact, course: Course | None) -> Section:
         drawn.append(
             Picture(
                 pictures.plan_picture(plan, kinds, f"plan {name!r}"),
-                alt=f"Plan {name!r}, steps across and blocks down. {pictures.caption_of(plan)}",
                 caption=f"Plan {name!r} of one call: steps across, blocks down. {pictures.caption_of(plan)}",
             )
         )
@@ -129,7 +128,6 @@ def _plans(artifact: Artifact, course: Course | None) -> Section:
             drawn.append(
                 Picture(
                     pictures.plan_picture(last, kinds, f"executed in call {calls - 1}"),
-                    alt=f"The plan of the episode's last call. {pictures.caption_of(last)}",
                     caption=f"What the last of {calls} calls of the episode executed. {pictures.caption_of(last)}",
                 )
             )

@@ -8,16 +8,16 @@ from typing import Any
 
 from ..artifact.ceiling import few_steps
 from ..artifact.load import Artifact
-from ..artifact.manifest import DENSE, BlockRecord, Manifest
+from ..artifact.manifest import DENSE, BlockRecord, Manifest, marked
 from ..ir.flops import graph_flops
 from ..ir.graph import TensorType
 from ..ir.program import Binding
 from ..measure.units import flops, plain, share
-from ..runtimes.onnxruntime.liveness import rollout_needs
+from ..runtimes.liveness import rollout_needs
 from .page import Section, Table
 
 _NOT_TOLD = ("plans", "precision", "sparsity", "flops_sparsity", "skipped")
-_LONG = 200
+_SCORE = ("error", "error_p90", "sparsity", "flops_saved")
 
 
 def provenance(artifact: Artifact) -> Section:
@@ -105,7 +105,15 @@ def hoisting(artifact: Artifact) -> Section:
 
 
 def blocks(manifest: Manifest) -> Section:
-    """The block table, repeated layers told once."""
+    """The block table, and what a group is."""
+    text = (
+        f"{len(manifest.blocks)} residual blocks, numbered in order of execution. Reuse from the last block of a kind"
+    )
+    return Section("Blocks", (f"{text} (FORWARD) stays within a group.",), (block_table(manifest),))
+
+
+def block_table(manifest: Manifest) -> Table:
+    """Blocks, with repeated layers told once: ``0, 3, .. 21 (8)``."""
 
     def alike(item: tuple[int, BlockRecord]) -> tuple[Any, ...]:
         block = item[1]
@@ -115,56 +123,59 @@ def blocks(manifest: Manifest) -> Section:
     for key, members in groupby(sorted(enumerate(manifest.blocks), key=alike), alike):
         group, kind, type_, cost, reason = key
         indices = [str(index) for index, _ in members]
-        shown = ", ".join(indices if len(indices) <= 6 else [*indices[:3], "…", indices[-1]])
-        rows.append(
-            (shown, kind + (f": {reason}" if reason else ""), type_, str(group), flops(cost), str(len(indices)))
-        )
-    head = ("block", "kind", "residual", "group", "FLOPs, one evaluation", "how many")
-    text = (
-        f"{len(manifest.blocks)} residual blocks, numbered in order of execution. Reuse from the last block of a kind"
-    )
-    return Section("Blocks", (f"{text} (FORWARD) stays within a group.",), (Table(head, tuple(rows)),))
+        shown = ", ".join(indices if len(indices) <= 4 else [*indices[:2], "..", indices[-1]]) + f" ({len(indices)})"
+        rows.append((shown, kind + (f": {reason}" if reason else ""), type_, str(group), flops(cost)))
+    return Table(("block", "kind", "residual", "group", "FLOPs, one evaluation"), tuple(rows))
+
+
+def plan_flops(artifact: Artifact, name: str) -> float | None:
+    """FLOPs of a call with a plan; a pruner's blocks cost what was measured on average, None if they were not."""
+    manifest = artifact.manifest
+    own = manifest.plans.get(name)
+    dense = manifest.flops.call(artifact.schedule(DENSE), pruned=own is not None and own.pruned)
+    if own is None:
+        return dense
+    share_saved = own.flops_sparsity
+    return None if share_saved is None else dense - share_saved * manifest.steps * sum(manifest.flops.blocks)
 
 
 def plan_table(artifact: Artifact) -> Table:
     """Every plan: its kind, its sparsity, its cost."""
     manifest = artifact.manifest
-    record = manifest.flops
     rows = []
     for name in (DENSE, *manifest.plans):
-        own = manifest.plans.get(name)
-        pruned = own is not None and own.pruned
+        own, cost = manifest.plans.get(name), plan_flops(artifact, name)
         cells, weighed = (0.0, 0.0) if own is None else (own.sparsity, own.flops_sparsity)
-        cost = None
-        if weighed is not None:
-            every = manifest.steps * sum(record.blocks)
-            cost = record.call(artifact.schedule(DENSE), pruned=pruned) - weighed * every
         rows.append(
             (
-                name + (" (default)" if name == manifest.default_plan else ""),
-                "for each observation" if pruned else "schedule",
+                f"{name} (default)" if name == manifest.default_plan else marked(name),
+                "schedule" if own is None else own.kind,
                 share(cells),
                 share(weighed),
                 "" if cost is None else flops(cost),
-                "" if cost is None else share(1 - cost / record.dense),
+                "" if cost is None else share(cost / manifest.flops.dense),
             )
         )
-    return Table(("plan", "made", "cells reused", "FLOPs reused", "FLOPs a call", "FLOPs saved"), tuple(rows))
+    head = ("plan", "kind", "cells reused", "FLOPs reused", "FLOPs a call", "of the captured policy")
+    return Table(head, tuple(rows))
 
 
 def score_table(record: Mapping[str, Any]) -> Table:
     """What calibration measured on episodes that it did not learn from."""
+
+    def errors(score: Mapping[str, Any]) -> tuple[str, str]:
+        return f"{score['error']:.4g}", f"{score['error_p90']:.4g}"
+
+    precision = _mapping(record.get("precision"))
     rows = [
-        (
-            name,
-            f"{score['error']:.4g}",
-            f"{score['error_p90']:.4g}",
-            share(score["sparsity"]),
-            share(score["flops_saved"]),
-        )
-        for name, score in scores(record).items()
+        (marked(name), *errors(score), share(score["sparsity"]), share(score["flops_saved"]))
+        for name, score in _scores(record, *_SCORE).items()
     ]
-    head = ("plan", "mean action error", "90th percentile", "cells reused", "FLOPs saved")
+    rows += [
+        (f"{name}: {precision.get('name')} against fp32", *errors(score), "", "")
+        for name, score in _scores(precision, *_SCORE[:2]).items()
+    ]
+    head = ("held-out episodes", "mean action error", "90th percentile", "cells reused", "FLOPs saved")
     return Table(head, tuple(rows))
 
 
@@ -173,24 +184,28 @@ def left_out(record: Mapping[str, Any]) -> tuple[str, ...]:
     return tuple(f"Plan {name!r}: none, {reason}." for name, reason in _mapping(record.get("skipped")).items())
 
 
-def record_table(record: Mapping[str, Any]) -> Table:
-    """The rest of the calibration record, shortened where it is long."""
+def record_table(record: Mapping[str, Any], most: int = 200) -> Table:
+    """The rest of the calibration record, shortened where it is longer than so many characters."""
     rows = []
     for name, value in record.items():
         if name in _NOT_TOLD:
             continue
         text = plain(value)
-        rows.append((name.replace("_", " "), text if len(text) <= _LONG else f"{text[:_LONG]}…"))
-    return Table(("", ""), tuple(rows), prose=True)
+        if isinstance(value, list | Mapping) and len(text) > most:
+            text = f"{len(value)} entries; ttscompile inspect DIR --json has them"
+        rows.append((name.replace("_", " "), text if len(text) <= most else f"{text[:most]}..."))
+    return Table(("calibration", ""), tuple(rows), prose=True)
 
 
 def scores(record: Mapping[str, Any] | None) -> Mapping[str, Mapping[str, Any]]:
     """Of each plan that calibration judged, if its figures are there: a record is free JSON of whoever made it."""
-    wanted = ("error", "error_p90", "sparsity", "flops_saved")
-    found = _mapping((record or {}).get("plans"))
+    return _scores(record or {}, *_SCORE)
+
+
+def _scores(record: Mapping[str, Any], *wanted: str) -> dict[str, Mapping[str, Any]]:
     return {
         str(name): score
-        for name, score in found.items()
+        for name, score in _mapping(record.get("plans")).items()
         if isinstance(score, Mapping) and all(isinstance(score.get(key), int | float) for key in wanted)
     }
 

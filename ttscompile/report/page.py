@@ -31,13 +31,13 @@ class Picture:
 
     Attributes:
         png: the file.
-        alt: what it shows, for who cannot see it.
         caption: under it.
+        alt: what it shows, for who cannot see it; empty where the caption says it.
     """
 
     png: bytes
-    alt: str
     caption: str
+    alt: str = ""
 
     @property
     def data(self) -> str:
@@ -66,10 +66,10 @@ class Page:
     """A report.
 
     Attributes:
-        title: of the page.
+        title: heading of the page.
         lead: under the title.
         figures: label and value of what matters most.
-        sections: of the page.
+        sections: what the page has below the figures, in order.
         foot: at its end.
     """
 

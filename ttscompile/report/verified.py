@@ -46,14 +46,11 @@ def _map(found: Verification) -> tuple[Picture, ...]:
         )
     )
     caption = "Relative error of every block's residual at the steps that were looked at: steps across, blocks down."
-    return (Picture(png, alt=caption, caption=caption),)
+    return (Picture(png, caption),)
 
 
 def _told(rung: Rung) -> str:
-    place = [f"step {rung.step}"] if rung.step is not None else []
-    if rung.blocks:
-        place.append("blocks " + ", ".join(map(str, rung.blocks[:8])) + ("…" if len(rung.blocks) > 8 else ""))
-    return f"{rung.told}." + (f" First at {', '.join(place)}." if place else "")
+    return f"{rung.told}." + (f" First at {rung.place}." if rung.place else "")
 
 
 def _number(figure: float | None) -> str:

@@ -32,7 +32,7 @@ class Frames:
     """What a file holds; arrays are read when they are asked for.
 
     Attributes:
-        names: of the arrays.
+        names: names of the arrays.
         read: the array ``[F, ...]`` of a name.
         ends: for each episode the frame after its last, increasing.
     """
@@ -47,7 +47,7 @@ class Recording:
     """A data set that is open, in the process that reads it.
 
     Attributes:
-        names: of the arrays.
+        names: names of the arrays.
         read: the rows of an array by its name, F, and blocks ``[n, ...]`` of them as they are stored.
         ends: for each episode the frame after its last, increasing.
         order: ``[F]`` which stored row is which frame, if they are not in order.
@@ -65,9 +65,9 @@ def observation_frames(
     """The frames of each key of the observation.
 
     Args:
-        path: for messages.
-        frames: of the file.
-        observations: of the policy.
+        path: of the file, for messages.
+        frames: what the file holds.
+        observations: what the policy observes, by key.
         sources: by key, the arrays that it is made of where they are called otherwise: flattened frame by frame and
             joined; ``NAME:N`` are the first N numbers of one.
 
@@ -142,7 +142,7 @@ def require_proportion(path: Path, total: int, size: int) -> None:
     """Raise if arrays are out of proportion to their file.
 
     Args:
-        path: for messages.
+        path: of the file, for messages.
         total: bytes of the arrays.
         size: bytes of the file.
 
@@ -203,7 +203,7 @@ def one_error(what: str, hint: str = "") -> Iterator[None]:
 
     Args:
         what: went wrong; the error's own words follow it in brackets.
-        hint: what comes after these.
+        hint: follows the brackets: what to do.
     """
     try:
         yield

@@ -16,7 +16,7 @@ from ..artifact.golden import load_golden, load_golden_plans
 from ..artifact.load import Artifact
 from ..core.spec import FP32
 from ..errors import ArtifactError, TtscompileError
-from ..runtimes.base import open_runtime
+from ..runtimes.open import open_runtime
 from ..runtimes.policy import CompiledPolicy
 from ..trajectories.episodes import load_trajectories
 from .calls import (
@@ -61,7 +61,7 @@ def verify(
         trajectories: recorded episodes, see ``ttscompile.trajectories``. None: errors of reuse are not judged.
         sources: by key of the observation, the arrays of a recording that it is made of.
         calls: recorded calls to go through at least, in whole episodes.
-        threads: of onnxruntime.
+        threads: threads that onnxruntime computes with.
         progress: told what is being done.
 
     Returns:

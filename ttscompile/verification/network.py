@@ -55,12 +55,8 @@ def check_preprocessing(artifact: Artifact, golden: Golden) -> Rung:
     errors: dict[str, float] = {}
     raw, network = golden.raw_observations(spec), golden.network_observations(spec)
     for key, one in spec.observations.items():
-        made = raw[key] if one.normalizer is None else one.normalizer.normalize(raw[key])
-        errors[f"observation {key!r}"] = largest(made, network[key])
-    actions = golden.sample[..., : spec.chunk.action_dim]
-    if spec.chunk.normalizer is not None:
-        actions = spec.chunk.normalizer.unnormalize(actions)
-    errors["the action"] = largest(actions, golden.actions)
+        errors[f"observation {key!r}"] = largest(one.normalized(raw[key]), network[key])
+    errors["the action"] = largest(spec.chunk.unnormalized(golden.sample), golden.actions)
     executed = golden.actions[:, spec.chunk.start : spec.chunk.stop]
     errors["the executed part of the chunk"] = largest(executed, golden.executed)
     wrong = [name for name, error in errors.items() if not error <= EXACT]
@@ -87,7 +83,7 @@ def block_errors(
     """Relative errors of each block taken alone, ``[A, blocks]``.
 
     Args:
-        manifest: of the artifact.
+        manifest: manifest of the artifact.
         golden: its record.
         function: gives the residuals.
         rows: which of the recorded steps; None for all.

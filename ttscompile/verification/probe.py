@@ -1,7 +1,7 @@
 """The pieces of an artifact one by one, with onnxruntime and numpy: what a runtime does in one go, to look inside.
 
-Slow and plain on purpose, and no part of the runtimes: where a call goes wrong and this goes right, the pieces are
-sound and the loop over them is not.
+Slow and plain on purpose, with a loop of its own that shares nothing with the runtimes': where a call goes wrong and
+this goes right, the pieces are sound and the loop over them is not.
 """
 
 from __future__ import annotations

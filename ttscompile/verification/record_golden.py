@@ -20,14 +20,14 @@ from ..artifact.load import Artifact
 from ..core.spec import FloatArray, Noise, PolicySpec
 from ..errors import CaptureError
 from ..frontends.eager import eager_policy
-from ..frontends.encoded import EncodedDenoiser
+from ..frontends.encoded import parts
 from ..ir.dataflow import reachable_from
 from ..ir.evaluate import Evaluator
 from ..ir.graph import Graph, TensorType, backward_slice
 from ..ir.program import Block, Program
 from ..ir.rows import Rows
-from ..runtimes.base import pruner_plan, settle_plan
 from ..runtimes.reference.model import ReferenceModel
+from ..runtimes.settle import pruner_plan, settle_plan
 
 STREAMS = 2
 """Streams of the call, so that what mixes streams up shows; one where that would take long or much room."""
@@ -73,7 +73,7 @@ def _record_original(module: nn.Module, program: Program) -> Golden:
         raw = np.concatenate([one.draw(draw) for _ in range(streams)])
         raw = np.stack([np.resize(each, one.shape) for each in pattern(raw, one.shape)])
         observations[key] = raw
-        normalized[key] = raw if one.normalizer is None else one.normalizer.normalize(raw)
+        normalized[key] = one.normalized(raw)
     original, kept = spec.original, spec.sample[0]
     shape = (streams, *original.sample)
     initial = draw.standard_normal(shape, dtype=np.float32)
@@ -92,9 +92,7 @@ def _record_original(module: nn.Module, program: Program) -> Golden:
             "the module's prediction on a random observation within the range of its normaliser is not a number."
             " Look for NaN in its weights, and check normaliser and sampler."
         )
-    actions = sample[..., : spec.chunk.action_dim]
-    if spec.chunk.normalizer is not None:
-        actions = spec.chunk.normalizer.unnormalize(actions)
+    actions = spec.chunk.unnormalized(sample)
     evaluated = _spread(steps, EVALUATIONS)
     anchors = _spread(steps, steps if small else max(3, int(steps * EFFORT / program.dense_flops)))
     inside = _Inside(program, tensors, streams)
@@ -144,13 +142,12 @@ def _episode(
         wanted = pruner_plan(model.logits(contexts).numpy()) if pruned else artifact.schedule(name)
         plan, _ = settle_plan(wanted, model.groups, cache.written, repair=True)
         draws = None if golden.draws is None else torch.from_numpy(golden.draws[:, ::order].copy())
-        result = model.rollout(
+        result = model.denoise(
             contexts,
             torch.from_numpy(golden.initial[::order].copy()),
             draws,
             plan,
             cache,
-            keep_samples=True,
             correction=artifact.corrections.get(name),
         )
         cache = result.cache
@@ -171,7 +168,7 @@ class _Watch:
     """What goes in and comes out of each evaluation of a module: ``[B, T, D]`` each.
 
     Args:
-        module: hooked. Of one with an observation encoder before it, which runs once a call, the rest.
+        module: whose part that is evaluated at every step is hooked.
         spec: names the sample's argument.
     """
 
@@ -179,8 +176,7 @@ class _Watch:
         self._argument = spec.sample_argument
         self.given: list[FloatArray] = []
         self.predicted: list[FloatArray] = []
-        evaluated = module.denoiser if isinstance(module, EncodedDenoiser) else module
-        evaluated.register_forward_hook(self._saw, with_kwargs=True)
+        parts(module).denoiser.register_forward_hook(self._saw, with_kwargs=True)
 
     def _saw(self, _: nn.Module, args: tuple[Any, ...], kwargs: dict[str, Any], output: torch.Tensor) -> None:
         sample = args[0] if args else kwargs[self._argument]

@@ -17,12 +17,12 @@ class Rung:
     """One check.
 
     Attributes:
-        name: of the rung.
+        name: name of the rung.
         status: ``passed``, ``failed`` or ``skipped``.
         told: what was compared, and what was found.
         figure: the error; None where there is no number.
-        tolerance: what it may be.
-        unit: of both.
+        tolerance: the largest error that passes.
+        unit: what error and tolerance are shares or multiples of.
         remedy: what to do; empty if nothing is to be done.
         step: first denoising step that differs; None if none does, or none can be named.
         blocks: residual blocks that differ.
@@ -40,6 +40,15 @@ class Rung:
     blocks: tuple[int, ...] = ()
     details: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def place(self) -> str:
+        """Where it first differs, for people: ``step 3, blocks 0, 2``; empty if nowhere."""
+        parts = [f"step {self.step}"] if self.step is not None else []
+        if self.blocks:
+            shown = ", ".join(map(str, self.blocks[:8])) + ", .." * (len(self.blocks) > 8)
+            parts.append(f"block{'s' * (len(self.blocks) > 1)} {shown}")
+        return ", ".join(parts)
+
 
 @dataclass(frozen=True, eq=False)
 class ErrorMap:
@@ -48,10 +57,10 @@ class ErrorMap:
     Attributes:
         steps: the steps that were looked at, ``[A]``.
         errors: relative error of each block's residual there, ``[A, blocks]``.
-        tolerance: what it may be.
+        tolerance: the largest error that passes.
         kinds: kind of each block.
         plan: name of a plan of which cells differ from what was calibrated; None if none does.
-        cells: bool ``[K, blocks]``, these cells; None likewise.
+        cells: bool ``[K, blocks]``, true for these cells; None if none differs.
     """
 
     steps: npt.NDArray[np.int64]
@@ -71,7 +80,7 @@ class Verification:
         identity: sha256 of what the artifact computes; None where that cannot be read.
         model_identity: the same without plans.
         rungs: in order; after one of integrity that failed there are none.
-        seconds: that it took.
+        seconds: how long all rungs took.
         map: errors of residuals; None if they were not looked at.
     """
 
@@ -85,12 +94,22 @@ class Verification:
     @property
     def passed(self) -> bool:
         """Whether no rung failed."""
-        return all(rung.status != FAILED for rung in self.rungs)
+        return not self.failed
 
     @property
     def first_failure(self) -> Rung | None:
-        """The lowest rung that failed: those above it stand on it."""
-        return next((rung for rung in self.rungs if rung.status == FAILED), None)
+        """The lowest rung that failed."""
+        return self.failed[0] if self.failed else None
+
+    @property
+    def failed(self) -> list[Rung]:
+        """The rungs that failed, from the lowest: those above it stand on it."""
+        return [rung for rung in self.rungs if rung.status == FAILED]
+
+    @property
+    def skipped(self) -> list[Rung]:
+        """The rungs that could not be tried."""
+        return [rung for rung in self.rungs if rung.status == SKIPPED]
 
     def rung(self, name: str) -> Rung:
         """The rung of this name."""

@@ -1,0 +1,139 @@
+"""What a robot did and will do in one episode: actions given out, scheduled, and in reserve. No clock, no threads."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from ttscompile.core.spec import FloatArray
+from ttscompile.errors import ExecutorError
+
+from .guard import Guard
+from .settings import ExecutorSettings, Resolved
+from .timeline import TickGrid, Timeline, expand, splice
+
+FAR = 1e6
+"""Seconds from now that a time may be at most; what is further is of another clock."""
+
+
+class Schedule:
+    """The actions of one episode by control tick.
+
+    Args:
+        settings: as given.
+        resolved: what follows from them and the policy.
+        guard: checks chunks before they are scheduled.
+
+    Attributes:
+        grid: from seconds to ticks.
+        timeline: what is scheduled; None before the first chunk.
+        due: first tick that the next chunk is needed for; what is scheduled after that is in reserve.
+        refusal: why the last chunk was refused; None if it was not.
+    """
+
+    def __init__(self, settings: ExecutorSettings, resolved: Resolved, guard: Guard) -> None:
+        self._settings, self._resolved, self._guard = settings, resolved, guard
+        self.grid = TickGrid(resolved.control_hz)
+        self.timeline: Timeline | None = None
+        self.due = 0
+        self.refusal: str | None = None
+        most = (resolved.horizon + resolved.reserve) * resolved.ticks_per_step
+        self._played: deque[tuple[int, FloatArray]] = deque(maxlen=max(most, 3))
+
+    @property
+    def last(self) -> tuple[int, FloatArray] | None:
+        """Tick and action that were given out last; None before the first."""
+        return self._played[-1] if self._played else None
+
+    def tick(self, time: float, now: float) -> int:
+        """The tick of a time for which an action is asked.
+
+        Raises:
+            ExecutorError: an action for a later time was given out before, or the time is of another clock.
+        """
+        if not abs(time - now) < FAR:
+            raise ExecutorError(
+                f"an action was asked for {time - now:.6g} s from now. Give times of time.monotonic(), or of the clock"
+                " that the executor was given."
+            )
+        tick = self.grid.tick(time)
+        if self.last is not None and tick < self.last[0]:
+            raise ExecutorError(
+                f"an action was asked for {self.last[0] - tick} ticks before the last one that was given out. Times"
+                " must not go backwards within an episode; one control loop asks for actions."
+            )
+        return tick
+
+    def give(self, tick: int, action: FloatArray, time: float) -> None:
+        """Take note that an action was given out for a time."""
+        self.grid.follow(time, tick)
+        self._played.append((tick, action))
+
+    def add(self, observed: float, actions: FloatArray, now: float) -> str:
+        """Let a chunk join what is scheduled, if the guard has nothing against it.
+
+        Args:
+            observed: time of the newest frame that it was computed from.
+            actions: ``[horizon + reserve, Da]``; the reserve is left out where the guard refuses that alone.
+            now: when it came.
+
+        Returns:
+            ``scheduled``, ``refused`` or ``overdue``.
+        """
+        settings, resolved = self._settings, self._resolved
+        self.refusal = self._guard.refuse(actions[: resolved.horizon])
+        if self.refusal is not None:
+            return "refused"
+        if self._guard.refuse(actions[resolved.horizon :]) is not None:
+            actions = actions[: resolved.horizon]
+        rows = expand(actions, resolved.ticks_per_step, settings.interpolation)
+        start = self.grid.tick(observed)
+        new = Timeline(start, rows, np.full(len(rows), observed))
+        seam = start if self.last is None else self.last[0] + 1
+        spliced = splice(self.timeline, new, seam, settings.blend_steps if settings.seam == "blend" else 0)
+        if spliced is None or new.end <= self.grid.tick(now):
+            return "overdue"
+        played = [action for _, action in list(self._played)[-3:]]
+        past = np.stack(played) if played else np.empty((0, resolved.channels), np.float32)
+        refusal = self._guard.refuse_motion(past, spliced.rows)
+        if refusal is not None:  # without its reserve it may do, if anything is left then
+            spliced = spliced.until(start + resolved.horizon * resolved.ticks_per_step)
+            self.refusal = self._guard.refuse_motion(past, spliced.rows) if len(spliced.rows) else refusal
+            if self.refusal is not None:
+                return "refused"
+        self.timeline = spliced
+        return "scheduled"
+
+    @property
+    def executed(self) -> float:
+        """When the policy would have executed the newest chunk, of which there must be one, and so observes again."""
+        assert self.timeline is not None
+        return float(self.timeline.observed[-1]) + self._resolved.horizon / self._resolved.policy_hz
+
+    def need_by(self, time: float) -> None:
+        """Say when the next chunk is needed: at the end of what is scheduled, or after a time, if that is sooner."""
+        if self.timeline is not None:
+            self.due = min(self.grid.tick(time) + 1, self.timeline.end)
+
+    def runs_out(self, now: float) -> float | None:
+        """When the first tick comes for which nothing is scheduled but the reserve; None if that is so already."""
+        if self.timeline is None:
+            return None
+        end = self.grid.time(self.due)
+        return end if end > now else None
+
+    def committed(self, observed: float, until: float) -> FloatArray:
+        """Actions given out and scheduled between two times, one a step of the policy, ``[N, Da]``."""
+        tick, last = self.grid.tick(observed), self.grid.tick(until)
+        played = dict(self._played)
+        rows: list[FloatArray] = []
+        while tick <= last and len(rows) < self._resolved.horizon:
+            row = played.get(tick)
+            if row is None and self.timeline is not None:
+                row = self.timeline.at(tick)
+            if row is None:
+                break
+            rows.append(row)
+            tick += self._resolved.ticks_per_step
+        return np.stack(rows) if rows else np.empty((0, self._resolved.channels), np.float32)

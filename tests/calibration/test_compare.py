@@ -1,0 +1,226 @@
+"""The comparison of strategies, plans and artifacts: what it measures, and what it refuses to compare."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from PIL import Image
+
+import ttscompile
+from ttscompile import SamplerTable
+from ttscompile.artifact.load import Artifact, load_artifact
+from ttscompile.artifact.write import update_calibration
+from ttscompile.calibration.compare import _require_same_policy, compare
+from ttscompile.cli import main
+from ttscompile.cli.compare import default_sparsities
+from ttscompile.core.lattice import uniform_plan
+from ttscompile.errors import CalibrationError, OutputError
+from ttscompile.measure.points import Frontier, MeasuredPoint
+from ttscompile.plots.frontier import plot_frontier
+
+from . import policies
+
+
+@pytest.fixture(scope="session")
+def planned(compiled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small policy with a plan, ``half``."""
+    directory = tmp_path_factory.mktemp("planned") / "compiled"
+    shutil.copytree(compiled, directory)
+    record = {"episodes": {"validation": [0, 1]}}
+    update_calibration(directory, None, {"half": uniform_plan(10, 6, 5)}, "half", record)
+    return directory
+
+
+@pytest.fixture(scope="session")
+def other_sampler(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same network with a deterministic sampler of five steps."""
+    spec = policies.spec(noise=0.0)
+    rows = {name: np.ascontiguousarray(getattr(spec.sampler, name)[::2]) for name in SamplerTable.COLUMNS}
+    sampler = replace(spec.sampler, name="five", timesteps=spec.sampler.timesteps[::2].copy(), **rows)
+    directory = tmp_path_factory.mktemp("five") / "five"
+    ttscompile.compile_denoiser(policies.Mixer(0).eval(), replace(spec, sampler=sampler), directory)
+    return directory
+
+
+@pytest.fixture(scope="session")
+def frontier(planned: Path, other_sampler: Path, recording: Path) -> Frontier:
+    return compare(planned, [recording], ["interval", "tts"], [0.5, 0.8], [other_sampler], calls=8, intervals=8)
+
+
+def points(frontier: Frontier) -> dict[tuple[str, str], MeasuredPoint]:
+    return {(point.series, point.name): point for point in frontier.points}
+
+
+def test_every_plan_is_measured_on_the_same_calls(frontier: Frontier) -> None:
+    found = points(frontier)
+    assert list(found) == [
+        ("this artifact", "dense"),
+        ("this artifact", "half"),
+        ("interval", "0.5"),
+        ("interval", "0.8"),
+        ("tts", "0.5"),
+        ("tts", "0.8"),
+        ("five", "dense"),
+    ]
+    assert found["this artifact", "dense"].error == 0.0  # the truth, with the same noise
+    half, same = found["this artifact", "half"], found["interval", "0.5"]
+    assert half.error == pytest.approx(same.error, rel=1e-6)  # one plan under two names
+    assert half.sparsity == same.sparsity == 0.5
+    assert found["interval", "0.8"].error != same.error
+    assert found["tts", "0.8"].error < found["interval", "0.8"].error  # its correction is there
+    assert all(point.latency_ms > 0 for point in found.values())
+    assert {point.noise for point in frontier.points if point.series != "five"} == {"all"}
+    assert found["five", "dense"].noise == "initial"
+    assert 0 < frontier.yardsticks["steps"] < frontier.yardsticks["all"]
+    assert frontier.calls == 8
+
+
+def test_it_says_where_plans_may_have_been_learned_from_these_episodes(planned: Path, frontier: Frontier) -> None:
+    assert len(frontier.warnings) == 1
+    assert frontier.warnings[0].startswith(
+        "this artifact: its calibration held out the episodes [0, 1], and this comparison"
+    )
+
+
+def test_nothing_is_written(planned: Path, recording: Path) -> None:
+    before = {path.name: path.read_bytes() for path in planned.iterdir()}
+    compare(planned, [recording], ["interval"], [0.5], calls=1)
+    assert {path.name: path.read_bytes() for path in planned.iterdir()} == before
+
+
+def test_it_says_when_a_search_had_too_little_time_or_too_few_calls(planned: Path, recording: Path) -> None:
+    found = compare(planned, [recording], ["tts", "interval", "teacache"], [0.8], calls=1, learned=8, max_minutes=0)
+    assert [point.series for point in found.points] == ["this artifact"] * 2 + ["tts", "interval"]
+    assert found.skipped["teacache 0.8"].startswith("the time limit ended the search for a threshold of 'teacache'")
+    assert found.warnings[1] == "the limit of 0 minutes cut the search short of tts 0.8: see --max-minutes."
+    assert "tts fits corrections of 48 features from at most 8 calls" in found.warnings[2]
+
+
+def test_a_strategy_that_cannot_reach_a_sparsity_is_left_out_with_the_reason(planned: Path, recording: Path) -> None:
+    found = compare(planned, [recording], ["deepcache"], [0.8], calls=1)
+    assert {point.series for point in found.points} == {"this artifact"}
+    assert "computes at least 24 of the 10 x 6 cells" in found.skipped["deepcache 0.8"]
+
+
+def test_what_cannot_be_compared_is_refused(
+    planned: Path, linear_policy: Path, recording: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(CalibrationError, match="same checkpoint; found other weights"):
+        compare(planned, [recording], [], [], [linear_policy])
+    with pytest.raises(CalibrationError, match=f"two artifacts are called '{planned.name}'"):
+        compare(planned, [recording], [], [], [planned, shutil.copytree(planned, tmp_path / planned.name)])
+    with pytest.raises(CalibrationError, match="'magic'; expected one of tts"):
+        compare(planned, [recording], ["magic"], [0.5])
+    with pytest.raises(CalibrationError, match=r"at most 0\.9 of the 10 x 6"):
+        compare(planned, [recording], ["tts"], [0.95])
+    with pytest.raises(CalibrationError, match="one episode; expected at least two"):
+        compare(planned, [policies.record(tmp_path / "one.npz", episodes=1)], [], [])
+
+
+def test_an_artifact_that_predicts_fewer_steps_is_of_the_same_policy(planned: Path) -> None:
+    artifact = load_artifact(planned)
+    manifest, (steps, channels) = artifact.manifest, artifact.manifest.spec.sample
+
+    def predicting(count: int, weight: float = 0.0, left_out: int = 0) -> Artifact:
+        spec = replace(manifest.spec, sample=(count, channels), left_out=left_out)
+        weights = {**artifact.weights, "mask": np.zeros(count), "weight": np.full(3, weight)}
+        return replace(artifact, manifest=replace(manifest, spec=spec), weights=weights)
+
+    narrow = predicting(steps, left_out=2)
+    _require_same_policy(narrow, predicting(steps + 2), "other")
+    with pytest.raises(CalibrationError, match="found other weights"):
+        _require_same_policy(narrow, predicting(steps + 2, weight=1.0), "other")
+    with pytest.raises(CalibrationError, match="found other weights"):
+        _require_same_policy(narrow, replace(predicting(steps + 2), weights={"mask": np.zeros(steps + 2)}), "other")
+    with pytest.raises(CalibrationError, match="same checkpoint; found .* instead of"):
+        _require_same_policy(narrow, predicting(steps), "other")
+
+
+def _point(name: str, latency: float, error: float) -> MeasuredPoint:
+    return MeasuredPoint("s", name, error, latency, 0.5, 1.0, error, (latency, latency), "all")
+
+
+def test_the_frontier_is_what_nothing_beats() -> None:
+    some = [_point("slow", 9, 0), _point("beaten", 5, 4), _point("good", 4, 2), _point("fast", 1, 7)]
+    frontier = Frontier(tuple(some), 1, (0,), 1, {}, {}, ())
+    assert [point.name for point in frontier.efficient()] == ["fast", "good", "slow"]
+    assert [point["efficient"] for point in frontier.to_json()["points"]] == [True, False, True, True]
+
+
+def test_the_picture_has_the_points_and_needs_a_folder(frontier: Frontier, tmp_path: Path) -> None:
+    path = tmp_path / "f.png"
+    arguments: tuple[Any, ...] = (frontier.points, frontier.efficient(), frontier.yardsticks)
+    plot_frontier(*arguments, path, "title")
+    with Image.open(path) as picture:
+        colours = {colour for _, colour in picture.convert("RGB").getcolors(1 << 20)}
+    assert {(0xD5, 0x5E, 0x00), (0x00, 0x72, 0xB2), (0x00, 0x9E, 0x73)} <= colours
+    with pytest.raises(OutputError, match="folder that exists"):
+        plot_frontier(*arguments, tmp_path / "none" / "f.png", "title")
+
+
+def test_the_command_prints_the_same_as_a_table_and_as_json(
+    planned: Path, other_sampler: Path, recording: Path, tmp_path: Path
+) -> None:
+    arguments = [
+        str(planned),
+        "--trajectories",
+        str(recording),
+        "--with",
+        str(other_sampler),
+        "--strategies",
+        "interval",
+    ]
+    arguments += ["--sparsities", "0.5,0.8", "--calls", "2"]
+    runner = CliRunner()
+    told = runner.invoke(main, ["compare", *arguments, "--json", "--plot", str(tmp_path / "f.svg")])
+    assert told.exit_code == 0, told.stderr
+    record = json.loads(told.stdout)
+    assert [point["series"] for point in record["points"]] == ["this artifact"] * 2 + ["interval"] * 2 + ["five"]
+    identity, other = (load_artifact(path).manifest.identity for path in (planned, other_sampler))
+    assert record["identity"] == identity
+    assert record["with"] == [{"path": str(other_sampler), "identity": other}]
+    assert "held-out calls" in (tmp_path / "f.svg").read_text()
+    assert "warning: this artifact" in told.stderr
+    assert told.stderr.count("search: interval 0.8\n") == 1  # a log has a line for each part of the work, and no bar
+    lost = runner.invoke(main, ["compare", *arguments, "--json", "--plot", str(tmp_path / "none" / "f.png")])
+    assert lost.exit_code == 2
+    assert json.loads(lost.stdout)["identity"] == identity  # what took minutes is told all the same
+    assert "folder that exists" in lost.stderr
+    shown = runner.invoke(main, ["compare", *arguments])
+    assert shown.exit_code == 0, shown.stderr
+    assert "* Another sampler" in shown.stdout
+    assert "Yardstick: two dense calls are apart" in shown.stdout
+
+
+def test_without_sparsities_those_are_taken_that_the_steps_allow(planned: Path, recording: Path) -> None:
+    assert default_sparsities(100) == (0.9, 0.95, 0.98)
+    assert default_sparsities(16) == (11 / 16, 13 / 16, 14 / 16)
+    arguments = ["compare", str(planned), "--trajectories", str(recording), "--calls", "2", "--json"]
+    told = CliRunner().invoke(main, [*arguments, "--strategies", "interval"])  # of ten steps: 95 % is none
+    assert told.exit_code == 0, told.stderr
+    made = [point["name"] for point in json.loads(told.stdout)["points"] if point["series"] == "interval"]
+    assert made == ["0.5", "0.7", "0.8"]
+    alone = CliRunner().invoke(main, [*arguments, "--strategies", ""])
+    assert alone.exit_code == 0, alone.stderr
+    assert {point["series"] for point in json.loads(alone.stdout)["points"]} == {"this artifact"}
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("--strategies", "magic", "'magic' is not one of tts"),
+        ("--sparsities", "0.9,x", "could not convert"),
+        ("--sparsities", "1", "1 is not above 0 and below 1"),
+    ],
+)
+def test_bad_lists_are_refused(planned: Path, option: str, value: str, message: str) -> None:
+    result = CliRunner().invoke(main, ["compare", str(planned), "--trajectories", "a.npz", option, value])
+    assert result.exit_code == 2
+    assert message in result.stderr

@@ -1,0 +1,159 @@
+"""What holds for every strategy: plans are legal and within the budget, and an interruption changes nothing."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ttscompile
+from ttscompile.calibration.published import evo, gates, online
+from ttscompile.calibration.search import open_search, plan_of
+from ttscompile.calibration.strategies import DEFAULT, FITTED, NAMES, STRATEGIES, Strategy, strategy_of
+from ttscompile.calibration.task import Found, Search
+from ttscompile.core.lattice import Source, illegal_cells
+from ttscompile.errors import CalibrationError
+
+from .tasks import MakeTask
+
+BUDGET = 34
+"""Of 10 x 6 cells: enough for all strategies."""
+
+
+@pytest.fixture(autouse=True)
+def short_searches(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gates.Gates, "intervals", 4)
+    monkeypatch.setattr(evo.Evo, "intervals", 4)
+    monkeypatch.setattr(evo, "POPULATION", 16)
+    monkeypatch.setattr(online, "HALVINGS", 5)
+
+
+def run(search: Search, first: int = 0) -> Found:
+    for interval in range(first, search.intervals):
+        if search.done:
+            break
+        search.advance(interval)
+    return search.found()
+
+
+@pytest.mark.parametrize(
+    ("name", "budget"),
+    [*((name, BUDGET) for name in NAMES), ("bac", 59), ("delta-dit", 59), ("deepcache", 59), ("sag", 7)],
+)
+def test_a_plan_is_legal_and_within_the_budget(make_task: MakeTask, name: str, budget: int) -> None:
+    task = make_task(budget, calls=8)
+    found, _ = plan_of(name, task)
+    model = task.executor.model
+    assert found.schedule.shape == (model.steps, model.blocks)
+    assert found.schedule.dtype == np.int8
+    assert not illegal_cells(found.schedule, model.groups, np.zeros(found.schedule.shape, np.bool_)).any()
+    computed = int((found.schedule == Source.COMPUTE).sum())
+    assert budget - model.blocks < computed <= budget  # and hardly less: no strategy leaves a whole step unused
+
+
+@pytest.mark.parametrize("name", sorted(set(NAMES) - {"interval"}))
+def test_going_on_from_a_state_ends_where_another_run_ends(make_task: MakeTask, name: str) -> None:
+    whole = run(open_search(name, make_task(BUDGET, calls=8)))
+    task = make_task(BUDGET, calls=8)
+    stopped = open_search(name, task)
+    stopped.advance(0)
+    if not stopped.done:
+        stopped.advance(1)
+    state = stopped.state()
+    resumed = open_search(name, task)
+    resumed.restore({key: value.copy() for key, value in state.items()})
+    assert resumed.done == stopped.done
+    np.testing.assert_array_equal(resumed.plan, stopped.plan)
+    found = run(resumed, first=2)
+    np.testing.assert_array_equal(found.schedule, whole.schedule)
+    assert found.notes == whole.notes
+
+
+@pytest.mark.parametrize("name", ["evo", "dip-go", "tts"])
+def test_a_search_beats_even_steps(make_task: MakeTask, name: str) -> None:
+    task = make_task(20, calls=24)
+    even, searched = (task.error(plan_of(one, task)[0].schedule, task.calls) for one in ("interval", name))
+    assert searched < even
+
+
+LEAST = {"deepcache": 24, "delta-dit": 15, "l2c": 30, "teacache": 12, "dbcache": 15}
+"""Cells of 10 x 6 that a strategy cannot do without; step 0 for the others."""
+
+
+@pytest.mark.parametrize(("name", "least"), [(name, LEAST.get(name, 6)) for name in NAMES])
+def test_a_budget_out_of_reach_is_refused_and_the_next_cell_is_not(make_task: MakeTask, name: str, least: int) -> None:
+    sparsity = f"{1 - least / 60:.4g}"
+    with pytest.raises(CalibrationError, match=rf"'{name}' computes at least {least} of the 10 x 6 .* of {sparsity};"):
+        open_search(name, make_task(least - 1))
+    with pytest.raises(CalibrationError, match=f"leaves {least - 1}"):
+        strategy_of(name).require_reach(10, 6, least - 1)
+    found, _ = plan_of(name, make_task(least))
+    assert int((found.schedule == Source.COMPUTE).sum()) == least
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_one_call_is_enough(make_task: MakeTask, name: str) -> None:
+    found, _ = plan_of(name, make_task(BUDGET, calls=1))
+    assert int((found.schedule == Source.COMPUTE).sum()) <= BUDGET
+
+
+def test_an_unknown_name_is_refused() -> None:
+    with pytest.raises(CalibrationError, match="'magic'; expected one of tts, interval, bac"):
+        strategy_of("magic")
+
+
+def test_fewer_intervals_than_a_strategy_has(make_task: MakeTask) -> None:
+    task = make_task(BUDGET)
+    assert plan_of("evo", task, 2)[0].notes == {"generations": 2}
+    assert plan_of("evo", task, 1000)[0].notes == {"generations": 4}
+
+
+MAKERS = {one.name: one.make() for one in STRATEGIES}
+"""Resolved when the tests are collected: a name without a maker is an error before any test runs."""
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_strategy_has_a_maker_that_is_described(make_task: MakeTask, name: str) -> None:
+    search = MAKERS[name](make_task(BUDGET, calls=4))
+    missing = {each for each in dir(Search) if not each.startswith("_") and not hasattr(search, each)}
+    assert missing == set()
+    assert strategy_of(name).source
+    assert MAKERS[name].__doc__
+
+
+def test_names_are_given_once_and_the_first_is_the_default() -> None:
+    assert len(set(NAMES)) == len(MAKERS) == len(STRATEGIES)
+    assert (DEFAULT, FITTED) == ("tts", ("tts",))
+    assert [one.name for one in STRATEGIES if one.baseline] == ["interval"]
+
+
+def test_a_name_without_a_maker_is_an_error() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'magic'"):
+        Strategy("magic", "none", "published.bac:magic").make()
+    with pytest.raises(ModuleNotFoundError, match="magic"):
+        Strategy("magic", "none", "published.magic:magic").make()
+
+
+def test_the_table_is_read_without_torch() -> None:
+    code = "import sys, ttscompile.calibration.strategies; print(sorted({'numpy', 'torch'} & set(sys.modules)))"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout == "[]\n"
+
+
+def test_nobody_asks_for_a_strategy_by_its_name() -> None:
+    """What depends on a strategy is a property of its record."""
+    asked = re.compile(rf"""(==|!=|\bin|\bcase) \(?["'](?:{"|".join(map(re.escape, NAMES))})["']""")
+    package = Path(ttscompile.__file__).parent
+    found = [
+        f"{path.relative_to(package)}:{number}: {line.strip()}"
+        for path in package.rglob("*.py")
+        for number, line in enumerate(path.read_text().splitlines(), 1)
+        if asked.search(line)
+    ]
+    assert found == []
+    assert asked.search('if strategy == "tts":')
+    assert asked.search('if strategy in ("sag", "l2c"):')

@@ -1,0 +1,174 @@
+"""Action heads of vision-language-action models, rebuilt, and what their originals made; see ``golden/README.md``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import diffusers
+from torch import nn
+
+from tests.families.checks import Arrays, golden
+from tests.families.cogact import CogACTHead
+from tests.families.dit_policy import DiTPolicyHead
+from tests.families.groot import GR00THead
+from tests.families.pi import PiHead
+from tests.families.rdt import RDTHead
+from tests.families.smolvla import SmolVLAHead
+from tests.families.weights import draw_weights
+from ttscompile import ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
+from ttscompile.samplers.flow import flow_matching_table
+from ttscompile.samplers.table import sampler_table
+
+
+@dataclass(frozen=True)
+class Family:
+    """A head, what its original made, and what has to be found in it.
+
+    Attributes:
+        title: in the support table.
+        verified: against what.
+        module: with random weights still.
+        conditions: observations of the golden file, in the order of the module's arguments.
+        sampler: as the original runs it.
+        prediction: name of the network's output in the golden file.
+        blocks: of each kind.
+        loop: largest share of the FLOPs that may stay in the loop.
+        others: names and shapes of the original's parameters that the head does not have.
+        scale: by which the golden file's timesteps are larger than the head's.
+        masks: whether the original multiplies the actions by ``action_mask`` at the end.
+    """
+
+    title: str
+    verified: str
+    module: nn.Module
+    conditions: tuple[str, ...]
+    sampler: SamplerTable
+    prediction: str
+    blocks: dict[str, int]
+    loop: float
+    others: dict[str, tuple[int, ...]] = field(default_factory=dict)
+    scale: float = 1.0
+    masks: bool = False
+
+
+def smolvla() -> Family:
+    return Family(
+        title="SmolVLA action expert",
+        verified="lerobot 7427f31 `denoise_step`, `euler_integrate`, 1e-5",
+        module=SmolVLAHead(width=24, heads=4, groups=2, channels=8, hidden=40, layers=4, actions=5),
+        conditions=("prefix_mask", "keys", "values"),
+        sampler=flow_matching_table(10, start=1.0, end=0.0),
+        prediction="velocity",
+        blocks={"self_attention": 2, "feed_forward": 4, "cross_attention": 2},
+        loop=0.96,
+        others={"state_proj.weight": (32, 6), "state_proj.bias": (32,)},
+    )
+
+
+def rdt() -> Family:
+    solver = diffusers.DPMSolverMultistepScheduler(beta_schedule="squaredcos_cap_v2", prediction_type="sample")
+    return Family(
+        title="RDT-1B",
+        verified="RoboticsDiffusionTransformer deb71d8 `conditional_sample`, 1e-5",
+        module=RDTHead(width=32, heads=4, layers=4, horizon=6, actions=5, lengths=(9, 8), features=(12, 10)),
+        conditions=("language", "language_mask", "image", "state", "action_mask", "frequency"),
+        sampler=sampler_table(solver, 5, name="dpmsolver++"),
+        prediction="prediction",
+        blocks={"self_attention": 4, "cross_attention": 4, "feed_forward": 4},
+        loop=0.78,
+        masks=True,
+    )
+
+
+def pi0() -> Family:
+    return Family(
+        title="pi0 action expert",
+        verified="lerobot 7427f31 `denoise_step`, `euler_integrate`, 1e-5",
+        module=PiHead(width=24, heads=4, groups=1, channels=8, hidden=40, layers=2, actions=5, adaptive=False),
+        conditions=("prefix_mask", "keys", "values", "state"),
+        sampler=flow_matching_table(10, start=1.0, end=0.0),
+        prediction="velocity",
+        blocks={"self_attention": 2, "feed_forward": 2},
+        loop=0.9995,
+    )
+
+
+def pi05() -> Family:
+    return Family(
+        title="pi0.5 action expert",
+        verified="lerobot 7427f31 `denoise_step`, `euler_integrate`, 1e-5",
+        module=PiHead(width=24, heads=4, groups=1, channels=8, hidden=40, layers=2, actions=5, adaptive=True),
+        conditions=("prefix_mask", "keys", "values"),
+        sampler=flow_matching_table(10, start=1.0, end=0.0),
+        prediction="velocity",
+        blocks={"self_attention": 2, "feed_forward": 2},
+        loop=0.9,
+    )
+
+
+def groot() -> Family:
+    return Family(
+        title="GR00T N1.7 action head",
+        verified="lerobot 7427f31 `get_action_with_features`, 1e-5",
+        module=GR00THead(24, heads=3, layers=4, source=20, out=16, actions=5, embodiments=2, embodiment=1),
+        conditions=("features", "state"),
+        sampler=flow_matching_table(4),
+        prediction="velocity",
+        blocks={"cross_attention": 2, "feed_forward": 4, "self_attention": 2},
+        loop=0.9,
+        scale=1000.0,
+    )
+
+
+def cogact() -> Family:
+    solver = diffusers.DDIMScheduler(100, beta_schedule="squaredcos_cap_v2", clip_sample=False)
+    return Family(
+        title="CogACT action model, guidance 1.5",
+        verified="CogACT b174a1b `forward_with_cfg`, `ddim_sample_loop`, 1e-4",
+        module=CogACTHead(24, heads=3, layers=2, horizon=6, actions=5, cognition=18, guidance=1.5),
+        conditions=("cognition",),
+        sampler=sampler_table(solver, 10, name="ddim"),
+        prediction="prediction",
+        blocks={"self_attention": 2, "feed_forward": 2},
+        loop=0.99,
+        others={"history_embedder.linear.weight": (24, 5), "history_embedder.linear.bias": (24,)},
+    )
+
+
+def dit_policy() -> Family:
+    solver = diffusers.DDIMScheduler(100, beta_schedule="squaredcos_cap_v2")
+    return Family(
+        title="DiT-Policy",
+        verified="dit-policy ba22ee3 `get_actions`, 1e-4",
+        module=DiTPolicyHead(24, heads=3, layers=2, hidden=40, waves=16, horizon=6, actions=5),
+        conditions=("tokens",),
+        sampler=sampler_table(solver, 8, name="ddim"),
+        prediction="prediction",
+        blocks={"self_attention": 2, "feed_forward": 2},
+        loop=0.5,
+    )
+
+
+FAMILIES = {
+    "smolvla": smolvla,
+    "rdt": rdt,
+    "pi0": pi0,
+    "pi05": pi05,
+    "groot": groot,
+    "cogact": cogact,
+    "dit_policy": dit_policy,
+}
+
+
+def loaded(family: Family, name: str) -> tuple[nn.Module, Arrays, PolicySpec]:
+    """The head with the original's weights, what the original made, and the specification."""
+    arrays = golden(name)
+    own = {key: tuple(value.shape) for key, value in family.module.state_dict().items()}
+    drawn = draw_weights(own | family.others, int(arrays["seed"]))
+    family.module.load_state_dict({key: drawn[key] for key in own})
+    observations = {
+        key: ObservationSpec(arrays[key].shape[1:], dtype=str(arrays[key].dtype)) for key in family.conditions
+    }
+    horizon, channels = arrays["noise"].shape[1:]
+    spec = PolicySpec((horizon, channels), observations, family.sampler, ChunkSpec(channels, 0, horizon))
+    return family.module.eval(), arrays, spec

@@ -1,0 +1,168 @@
+"""Data sets as users have them, written with the libraries that write them, and read as the calls of a policy."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import h5py
+import numcodecs
+import numpy as np
+import pytest
+import zarr
+
+from tests.hostile.pickles import Runs
+from ttscompile.core.spec import ObservationSpec
+from ttscompile.errors import TrajectoryError
+from ttscompile.trajectories import Episode, apart, load_trajectories
+from ttscompile.trajectories import frames as trajectories_frames
+
+from .data_sets import ENDS, IMAGES, LOW, SOURCES, arrays, as_hdf5, as_lerobot, as_npz, as_zarr, read_here
+
+
+@pytest.fixture(autouse=True)
+def _read_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(apart, "reader", read_here)
+
+
+WRITERS = {
+    "npz": as_npz,
+    "zarr 2": as_zarr,
+    "zarr 3": lambda path: as_zarr(path, 3),
+    "zarr 2, blosc, zipped": lambda path: as_zarr(path, 2, numcodecs.Blosc("zstd"), zipped=True),
+    "hdf5": as_hdf5,
+    "lerobot": as_lerobot,
+}
+
+
+def windows(frames: np.ndarray, action_steps: int) -> list[np.ndarray]:
+    """By hand: the frame of a call and the one before it; the first stands for the one before the first."""
+    found = []
+    for begin, end in zip([0, *ENDS], ENDS, strict=False):
+        calls = range(begin, end, action_steps)
+        found.append(np.stack([frames[[max(i - 1, begin), i]] for i in calls]))
+    return found
+
+
+def require_equal(episodes: list[Episode], key: str, expected: list[np.ndarray]) -> None:
+    assert len(episodes) == len(expected) == 2
+    for episode, one in zip(episodes, expected, strict=True):
+        np.testing.assert_allclose(episode.observations[key], one, rtol=1e-6)
+
+
+@pytest.mark.parametrize("format", WRITERS)
+def test_an_observation_is_joined_from_the_arrays_of_a_recording(format: str, tmp_path: Path) -> None:
+    held = arrays()
+    frames = np.concatenate([held["keypoint"].reshape(9, 6), held["state"][:, :2]], axis=1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("warnings.warn", lambda *_, **__: pytest.fail("a warning"))
+        episodes = load_trajectories([WRITERS[format](tmp_path)], LOW, 3, SOURCES)
+    require_equal(episodes, "obs", windows(frames, 3))
+
+
+@pytest.mark.parametrize("format", ["zarr 2", "zarr 3", "hdf5", "lerobot"])
+def test_images_come_as_the_policy_takes_them(format: str, tmp_path: Path) -> None:
+    episodes = load_trajectories([WRITERS[format](tmp_path)], IMAGES, 2, {"image": ("img",)})
+    held = arrays()
+    require_equal(episodes, "image", windows(np.moveaxis(held["img"], -1, 1).astype(np.float32) / 255, 2))
+    require_equal(episodes, "state", windows(held["state"], 2))
+
+
+@pytest.mark.parametrize("format", WRITERS)
+def test_what_is_missing_is_named_beside_what_there_is(format: str, tmp_path: Path) -> None:
+    with pytest.raises(TrajectoryError, match=r"no array 'obs' .* it has .*keypoint, .*state.*--observation obs=NAME"):
+        load_trajectories([WRITERS[format](tmp_path)], LOW, 3)
+
+
+@pytest.mark.parametrize("part", ["state:0", "state:6", "state:x", "state:"])
+def test_more_numbers_than_there_are_cannot_be_taken(part: str, tmp_path: Path) -> None:
+    with pytest.raises(TrajectoryError, match=f"'{part}' .* how many of the 5 numbers of 'state' are taken"):
+        load_trajectories([as_npz(tmp_path)], LOW, 3, {"obs": ("keypoint", part)})
+
+
+def test_calls_are_not_joined(tmp_path: Path) -> None:
+    np.savez(tmp_path / "calls.npz", a=np.zeros((3, 2, 4)), b=np.zeros((3, 2, 4)), episode_ends=np.array([3]))
+    with pytest.raises(TrajectoryError, match="its rows are calls of the policy"):
+        load_trajectories([tmp_path / "calls.npz"], LOW, 3, {"obs": ("a", "b")})
+
+
+def test_an_array_for_no_key_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(TrajectoryError, match=r"observes \['obs'\]; found arrays for \['observation'\]"):
+        load_trajectories([as_npz(tmp_path)], LOW, 3, {"observation": ("state",)})
+
+
+@pytest.mark.parametrize("declared", ["|O", "<f4"])
+def test_a_zarr_codec_that_unpickles_is_never_run(declared: str, tmp_path: Path) -> None:
+    target, store = tmp_path / "touched", as_zarr(tmp_path)
+    array = store / "data" / "state"
+    payload = np.empty(4, object)
+    payload[:] = Runs(os.mkdir, str(target))
+    (array / "0.0").write_bytes(numcodecs.Pickle().encode(payload))
+    meta = json.loads((array / ".zarray").read_text())
+    meta |= {"dtype": declared, "filters": [{"id": "pickle", "protocol": 5}], "compressor": None, "fill_value": 0}
+    (array / ".zarray").write_text(json.dumps(meta))
+    with pytest.raises(TrajectoryError):
+        load_trajectories([store], LOW, 3, SOURCES)
+    assert not target.exists()
+
+
+def test_a_zarr_array_of_nothing_but_its_size_is_refused(tmp_path: Path) -> None:
+    store = as_zarr(tmp_path)
+    shutil.rmtree(store / "data" / "state")
+    zarr.open_group(str(store))["data"].create_array("state", shape=(10**9, 5), chunks=(1000, 5), dtype="f4")
+    with pytest.raises(TrajectoryError, match="in proportion to a file of"):
+        load_trajectories([store], LOW, 3, SOURCES)
+
+
+def test_data_of_other_files_is_not_read(tmp_path: Path) -> None:
+    path = as_hdf5(tmp_path)
+    (tmp_path / "secret").write_bytes(bytes(100))
+    with h5py.File(path, "r+") as file:
+        del file["data/demo_2/obs/state"]
+        file.create_dataset("data/demo_2/obs/state", (5, 5), "f4", external=[(str(tmp_path / "secret"), 0, 100)])
+    with pytest.raises(TrajectoryError, match="with its data in other files; expected numbers in the file itself"):
+        load_trajectories([path], LOW, 3, SOURCES)
+    with h5py.File(path, "r+") as file:
+        del file["data/demo_2/obs/state"]
+        file["data/demo_2/obs/state"] = h5py.ExternalLink("other.hdf5", "/state")
+    with pytest.raises(TrajectoryError, match="is a link, maybe to another file"):
+        load_trajectories([path], LOW, 3, SOURCES)
+
+
+def test_videos_are_refused_by_name(tmp_path: Path) -> None:
+    root = as_lerobot(tmp_path, {"top": {"dtype": "video", "shape": [3, 5, 4]}})
+    with pytest.raises(TrajectoryError, match="'top' is a video, which is not decoded. Save its frames as images"):
+        load_trajectories([root], {"image": ObservationSpec((2, 3, 5, 4))}, 2, {"image": ("top",)})
+
+
+@pytest.mark.parametrize(("part", "message"), [("task_name", "is string; expected numbers"), ("nested", "no array")])
+def test_columns_of_text_are_refused(part: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(TrajectoryError, match=message):
+        load_trajectories([as_lerobot(tmp_path)], LOW, 3, {"obs": (part,)})
+
+
+@pytest.mark.parametrize("format", ["zarr 2", "zarr 2, blosc, zipped", "hdf5", "lerobot"])
+def test_damage_is_one_error(format: str, tmp_path: Path) -> None:
+    """Every file cut in two, one after the other."""
+    path = WRITERS[format](tmp_path)
+    files = [path] if path.is_file() else [f for f in sorted(path.rglob("*")) if f.is_file()]
+    for file in files:
+        content = file.read_bytes()
+        file.write_bytes(content[: len(content) // 2])
+        try:
+            episodes = load_trajectories([path], LOW, 3, SOURCES)
+            assert "img" in str(file) or "attrs" in file.name or len(episodes) == 2  # not read, or of no consequence
+        except TrajectoryError as error:
+            assert str(path) in str(error)  # noqa: PT017
+        file.write_bytes(content)
+    assert len(load_trajectories([path], LOW, 3, SOURCES)) == 2
+
+
+@pytest.mark.parametrize("format", ["hdf5", "lerobot"])
+def test_arrays_out_of_proportion_are_refused(format: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trajectories_frames, "FREE_BYTES", 0)
+    monkeypatch.setattr(trajectories_frames, "MAX_RATIO", 0)
+    with pytest.raises(TrajectoryError, match="in proportion"):
+        load_trajectories([WRITERS[format](tmp_path)], LOW, 3, SOURCES)

@@ -1,0 +1,167 @@
+"""Records to JSON by the types of their fields, and strictly back.
+
+A frozen dataclass is an object with a member a field, a mapping an object, a tuple a list, an enumeration its value. A
+vector of float32 is a list of numbers; another array is ``{"dtype", "shape", "values"}``. Floats are written as the
+shortest decimal of the double that equals the float32, so that they come back bit by bit. A tensor type has the sizes
+that depend on the batch as text: ``{"dtype": "float32", "shape": ["B", 16, 64]}``.
+
+What a type does not say stands beside it as a ``core.rules.Rule``.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+import re
+import types
+from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass
+from functools import cache
+from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.rules import DType
+from ..errors import ArtifactError, SpecError
+from ..ir.graph import Batch, Size, TensorType
+from .strict_json import REMEDY, Value
+
+Record = TypeVar("Record")
+_BATCH = re.compile(r"(?:([1-9][0-9]{0,8})\*)?B")
+
+
+def to_json(value: Any) -> Any:
+    """Plain JSON values; the order of fields and mappings is kept."""
+    if isinstance(value, TensorType):
+        return {"dtype": value.dtype, "shape": [str(n) if isinstance(n, Batch) else n for n in value.shape]}
+    if is_dataclass(value):
+        return {field.name: to_json(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, Mapping):
+        return {key: to_json(item) for key, item in value.items()}
+    if isinstance(value, tuple | list):
+        return [to_json(item) for item in value]
+    if isinstance(value, enum.Enum):
+        return value.value
+    if isinstance(value, np.ndarray):
+        if value.ndim == 1 and value.dtype == np.float32:
+            return value.tolist()
+        return {"dtype": str(value.dtype), "shape": list(value.shape), "values": value.ravel().tolist()}
+    return value
+
+
+def from_json(kind: type[Record], value: Value) -> Record:
+    """Inverse of ``to_json``.
+
+    Args:
+        kind: a frozen dataclass. Integers are not negative where no rule says otherwise.
+        value: the document.
+
+    Raises:
+        ArtifactError: not such a record; says where, what was expected, and what was found.
+    """
+    return cast(Record, _read(kind, value))
+
+
+def _read(kind: Any, value: Value) -> Any:
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        found = _read(arguments[0], value)
+        for rule in arguments[1:]:
+            if not rule.holds(found):
+                value.fail(rule.expected)
+        return found
+    if origin in (Union, types.UnionType):
+        return _read_either(arguments, value)
+    if origin is Literal:
+        return value.text(*arguments)
+    if origin is np.ndarray:
+        return _array(value)
+    if origin is tuple:
+        return _tuple(arguments, value)
+    if origin is not None and issubclass(origin, Mapping):
+        key, item = arguments
+        return {_read(key, Value(name, value.path)): _read(item, one) for name, one in value.members().items()}
+    if kind is TensorType:
+        parts = value.keys("dtype", "shape")
+        return TensorType(tuple(map(_size, parts["shape"].items())), _read(DType, parts["dtype"]))
+    if isinstance(kind, enum.EnumMeta):
+        members = {str(one.value): one for one in cast(type[enum.Enum], kind)}
+        return members[value.text(*members)]
+    if is_dataclass(kind):
+        return _record(kind, value)
+    plain: Mapping[Any, Callable[[], Any]] = {
+        int: value.integer,
+        float: value.number,
+        str: value.text,
+        bool: value.boolean,
+        Any: lambda: value.data,
+    }
+    return plain[kind]()
+
+
+def _record(kind: Any, value: Value) -> Any:
+    hints = _hints(kind)
+    members = value.keys(*hints)
+    read = {name: _read(hint, members[name]) for name, hint in hints.items()}
+    try:
+        return kind(**read)
+    except SpecError as error:
+        raise ArtifactError(f"{value.path}: {error} {REMEDY}") from error
+
+
+@cache
+def _hints(kind: type) -> dict[str, Any]:
+    hints = get_type_hints(kind, include_extras=True)
+    return {field.name: hints[field.name] for field in fields(kind)}
+
+
+def _read_either(kinds: tuple[Any, ...], value: Value) -> Any:
+    """One of several types, told apart by what JSON has: null, a list, or something else."""
+    if value.data is None and types.NoneType in kinds:
+        return None
+    rest = [kind for kind in kinds if kind is not types.NoneType]
+    listed = [kind for kind in rest if get_origin(kind) in (tuple, np.ndarray)]
+    single = [kind for kind in rest if kind not in listed]
+    return _read((listed if listed and (isinstance(value.data, list) or not single) else single)[0], value)
+
+
+def _tuple(kinds: tuple[Any, ...], value: Value) -> tuple[Any, ...]:
+    items = value.items()
+    if kinds[1:] == (...,):
+        return tuple(_read(kinds[0], item) for item in items)
+    if len(items) != len(kinds):
+        value.fail(f"a list of {len(kinds)}")
+    return tuple(_read(kind, item) for kind, item in zip(kinds, items, strict=True))
+
+
+def _array(value: Value) -> npt.NDArray[Any]:
+    if isinstance(value.data, list):
+        return _vector(value, "float32")
+    members = value.keys("dtype", "shape", "values")
+    shape = tuple(item.integer() for item in members["shape"].items())
+    array = _vector(members["values"], members["dtype"].text("float32", "int64"))
+    if array.size != math.prod(shape):
+        value.fail(f"{math.prod(shape)} numbers, for the shape {list(shape)}")
+    return array.reshape(shape)
+
+
+def _vector(value: Value, dtype: str) -> npt.NDArray[Any]:
+    if dtype == "int64":
+        return np.array([item.integer(None) for item in value.items()], np.int64)
+    numbers = [item.number() for item in value.items()]
+    with np.errstate(over="ignore"):
+        array = np.array(numbers, np.float32)
+    for item, number, kept in zip(value.items(), numbers, array.tolist(), strict=True):
+        if kept != number:
+            item.fail("a number that float32 holds exactly")
+    return array
+
+
+def _size(value: Value) -> Size:
+    if isinstance(value.data, str):
+        match = _BATCH.fullmatch(value.data)
+        if match is None or match[1] == "1":
+            value.fail("a size: an integer, 'B' or 'n*B'")
+        return Batch(int(match[1] or 1))
+    return value.integer()

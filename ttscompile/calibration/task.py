@@ -1,0 +1,147 @@
+"""What a strategy is given (``Task``), how it is interrupted (``Search``), and what it gives (``Found``)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from ..artifact.load import Artifact
+from ..core.correction import Correction
+from ..core.lattice import PlanArray
+from .calls import Actions, Calls
+from .clock import Clock
+from .execute import Executor
+from .whole_steps import WholeSteps
+
+Array = npt.NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Found:
+    """The outcome of a strategy.
+
+    Attributes:
+        schedule: int8 ``[K, blocks]``, within the budget.
+        notes: what is worth keeping about how it was found; JSON.
+        correction: of the sampler's steps, for the schedule and the pruner's plans; None for none.
+        pruner: all constants of the pruner, by name, for plans that depend on the observation; None for none.
+        error: of the schedule on calls to learn from, normalised; NaN where it was not measured.
+    """
+
+    schedule: PlanArray
+    notes: Mapping[str, Any] = field(default_factory=dict)
+    correction: Correction | None = None
+    pruner: Mapping[str, Array] | None = None
+    error: float = math.nan
+
+
+@dataclass(frozen=True)
+class Task:
+    """What to find a plan for.
+
+    Attributes:
+        executor: runs the policy.
+        actions: which part of the sample counts.
+        calls: to learn from, with targets; never those that the plan is judged on.
+        budget: cells that a plan may compute, step 0 included.
+        seed: the seed of everything random.
+        pruner: constants of the pruner by name; empty if the artifact has none.
+        kinds: what each block is.
+        whole: compares schedules of whole steps on ``calls``.
+        clock: what can be left out is not begun if it would end after its limit.
+    """
+
+    executor: Executor
+    actions: Actions
+    calls: Calls
+    budget: int
+    seed: int
+    pruner: Mapping[str, Array]
+    kinds: tuple[str, ...]
+    whole: WholeSteps
+    clock: Clock = field(default_factory=Clock)
+
+    @classmethod
+    def of(cls, artifact: Artifact, executor: Executor, calls: Calls, budget: int, seed: int) -> Task:
+        """The task of finding a plan for an artifact."""
+        actions, kinds = Actions(artifact.manifest.spec), tuple(block.kind for block in artifact.manifest.blocks)
+        whole = WholeSteps(executor, actions, calls, seed)
+        return cls(executor, actions, calls, budget, seed, artifact.pruner, kinds, whole)
+
+    def draw(self, *stage: int) -> np.random.Generator:
+        """Random numbers that belong to a stage, whatever was drawn before: so that going on equals not stopping."""
+        return np.random.default_rng((self.seed, 3, *stage))
+
+    def some_calls(self, count: int) -> Calls:
+        """Some of the calls to learn from, always the same ones; all if there are fewer."""
+        return self.executor.selector.calls(self.calls, self.draw(0).permutation(self.calls.count)[:count])
+
+    def error(self, plan: PlanArray, calls: Calls) -> float:
+        """Mean error of the executed actions of a plan on some calls, normalised; see ``Executor.run``."""
+        return float(self.actions.errors(self.executor.run(plan, calls), calls.targets, units=False).mean())
+
+    def whole_steps(self, steps: Sequence[int], **notes: Any) -> Found:
+        """The schedule that computes these steps, with its correction; they are added to the notes."""
+        return Found(self.whole.plan(steps), {"steps": list(steps), **notes}, self.whole.correction(steps))
+
+
+class Search(Protocol):
+    """A strategy at work, in intervals. Between two of them it can stop, and go on later from its ``state``.
+
+    Attributes:
+        intervals: how many there are at most.
+        closing: how many are still to be done after ``close``.
+    """
+
+    intervals: int
+    closing: int
+
+    @property
+    def settling(self) -> float:
+        """Seconds that ``found`` takes, about."""
+
+    def advance(self, interval: int) -> None:
+        """Do interval number ``interval``, of ``intervals``; they are done in order."""
+
+    def close(self) -> None:
+        """The time is running out: do what is still to be done at the end, and be done."""
+
+    @property
+    def done(self) -> bool:
+        """Whether further intervals would change nothing."""
+
+    @property
+    def loss(self) -> float:
+        """Error of the best plan so far, normalised; NaN before any."""
+
+    @property
+    def plan(self) -> PlanArray:
+        """The best schedule so far."""
+
+    def state(self) -> dict[str, Array]:
+        """Everything that ``restore`` needs."""
+
+    def restore(self, state: Mapping[str, Array]) -> None:
+        """Go back to where ``state`` was taken.
+
+        Raises:
+            KeyError: not the state of this search.
+        """
+
+    def found(self) -> Found:
+        """The outcome."""
+
+
+class NothingAfter:
+    """What a ``Search`` says that has nothing left to do after its intervals: it keeps its best plan throughout."""
+
+    closing = 0
+    settling = 0.0
+
+    def close(self) -> None:
+        """Nothing is left to be done."""

@@ -1,0 +1,120 @@
+"""Test-time sparsity, after arXiv 2605.13316: a schedule with a correction, from which the pruner may depart.
+
+The search places whole steps, because with a correction (``fit_correction``) it is they that carry information
+about the observation and the noise, and everything in between is nearly linear. Every candidate gets a correction of
+its own, fitted on some of the calls, and is judged by the true error of its actions on others. It starts with the best
+of a family of crowded schedules, and then moves one step at a time, far at first, until no move helps. The winner's
+correction is fitted again, on all calls. Then ``pruner.adaptation`` lets the pruner depart from the schedule.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from ..core.lattice import PlanArray
+from .crowded import crowded_family
+from .pruner.adaptation import Adaptation
+from .pruner.head import has_head
+from .task import Array, Found, Task
+
+DISTANCES = (8, 4, 2, 1)
+"""How far a step is moved, in either direction. All steps are tried at one distance before the next."""
+
+
+class Tts:
+    """The search of this module; see ``Search``.
+
+    Args:
+        task: see ``Task``.
+
+    Attributes:
+        loss: error of the plan on calls that its correction was not fitted on.
+    """
+
+    def __init__(self, task: Task) -> None:
+        self._task, self._whole = task, task.whole
+        model = task.executor.model
+        self._full = min(max(1, task.budget // model.blocks), model.steps)
+        self._steps: tuple[int, ...] = tuple(range(self._full))
+        self.loss = float("nan")
+        self._crowded = crowded_family(model.steps, self._full)
+        self._moves = [(distance, i) for distance in DISTANCES for i in range(1, self._full)]
+        self.closing = Adaptation.INTERVALS if has_head(task.pruner) else 0
+        self.intervals = len(self._crowded) + len(self._moves) + self.closing
+        self._adaptation: Adaptation | None = None
+        self._settled: Found | None = None
+
+    @property
+    def plan(self) -> PlanArray:
+        """The best schedule so far."""
+        return self._whole.plan(self._steps)
+
+    @property
+    def done(self) -> bool:
+        """Whether the schedule is settled, and the pruner fitted to it."""
+        return self._adaptation is not None and self._adaptation.done
+
+    @property
+    def settling(self) -> float:
+        """The correction, if it is not fitted yet."""
+        return 0.0 if self._adaptation is not None else self._whole.correcting(self._full)
+
+    def close(self) -> None:
+        """Settle the schedule, with a correction from all calls."""
+        if self._adaptation is None:
+            task, self._settled = self._task, self._task.whole_steps(self._steps)
+            corrected = replace(task, executor=task.executor.corrected(self._settled.correction))
+            self._adaptation = Adaptation(corrected, self._settled.schedule)
+
+    def advance(self, interval: int) -> None:
+        """Try a schedule of the family, or two moves of a step; or adapt the plan to observations."""
+        if self._adaptation is not None:
+            self._adaptation.advance()
+            return
+        if interval < len(self._crowded):
+            self._try([self._crowded[interval]])
+        else:
+            distance, i = self._moves[interval - len(self._crowded)]
+            self._try([self._moved(i, offset) for offset in (-distance, distance)])
+        if interval + 1 >= len(self._crowded) + len(self._moves):
+            self.close()
+
+    def state(self) -> dict[str, Array]:
+        """Computed steps and their error; corrections are fitted again."""
+        state: dict[str, Array] = {"steps": np.array(self._steps, np.int64), "loss": np.array(self.loss)}
+        return state if self._adaptation is None else {**state, **self._adaptation.state()}
+
+    def restore(self, state: Mapping[str, Array]) -> None:
+        """Go back to where ``state`` was taken."""
+        self._steps, self.loss = tuple(int(k) for k in state["steps"]), float(state["loss"])
+        if Adaptation.KEY in state:
+            self.close()
+            assert self._adaptation is not None
+            self._adaptation.restore(state)
+
+    def found(self) -> Found:
+        """The schedule with its correction, and the pruner if plans that depend on the observation were better."""
+        self.close()
+        assert self._adaptation is not None
+        assert self._settled is not None
+        notes = {**self._settled.notes, "switches": self._adaptation.switches}
+        return replace(self._settled, notes=notes, pruner=self._adaptation.pruner)
+
+    def _try(self, candidates: list[tuple[int, ...] | None]) -> None:
+        """Take the best of the candidates if it is better than the schedule so far."""
+        for steps in candidates:
+            if steps is None:
+                continue
+            error = self._whole.errors(steps).normalised
+            if not error >= self.loss:  # the first one beats NaN
+                self._steps, self.loss = steps, error
+
+    def _moved(self, i: int, offset: int) -> tuple[int, ...] | None:
+        """The schedule with its i-th step moved; None if it would meet another, or leave the loop."""
+        target = self._steps[i] + offset
+        if not 0 < target < self._task.executor.model.steps or target in self._steps:
+            return None
+        return tuple(sorted((*self._steps[:i], target, *self._steps[i + 1 :])))

@@ -1,0 +1,33 @@
+"""What a field must be beside its type: ``Annotated[str, Rule("64 hexadecimal digits", ...)]``.
+
+A reader of records that somebody else wrote (``artifact.typed_json``) holds every value against the rules of its field.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+
+@dataclass(frozen=True)
+class Rule:
+    """One rule.
+
+    Attributes:
+        expected: in words, after "expected".
+        holds: of a value of the field's type; true or a match where it is met.
+    """
+
+    expected: str
+    holds: Callable[[Any], object]
+
+
+_DTYPES = ("float32", "float64", "float16", "int64", "int32", "int16", "int8", "uint8", "bool")
+
+DType = Annotated[str, Rule(f"one of {', '.join(_DTYPES)}", _DTYPES.__contains__)]
+NotNegative = Annotated[float, Rule("a number that is not negative", lambda x: x >= 0)]
+Positive = Annotated[int, Rule("a 64-bit integer of at least 1", lambda n: n >= 1)]
+Sha256 = Annotated[str, Rule("64 hexadecimal digits", re.compile(r"[0-9a-f]{64}").fullmatch)]
+Share = Annotated[float, Rule("a number in 0..1", lambda x: 0 <= x <= 1)]

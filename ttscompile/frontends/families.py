@@ -1,0 +1,143 @@
+"""The policy families that are read: how a checkpoint of each is told, which options it takes, and what loads it.
+
+A family is a module beside this one and a row in ``FAMILIES``. Nothing here imports torch, so that the command line can
+list formats and samplers, and say what is wrong with a path or an option, before the compiler is loaded.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from ..core.spec import PolicySpec
+from ..errors import CheckpointError
+from ..samplers.flow import METHODS
+from .json_files import read_json
+from .refusals import refuse_directory
+
+if TYPE_CHECKING:
+    from torch import nn
+
+DIFFUSION_SAMPLERS = ("ddpm", "ddim", "dpmsolver++")
+"""Samplers that a policy trained with diffusion can be given in place of its own."""
+
+SAMPLERS = (*DIFFUSION_SAMPLERS, *METHODS)
+SPACINGS = ("leading", "trailing", "linspace")
+
+
+@dataclass(frozen=True)
+class LoadOptions:
+    """What can be asked of a checkpoint in place of what it says itself; None leaves it as it was saved.
+
+    The fields are the arguments of ``ttscompile.convert`` of the same names, and are described there.
+    """
+
+    sampler: str | None = None
+    steps: int | None = None
+    spacing: str | None = None
+    task: str | None = None
+    encoders: str | os.PathLike[str] | None = None
+
+
+AS_SAVED = LoadOptions()
+
+
+@dataclass(frozen=True)
+class Family:
+    """How the checkpoints of one family of policies are read.
+
+    Attributes:
+        name: of the format, as ``convert`` takes it and ``PolicySpec.source`` keeps it.
+        title: of the project, for messages.
+        reads: what the user gives, for messages; begins with an article.
+        kind: of thing that a checkpoint is.
+        detect: whether a path looks like one of this family's, told by names, first bytes or an entry of a JSON file.
+            The first row of ``FAMILIES`` that says so takes it; where several would, the narrower one stands first.
+        module: in this package. Its ``load(path, options)`` gives the network in eval mode and the ``PolicySpec``, and
+            raises CheckpointError or SpecError. Imported when a checkpoint is loaded, with torch and all it needs.
+        options: names of ``LoadOptions`` that it takes; the others are refused.
+    """
+
+    name: str
+    title: str
+    reads: str
+    kind: Literal["file", "directory"]
+    detect: Callable[[Path], bool]
+    module: str
+    options: frozenset[str]
+
+    def load(self, path: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
+        """Load a checkpoint of this family.
+
+        Raises:
+            CheckpointError: an option that is of other families, or whatever the family's module refuses.
+            SpecError: the sampler asked for is not possible.
+        """
+        for name in (field.name for field in fields(options) if getattr(options, field.name) is not None):
+            if name not in self.options:
+                takers = " and ".join(each.title for each in FAMILIES if name in each.options)
+                raise CheckpointError(
+                    f"{path}: the option {name} is for {takers} policies; this is one of {self.title}. Leave it out."
+                )
+        load: Callable[[Path, LoadOptions], tuple[nn.Module, PolicySpec]]
+        load = import_module(f".{self.module}", __package__).load
+        return load(path, options)
+
+
+def _is_lerobot(path: Path) -> bool:
+    """Whether a directory is a policy that lerobot saved: a configuration with a type, and more than an adapter."""
+    config, weights, adapter = (path / name for name in ("config.json", "model.safetensors", "adapter_config.json"))
+    if adapter.is_file() and not weights.is_file():
+        return False
+    return config.is_file() and "type" in read_json(config)
+
+
+FAMILIES = (
+    Family(
+        name="lerobot",
+        title="LeRobot",
+        reads="a directory that lerobot's save_pretrained wrote, with config.json and model.safetensors",
+        kind="directory",
+        detect=_is_lerobot,
+        module="lerobot",
+        options=frozenset({"sampler", "steps", "spacing", "task", "encoders"}),
+    ),
+    Family(
+        name="diffusion_policy",
+        title="Diffusion Policy",
+        reads="a .ckpt file of Diffusion Policy",
+        kind="file",
+        # Every file that no other family takes: its module names what a file is that is none of its own.
+        detect=lambda path: not path.is_dir(),
+        module="diffusion_policy",
+        options=frozenset({"sampler", "steps", "spacing"}),
+    ),
+)
+
+FORMATS = ("auto", *(each.name for each in FAMILIES))
+
+
+def find_family(path: Path, format: str) -> Family:
+    """The family that reads a checkpoint.
+
+    Args:
+        path: of the checkpoint.
+        format: name of the family; ``auto`` asks every row of ``FAMILIES`` in turn.
+
+    Raises:
+        CheckpointError: the format is not known, or no family reads what is there; says what it is, if that is known.
+    """
+    if format not in FORMATS:
+        raise CheckpointError(f"format {format!r} is not known; expected one of {', '.join(FORMATS)}.")
+    rows = [each for each in FAMILIES if format in ("auto", each.name)]
+    found = next((each for each in rows if each.detect(path)), None)
+    if found is not None:
+        return found
+    if path.is_dir():
+        refuse_directory(path)
+    wrong = f"not of the format {format}" if path.exists() else f"no such {rows[0].kind}"
+    raise CheckpointError(f"{path}: {wrong}; expected {rows[0].reads}.")
