@@ -4,58 +4,59 @@ from __future__ import annotations
 
 import abc
 from dataclasses import dataclass
+from typing import Generic, TypeVar, get_type_hints
 
 from ttscompile.errors import PassError
-from ttscompile.ir.program import Program
+from ttscompile.ir.program import Phase
+
+Before = TypeVar("Before", bound=Phase)
+After = TypeVar("After", bound=Phase)
 
 
 @dataclass(frozen=True)
-class PassResult:
+class PassResult(Generic[After]):
     """What a pass gives.
 
     Attributes:
         program: the new program; the argument itself if nothing changed.
-        modified: whether it differs.
         notes: what was done, and every match that was declined with why and where; ``--explain`` prints them.
     """
 
-    program: Program
-    modified: bool
+    program: After
     notes: tuple[str, ...] = ()
 
 
-class Pass(abc.ABC):
-    """One rewriting. Subclasses implement ``call`` and may hold preconditions and postconditions."""
+class Pass(abc.ABC, Generic[Before, After]):
+    """One rewriting, from one phase of the program (``ir.program``) to the same or another.
+
+    Subclasses implement ``call``, whose signature says what they take, and may hold a postcondition.
+    """
 
     @property
     def name(self) -> str:
         """The name that messages use."""
         return type(self).__name__
 
-    def __call__(self, program: Program) -> PassResult:
-        """Check ``requires``, rewrite, check ``ensures``.
+    def __call__(self, program: Before) -> PassResult[After]:
+        """Rewrite, and check ``ensures``.
 
         Raises:
-            PassError: a condition does not hold; the message starts with the pass's name.
+            PassError: the program is in another phase, or a condition does not hold; the message starts with the
+                pass's name.
         """
-        self.requires(program)
+        takes = get_type_hints(type(self).call)["program"]
+        takes = getattr(takes, "__bound__", takes)
+        if not isinstance(program, takes):
+            raise self.fail(f"takes a program that is {takes.__name__}; found {type(program).__name__}.")
         result = self.call(program)
-        if result.modified == (result.program is program):
-            raise PassError(
-                f"{self.name}: says modified={result.modified} and returned the "
-                f"{'same' if result.program is program else 'new'} program."
-            )
         self.ensures(result.program)
         return result
 
     @abc.abstractmethod
-    def call(self, program: Program) -> PassResult:
+    def call(self, program: Before) -> PassResult[After]:
         """Rewrite the program; never change the argument."""
 
-    def requires(self, program: Program) -> None:  # noqa: B027  (optional hook)
-        """Raise PassError if the pass cannot run on this program."""
-
-    def ensures(self, program: Program) -> None:  # noqa: B027  (optional hook)
+    def ensures(self, program: After) -> None:
         """Raise PassError if the result is not what the pass promises."""
 
     def fail(self, what: str) -> PassError:

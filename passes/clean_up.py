@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy.typing as npt
 import torch
@@ -13,16 +12,17 @@ from ttscompile.ir.dataflow import reaching
 from ttscompile.ir.evaluate import Evaluator
 from ttscompile.ir.graph import Argument, Enum, Graph, Node, Ref, TensorType
 from ttscompile.ir.operations import Movement, operation
-from ttscompile.ir.program import Pieces, Program
+from ttscompile.ir.program import Phase
 
 from .base import Pass, PassResult
 
+AnyPhase = TypeVar("AnyPhase", bound=Phase)
 Weights = dict[str, npt.NDArray[Any]]
 
 _CAST = "aten._to_copy.default"
 
 
-class CleanUp(Pass):
+class CleanUp(Pass[AnyPhase, AnyPhase]):
     """Simplify every graph of the program.
 
     Before::
@@ -38,20 +38,17 @@ class CleanUp(Pass):
     Graph outputs keep their names, so pieces that are wired by name still fit together.
     """
 
-    def call(self, program: Program) -> PassResult:
+    def call(self, program: AnyPhase) -> PassResult[AnyPhase]:
         """Clean the denoiser, and the pieces if there are any."""
         weights = dict(program.weights)
-        before = sum(len(g.nodes) for g in _all_graphs(program))
-        clean: Callable[[Graph], Graph] = lambda graph: clean_graph(graph, weights)  # noqa: E731
-        new = replace(program, denoiser=clean(program.denoiser))
-        if program.pieces is not None:
-            new = replace(new, pieces=_map_graphs(program.pieces, clean))
-        used = {name for graph in _all_graphs(new) for name in graph.constants}
+        new = program.mapped(lambda graph: clean_graph(graph, weights))
+        before, after = program.graphs(), new.graphs()
+        used = {name for graph in after.values() for name in graph.constants}
         kept = {name: value for name, value in weights.items() if name in used}
-        if list(_all_graphs(new)) == list(_all_graphs(program)) and kept.keys() == program.weights.keys():
-            return PassResult(program, modified=False)
-        after = sum(len(g.nodes) for g in _all_graphs(new))
-        return PassResult(replace(new, weights=kept), True, (f"{before} nodes became {after}",))
+        if after == before and kept.keys() == program.weights.keys():
+            return PassResult(program)
+        counts = [sum(len(graph.nodes) for graph in graphs.values()) for graphs in (before, after)]
+        return PassResult(replace(new, weights=kept), (f"{counts[0]} nodes became {counts[1]}",))
 
 
 def clean_graph(graph: Graph, weights: Weights) -> Graph:
@@ -166,29 +163,3 @@ def drop_dead(graph: Graph) -> Graph:
         constants={n: t for n, t in graph.constants.items() if n in live},
         nodes=tuple(n for n in graph.nodes if n.name in live),
     )
-
-
-def _map_graphs(pieces: Pieces, function: Callable[[Graph], Graph]) -> Pieces:
-    return replace(
-        pieces,
-        condition=function(pieces.condition),
-        step=function(pieces.step) if pieces.step is not None else None,
-        stem=function(pieces.stem),
-        blocks=tuple(function(b) for b in pieces.blocks),
-        tail=function(pieces.tail),
-        pruner=function(pieces.pruner) if pieces.pruner is not None else None,
-    )
-
-
-def _all_graphs(program: Program) -> list[Graph]:
-    found = [program.denoiser]
-    if program.pieces is not None:
-        collected: list[Graph] = []
-
-        def collect(graph: Graph) -> Graph:
-            collected.append(graph)
-            return graph
-
-        _map_graphs(program.pieces, collect)
-        found += collected
-    return found

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from ttscompile.ir.graph import GETITEM, Argument, Batch, Node, Ref, TensorType
-from ttscompile.ir.program import Program
+from ttscompile.ir.program import Captured
 
 from .base import Pass, PassResult
 
@@ -14,7 +14,7 @@ _RESHAPE = "aten.reshape.default"
 _SPLITS = ("aten.split.Tensor", "aten.split_with_sizes.default")
 
 
-class CutCopies(Pass):
+class CutCopies(Pass[Captured, Captured]):
     """Select whole copies of the batch by their number.
 
     Before::
@@ -29,12 +29,7 @@ class CutCopies(Pass):
         %free        = aten.select.int(%both.copies, 0, 1)
     """
 
-    def requires(self, program: Program) -> None:
-        """The program has no block table yet."""
-        if program.blocks:
-            raise self.fail("runs before find_residual_blocks.")
-
-    def call(self, program: Program) -> PassResult:
+    def call(self, program: Captured) -> PassResult[Captured]:
         """Rewrite in the denoiser."""
         graph = program.denoiser
         types, producers = graph.types(), graph.producers()
@@ -50,11 +45,11 @@ class CutCopies(Pass):
             cut += 1
             nodes += _cut(node, types[source], source, axis, start, stop, made)
         if not cut:
-            return PassResult(program, False)
+            return PassResult(program)
         read = {name for node in nodes for name in node.refs()} | set(graph.outputs)
         kept = tuple(n for n in nodes if n.op not in _SPLITS or n.name in read)
         new = replace(program, denoiser=replace(graph, nodes=kept))
-        return PassResult(new, True, (f"{cut} cuts of a multiple of the batch",))
+        return PassResult(new, (f"{cut} cuts of a multiple of the batch",))
 
 
 _Found = tuple[str, int, int, int]

@@ -31,6 +31,18 @@ class BlockTable:
     blocks: tuple[Block, ...]
     declined: tuple[str, ...]
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What ``--explain`` prints: the blocks, which of them share a FORWARD cache, and what was declined."""
+        kinds, groups = dict.fromkeys(b.kind for b in self.blocks), Counter(b.group for b in self.blocks)
+        alone = (b.index for b in self.blocks if groups[b.group] == 1)
+        return (
+            f"{len(self.blocks)} blocks: {', '.join(kinds)}",
+            f"{len(self.blocks)} branches in {len(groups)} FORWARD groups",
+            *(f"block {index} is alone in its group: FORWARD is its own TIMESTEP" for index in alone),
+            *self.declined,
+        )
+
 
 @dataclass(frozen=True)
 class _Link:

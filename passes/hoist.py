@@ -15,7 +15,7 @@ from ttscompile.ir.binding import bindings, input_bindings, numbering
 from ttscompile.ir.evaluate import Evaluator
 from ttscompile.ir.flops import graph_flops
 from ttscompile.ir.graph import Graph, Node, Ref, TensorType, backward_slice
-from ttscompile.ir.program import Binding, Pieces, Program
+from ttscompile.ir.program import Binding, Cut, Pieces, Program
 from ttscompile.ir.rows import crossing_inputs, unfold
 
 from .base import Pass, PassResult
@@ -23,7 +23,7 @@ from .base import Pass, PassResult
 _CAT = "aten.cat.default"
 
 
-class Hoist(Pass):
+class Hoist(Pass[Cut, Program]):
     """Split the prologue by binding time and evaluate its constant part.
 
     Before (contexts of the loop pieces come from one graph, run at every step)::
@@ -39,32 +39,23 @@ class Hoist(Pass):
         step(...)                                           # what needs both, all K steps in one batch
     """
 
-    def requires(self, program: Program) -> None:
-        """The program is cut and not hoisted."""
-        if program.pieces is None or program.pieces.bindings:
-            raise self.fail("runs once, after partition.")
-
-    def call(self, program: Program) -> PassResult:
+    def call(self, program: Cut) -> PassResult[Program]:
         """Hoist."""
-        assert program.pieces is not None
         spec = program.spec
         inputs = input_bindings(spec)
-        prologue, renamed = _name_inputs(program.pieces.condition)
+        prologue, renamed = _name_inputs(program.prologue)
         known = bindings(prologue, inputs)
-        pieces = _sink(_rename_contexts(program.pieces, renamed), prologue, known)
-        wanted = list(dict.fromkeys(n for g in _loop(pieces) for n in list(g.inputs)[1:]))
-        types = prologue.types()
-        at = {b: [n for n in wanted if known[n] is b] for b in Binding}
+        loop = program.loop.mapped(lambda graph: _sink(_rename_contexts(graph, renamed), prologue, known))
+        at = {b: [n for n in loop.contexts if known[n] is b] for b in Binding}
         step, boundary, prologue = _step_graph(prologue, at[Binding.STEP], known)
         types, known = prologue.types(), bindings(prologue, inputs)
         early = {b: [n for n in boundary if known[n] is b] for b in (Binding.CONDITION, Binding.TABLE)}
         conditions = list(dict.fromkeys(at[Binding.CONDITION] + early[Binding.CONDITION]))
         tables = list(dict.fromkeys(at[Binding.TABLE] + at[Binding.CONSTANT] + early[Binding.TABLE]))
         condition = backward_slice(prologue, tuple(conditions), {})
-        condition = replace(condition, inputs={k: types[k] for k in spec.observations})
-        new = replace(
-            pieces,
-            condition=condition,
+        pieces = Pieces(
+            **vars(loop),
+            condition=replace(condition, inputs={k: types[k] for k in spec.observations}),
             step=step,
             tables=_evaluate_tables(prologue, tables, program.weights, spec.sampler, spec.timestep_argument),
             bindings={
@@ -73,48 +64,34 @@ class Hoist(Pass):
                 **dict.fromkeys(at[Binding.STEP], Binding.STEP),
             },
         )
-        blocks = tuple(replace(b, flops=graph_flops(g)) for b, g in zip(program.blocks, new.blocks, strict=True))
-        return PassResult(replace(program, pieces=new, blocks=blocks), True, _notes(program, new))
+        new = Program(spec, program.denoiser, program.weights, program.blocks, pieces, dense_flops=program.dense_flops)
+        return PassResult(new, _notes(new))
 
     def ensures(self, program: Program) -> None:
-        """No loop piece reads timestep or observation; every context has a binding."""
-        assert program.pieces is not None
+        """No loop piece reads timestep or observation."""
         raw = {program.spec.timestep_argument, *program.spec.observations}
-        for graph in _loop(program.pieces):
-            for name in list(graph.inputs)[1:]:
-                if name in raw or name not in program.pieces.bindings:
-                    raise self.fail(f"a loop piece still reads %{name}.")
+        if read := sorted(raw.intersection(program.pieces.contexts)):
+            raise self.fail(f"a loop piece still reads %{read[0]}.")
 
 
-def _loop(pieces: Pieces) -> list[Graph]:
-    return [pieces.stem, *pieces.blocks, pieces.tail]
-
-
-def _sink(pieces: Pieces, prologue: Graph, known: Mapping[str, Binding]) -> Pieces:
-    """Move concatenations of different binding times into the loop pieces: they cost a copy, not arithmetic.
+def _sink(piece: Graph, prologue: Graph, known: Mapping[str, Binding]) -> Graph:
+    """Move concatenations of different binding times into a loop piece: they cost a copy, not arithmetic.
 
     Hoisted they would be a copy for each of the K steps, computed or not, and their rows would fill the cache.
     """
     producers, types = prologue.producers(), prologue.types()
-    movable = {
-        n.name
-        for n in prologue.nodes
-        if n.op == _CAT and known[n.name] is Binding.STEP and any(known[r] is not Binding.STEP for r in n.refs())
-    }
-
-    def sink(piece: Graph) -> Graph:
-        moved: list[Node] = []
-        inputs: dict[str, TensorType] = {}
-        for position, (name, type_) in enumerate(piece.inputs.items()):
-            if position and name in movable:
-                moved.append(producers[name])
-                for part in producers[name].refs():
-                    inputs.setdefault(part, types[part])
-            else:
-                inputs[name] = type_
-        return replace(piece, inputs=inputs, nodes=(*moved, *piece.nodes)) if moved else piece
-
-    return replace(pieces, stem=sink(pieces.stem), blocks=tuple(map(sink, pieces.blocks)), tail=sink(pieces.tail))
+    moved: list[Node] = []
+    inputs: dict[str, TensorType] = {}
+    for name, type_ in piece.inputs.items():
+        node = producers.get(name)
+        whole = known.get(name) is Binding.STEP and node is not None and node.op == _CAT
+        if node is not None and whole and any(known[part] is not Binding.STEP for part in node.refs()):
+            moved.append(node)
+            for part in node.refs():
+                inputs.setdefault(part, types[part])
+        else:
+            inputs[name] = type_
+    return replace(piece, inputs=inputs, nodes=(*moved, *piece.nodes)) if moved else piece
 
 
 def _name_inputs(prologue: Graph) -> tuple[Graph, dict[str, str]]:
@@ -128,17 +105,12 @@ def _name_inputs(prologue: Graph) -> tuple[Graph, dict[str, str]]:
     return replace(prologue, nodes=(*copies, *nodes), outputs=outputs), renamed
 
 
-def _rename_contexts(pieces: Pieces, renamed: Mapping[str, str]) -> Pieces:
-    def rename(piece: Graph) -> Graph:
-        first = next(iter(piece.inputs))
-        mapping = {k: v for k, v in renamed.items() if k != first and k in piece.inputs}
-        return replace(
-            piece,
-            inputs={mapping.get(n, n): t for n, t in piece.inputs.items()},
-            nodes=tuple(n.renamed(lambda name: mapping.get(name, name)) for n in piece.nodes),
-        )
+def _rename_contexts(piece: Graph, renamed: Mapping[str, str]) -> Graph:
+    def rename(name: str) -> str:
+        return renamed.get(name, name)
 
-    return replace(pieces, stem=rename(pieces.stem), blocks=tuple(map(rename, pieces.blocks)), tail=rename(pieces.tail))
+    inputs = {rename(name): type_ for name, type_ in piece.inputs.items()}
+    return replace(piece, inputs=inputs, nodes=tuple(node.renamed(rename) for node in piece.nodes))
 
 
 def _step_graph(
@@ -183,10 +155,10 @@ def _evaluate_tables(
     return {name: np.stack(values) for name, values in rows.items()}
 
 
-def _notes(program: Program, pieces: Pieces) -> tuple[str, ...]:
-    steps = program.spec.sampler.steps
+def _notes(program: Program) -> tuple[str, ...]:
+    pieces, steps = program.pieces, program.spec.sampler.steps
     dense = max(program.dense_flops or graph_flops(program.denoiser) * steps, 1)
-    loop = sum(graph_flops(g) for g in _loop(pieces)) * steps
+    loop = sum(graph_flops(piece.graph) for piece in pieces.loop.values()) * steps
     once = graph_flops(pieces.condition)
     batch = graph_flops(pieces.step) * steps if pieces.step is not None else 0
     table_bytes = sum(t.nbytes for t in pieces.tables.values())

@@ -28,7 +28,7 @@ MAX_FEATURE = 16384
 
 
 @dataclass(frozen=True)
-class InsertPruner(Pass):
+class InsertPruner(Pass[Program, Program]):
     """Put a low-rank plan head on the features of the policy's own condition encoder.
 
     Before::
@@ -52,14 +52,8 @@ class InsertPruner(Pass):
     rank: int = 16
     width: int = 64
 
-    def requires(self, program: Program) -> None:
-        """The program is hoisted."""
-        if program.pieces is None or not program.pieces.bindings:
-            raise self.fail("the condition features are known only after hoist.")
-
-    def call(self, program: Program) -> PassResult:
+    def call(self, program: Program) -> PassResult[Program]:
         """Build the head and choose its features."""
-        assert program.pieces is not None
         condition, features = _features(program)
         types = condition.types()
         steps, blocks = program.spec.sampler.steps, len(program.blocks)
@@ -80,7 +74,7 @@ class InsertPruner(Pass):
         notes = [f"reads {where}", f"rank {head.rank}, {graph_flops(graph):,} FLOPs, {share:.4%} of a dense call"]
         if share > MAX_SHARE:
             notes.append(f"more than {MAX_SHARE:.0%} even at its smallest: on a policy this small sparsity hardly pays")
-        return PassResult(new, True, tuple(notes))
+        return PassResult(new, tuple(notes))
 
     def _fitted(self, inputs: int, steps: int, blocks: int, dense: int) -> InsertPruner:
         """This head, halved until it costs at most ``MAX_SHARE`` of a dense call or cannot shrink."""
@@ -183,7 +177,6 @@ def _features(program: Program) -> tuple[Graph, tuple[str, ...]]:
     produced is the output of the policy's condition encoder; without one the observations themselves are read.
     """
     pieces = program.pieces
-    assert pieces is not None
     graph = pieces.condition
     types, producers = graph.types(), graph.producers()
     chosen: str | None = None

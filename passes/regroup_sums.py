@@ -6,14 +6,14 @@ from dataclasses import replace
 
 from ttscompile.ir.dataflow import dominators, reachable_from, reaching
 from ttscompile.ir.graph import Graph, Node, Ref
-from ttscompile.ir.program import Program
+from ttscompile.ir.program import Captured
 
 from .base import Pass, PassResult
 
 _ADD = "aten.add.Tensor"
 
 
-class RegroupSums(Pass):
+class RegroupSums(Pass[Captured, Captured]):
     """Add the branches of parallel blocks to each other first, and then to the stream.
 
     Before (``x + attention(n) + feed_forward(n)``, as Python reads it)::
@@ -30,12 +30,7 @@ class RegroupSums(Pass):
     are regrouped; a term that does not (a position, say) is no residual, and stays where it is.
     """
 
-    def requires(self, program: Program) -> None:
-        """The program has no block table yet."""
-        if program.blocks:
-            raise self.fail("runs before find_residual_blocks.")
-
-    def call(self, program: Program) -> PassResult:
+    def call(self, program: Captured) -> PassResult[Captured]:
         """Regroup in the denoiser."""
         graph, sample = program.denoiser, program.spec.sample_argument
         producers, types, users = graph.producers(), graph.types(), graph.users()
@@ -56,11 +51,11 @@ class RegroupSums(Pass):
             new[node.name] = _regrouped(node, streams[0], branches)
             notes.append(f"%{node.name} ({node.source or 'source unknown'}): {len(branches)} branches in parallel")
         if not new:
-            return PassResult(program, False)
+            return PassResult(program)
         regrouped = replace(graph, nodes=tuple(n for node in graph.nodes for n in new.get(node.name, [node])))
         live = reaching(regrouped, graph.outputs)  # without the sums that were inside
         regrouped = replace(regrouped, nodes=tuple(n for n in regrouped.nodes if n.name in live))
-        return PassResult(replace(program, denoiser=regrouped), True, tuple(notes))
+        return PassResult(replace(program, denoiser=regrouped), tuple(notes))
 
 
 def _plain(node: Node) -> bool:

@@ -7,14 +7,14 @@ from dataclasses import replace
 
 from ttscompile.ir.binding import bindings, input_bindings
 from ttscompile.ir.graph import Argument, Node, Ref, TensorType
-from ttscompile.ir.program import Program
+from ttscompile.ir.program import Cut
 
 from .base import Pass, PassResult
 
 _CAT, _LINEAR = "aten.cat.default", "aten.linear.default"
 
 
-class SplitFeatures(Pass):
+class SplitFeatures(Pass[Cut, Cut]):
     """Let each part of a feature vector meet its columns of the weight at its own binding time.
 
     The modulations of adaLN are linear in [timestep, observation]. Before::
@@ -31,15 +31,9 @@ class SplitFeatures(Pass):
     The result differs from the original by rounding only.
     """
 
-    def requires(self, program: Program) -> None:
-        """The program is cut, its prologue is still whole."""
-        if program.pieces is None or program.pieces.bindings:
-            raise self.fail("runs between partition and hoist.")
-
-    def call(self, program: Program) -> PassResult:
+    def call(self, program: Cut) -> PassResult[Cut]:
         """Split in the prologue."""
-        assert program.pieces is not None
-        prologue, spec = program.pieces.condition, program.spec
+        prologue, spec = program.prologue, program.spec
         known, producers, types = bindings(prologue, input_bindings(spec)), prologue.producers(), prologue.types()
         nodes: list[Node] = []
         split = 0
@@ -51,10 +45,9 @@ class SplitFeatures(Pass):
             nodes += _sum(node, parts, types)
             split += 1
         if not split:
-            return PassResult(program, False)
-        new = replace(program.pieces, condition=replace(prologue, nodes=tuple(nodes)))
+            return PassResult(program)
         note = f"{split} linear layers of features with different binding times became sums"
-        return PassResult(replace(program, pieces=new), True, (note,))
+        return PassResult(replace(program, prologue=replace(prologue, nodes=tuple(nodes))), (note,))
 
 
 def _parts(node: Node, producers: Mapping[str, Node], types: Mapping[str, TensorType]) -> list[str]:

@@ -10,7 +10,7 @@ from functools import reduce
 from ttscompile.ir.binding import bindings, input_bindings, join
 from ttscompile.ir.graph import GETITEM, Argument, Batch, Graph, Node, Ref, Size, TensorType
 from ttscompile.ir.operations import Movement, axes_along, operation, permutation
-from ttscompile.ir.program import Binding, Program
+from ttscompile.ir.program import Binding, Cut
 
 from .base import Pass, PassResult
 
@@ -24,7 +24,7 @@ class _Parts:
     sizes: tuple[int, ...]
 
 
-class SplitTokens(Pass):
+class SplitTokens(Pass[Cut, Cut]):
     """Let each token of a condition sequence be encoded at its own binding time.
 
     Before::
@@ -41,22 +41,12 @@ class SplitTokens(Pass):
     Attention and everything else that mixes tokens is not split: there the concatenation is made.
     """
 
-    def requires(self, program: Program) -> None:
-        """The program is cut, its prologue is still whole."""
-        if program.pieces is None or program.pieces.bindings:
-            raise self.fail("runs between partition and hoist.")
-
-    def call(self, program: Program) -> PassResult:
+    def call(self, program: Cut) -> PassResult[Cut]:
         """Split in the prologue."""
-        assert program.pieces is not None
-        prologue = program.pieces.condition
-        splitter = _Splitter(prologue, input_bindings(program.spec))
+        splitter = _Splitter(program.prologue, input_bindings(program.spec))
         rewritten = splitter.run()
-        if not splitter.split_at:
-            return PassResult(program, False, tuple(splitter.notes))
-        return PassResult(
-            replace(program, pieces=replace(program.pieces, condition=rewritten)), True, tuple(splitter.notes)
-        )
+        new = replace(program, prologue=rewritten) if splitter.split_at else program
+        return PassResult(new, tuple(splitter.notes))
 
 
 class _Splitter:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from ttscompile.ir.graph import Argument, Node, Ref, TensorType
-from ttscompile.ir.program import Program
+from ttscompile.ir.program import Captured
 
 from .base import Pass, PassResult
 
@@ -13,7 +13,7 @@ _ATTENTION = "aten.scaled_dot_product_attention.default"
 _MASK = 3
 
 
-class WidenAttention(Pass):
+class WidenAttention(Pass[Captured, Captured]):
     """Write attention of ``[B, T, C]`` as attention of one head, and masks without rows with the same row repeated.
 
     Before::
@@ -30,12 +30,7 @@ class WidenAttention(Pass):
         %z      = aten.scaled_dot_product_attention.default(%r, %l, %w, %z.mask)
     """
 
-    def requires(self, program: Program) -> None:
-        """The program has no block table yet."""
-        if program.blocks:
-            raise self.fail("runs before find_residual_blocks.")
-
-    def call(self, program: Program) -> PassResult:
+    def call(self, program: Captured) -> PassResult[Captured]:
         """Rewrite in the denoiser."""
         graph = program.denoiser
         types = graph.types()
@@ -50,9 +45,9 @@ class WidenAttention(Pass):
             for part in parts:
                 nodes += _with_rows(part, types, masks) if part.op == _ATTENTION else [part]
         if not widened and not masks:
-            return PassResult(program, False)
+            return PassResult(program)
         notes = (f"{widened} attentions got an axis for their one head, {len(masks)} masks a row for each query",)
-        return PassResult(replace(program, denoiser=replace(graph, nodes=tuple(nodes))), True, notes)
+        return PassResult(replace(program, denoiser=replace(graph, nodes=tuple(nodes))), notes)
 
 
 def _widened(node: Node, types: dict[str, TensorType]) -> list[Node]:

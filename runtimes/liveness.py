@@ -55,7 +55,7 @@ def readable_rollout(artifact: Artifact) -> BoolArray:
     readable = np.zeros((manifest.steps, len(manifest.blocks)), dtype=np.bool_)
     for schedule in artifact.schedules.values():
         readable |= schedule == Source.ROLLOUT
-    if any(plan.kind == "pruner" for plan in manifest.plans.values()):
+    if any(plan.pruned for plan in manifest.plans.values()):
         readable |= _pruner_can_read(artifact)
     return readable
 

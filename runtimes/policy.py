@@ -329,7 +329,7 @@ class CompiledPolicy:
             return self._artifact.schedule(DENSE), DENSE, False
         _require_plan(self._artifact, plan)
         record = self._manifest.plans[plan]
-        return (None if record.kind == "pruner" else self._artifact.schedule(plan)), plan, True
+        return (None if record.pruned else self._artifact.schedule(plan)), plan, True
 
     def _example(self, batch: Mapping[str, Any]) -> Any:
         """A tensor among the observations of a batch, if there is one; what else it holds is not ours."""

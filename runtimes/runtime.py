@@ -19,11 +19,12 @@ import numpy as np
 import numpy.typing as npt
 
 from ttscompile.artifact.load import Artifact
-from ttscompile.artifact.manifest import DENSE, PRUNER
+from ttscompile.artifact.manifest import DENSE
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import BoolArray, PlanArray, Source, check_plan, require_legal
 from ttscompile.core.spec import FloatArray, Noise
 from ttscompile.errors import IllegalPlanError, ObservationError
+from ttscompile.ir.pieces import PRUNER
 
 from .arrays import check_noise
 from .backend import Backend, Call

@@ -144,7 +144,7 @@ def compiled_module(once: Once) -> Callable[[str], tuple[nn.Module, Path]]:
     def compiled(name: str) -> tuple[nn.Module, Path]:
         import torch
 
-        from .passes.test_pipeline import MODULES, spec
+        from .passes.modules import MODULES, spec
 
         torch.manual_seed(0)
         module = MODULES[name]().eval()

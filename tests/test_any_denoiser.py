@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 import ttscompile
-from tests.passes.test_pipeline import MODULES, spec
+from tests.passes.modules import MODULES, spec
 from tests.rounding import Counted, assert_equal_but_for_rounding, bound
 from tests.runtimes.agreement import call_terms, largest_difference
 from ttscompile.artifact import load_artifact

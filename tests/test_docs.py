@@ -24,7 +24,7 @@ from click.testing import CliRunner
 
 from tests.calibration import policies, tasks
 from tests.once import Once
-from tests.passes.test_pipeline import MODULES, spec
+from tests.passes.modules import MODULES, spec
 from ttscompile.calibration import strategies
 from ttscompile.cli import main
 from ttscompile.frontends import families

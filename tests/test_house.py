@@ -193,6 +193,17 @@ def test_the_closure_sees_through_modules_and_parents_but_not_into_functions(tmp
     assert {"onnx", "diffusers"}.isdisjoint(chains)
 
 
+def test_every_pass_has_its_test_and_tests_import_helpers_not_each_other() -> None:
+    passes = {p.stem for p in (ROOT / "passes").glob("*.py")} - {"__init__", "base"}
+    assert {f"test_{name}.py" for name in passes} <= {p.name for p in (ROOT / "tests" / "passes").iterdir()}
+    found = {}
+    for path in (ROOT / "tests").rglob("*.py"):
+        lines = re.findall(r"^\s*(?:from|import) [\w.]*\btest_\w+.*", path.read_text(), re.MULTILINE)
+        own = [line for line in lines if f"{path.stem} import" not in line]  # in a process of its own
+        found |= {str(path.relative_to(ROOT)): own} if own else {}
+    assert found == {}
+
+
 def test_files_are_short() -> None:
     files = [p for top in (*PACKAGES, "tests", "examples") for p in (ROOT / top).rglob("*.py")]
     lengths = {str(p.relative_to(ROOT)): len(p.read_text().splitlines()) for p in files}
@@ -218,9 +229,24 @@ def test_importing_the_package_loads_neither_numpy_nor_torch() -> None:
     assert result.stdout == "[]\n"
 
 
+def anchors(page: str) -> set[str]:
+    """What a link may name in a page of Markdown: its titles in small letters, with hyphens."""
+    titles = re.findall(r"^#+ (.+)$", page, flags=re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+def leads_somewhere(link: str) -> bool:
+    """Whether a relative link of the README names a file of the tree and, after #, a title in it."""
+    file, _, anchor = link.partition("#")
+    page = ROOT / (file or "README.md")
+    return page.exists() and (not anchor or anchor in anchors(page.read_text()))
+
+
 def test_readme_is_finished_and_its_links_lead_somewhere() -> None:
     text = (ROOT / "README.md").read_text()
     assert not re.findall(r"@[A-Z]+@", text)
     links = [link for link in re.findall(r"\]\(([^)]+)\)", text) if "://" not in link]
     assert links
-    assert [link for link in links if not (ROOT / link).exists()] == []
+    assert [link for link in links if not leads_somewhere(link)] == []
+    assert not leads_somewhere("docs/nothing.md")
+    assert not leads_somewhere("#no-such-title")

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import nn
 
-from tests.families.test_vla import FAMILIES, loaded
+from tests.families.heads import FAMILIES, loaded
 from tests.rounding import FLOAT64, Counted, allowed, amplified, assert_equal_but_for_rounding, bound
 from ttscompile import flow_matching_table
 

@@ -25,20 +25,18 @@ from .frontends.families import LoadOptions
 from .ir.dataflow import reachable_from
 from .ir.flops import graph_flops, node_flops
 from .ir.graph import Graph
-from .ir.joint import DENSE_STEP, JOINT
-from .ir.program import Program
+from .ir.program import Captured, Cut, Program
 from .ir.verify import verify
-from .lower.joint import chain_blocks, join_blocks
+from .lower.joint import lower_all_blocks
 from .lower.precision import lower_precision, require_precision
 from .lower.program import lower_program
 from .lower.single_file import lower_single_file
-from .passes.base import Pass
+from .passes.base import After, Before, Pass
 from .passes.clean_up import CleanUp
 from .passes.cut_copies import CutCopies
 from .passes.find_residual_blocks import find_residual_blocks
 from .passes.hoist import Hoist
 from .passes.insert_pruner import InsertPruner
-from .passes.insert_reuse import InsertReuse
 from .passes.partition import Partition
 from .passes.regroup_sums import RegroupSums
 from .passes.split_features import SplitFeatures
@@ -198,9 +196,7 @@ def _lower_blocks(
 ) -> LoweredBlocks:
     """Residual blocks of another precision than fp32, and the error that they make."""
     lowered, weights, notes = lower_precision(models, program.weights, precision)
-    assert program.pieces is not None
-    own = {**models, **lowered}
-    lowered |= {JOINT: join_blocks(program.pieces.blocks, own), DENSE_STEP: chain_blocks(program.pieces.blocks, own)}
+    lowered |= lower_all_blocks(program.pieces.blocks, {**models, **lowered})
     blocks = LoweredBlocks(precision, lowered, weights)
     with TemporaryDirectory() as folder:
         write_artifact(program, models, folder, blocks)
@@ -216,26 +212,18 @@ def transform(module: nn.Module, spec: PolicySpec, *, explain: Explain = _silent
     megabytes = sum(w.nbytes for w in weights.values()) / 1e6
     explain("capture", (f"{len(graph.nodes)} operations, {megabytes:.1f} MB of weights",))
     whole = capture(module, spec.original)[0] if spec.left_out else graph
-    program = Program(spec, graph, weights, dense_flops=_dense_flops(module, whole, spec))
-    verify(program)
-    for first in (CleanUp(), CutCopies(), WidenAttention(), RegroupSums()):
-        program = _run(first, program, explain)
-    table = find_residual_blocks(program.denoiser, spec.sample_argument)
-    kinds = ", ".join(dict.fromkeys(block.kind for block in table.blocks))
-    explain("find_residual_blocks", (f"{len(table.blocks)} blocks: {kinds}", *table.declined))
-    program = replace(program, blocks=table.blocks)
-    for each in (
-        Partition(),
-        UnfoldBatch(),
-        SplitTokens(),
-        SplitFeatures(),
-        CleanUp(),
-        Hoist(),
-        InsertPruner(),
-        InsertReuse(),
-        CleanUp(),
-    ):
-        program = _run(each, program, explain)
+    captured = Captured(spec, graph, weights, dense_flops=_dense_flops(module, whole, spec))
+    verify(captured)
+    for simplify in (CleanUp[Captured](), CutCopies(), WidenAttention(), RegroupSums()):
+        captured = _run(simplify, captured, explain)
+    table = find_residual_blocks(captured.denoiser, spec.sample_argument)
+    explain("find_residual_blocks", table.notes)
+    cut = _run(Partition(table.blocks), captured, explain)
+    for split in (UnfoldBatch(), SplitTokens(), SplitFeatures(), CleanUp[Cut]()):
+        cut = _run(split, cut, explain)
+    program = _run(Hoist(), cut, explain)
+    for finish in (InsertPruner(), CleanUp[Program]()):
+        program = _run(finish, program, explain)
     return program
 
 
@@ -248,7 +236,7 @@ def _dense_flops(module: nn.Module, graph: Graph, spec: PolicySpec) -> int:
     return (graph_flops(graph) - once) * spec.sampler.steps + once
 
 
-def _run(each: Pass, program: Program, explain: Explain) -> Program:
+def _run(each: Pass[Before, After], program: Before, explain: Explain) -> After:
     result = each(program)
     try:
         verify(result.program)

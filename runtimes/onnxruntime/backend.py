@@ -42,7 +42,7 @@ class OnnxBackend:
         self._manifest = artifact.manifest
         self._artifact, self._threads = artifact, threads
         self._schedules = tuple(self.lower(plan) for plan in artifact.schedules.values())
-        self._pruned = any(plan.kind == "pruner" for plan in self._manifest.plans.values())
+        self._pruned = any(plan.pruned for plan in self._manifest.plans.values())
         self._blocks = self._pruned or any(one.partial for one in self._schedules)  # whether these have sessions
         self.sessions = open_sessions(artifact, threads, self._blocks)
         self.keeps = readable_rollout(artifact)

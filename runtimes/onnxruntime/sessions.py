@@ -29,15 +29,14 @@ from ttscompile.artifact.manifest import PieceRecord
 from ttscompile.core.spec import FP32
 from ttscompile.errors import ArtifactError, RuntimeUnavailableError
 from ttscompile.ir.graph import TensorType
-from ttscompile.ir.idle import IDLE
-from ttscompile.ir.joint import JOINT, OF_ALL_BLOCKS, RESIDUAL, STREAM, Joint, join
-from ttscompile.ir.pieces import block_name
+from ttscompile.ir.joint import Joint, join
+from ttscompile.ir.pieces import ADVANCE, IDLE, JOINT, OF_ALL_BLOCKS, PRUNER, RESIDUAL, STEM, STREAM, block_name
 from ttscompile.measure.machine import has_integer_dot_product
 
 Array: TypeAlias = npt.NDArray[Any]
 
 
-SINGLE_THREADED = frozenset({"stem", "advance", "pruner", IDLE})
+SINGLE_THREADED = frozenset({STEM, ADVANCE, PRUNER, IDLE})
 """Pieces too small for a second thread."""
 
 SPIN_US = 50

@@ -19,10 +19,9 @@ from ttscompile.core.correction import HISTORY, Correction, no_correction, remem
 from ttscompile.core.spec import FloatArray, Noise
 from ttscompile.core.update import matrices
 from ttscompile.errors import ArtifactError, ObservationError
+from ttscompile.ir import pieces
 from ttscompile.ir.graph import TensorType
-from ttscompile.ir.idle import IDLE
-from ttscompile.ir.joint import CONTEXT, DENSE_STEP, STREAM
-from ttscompile.ir.pieces import ADVANCE, PRUNER, STEM, block_name
+from ttscompile.ir.pieces import ADVANCE, CONTEXT, DENSE_STEP, IDLE, PRUNER, STEM, STREAM, block_name
 from ttscompile.runtimes.inpainting import Known, MaskedUpdates
 
 from .bound_block import BoundBlock
@@ -256,27 +255,26 @@ class Workspace:
         piece = self._manifest.pieces[ADVANCE]
         following = min(k + 1, self._steps - 1)  # after the last step there is no stream to make; it is not read
         inputs = {
-            "stream": self.stream,
-            "sample": self.sample[k % 2],
-            "offset": self._offset[k],
-            "history": self._history,
-            "update": update,
-            "sample_to_x0": self._sampler.sample_to_x0[k : k + 1],
-            "out_to_x0": self._sampler.out_to_x0[k : k + 1],
+            pieces.STREAM: self.stream,
+            pieces.SAMPLE: self.sample[k % 2],
+            pieces.OFFSET: self._offset[k],
+            pieces.HISTORY: self._history,
+            pieces.UPDATE: update,
+            **{name: getattr(self._sampler, name)[k : k + 1] for name in pieces.X0_COLUMNS},
         }
         if self._memory:
-            inputs["memory"] = self._memory[k % 2]
+            inputs[pieces.MEMORY] = self._memory[k % 2]
         for name in piece.inputs:
             if name not in inputs:
                 where, _, context = name.partition(".")
-                inputs[name] = self._contexts.at(context, k if where == "tail" else following)
+                inputs[name] = self._contexts.at(context, k if where == pieces.TAIL else following)
         outputs = {
-            "sample_next": self.sample[(k + 1) % 2],
-            "stream_next": self.fresh,
-            "prediction": self._prediction,
+            pieces.SAMPLE_NEXT: self.sample[(k + 1) % 2],
+            pieces.STREAM_NEXT: self.fresh,
+            pieces.PREDICTION: self._prediction,
         }
         if self._memory:
-            outputs["memory_next"] = self._memory[(k + 1) % 2]
+            outputs[pieces.MEMORY_NEXT] = self._memory[(k + 1) % 2]
         return Bound(self._sessions[ADVANCE], {name: inputs[name] for name in piece.inputs}, outputs)
 
 

@@ -18,10 +18,10 @@ from ttscompile.artifact.load import Artifact
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import PlanArray, Source, check_plan, require_legal
 from ttscompile.core.spec import Noise, PolicySpec
-from ttscompile.errors import IllegalPlanError, PassError
+from ttscompile.errors import IllegalPlanError
 from ttscompile.ir.evaluate import Evaluator
-from ttscompile.ir.graph import Graph, TensorType
-from ttscompile.ir.pieces import block_name
+from ttscompile.ir.graph import TensorType
+from ttscompile.ir.pieces import LoopPiece
 from ttscompile.ir.program import Binding, Pieces, Program
 from ttscompile.runtimes.inpainting import Known
 
@@ -99,22 +99,16 @@ class ReferenceModel:
         self._tables = {name: _tensor(value) for name, value in self._pieces.tables.items()}
         self._condition = Evaluator(self._pieces.condition, self._weights)
         self._step = Evaluator(self._pieces.step, self._weights) if self._pieces.step is not None else None
-        self._stem = Evaluator(self._pieces.stem, self._weights)
-        self._blocks = tuple(Evaluator(graph, self._weights) for graph in self._pieces.blocks)
-        self._tail = Evaluator(self._pieces.tail, self._weights)
+        self._stem = Evaluator(pieces.stem.graph, self._weights)
+        self._blocks = tuple(Evaluator(piece.graph, self._weights) for piece in pieces.blocks)
+        self._tail = Evaluator(pieces.tail.graph, self._weights)
         self.steps = spec.sampler.steps
         self.blocks = len(self._pieces.blocks)
         self.groups = tuple(groups)
 
     @classmethod
     def from_program(cls, program: Program) -> ReferenceModel:
-        """The model of a program in memory, after all passes.
-
-        Raises:
-            PassError: the program has not been partitioned.
-        """
-        if program.pieces is None:
-            raise PassError("the program has no pieces: run all passes (driver.transform) before executing it.")
+        """The model of a program in memory, after all passes."""
         types = [block.type for block in program.blocks]
         groups = [block.group for block in program.blocks]
         return cls(program.pieces, program.spec, types, groups, program.weights)
@@ -126,20 +120,10 @@ class ReferenceModel:
         Raises:
             ArtifactError: its graphs cannot be read.
         """
-        manifest, graphs = artifact.manifest, artifact.graphs
-        pieces = Pieces(
-            condition=artifact.graph("condition"),
-            step=graphs.get("step"),
-            stem=artifact.graph("stem"),
-            blocks=tuple(artifact.graph(block_name(b)) for b in range(len(manifest.blocks))),
-            tail=artifact.graph("tail"),
-            pruner=graphs.get("pruner"),
-            tables=artifact.tables,
-            bindings={name: context.binding for name, context in manifest.contexts.items()},
-            features=manifest.features,
-        )
+        manifest = artifact.manifest
         weights = {**artifact.weights, **artifact.pruner}
-        return cls(pieces, manifest.spec, [b.type for b in manifest.blocks], manifest.groups, weights)
+        types = [block.type for block in manifest.blocks]
+        return cls(artifact.pieces, manifest.spec, types, manifest.groups, weights)
 
     @property
     def pruner_weights(self) -> dict[str, Tensor]:
@@ -160,7 +144,7 @@ class ReferenceModel:
         if self._pieces.step is None or self._step is None:
             return contexts
         names = self._pieces.step.outputs
-        rows = [self._step(self._bind(self._pieces.step, None, k, contexts)) for k in range(self.steps)]
+        rows = [self._step(self._contexts(self._pieces.step.inputs, k, contexts)) for k in range(self.steps)]
         return Contexts(streams, condition, tuple(dict(zip(names, row, strict=True)) for row in rows))
 
     def logits(self, contexts: Contexts, weights: Mapping[str, Tensor] | None = None) -> Tensor:
@@ -328,19 +312,22 @@ class ReferenceModel:
 
     def _bind(
         self,
-        graph: Graph,
-        value: Tensor | None,
+        piece: LoopPiece,
+        value: Tensor,
         k: int,
         contexts: Contexts,
         streams: Sequence[int] | None = None,
     ) -> dict[str, Tensor]:
-        """Inputs of a piece at step k: the sample or stream (its first input, unless None), and its contexts."""
-        names: Iterator[tuple[str, TensorType]] = iter(graph.inputs.items())
+        """The inputs of a loop piece at step k; of some streams only, if they are given."""
+        stream = {piece.stream: _select(value, piece.type, streams)}
+        return stream | self._contexts(piece.contexts, k, contexts, streams)
+
+    def _contexts(
+        self, types: Mapping[str, TensorType], k: int, contexts: Contexts, streams: Sequence[int] | None = None
+    ) -> dict[str, Tensor]:
+        """Values of these contexts at step k."""
         bound: dict[str, Tensor] = {}
-        if value is not None:
-            name, kind = next(names)
-            bound[name] = _select(value, kind, streams)
-        for name, kind in names:
+        for name, kind in types.items():
             binding = self._pieces.bindings[name]
             if binding is Binding.TABLE:
                 bound[name] = _select(_expanded(self._tables[name][k], kind, contexts.streams), kind, streams)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 
@@ -13,3 +15,17 @@ def flip(path: Path, position: int, bit: int = 0) -> None:
     content = bytearray(path.read_bytes())
     content[position] ^= 1 << bit
     path.write_bytes(content)
+
+
+Edit = Callable[[zipfile.ZipFile], object]
+
+
+def packed(written: Path, prefix: str = "", edit: Edit | None = None, skip: str = "") -> Path:
+    path = written.parent / "artifact.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        for member in sorted(written.iterdir()):
+            if member.name != skip:
+                file.write(member, prefix + member.name)
+        if edit is not None:
+            edit(file)
+    return path

@@ -3,27 +3,13 @@ from __future__ import annotations
 import gc
 import stat
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from tests.artifact.folders import flip
+from tests.artifact.folders import Edit, flip, packed
 from ttscompile.artifact import archive, load_artifact
 from ttscompile.errors import ArtifactError
-
-Edit = Callable[[zipfile.ZipFile], object]
-
-
-def packed(written: Path, prefix: str = "", edit: Edit | None = None, skip: str = "") -> Path:
-    path = written.parent / "artifact.zip"
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
-        for member in sorted(written.iterdir()):
-            if member.name != skip:
-                file.write(member, prefix + member.name)
-        if edit is not None:
-            edit(file)
-    return path
 
 
 @pytest.mark.parametrize("prefix", ["", "compiled/", "./"])

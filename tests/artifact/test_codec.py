@@ -84,7 +84,6 @@ def test_manifest_comes_back(manifest: Manifest) -> None:
     assert again.pieces == manifest.pieces
     assert again.contexts == manifest.contexts
     assert again.blocks == manifest.blocks
-    assert again.reuse == manifest.reuse
     assert again.flops == manifest.flops
     assert again.files == manifest.files
 
@@ -146,7 +145,6 @@ def change(manifest: Manifest, edit: Change) -> bytes:
         (lambda d: d["spec"]["observations"]["obs"]["normalizer"]["scale"].__setitem__(0, 0), "scale is zero"),
         (lambda d: d["blocks"].pop(), "expected FLOPs of 1 blocks"),
         (lambda d: d["blocks"][1].update(flops=-1), r"blocks\[1\]\.flops"),
-        (lambda d: d["reuse"].pop(), "one for each of 2 blocks"),
         (lambda d: d["pieces"].pop("advance"), "'advance'"),
         (lambda d: d["pieces"].pop("block_01"), "'block_01'"),
         (lambda d: d["pieces"].pop("pruner"), "exactly when there is a piece called pruner"),

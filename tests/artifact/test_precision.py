@@ -22,8 +22,8 @@ from ttscompile.artifact.strict_json import Value
 from ttscompile.artifact.write import update_calibration, write_artifact
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import ArtifactError
-from ttscompile.ir.joint import DENSE_STEP, JOINT
-from ttscompile.lower.joint import chain_blocks, join_blocks
+from ttscompile.ir.pieces import DENSE_STEP, JOINT
+from ttscompile.lower.joint import lower_all_blocks
 from ttscompile.lower.precision import lower_precision
 
 ERROR = PrecisionError(calls=8, mean=0.25, p90=0.5, largest=1.5, tolerance=0.03)
@@ -31,9 +31,8 @@ ERROR = PrecisionError(calls=8, mean=0.25, p90=0.5, largest=1.5, tolerance=0.03)
 
 def lowered(seed: int = 0) -> LoweredBlocks:
     program = tiny_program(seed)
-    assert program.pieces is not None
     models, weights, _ = lower_precision(tiny_models(program), program.weights, "int8")
-    whole = {JOINT: join_blocks(program.pieces.blocks, models), DENSE_STEP: chain_blocks(program.pieces.blocks, models)}
+    whole = lower_all_blocks(program.pieces.blocks, models)
     return LoweredBlocks("int8", {**models, **whole}, weights, ERROR)
 
 

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.artifact.folders import contents
-from tests.artifact.test_archive import packed
+from tests.artifact.folders import contents, packed
 from tests.artifact.tiny import CHANNELS, HORIZON, STEPS, tiny_models, tiny_program
 from tests.rounding import assert_equal_but_for_rounding
 from ttscompile.artifact import load_artifact

@@ -19,6 +19,7 @@ from ttscompile.artifact.write import write_artifact
 from ttscompile.errors import ArtifactError
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Graph, Node
+from ttscompile.ir.pieces import LoopPiece
 from ttscompile.ir.program import Binding, Program
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -31,7 +32,6 @@ def without_sources(graph: Graph) -> Graph:
 def test_round_trip(written: Path) -> None:
     program = tiny_program()
     pieces = program.pieces
-    assert pieces is not None
     artifact = load_artifact(written)
     manifest = artifact.manifest
     assert (manifest.steps, manifest.groups, manifest.default_plan, manifest.calibration) == (3, (0, 0), "dense", None)
@@ -48,16 +48,14 @@ def test_round_trip(written: Path) -> None:
     for name, value in stored.items():
         assert value.tobytes() == program.weights[name].tobytes()
     assert all(name.startswith("pruner.") for name in artifact.pruner)
-    found = artifact.program()
-    assert found.pieces is not None
+    found, expected = artifact.pieces, pieces.mapped(without_sources)
+    for name, graph in expected.graphs().items():
+        assert artifact.graph(name) == graph
     for name in ("condition", "step", "stem", "tail", "pruner"):
-        expected = without_sources(getattr(pieces, name))
-        assert artifact.graph(name) == expected
-        assert getattr(found.pieces, name) == expected
-    assert found.pieces.blocks == tuple(map(without_sources, pieces.blocks))
-    assert found.pieces.bindings == pieces.bindings
-    assert found.reuse == program.reuse
-    assert [b.group for b in found.blocks] == [0, 0]
+        assert getattr(found, name) == getattr(expected, name)
+    assert found.blocks == expected.blocks
+    assert found.bindings == pieces.bindings
+    assert [b.group for b in manifest.blocks] == [0, 0]
 
 
 def test_flops_of_a_call(written: Path) -> None:
@@ -169,11 +167,10 @@ def test_identity_covers_what_is_computed(tmp_path: Path) -> None:
     spec = program.spec
     weight = {**program.weights, "tail.weight": program.weights["tail.weight"] * 2}
     pruner = {**program.weights, "pruner.bias": program.weights["pruner.bias"] + 1}
-    assert program.pieces is not None
     table = replace(program.pieces, tables={**program.pieces.tables, "time": program.pieces.tables["time"] + 1})
-    stem = program.pieces.stem
+    stem = program.pieces.stem.graph
     node = Node("stream_0", "aten.sub.Tensor", stem.nodes[1].args, (), stem.nodes[1].types)
-    graph = replace(program.pieces, stem=replace(stem, nodes=(stem.nodes[0], node)))
+    graph = replace(program.pieces, stem=LoopPiece(replace(stem, nodes=(stem.nodes[0], node)), "sample"))
     obs = dict(spec.observations)
     changed = {
         "weights": replace(program, weights=weight),
@@ -202,7 +199,6 @@ def test_identity_does_not_cover_what_people_are_told(tmp_path: Path) -> None:
 
 def test_a_policy_without_pruner(tmp_path: Path) -> None:
     program = tiny_program()
-    assert program.pieces is not None
     program = replace(program, pieces=replace(program.pieces, pruner=None, features=()))
     models = tiny_models(tiny_program())
     del models["pruner"]
@@ -210,7 +206,6 @@ def test_a_policy_without_pruner(tmp_path: Path) -> None:
     artifact = load_artifact(tmp_path / "a")
     assert artifact.pruner == {}
     assert artifact.manifest.stores.pruner is None
-    assert artifact.program().pieces is not None
 
 
 def test_an_artifact_is_replaced_whole(written: Path) -> None:
@@ -313,14 +308,12 @@ def test_failure_anywhere_changes_nothing(
 
 
 def broken(program: Program, **pieces: Any) -> Program:
-    assert program.pieces is not None
     return replace(program, pieces=replace(program.pieces, **pieces))
 
 
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (lambda p: replace(p, pieces=None), "no pieces"),
         (lambda p: replace(p, weights={}), "its value is none"),
         (
             lambda p: replace(p, weights={**p.weights, "tail.weight": np.zeros((2, 16))}),

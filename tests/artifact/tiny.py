@@ -9,10 +9,9 @@ from onnx.helper import make_graph, make_model, make_node, make_opsetid, make_te
 
 from ttscompile.core.spec import Affine, ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
 from ttscompile.ir.graph import Batch, Graph, Node, Ref, TensorType
-from ttscompile.ir.joint import DENSE_STEP, JOINT
-from ttscompile.ir.pieces import block_name
-from ttscompile.ir.program import Binding, Block, Pieces, Program, Reuse
-from ttscompile.lower.joint import chain_blocks, join_blocks
+from ttscompile.ir.pieces import LoopPiece, block_name
+from ttscompile.ir.program import Binding, Block, Pieces, Program
+from ttscompile.lower.joint import lower_all_blocks
 
 STEPS, HORIZON, CHANNELS, WIDTH, MEMORY = 3, 4, 2, 16, 8
 
@@ -82,29 +81,38 @@ def tiny_program(seed: int = 0) -> Program:
             (linear("mixed", "memory", "step.weight", CONTEXT), add("modulation", "mixed", "time", CONTEXT)),
             ("modulation",),
         ),
-        stem=Graph(
-            {"sample": SAMPLE, "position": f32(1, HORIZON, WIDTH)},
-            {"stem.weight": constant["stem.weight"]},
-            (linear("embedded", "sample", "stem.weight", STREAM), add("stream_0", "embedded", "position", STREAM)),
-            ("stream_0",),
+        stem=LoopPiece(
+            Graph(
+                {"sample": SAMPLE, "position": f32(1, HORIZON, WIDTH)},
+                {"stem.weight": constant["stem.weight"]},
+                (linear("embedded", "sample", "stem.weight", STREAM), add("stream_0", "embedded", "position", STREAM)),
+                ("stream_0",),
+            ),
+            "sample",
         ),
         blocks=tuple(
-            Graph(
-                {f"stream_{i}": STREAM, context: CONTEXT},
-                {f"block.{i}.weight": constant[f"block.{i}.weight"]},
-                (
-                    add(f"in_{i}", f"stream_{i}", context, STREAM),
-                    linear(f"r_{i}", f"in_{i}", f"block.{i}.weight", STREAM),
+            LoopPiece(
+                Graph(
+                    {f"stream_{i}": STREAM, context: CONTEXT},
+                    {f"block.{i}.weight": constant[f"block.{i}.weight"]},
+                    (
+                        add(f"in_{i}", f"stream_{i}", context, STREAM),
+                        linear(f"r_{i}", f"in_{i}", f"block.{i}.weight", STREAM),
+                    ),
+                    (f"r_{i}",),
                 ),
-                (f"r_{i}",),
+                f"stream_{i}",
             )
             for i, context in enumerate(("modulation", "memory"))
         ),
-        tail=Graph(
-            {"stream_2": STREAM},
-            {"tail.weight": constant["tail.weight"]},
-            (linear("prediction", "stream_2", "tail.weight", SAMPLE),),
-            ("prediction",),
+        tail=LoopPiece(
+            Graph(
+                {"stream_2": STREAM},
+                {"tail.weight": constant["tail.weight"]},
+                (linear("prediction", "stream_2", "tail.weight", SAMPLE),),
+                ("prediction",),
+            ),
+            "stream_2",
         ),
         pruner=Graph(
             {"memory": CONTEXT},
@@ -142,14 +150,12 @@ def tiny_program(seed: int = 0) -> Program:
         weights=weights,
         blocks=blocks,
         pieces=pieces,
-        reuse=tuple(Reuse(STREAM, 0, (0, 1)) for _ in blocks),
         dense_flops=123_456,
     )
 
 
 def tiny_models(program: Program) -> dict[str, ModelProto]:
     """What ``lower_program`` gives: initializers named like constants, without data."""
-    assert program.pieces is not None
     pieces = program.pieces
     assert pieces.step is not None
     assert pieces.pruner is not None
@@ -168,19 +174,18 @@ def tiny_models(program: Program) -> dict[str, ModelProto]:
             ],
         ),
         "stem": model(
-            pieces.stem,
+            pieces.stem.graph,
             [*project("embedded", "sample", "stem.weight"), make_node("Add", ["embedded", "position"], ["stream_0"])],
         ),
         "advance": advance(),
     }
-    for i, (graph, context) in enumerate(zip(pieces.blocks, ("modulation", "memory"), strict=True)):
+    for i, (piece, context) in enumerate(zip(pieces.blocks, ("modulation", "memory"), strict=True)):
         nodes = [
             make_node("Add", [f"stream_{i}", context], [f"in_{i}"]),
             *project(f"r_{i}", f"in_{i}", f"block.{i}.weight"),
         ]
-        models[block_name(i)] = model(graph, nodes)
-    blocks = pieces.blocks
-    return {**models, JOINT: join_blocks(blocks, models), DENSE_STEP: chain_blocks(blocks, models)}
+        models[block_name(i)] = model(piece.graph, nodes)
+    return {**models, **lower_all_blocks(pieces.blocks, models)}
 
 
 def project(result: str, x: str, weight: str) -> list[NodeProto]:

@@ -11,7 +11,7 @@ import numpy as np
 import onnxruntime
 import pytest
 
-from tests.lower.test_single_file import Episode, groups, inputs, make
+from tests.lower.whole_call import Episode, groups, inputs, make
 from tests.runtimes.plans import random_plan
 from tests.runtimes.toys import toy_program
 from ttscompile.core.correction import no_correction

@@ -34,9 +34,8 @@ def kinds(program: Program) -> dict[str, int]:
 def in_loop(program: Program) -> float:
     """Share of the dense FLOPs that are left in the loop."""
     pieces = program.pieces
-    assert pieces is not None
     steps = program.spec.sampler.steps
-    return sum(graph_flops(g) for g in (pieces.stem, *pieces.blocks, pieces.tail)) * steps / program.dense_flops
+    return sum(graph_flops(piece.graph) for piece in pieces.loop.values()) * steps / program.dense_flops
 
 
 def assert_runtimes_agree(folder: Path, streams: tuple[int, ...] = (1, 3)) -> None:

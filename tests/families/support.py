@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from tests.ir.meta import assert_types_of
+from ttscompile.artifact.load import Artifact
 from ttscompile.ir.flops import graph_flops
-from ttscompile.ir.program import Program
+from ttscompile.ir.graph import Graph
+from ttscompile.ir.program import Block, Program
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORD = ROOT / "docs" / "support.json"
@@ -59,9 +61,8 @@ def row(family: str, verified_against: str, sampler: str, program: Program) -> R
     original does not compute an encoder for every step either.
     """
     pieces = program.pieces
-    assert pieces is not None
     steps = program.spec.sampler.steps
-    loop = sum(graph_flops(graph) for graph in (pieces.stem, *pieces.blocks, pieces.tail)) * steps
+    loop = sum(graph_flops(piece.graph) for piece in pieces.loop.values()) * steps
     batched = 0 if pieces.step is None else graph_flops(pieces.step) * steps
     evaluations = program.dense_flops - graph_flops(pieces.condition)
     kinds = Counter(block.kind for block in program.blocks)
@@ -73,6 +74,14 @@ def row(family: str, verified_against: str, sampler: str, program: Program) -> R
         "hoisted": round(1 - (loop + batched) / evaluations, 3),
         "batched": round(batched / evaluations, 3),
     }
+
+
+def stored_program(artifact: Artifact) -> Program:
+    """The program of an artifact, which does not keep the captured denoiser: its blocks name no values."""
+    blocks = tuple(Block(i, b.kind, "", "", None, b.type, b.group) for i, b in enumerate(artifact.manifest.blocks))
+    weights = {**artifact.weights, **artifact.pruner}
+    empty, dense = Graph({}, {}, (), ()), artifact.manifest.flops.dense
+    return Program(artifact.manifest.spec, empty, weights, blocks, artifact.pieces, dense_flops=dense)
 
 
 def read_record() -> dict[str, list[Row]]:

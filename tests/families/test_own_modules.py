@@ -13,8 +13,8 @@ import ttscompile
 from tests.families.checks import assert_runtimes_agree, in_loop, kinds
 from tests.families.modules import CHANNELS, FEATURES, HORIZON, MODULES, TOKENS
 from tests.ir.meta import assert_types_of
+from tests.passes.modules import STREAMS, evaluate_pieces
 from tests.passes.specs import toy_spec
-from tests.passes.test_pipeline import STREAMS, evaluate_pieces
 from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile import PolicySpec
 from ttscompile.driver import transform

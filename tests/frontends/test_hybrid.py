@@ -139,9 +139,9 @@ def test_the_encoder_is_a_piece_of_its_own(compiled: tuple[Program, Path]) -> No
     """Every convolution is in the graph that runs once a call, and the dense FLOPs count it once."""
     program, _ = compiled
     pieces = program.pieces
-    assert pieces is not None and pieces.step is not None
+    assert pieces.step is not None
     assert sum("conv" in node.op for node in pieces.condition.nodes) == 21  # ResNet-18 has 20; and the keypoints
-    loop = (pieces.stem, *pieces.blocks, pieces.tail, pieces.step)
+    loop = (*(piece.graph for piece in pieces.loop.values()), pieces.step)
     assert not any("conv" in node.op for graph in loop for node in graph.nodes)
     every_step = sum(graph_flops(graph) for graph in loop) * hybrid.STEPS
     assert 0 < program.dense_flops - graph_flops(pieces.condition) < 1.2 * every_step

@@ -13,9 +13,9 @@ from ttscompile.errors import PassError
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.flops import graph_flops
 from ttscompile.ir.graph import TensorType
-from ttscompile.ir.layout import sink_layout
-from ttscompile.ir.program import Program
+from ttscompile.ir.program import Captured
 from ttscompile.ir.verify import verify, verify_graph
+from ttscompile.lower.layout import sink_layout
 from ttscompile.passes.find_residual_blocks import find_residual_blocks
 from ttscompile.passes.partition import Partition
 
@@ -61,11 +61,10 @@ def test_a_context_that_nothing_gives_is_found_before_hoist() -> None:
     )  # fmt: skip
     spec = replace(toy_spec(), sample_argument="x")
     weights = {name: torch.zeros(type_.at(1)).numpy() for name, type_ in graph.constants.items()}
-    program = Program(spec, graph, weights, find_residual_blocks(graph, "x").blocks)
-    cut = Partition()(program).program
+    cut = Partition(find_residual_blocks(graph, "x").blocks)(Captured(spec, graph, weights)).program
     verify(cut)
-    assert cut.pieces is not None
-    tail = replace(cut.pieces.tail, inputs={**cut.pieces.tail.inputs, "obs": graph.inputs["obs"]})
-    broken = replace(cut, pieces=replace(cut.pieces, tail=tail))
+    tail = cut.loop.tail
+    reads = replace(tail.graph, inputs={**tail.graph.inputs, "obs": graph.inputs["obs"]})
+    broken = replace(cut, loop=replace(cut.loop, tail=replace(tail, graph=reads)))
     with pytest.raises(PassError, match="tail: nothing provides its context %obs"):
         verify(broken)

@@ -11,15 +11,15 @@ from tests.passes.graphs import B, chain
 from tests.passes.specs import toy_spec
 from ttscompile.errors import PassError
 from ttscompile.ir.graph import Graph, Node, Ref, TensorType
-from ttscompile.ir.program import Program
+from ttscompile.ir.program import Captured
 from ttscompile.ir.verify import verify, verify_graph
 
 
-def program(graph: Graph) -> Program:
+def program(graph: Graph) -> Captured:
     inputs = {"sample": graph.inputs["x"], "timestep": TensorType((B,), "int64"), "obs": TensorType((B, 3), "float32")}
     nodes = tuple(n.renamed(lambda name: "sample" if name == "x" else name) for n in graph.nodes)
     weights = {n: np.zeros(t.at(1), np.float32) for n, t in graph.constants.items()}
-    return Program(toy_spec(), replace(graph, inputs=inputs, nodes=nodes), weights)
+    return Captured(toy_spec(), replace(graph, inputs=inputs, nodes=nodes), weights)
 
 
 def test_a_sound_program_passes() -> None:

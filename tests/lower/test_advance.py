@@ -1,4 +1,4 @@
-"""``ir.advance``: tail, sampler update and stem as one graph."""
+"""``lower.advance``: tail, sampler update and stem as one graph."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from tests.lower.modules import TOKENS, WIDTH, spec, table
 from tests.passes.graphs import Builder
 from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile.core.correction import Correction, no_correction
-from ttscompile.core.spec import SamplerTable
+from ttscompile.core.spec import PolicySpec, SamplerTable
 from ttscompile.core.update import matrices
 from ttscompile.errors import LoweringError
-from ttscompile.ir.advance import fuse_advance
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Batch, Graph, Ref
+from ttscompile.ir.pieces import LoopPiece
+from ttscompile.lower.advance import fuse_advance
 
 B = Batch()
 SHAPE = (B, TOKENS, WIDTH)
@@ -36,6 +37,10 @@ def pieces() -> tuple[Graph, Graph]:
     y = stem.op("y", "add.Tensor", SHAPE, x, stem.constant("bias", WIDTH))
     y = stem.op("z", "linear.default", STREAM, y, stem.constant("embed", 8, WIDTH))
     return tail.graph(z), stem.graph(stem.op("w", "mul.Tensor", STREAM, y, t))
+
+
+def fused_of(tail: Graph, stem: Graph, spec: PolicySpec) -> Graph:
+    return fuse_advance(LoopPiece(tail, "a9"), LoopPiece(stem, "sample"), spec)
 
 
 def update(sampler: SamplerTable, x: torch.Tensor, out: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
@@ -87,7 +92,7 @@ def turned(x: torch.Tensor) -> torch.Tensor:
 )
 def test_equals_the_parts_one_by_one(sampler: SamplerTable, terms: int) -> None:
     tail, stem = pieces()
-    fused = fuse_advance(tail, stem, spec(sampler))
+    fused = fused_of(tail, stem, spec(sampler))
     assert list(fused.inputs) == [
         "stream",
         "sample",
@@ -131,7 +136,7 @@ def test_equals_the_parts_one_by_one(sampler: SamplerTable, terms: int) -> None:
 def test_a_stem_that_does_nothing() -> None:
     tail, _ = pieces()
     stem = Builder()
-    fused = fuse_advance(tail, stem.graph(stem.input("sample", *SHAPE)), spec(table(**DDPM)))
+    fused = fused_of(tail, stem.graph(stem.input("sample", *SHAPE)), spec(table(**DDPM)))
     weights = {name: torch.randn(type_.at(1)) for name, type_ in fused.constants.items()}
     inputs = {name: torch.randn(type_.at(2)) for name, type_ in fused.inputs.items()}
     sample_next, stream_next, _ = evaluate(fused, weights, inputs)
@@ -144,14 +149,14 @@ def test_weights_whose_names_are_taken_are_refused() -> None:
         nodes = tuple(node.renamed(lambda n, name=name: name if n == "head" else n) for node in tail.nodes)
         constants = {name if n == "head" else n: t for n, t in tail.constants.items()}
         with pytest.raises(LoweringError, match=f"'{name}'.*Rename"):
-            fuse_advance(replace(tail, nodes=nodes, constants=constants), stem, spec())
+            fused_of(replace(tail, nodes=nodes, constants=constants), stem, spec())
 
 
 def test_inner_names_give_way_to_constants() -> None:
     tail, stem = pieces()
     nodes = tuple(node.renamed(lambda n: "update.features" if n == "head" else n) for node in tail.nodes)
     constants = {"update.features" if n == "head" else n: t for n, t in tail.constants.items()}
-    fused = fuse_advance(replace(tail, nodes=nodes, constants=constants), stem, spec(table(**DDPM)))
+    fused = fused_of(replace(tail, nodes=nodes, constants=constants), stem, spec(table(**DDPM)))
     names = [*fused.inputs, *fused.constants, *(node.name for node in fused.nodes)]
     assert len(set(names)) == len(names)
     assert any(Ref("update.features") in node.args for node in fused.nodes)

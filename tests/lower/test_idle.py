@@ -12,8 +12,8 @@ from tests.rounding import Counted, assert_equal_but_for_rounding
 from tests.runtimes.toys import B, f32, node, toy_program
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Graph, Node, Ref
-from ttscompile.ir.idle import OUTPUTS, TOTAL
-from ttscompile.ir.program import Pieces, Program
+from ttscompile.ir.pieces import IDLE_OUTPUTS, TOTAL, LoopPiece
+from ttscompile.ir.program import Program
 from ttscompile.lower.idle import lower_idle
 from ttscompile.lower.program import OPSET
 
@@ -21,11 +21,6 @@ from .sessions import session
 
 STREAM, SAMPLE = f32(B, 3, 4), f32(B, 3, 2)
 WEIGHTS = {"mix": f32(3, 3), "position": f32(3, 4), "scale": f32(3, 1), "norm.w": f32(4), "norm.b": f32(4)}
-
-
-def pieces_of(program: Program) -> Pieces:
-    assert program.pieces is not None
-    return program.pieces
 
 
 def values_of(program: Program) -> dict[str, np.ndarray]:
@@ -38,25 +33,25 @@ def values_of(program: Program) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("size", [1e-3, 1.0, 300.0])
 def test_the_prediction_is_the_tails(sequence_first: bool, size: float) -> None:
     program = toy_program(normed=True, sequence_first=sequence_first)
-    pieces, weights = pieces_of(program), values_of(program)
+    pieces, weights = program.pieces, values_of(program)
     model, why = lower_idle(pieces, weights, OPSET)
     assert (model is None, why) == (False, "")
     rng = np.random.default_rng(0)
     x = rng.standard_normal((5, 3, 2)).astype(np.float32)
-    total = (size * rng.standard_normal(pieces.stem.types()[pieces.stem.outputs[0]].at(5))).astype(np.float32)
-    base, product, shift = session(model, {}).run(list(OUTPUTS), {TOTAL: total})
+    total = (size * rng.standard_normal(pieces.tail.type.at(5))).astype(np.float32)
+    base, product, shift = session(model, {}).run(list(IDLE_OUTPUTS), {TOTAL: total})
     y = np.einsum("ed,dbt->ebt", product, x.transpose(2, 0, 1)) + base
     found = y[3:] / np.sqrt((y[:3] ** 2).sum(axis=0)) + shift
     tensors = {name: torch.from_numpy(value) for name, value in weights.items()}
-    stream = evaluate(pieces.stem, tensors, {"sample": torch.from_numpy(x)})[0] + torch.from_numpy(total)
+    stream = evaluate(pieces.stem.graph, tensors, {"sample": torch.from_numpy(x)})[0] + torch.from_numpy(total)
     with Counted() as counted:
-        expected = evaluate(pieces.tail, tensors, {next(iter(pieces.tail.inputs)): stream})[0]
+        expected = evaluate(pieces.tail.graph, tensors, {pieces.tail.stream: stream})[0]
     # The norm is taken apart: base and product are rounded before they are added, and so is the shift.
     assert_equal_but_for_rounding(found, expected.numpy().transpose(2, 0, 1), 4 * counted.terms)
 
 
-def tail(*nodes: object, **constants: object) -> Graph:
-    return Graph({"h": STREAM}, {"tail.w": f32(2, 4), **constants}, nodes, ("out",))  # type: ignore[arg-type]
+def tail(*nodes: object, **constants: object) -> LoopPiece:
+    return LoopPiece(Graph({"h": STREAM}, {"tail.w": f32(2, 4), **constants}, nodes, ("out",)), "h")  # type: ignore[arg-type]
 
 
 NORM = node("n", "layer_norm.default", STREAM, Ref("h"), (4,), None, None, 1e-5, False)
@@ -69,14 +64,20 @@ def head_of(value: str) -> Node:
 LIFT = node("l", "linear.default", STREAM, Ref("sample"), Ref("stem.w"))
 
 
-def stem(*nodes: object, **constants: object) -> Graph:
-    return Graph({"sample": SAMPLE}, {"stem.w": f32(4, 2), **constants}, (LIFT, *nodes), ("h0" if nodes else "l",))  # type: ignore[arg-type]
+def stem(*nodes: object, **constants: object) -> LoopPiece:
+    result = ("h0" if nodes else "l",)
+    return LoopPiece(Graph({"sample": SAMPLE}, {"stem.w": f32(4, 2), **constants}, (LIFT, *nodes), result), "sample")  # type: ignore[arg-type]
+
+
+def reads_a_context() -> LoopPiece:
+    graph = tail(NORM, head_of("n")).graph
+    return LoopPiece(replace(graph, inputs={**graph.inputs, "c": f32(B, 1, 4)}), "h")
 
 
 def test_a_norm_without_weights_and_a_stem_with_positions_have_the_form() -> None:
     program = toy_program(normed=True)
     moved = stem(node("h0", "add.Tensor", STREAM, Ref("l"), Ref("position")), position=f32(3, 4))
-    pieces = replace(pieces_of(program), stem=moved, tail=tail(NORM, head_of("n")))
+    pieces = replace(program.pieces, stem=moved, tail=tail(NORM, head_of("n")))
     assert lower_idle(pieces, values_of(program), OPSET)[0] is not None
 
 
@@ -108,14 +109,14 @@ def test_a_norm_without_weights_and_a_stem_with_positions_have_the_form() -> Non
             "is not over the 4 numbers",
         ),
         (
-            {"tail": Graph({"h": STREAM, "c": f32(B, 1, 4)}, {"tail.w": f32(2, 4)}, (NORM, head_of("n")), ("out",))},
+            {"tail": reads_a_context()},
             "values of the observation or the step",
         ),
     ],
 )
-def test_near_misses_have_no_model(change: dict[str, Graph], why: str) -> None:
+def test_near_misses_have_no_model(change: dict[str, LoopPiece], why: str) -> None:
     program = toy_program(normed=True)
-    pieces = replace(pieces_of(program), **change)
+    pieces = replace(program.pieces, **change)
     model, reason = lower_idle(pieces, values_of(program), OPSET)
     assert model is None
     assert why in reason

@@ -10,7 +10,8 @@ import torch
 
 from tests.runtimes.toys import toy_program
 from ttscompile.ir.graph import Batch, TensorType
-from ttscompile.ir.joint import RESIDUAL, STREAM, join
+from ttscompile.ir.joint import join
+from ttscompile.ir.pieces import RESIDUAL, STREAM
 from ttscompile.lower.program import lower_program
 
 from .sessions import session
@@ -25,8 +26,7 @@ def test_each_block_is_what_its_own_model_is(blocks: int) -> None:
     program = toy_program(blocks=blocks)
     models = lower_program(program)
     pieces = program.pieces
-    assert pieces is not None
-    joint = join([tuple(graph.inputs.values())[1:] for graph in pieces.blocks])
+    joint = join([tuple(piece.contexts.values()) for piece in pieces.blocks])
     weights = {name: torch.from_numpy(np.asarray(value)) for name, value in program.weights.items()}
     whole = session(models["blocks"], weights)
     assert [value.name for value in whole.get_inputs()] == list(joint.inputs)
@@ -34,12 +34,11 @@ def test_each_block_is_what_its_own_model_is(blocks: int) -> None:
     feeds = {name: rng.standard_normal(type_.at(3)).astype(np.float32) for name, type_ in joint.slots}
     feeds[STREAM] = rng.standard_normal((3, 3, 4)).astype(np.float32)
     residuals = []
-    for b, graph in enumerate(pieces.blocks):
+    for b, piece in enumerate(pieces.blocks):
         turns = {name: np.array(turn) for name, turn in zip(joint.switches, joint.turns[b], strict=True)}
         (found,) = whole.run([RESIDUAL], feeds | turns)
-        stream, *contexts = graph.inputs
-        own = {name: feeds[slot] for name, slot in zip(contexts, joint.places[b], strict=True)}
-        (expected,) = session(models[f"block_{b:02d}"], weights).run(None, own | {stream: feeds[STREAM]})
+        own = {name: feeds[slot] for name, slot in zip(piece.contexts, joint.places[b], strict=True)}
+        (expected,) = session(models[f"block_{b:02d}"], weights).run(None, own | {piece.stream: feeds[STREAM]})
         np.testing.assert_array_equal(found, expected)
         residuals.append(found)
     assert all(np.abs(left - right).max() > 1e-3 for left, right in pairwise(residuals))

@@ -1,4 +1,4 @@
-"""``ir.layout``: moving operations composed and delayed."""
+"""``lower.layout``: moving operations composed and delayed."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.lower.modules import ALL, captured, random_values
 from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Argument, Batch, Graph, Node, Ref, Size, TensorType
-from ttscompile.ir.layout import product, ratio, sink_layout
+from ttscompile.lower.layout import product, ratio, sink_layout
 from ttscompile.lower.program import structural_key
 
 B = Batch()

@@ -14,10 +14,11 @@ from tests.lower.sessions import run, session
 from tests.passes.graphs import Builder
 from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile.errors import LoweringError
-from ttscompile.ir.advance import fuse_advance
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Batch, Graph, Node, Ref, TensorType
+from ttscompile.ir.pieces import LoopPiece
 from ttscompile.ir.program import Pieces, Program
+from ttscompile.lower.advance import fuse_advance
 from ttscompile.lower.program import OPSET, lower_graph, lower_program, structural_key
 
 B = Batch()
@@ -115,7 +116,7 @@ def test_expansion_over_streams() -> None:
     assert_parity(build.graph(build.op("y", "mul.Tensor", (2, B, 3), same, wide)), {"token": torch.randn(1, 3)})
 
 
-def feed_forward(index: int, hidden: int) -> Graph:
+def feed_forward(index: int, hidden: int) -> LoopPiece:
     build = Builder()
     x, shift = build.input(f"a{index}", B, TOKENS, WIDTH), build.input(f"table{index}", 1, WIDTH)
     h = build.op(f"add{index}", "add.Tensor", (B, TOKENS, WIDTH), x, shift)
@@ -123,7 +124,7 @@ def feed_forward(index: int, hidden: int) -> Graph:
     h = build.op(f"up{index}", "linear.default", (B, TOKENS, hidden), h, up)
     h = build.op(f"gelu{index}", "gelu.default", (B, TOKENS, hidden), h)
     down = build.constant(f"layers.{index}.down", WIDTH, hidden)
-    return build.graph(build.op(f"down{index}", "linear.default", (B, TOKENS, WIDTH), h, down))
+    return LoopPiece(build.graph(build.op(f"down{index}", "linear.default", (B, TOKENS, WIDTH), h, down)), f"a{index}")
 
 
 def program() -> Program:
@@ -134,11 +135,15 @@ def program() -> Program:
     pieces = Pieces(
         condition=condition.graph(condition.op("memory", "tanh.default", (B, 3, WIDTH), obs)),
         step=None,
-        stem=stem.graph(stem.op("a0", "linear.default", shape, sample, stem.constant("embed", WIDTH, WIDTH))),
+        stem=LoopPiece(
+            stem.graph(stem.op("a0", "linear.default", shape, sample, stem.constant("embed", WIDTH, WIDTH))), "sample"
+        ),
         blocks=(feed_forward(0, 32), feed_forward(1, 24), feed_forward(2, 32)),
-        tail=tail.graph(tail.op("out", "linear.default", shape, stream, tail.constant("head", WIDTH, WIDTH))),
+        tail=LoopPiece(
+            tail.graph(tail.op("out", "linear.default", shape, stream, tail.constant("head", WIDTH, WIDTH))), "a3"
+        ),
     )
-    return Program(spec(table(out_to_x0=1.0, x0_to_next=1.0)), pieces.stem, {}, pieces=pieces)
+    return Program(spec(table(out_to_x0=1.0, x0_to_next=1.0)), pieces.stem.graph, {}, (), pieces)
 
 
 def test_program(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,13 +157,12 @@ def test_program(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.onnx, "export", counting)
     compiled = program()
     pieces = compiled.pieces
-    assert pieces is not None
     models = lower_program(compiled)
     assert list(models) == ["condition", "stem", "block_00", "block_01", "block_02", "advance", "blocks", "dense_step"]
     (export,) = exports  # of everything at once
     linear = [node for node in export.graph.nodes if node.target is torch.ops.aten.linear.default]
     assert len(linear) == 7  # stem, 2 in block_00, 2 in block_01, tail and stem; block_02 is block_00 with other names
-    graphs = dict(zip(models, [pieces.condition, pieces.stem, *pieces.blocks], strict=False))
+    graphs = dict(zip(models, pieces.graphs().values(), strict=False))
     graphs["advance"] = fuse_advance(pieces.tail, pieces.stem, compiled.spec)
     for name, graph in graphs.items():
         assert models[name].graph.name == name
@@ -171,7 +175,7 @@ def test_program(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_structure_is_all_but_names() -> None:
-    first, other, second = program().pieces.blocks  # type: ignore[union-attr]
+    first, other, second = (piece.graph for piece in program().pieces.blocks)
     assert structural_key(first) == structural_key(second) != structural_key(other)
     neg = TensorType((2,), "float32")
     keys = {
@@ -190,12 +194,11 @@ def test_what_cannot_be_lowered() -> None:
     with pytest.raises(LoweringError, match=r"piece 'block_03' could not be exported.*No ONNX function.*linalg_eigh"):
         lower_graph(Graph({"x": type_}, {}, nodes, ("z",)), "block_03")
     broken = program()
-    assert broken.pieces is not None
     condition = Graph({"x": type_}, {}, nodes, ("z",))
     broken = replace(broken, pieces=replace(broken.pieces, condition=condition, blocks=broken.pieces.blocks[:1]))
     with pytest.raises(LoweringError, match=r"piece 'condition' could not be exported"):  # named among all pieces
         lower_program(broken)
     with pytest.raises(LoweringError, match="twice"):
         lower_graph(Graph({"x": type_}, {}, (), ("x", "x")), "stem")
-    with pytest.raises(LoweringError, match="no pieces"):
-        lower_program(Program(spec(), Graph({}, {}, (), ()), {}))
+    with pytest.raises(TypeError, match="'blocks' and 'pieces'"):
+        lower_program(Program(spec(), Graph({}, {}, (), ()), {}))  # type: ignore[call-arg]

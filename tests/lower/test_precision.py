@@ -201,7 +201,6 @@ def test_only_blocks_are_lowered_and_the_notes_say_which() -> None:
 
 
 def test_a_precision_that_cannot_be_had_is_refused_with_what_can() -> None:
-    with pytest.raises(LoweringError, match="bf16.*expected an onnxruntime.*found none.*Convert with precision 'int8'"):
-        lower_precision({}, {}, "bf16")
-    with pytest.raises(LoweringError, match="'int4': expected one of 'fp32', 'bf16', 'int8'"):
-        lower_precision({}, {}, "int4")
+    for name in ("bf16", "int4"):
+        with pytest.raises(LoweringError, match=f"'{name}': expected one of 'fp32', 'int8'"):
+            lower_precision({}, {}, name)

@@ -5,20 +5,19 @@ from __future__ import annotations
 import subprocess
 import sys
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
-import onnxruntime
 import pytest
+from onnx import GraphProto
 from torch import nn
 
 import ttscompile
-from tests.passes.test_pipeline import MODULES, spec
+from tests.lower.whole_call import Arrays, Episode, groups, inputs, make, policy_groups
+from tests.passes.modules import MODULES, spec
 from tests.rounding import allowed, assert_equal_but_for_rounding, bound
 from tests.runtimes.agreement import call_terms
 from tests.runtimes.plans import random_plan
@@ -32,71 +31,13 @@ from ttscompile.core.lattice import Source
 from ttscompile.driver import compile_denoiser
 from ttscompile.errors import ArtifactError, LoweringError
 from ttscompile.ir.graph import Batch
-from ttscompile.ir.joint import DENSE_STEP, JOINT
 from ttscompile.ir.program import Program
-from ttscompile.lower.joint import chain_blocks, join_blocks
+from ttscompile.lower.joint import lower_all_blocks
 from ttscompile.lower.precision import lower_precision
 from ttscompile.lower.program import lower_program
 from ttscompile.lower.single_file import lower_single_file
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy
-
-Arrays = dict[str, np.ndarray]
-
-
-@lru_cache(maxsize=1)
-def opened(model: str | bytes) -> onnxruntime.InferenceSession:
-    """A session, which keeps nothing from call to call: the episodes of a test share it."""
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    options.log_severity_level = 3  # optional inputs have values in the model, which is worth a warning to it
-    return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-
-
-class Episode:
-    """Calls of the single file that hand the rollout cache on, as its user would."""
-
-    def __init__(self, model: str | bytes, streams: int) -> None:
-        self.session = opened(model)
-        shapes = {value.name: value.shape for value in self.session.get_inputs()}
-        self.takes_noise = "step_noise" in shapes
-        row = [streams if n == "B" else n for n in shapes["rollout_rows"][1:]]
-        self.rows = np.zeros((0, *row), np.float32)
-        self.index = np.full(shapes["rollout_index"], -1, np.int64)
-
-    def call(self, obs: Arrays, noise: Noise, plan: np.ndarray, keep: bool = True, **more: Any) -> Arrays:
-        feeds = {**obs, **more, "initial_noise": noise.initial, "plan": plan.astype(np.int8)}
-        if self.takes_noise:
-            feeds["step_noise"] = noise.steps
-        feeds |= {"rollout_rows": self.rows, "rollout_index": self.index}
-        feeds["rollout_keep"] = np.full(self.index.shape, keep)
-        names = [value.name for value in self.session.get_outputs()]
-        out = dict(zip(names, self.session.run(names, feeds), strict=True))
-        self.rows, self.index = out["rollout_rows_next"], out["rollout_index_next"]
-        return out
-
-
-def make(program: Program, folder: Path) -> tuple[CompiledPolicy, bytes]:
-    models = lower_program(program)
-    write_artifact(program, models, folder / "artifact")
-    model = lower_single_file(program, models, program.weights)
-    onnx.checker.check_model(model, full_check=True)
-    return ttscompile.load(folder / "artifact", "reference"), model.SerializeToString(deterministic=True)
-
-
-def inputs(policy: CompiledPolicy, rng: np.random.Generator, streams: int) -> tuple[Arrays, Noise]:
-    info = policy.info
-    obs = {k: rng.standard_normal((streams, *o.shape)).astype(o.dtype) for k, o in info.observation.items()}
-    draws = rng.standard_normal((info.K, streams, *info.sample), dtype=np.float32) if info.stochastic else None
-    return obs, Noise(rng.standard_normal((streams, *info.sample), dtype=np.float32), draws)
-
-
-def policy_groups(artifact: Path) -> tuple[int, ...]:
-    return load_artifact(artifact).manifest.groups
-
-
-def groups(program: Program) -> list[int]:
-    return [block.group for block in program.blocks]
 
 
 @pytest.mark.parametrize(
@@ -215,13 +156,28 @@ def test_what_is_not_kept_is_not_there(tmp_path: Path) -> None:
     assert np.abs(again["action"] - out["action"]).max() > 1e-3
 
 
+def branches(graph: GraphProto) -> Iterator[tuple[str, str]]:
+    """Names of the branches of every If, at any depth."""
+    for node in graph.node:
+        inner = {attribute.name: attribute.g for attribute in node.attribute if attribute.HasField("g")}
+        if node.op_type == "If":
+            yield inner["then_branch"].name, inner["else_branch"].name
+        for body in inner.values():
+            yield from branches(body)
+
+
+def test_every_block_has_a_branch_that_computes_and_one_that_reuses() -> None:
+    program = toy_program(blocks=8)
+    model = lower_single_file(program, lower_program(program), program.weights)
+    found = sorted(pair for pair in branches(model.graph) if pair[0].startswith("block_"))
+    assert found == [(f"block_{b:02d}", f"block_{b:02d}_reused") for b in range(8)]
+
+
 def test_blocks_of_another_precision(tmp_path: Path) -> None:
     program = toy_program(blocks=6)
     models = lower_program(program)
     lowered, weights, _ = lower_precision(models, program.weights, "int8")
-    assert program.pieces is not None
-    own = {**models, **lowered}
-    lowered |= {JOINT: join_blocks(program.pieces.blocks, own), DENSE_STEP: chain_blocks(program.pieces.blocks, own)}
+    lowered |= lower_all_blocks(program.pieces.blocks, {**models, **lowered})
     write_artifact(program, models, tmp_path / "artifact", LoweredBlocks("int8", lowered, weights))
     model = lower_single_file(program, {**models, **lowered}, {**program.weights, **weights})
     policy = ttscompile.load(tmp_path / "artifact", precision="int8")
@@ -261,7 +217,6 @@ def wider(program: Program) -> Program:
         (renamed("plan"), r"observations \['plan'\] have names of the single file's own"),
         (renamed("action_pred"), r"observations \['action_pred'\]"),
         (wider, "the residual stream changes its type"),
-        (lambda p: replace(p, pieces=None), "no pieces to lower"),
         (lambda p: replace(p, weights={k: v for k, v in p.weights.items() if k != "stem.w"}), "'stem.w' .* no value"),
     ],
 )

@@ -7,6 +7,8 @@ import torch
 from torch import nn
 
 from tests.passes.graphs import B, Builder, chain
+from tests.passes.specs import toy_spec
+from ttscompile.driver import transform
 from ttscompile.errors import NoResidualBlocksError
 from ttscompile.ir.graph import GETITEM, Graph, Node, Ref, TensorType
 from ttscompile.passes.find_residual_blocks import find_residual_blocks
@@ -231,3 +233,20 @@ def test_a_captured_decoder_has_three_blocks_a_layer() -> None:
     graph, _ = capture(_Decoder(), toy_spec(sample=(4, 2), obs=(3, 16)))
     table = find_residual_blocks(graph, "sample")
     assert [b.kind for b in table.blocks] == ["self_attention", "cross_attention", "feed_forward"] * 2
+
+
+class NoResidual(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.net = nn.Sequential(nn.Linear(2, 8), nn.GELU(), nn.Linear(8, 2))
+
+    def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
+        return self.net(sample) * obs.flatten(1).mean(1)[:, None, None] * timestep[:, None, None]
+
+
+def test_a_network_without_residuals_is_refused_with_its_source_line() -> None:
+    with pytest.raises(
+        NoResidualBlocksError,
+        match=r"ended at %\w+ = aten\.mul\.Tensor \(test_find_residual_blocks\.py:\d+ in forward\)",
+    ):
+        transform(NoResidual(), toy_spec(obs=(3, 7)))

@@ -9,7 +9,7 @@ from tests.passes.specs import toy_spec
 from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Graph, Ref
-from ttscompile.ir.program import Program
+from ttscompile.ir.program import Captured
 from ttscompile.passes.find_residual_blocks import find_residual_blocks
 from ttscompile.passes.regroup_sums import RegroupSums
 
@@ -18,13 +18,14 @@ SHAPE = (B, 4, 8)
 
 def regrouped(graph: Graph) -> tuple[Graph, bool]:
     weights = {n: torch.randn(t.at(1)).numpy() for n, t in graph.constants.items()}
-    result = RegroupSums()(Program(toy_spec(sample=(4, 8)), graph, weights))
+    captured = Captured(toy_spec(sample=(4, 8)), graph, weights)
+    result = RegroupSums()(captured)
     value = {"sample": torch.randn(2, 4, 8)}
     tensors = {n: torch.from_numpy(w) for n, w in weights.items()}
     with Counted() as counted:
         before = evaluate(graph, tensors, value)[0]
     assert_equal_but_for_rounding(evaluate(result.program.denoiser, tensors, value)[0], before, counted.terms)
-    return result.program.denoiser, result.modified
+    return result.program.denoiser, result.program is not captured
 
 
 def branches(builder: Builder, count: int) -> tuple[Ref, list[Ref]]:

@@ -18,7 +18,7 @@ from ttscompile.errors import PassError
 from ttscompile.ir.binding import bindings
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Batch, Graph, Node, Ref, TensorType
-from ttscompile.ir.program import Binding, Program
+from ttscompile.ir.program import Binding, Captured, Cut
 from ttscompile.passes.clean_up import CleanUp
 from ttscompile.passes.find_residual_blocks import find_residual_blocks
 from ttscompile.passes.hoist import Hoist
@@ -42,43 +42,40 @@ class _Modulated(nn.Module):
         return sample + gate[:, None] * torch.tanh(self.f(sample))
 
 
-def _program(with_time: bool) -> Program:
+def _program(with_time: bool) -> Cut:
     """Cut, with its tokens split, not hoisted."""
     torch.manual_seed(0)
     columns: Any = {name: np.ones(3) for name in SamplerTable.COLUMNS}
     sampler = SamplerTable(name="x", timesteps=np.array([0.3, 0.2, 0.1], np.float32), clip=None, **columns)
     spec = PolicySpec((5, 4), {"obs": ObservationSpec((6,))}, sampler, ChunkSpec(4, 0, 5))
     graph, weights = capture(_Modulated(with_time), spec)
-    program = Program(spec, graph, weights, dense_flops=1000)
-    program = replace(program, blocks=find_residual_blocks(graph, "sample").blocks)
-    return SplitTokens()(Partition()(program).program).program
+    captured = Captured(spec, graph, weights, dense_flops=1000)
+    return SplitTokens()(Partition(find_residual_blocks(graph, "sample").blocks)(captured).program).program
 
 
 def test_modulations_become_a_sum_of_a_table_and_a_condition() -> None:
     before = _program(True)
     result = SplitFeatures()(before)
     assert result.notes == ("1 linear layers of features with different binding times became sums",)
-    assert before.pieces is not None and result.program.pieces is not None
     inputs = {"timestep": torch.rand(2), "obs": torch.randn(2, 6)}
     values = []
     for program in (before, result.program):
-        assert program.pieces is not None
         weights = {name: torch.from_numpy(value) for name, value in program.weights.items()}
         with Counted() as counted:
-            values.append(evaluate(program.pieces.condition, weights, inputs))
+            values.append(evaluate(program.prologue, weights, inputs))
     for one, other in zip(*values, strict=True):
         assert_equal_but_for_rounding(one, other, counted.terms)
     pieces = Hoist()(CleanUp()(result.program).program).program.pieces
-    assert pieces is not None and pieces.step is not None
+    assert pieces.step is not None
     assert not any("linear" in node.op for node in pieces.step.nodes)
     assert any("linear" in node.op for node in pieces.condition.nodes)
     again = SplitFeatures()(result.program)
-    assert not again.modified
+    assert again.program is result.program
 
 
 def test_features_of_one_binding_time_are_left_alone() -> None:
-    result = SplitFeatures()(_program(False))
-    assert not result.modified
+    program = _program(False)
+    assert SplitFeatures()(program).program is program
 
 
 def test_features_of_another_dtype_stay_together() -> None:
@@ -92,8 +89,8 @@ def test_features_of_another_dtype_stay_together() -> None:
 
 
 def test_runs_before_hoist_only() -> None:
-    with pytest.raises(PassError, match="between partition and hoist"):
-        SplitFeatures()(Hoist()(_program(True)).program)
+    with pytest.raises(PassError, match="takes a program that is Cut; found Program"):
+        SplitFeatures()(Hoist()(_program(True)).program)  # type: ignore[arg-type]  # type: ignore[arg-type]
 
 
 def test_a_class_token_for_every_image_is_no_table() -> None:

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ttscompile import legalize
+from ttscompile.artifact import Artifact
+from ttscompile.core.correction import Correction, no_correction
 from ttscompile.core.lattice import BoolArray, PlanArray
 
 
@@ -21,3 +23,14 @@ def random_plan(
         for k in np.flatnonzero(repeat[1:]) + 1:
             plan[k] = np.where(plan[k - 1] == 0, 2, plan[k - 1])
     return legalize(plan, groups, written)[0]
+
+
+def random_correction(artifact: Artifact, rng: np.random.Generator) -> Correction:
+    manifest = artifact.manifest
+    like = no_correction(manifest.steps, manifest.spec.sample)
+    scale = 0.3 / np.sqrt(like.weights.shape[2])
+    return Correction(
+        rng.random(manifest.steps) < 0.5,
+        (scale * rng.standard_normal(like.weights.shape)).astype(np.float32),
+        (0.1 * rng.standard_normal(like.bias.shape)).astype(np.float32),
+    )

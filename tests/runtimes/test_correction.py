@@ -9,6 +9,7 @@ import pytest
 
 import ttscompile
 from tests.rounding import assert_equal_but_for_rounding
+from tests.runtimes.plans import random_correction
 from ttscompile import Noise, Source
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.write import update_calibration
@@ -19,17 +20,6 @@ from ttscompile.runtimes import open_runtime
 
 from .agreement import call_terms, random_inputs
 from .plans import random_plan
-
-
-def random_correction(artifact: Artifact, rng: np.random.Generator) -> Correction:
-    manifest = artifact.manifest
-    like = no_correction(manifest.steps, manifest.spec.sample)
-    scale = 0.3 / np.sqrt(like.weights.shape[2])
-    return Correction(
-        rng.random(manifest.steps) < 0.5,
-        (scale * rng.standard_normal(like.weights.shape)).astype(np.float32),
-        (0.1 * rng.standard_normal(like.bias.shape)).astype(np.float32),
-    )
 
 
 @pytest.mark.parametrize("streams", [1, 3])

@@ -12,14 +12,14 @@ from ttscompile import SamplerTable, Source
 from ttscompile.artifact import Artifact
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import legalize, uniform_plan
-from ttscompile.ir.idle import IDLE
+from ttscompile.ir.pieces import IDLE
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.onnxruntime.backend import OnnxBackend
 from ttscompile.runtimes.onnxruntime.idle_steps import IdleSteps
 
 from .agreement import call_terms, random_inputs
 from .conftest import MakeArtifact
-from .test_correction import random_correction
+from .plans import random_correction
 from .toys import toy_program
 
 STEPS, BLOCKS = 12, 4

@@ -32,8 +32,7 @@ from ttscompile.samplers.table import sampler_table
 
 from .agreement import call_terms, random_inputs
 from .conftest import MakeArtifact
-from .plans import random_plan
-from .test_correction import random_correction
+from .plans import random_correction, random_plan
 from .toys import toy_program
 
 STEPS, BLOCKS, HORIZON, START = 8, 4, 6, 1

@@ -10,8 +10,8 @@ import pytest
 import torch
 from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultistepScheduler
 
-from tests.lower.test_single_file import Episode as FileEpisode
-from tests.lower.test_single_file import inputs, make
+from tests.lower.whole_call import Episode as FileEpisode
+from tests.lower.whole_call import inputs, make
 from tests.rounding import Counted, amplified, assert_equal_but_for_rounding, bound
 from ttscompile import Noise, SamplerTable, Source, flow_matching_table
 from ttscompile.artifact import Artifact, load_artifact
@@ -28,8 +28,7 @@ from ttscompile.samplers.table import sampler_table
 
 from .agreement import call_terms, largest_difference, random_inputs
 from .literal import Episode
-from .plans import random_plan
-from .test_correction import random_correction
+from .plans import random_correction, random_plan
 from .toys import as_functions, pencil_program, toy_program
 
 C, T = Source.COMPUTE, Source.TIMESTEP

@@ -54,12 +54,11 @@ def test_reuse_gives_41_and_compute_gives_44(pencil_artifact: Artifact, name: st
 def test_a_value_of_the_step_may_be_one_number(make_artifact: MakeArtifact) -> None:
     program = pencil_program()
     pieces = program.pieces
-    assert pieces is not None
     (block,) = pieces.blocks
-    nodes = tuple(node.renamed(lambda name: "time" if name == "offset" else name) for node in block.nodes)
+    nodes = tuple(node.renamed(lambda name: "time" if name == "offset" else name) for node in block.graph.nodes)
     pieces = replace(
         pieces,
-        blocks=(replace(block, inputs={"h0": block.inputs["h0"], "time": f32()}, nodes=nodes),),
+        blocks=(replace(block, graph=replace(block.graph, inputs={"h0": block.type, "time": f32()}, nodes=nodes)),),
         tables={"time": np.array([-32, -31], np.float32)},  # as timestep[0] gives it
         bindings={**pieces.bindings, "time": Binding.TABLE},
     )

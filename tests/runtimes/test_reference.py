@@ -12,7 +12,7 @@ from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile import Noise, Source
 from ttscompile.artifact import Artifact
 from ttscompile.core.lattice import PlanArray
-from ttscompile.errors import IllegalPlanError, PassError
+from ttscompile.errors import IllegalPlanError
 from ttscompile.ir.program import Program
 from ttscompile.runtimes.reference.model import Contexts, ReferenceModel, RolloutCache
 
@@ -194,8 +194,8 @@ def test_a_program_without_pieces_or_pruner_is_refused() -> None:
     assert model.pruner_weights == {}
     with pytest.raises(IllegalPlanError, match="no pruner"):
         model.logits(model.prologue(inputs(np.random.default_rng(0), 1)[0]))
-    with pytest.raises(PassError, match="no pieces"):
-        ReferenceModel.from_program(Program(program.spec, program.denoiser, program.weights))
+    with pytest.raises(TypeError, match="'blocks' and 'pieces'"):
+        Program(program.spec, program.denoiser, program.weights)  # type: ignore[call-arg]
 
 
 def test_an_artifact_gives_the_model_of_its_program(toy_artifact: Artifact) -> None:

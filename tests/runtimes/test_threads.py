@@ -10,7 +10,7 @@ import pytest
 
 from tests.rounding import bound
 from ttscompile.artifact import Artifact
-from ttscompile.ir.joint import JOINT
+from ttscompile.ir.pieces import JOINT
 from ttscompile.ir.program import Program
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.onnxruntime.sessions import SINGLE_THREADED, JointBlock, open_sessions

@@ -13,7 +13,8 @@ from ttscompile import Affine, ChunkSpec, ObservationSpec, PolicySpec, SamplerTa
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.write import write_artifact
 from ttscompile.ir.graph import Argument, Batch, Graph, Node, Ref, TensorType
-from ttscompile.ir.program import Binding, Block, Pieces, Program, Reuse
+from ttscompile.ir.pieces import LoopPiece
+from ttscompile.ir.program import Binding, Block, Pieces, Program
 from ttscompile.lower.program import lower_program
 
 from .literal import Toy
@@ -45,10 +46,10 @@ def assemble(
         Block(i, kind, f"h{i}", f"h{i + 1}", f"r{i}", stream, group)
         for i, (kind, group) in enumerate(zip(kinds, groups, strict=True))
     )
-    members = {g: tuple(i for i, other in enumerate(groups) if other == g) for g in groups}
-    reuse = tuple(Reuse(stream, g, members[g]) for g in groups)
     empty = Graph({}, {}, (), ())
-    return Program(spec, empty, {k: np.asarray(v, np.float32) for k, v in weights.items()}, blocks, pieces, reuse, 1000)
+    return Program(
+        spec, empty, {k: np.asarray(v, np.float32) for k, v in weights.items()}, blocks, pieces, dense_flops=1000
+    )
 
 
 def pencil_program() -> Program:
@@ -68,13 +69,24 @@ def pencil_program() -> Program:
             {"obs": f32(B, 1)}, {}, (node("offset", "unsqueeze.default", one, Ref("obs"), 1),), ("offset",)
         ),
         step=None,
-        stem=Graph(
-            {"sample": one}, {"unit": f32(1)}, (node("h0", "mul.Tensor", one, Ref("sample"), Ref("unit")),), ("h0",)
+        stem=LoopPiece(
+            Graph(
+                {"sample": one}, {"unit": f32(1)}, (node("h0", "mul.Tensor", one, Ref("sample"), Ref("unit")),), ("h0",)
+            ),
+            "sample",
         ),
         blocks=(
-            Graph({"h0": one, "offset": one}, {}, (node("r0", "add.Tensor", one, Ref("h0"), Ref("offset")),), ("r0",)),
+            LoopPiece(
+                Graph(
+                    {"h0": one, "offset": one}, {}, (node("r0", "add.Tensor", one, Ref("h0"), Ref("offset")),), ("r0",)
+                ),
+                "h0",
+            ),
         ),
-        tail=Graph({"h1": one}, {"unit": f32(1)}, (node("out", "mul.Tensor", one, Ref("h1"), Ref("unit")),), ("out",)),
+        tail=LoopPiece(
+            Graph({"h1": one}, {"unit": f32(1)}, (node("out", "mul.Tensor", one, Ref("h1"), Ref("unit")),), ("out",)),
+            "h1",
+        ),
         bindings={"offset": Binding.CONDITION},
     )
     return assemble(spec, pieces, ("feed_forward",), one, {"unit": [1.0]})
@@ -122,14 +134,15 @@ def toy_program(
     def turned(name: str, value: str, kind: TensorType) -> Node:
         return node(name, "transpose.int", kind, Ref(value), 0, 1)
 
-    def block(b: int) -> Graph:
+    def block(b: int) -> LoopPiece:
         context = contexts[b % 3]
         nodes = (
             node("y", "linear.default", stream, Ref(f"h{b}"), Ref(f"block.{b}.w")),
             node("z", "add.Tensor", stream, Ref("y"), Ref(context)),
             node(f"r{b}", "tanh.default", stream, Ref("z")),
         )
-        return Graph({f"h{b}": stream, context: wide}, {f"block.{b}.w": f32(width, width)}, nodes, (f"r{b}",))
+        graph = Graph({f"h{b}": stream, context: wide}, {f"block.{b}.w": f32(width, width)}, nodes, (f"r{b}",))
+        return LoopPiece(graph, f"h{b}")
 
     in_order = f32(B, horizon, width)
     lift = node("h", "linear.default", in_order, Ref("sample"), Ref("stem.w"))
@@ -165,9 +178,13 @@ def toy_program(
         )
         if blocks > 2
         else None,
-        stem=Graph({"sample": sample}, {"stem.w": f32(width, channels)}, stem_nodes, (stem_nodes[-1].name,)),
+        stem=LoopPiece(
+            Graph({"sample": sample}, {"stem.w": f32(width, channels)}, stem_nodes, (stem_nodes[-1].name,)), "sample"
+        ),
         blocks=tuple(block(b) for b in range(blocks)),
-        tail=Graph({last: stream}, {"tail.w": f32(channels, width), **of_norm}, (*back, head), ("out",)),
+        tail=LoopPiece(
+            Graph({last: stream}, {"tail.w": f32(channels, width), **of_norm}, (*back, head), ("out",)), last
+        ),
         pruner=Graph(
             {"cond": wide},
             {n: f32(*np.shape(weights[n])) for n in ("pruner.w", "pruner.b", "pruner.mask")},
@@ -210,7 +227,6 @@ def as_functions(program: Program, obs: npt.NDArray[np.float32], noise: npt.NDAr
         noise: ``[K, T, D]``.
     """
     pieces, weights = program.pieces, {k: np.asarray(v, np.float64) for k, v in program.weights.items()}
-    assert pieces is not None
     cond = weights["cond.w"] @ obs
     row, time = (np.asarray(pieces.tables[name], np.float64)[:, 0, 0] for name in ("row", "time"))
     table = program.spec.sampler

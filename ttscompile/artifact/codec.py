@@ -10,8 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ..errors import ArtifactError
-from ..ir.joint import OF_ALL_BLOCKS
-from ..ir.pieces import block_name
+from ..ir.pieces import ADVANCE, CONDITION, OF_ALL_BLOCKS, PRUNER, STEM, block_name
 from . import typed_json
 from .manifest import DENSE, FORMAT, MANIFEST, SCHEMA_VERSION, Manifest, PrecisionRecord
 from .strict_json import Value, dump, dump_compact, parse
@@ -75,9 +74,7 @@ def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:
     blocks = len(manifest.blocks)
     if len(manifest.flops.blocks) != blocks:
         fields["flops"].fail(f"FLOPs of {blocks} blocks")
-    if len(manifest.reuse) not in (0, blocks):
-        fields["reuse"].fail(f"none, or one for each of {blocks} blocks")
-    missing = {"condition", "stem", "advance", *OF_ALL_BLOCKS, *map(block_name, range(blocks))} - set(manifest.pieces)
+    missing = {CONDITION, STEM, ADVANCE, *OF_ALL_BLOCKS, *map(block_name, range(blocks))} - set(manifest.pieces)
     if missing:
         fields["pieces"].fail(f"the pieces {sorted(missing)} too")
     for name, piece in manifest.pieces.items():
@@ -85,10 +82,10 @@ def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:
             fields["pieces"].members()[name].members()["stream"].fail(f"one of {', '.join(map(repr, piece.inputs))}")
         if not set(piece.contexts) <= set(manifest.contexts):
             fields["pieces"].fail(f"contexts of {name} that are among {list(manifest.contexts)}")
-    has_pruner = "pruner" in manifest.pieces
+    has_pruner = PRUNER in manifest.pieces
     if has_pruner != (manifest.stores.pruner is not None):
         fields["stores"].fail("a file of pruner weights exactly when there is a piece called pruner")
-    if not has_pruner and any(plan.kind == "pruner" for plan in manifest.plans.values()):
+    if not has_pruner and any(plan.pruned for plan in manifest.plans.values()):
         fields["plans"].fail("no plan of the kind pruner, because there is no piece called pruner")
     files = {piece.file for piece in manifest.pieces.values()} | {n for n in vars(manifest.stores).values() if n}
     if manifest.precision is not None:
@@ -99,7 +96,7 @@ def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:
         fields["plans"].fail("no plan called 'dense', which every artifact has")
     if manifest.default_plan not in {DENSE, *manifest.plans}:
         fields["default_plan"].fail(f"one of {[DENSE, *manifest.plans]}")
-    scheduled = any(plan.kind == "schedule" for plan in manifest.plans.values())
+    scheduled = any(not plan.pruned for plan in manifest.plans.values())
     if scheduled != (manifest.stores.plans is not None):
         fields["stores"].fail("a file of plans exactly when there are schedules")
 

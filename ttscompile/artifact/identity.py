@@ -6,8 +6,9 @@ import hashlib
 from collections.abc import Mapping
 from typing import Any
 
+from ..ir.pieces import PRUNER
 from .codec import to_json
-from .manifest import PRUNER, Manifest
+from .manifest import Manifest
 from .strict_json import dump_compact
 
 

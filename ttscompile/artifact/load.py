@@ -19,8 +19,8 @@ from ..core.lattice import PlanArray, Source, check_plan, dense_plan
 from ..core.spec import FP32
 from ..errors import ArtifactError, IllegalPlanError
 from ..ir.graph import Graph
-from ..ir.pieces import block_name
-from ..ir.program import Binding, Block, Pieces, Program
+from ..ir.pieces import CONDITION, PRUNER, STEM, STEP, TAIL, LoopPiece, block_name
+from ..ir.program import Binding, Pieces
 from ..ir.serialize import graph_from_json
 from ..measure.versions import release
 from .archive import Unpacked, is_checkpoint, unpack
@@ -30,7 +30,7 @@ from .identity import identities
 from .manifest import DENSE, MANIFEST, Manifest, Requires, abbreviated
 from .onnx_files import check_model
 from .size import check_size
-from .strict_json import REMEDY, parse
+from .strict_json import REMEDY, Value, parse
 
 TABLE_PREFIX = "table/"
 CORRECTION_PREFIX = "correction/"
@@ -97,20 +97,23 @@ class Artifact:
         return self.schedules[name]
 
     @cached_property
+    def _document(self) -> Value:
+        path = self.path / self.manifest.stores.program
+        try:
+            content = path.read_bytes()
+        except OSError as error:
+            raise ArtifactError(f"{path}: cannot be read: {error}. {REMEDY}") from error
+        return parse(content, path.name)
+
+    @cached_property
     def graphs(self) -> Mapping[str, Graph]:
         """Graphs of all pieces: ``condition``, ``step``, ``pruner``, ``stem``, ``block_00``..., ``tail``.
 
         Raises:
             ArtifactError: ``program.json`` is not valid, or asks for a constant that the artifact lacks.
         """
-        path = self.path / self.manifest.stores.program
-        try:
-            content = path.read_bytes()
-        except OSError as error:
-            raise ArtifactError(f"{path}: cannot be read: {error}. {REMEDY}") from error
-        members = parse(content, path.name).keys("graphs")["graphs"].members()
         graphs = {}
-        for name, value in members.items():
+        for name, value in self._document.keys("graphs", "streams")["graphs"].members().items():
             try:
                 graphs[name] = graph_from_json(value.data)
             except ArtifactError as error:
@@ -128,48 +131,31 @@ class Artifact:
             raise ArtifactError(f"{self.path}: has no graph {name!r}; it has {list(self.graphs)}. {REMEDY}")
         return self.graphs[name]
 
-    def program(self) -> Program:
-        """The program as the reference runtime takes it.
-
-        The captured denoiser is not kept in an artifact: its graph is empty here, and blocks name no values of it.
+    @cached_property
+    def pieces(self) -> Pieces:
+        """The pieces as the reference runtime executes them.
 
         Raises:
             ArtifactError: see ``graphs``.
         """
-        manifest = self.manifest
-        pieces = Pieces(
-            condition=self.graph("condition"),
-            step=self.graphs.get("step"),
-            stem=self.graph("stem"),
-            blocks=tuple(self.graph(block_name(i)) for i in range(len(manifest.blocks))),
-            tail=self.graph("tail"),
-            pruner=self.graphs.get("pruner"),
+        streams = self._document.keys("graphs", "streams")["streams"].members()
+
+        def inside(name: str) -> LoopPiece:
+            graph = self.graph(name)
+            if name not in streams:
+                raise ArtifactError(f"{self.path}: has no stream of {name!r}; it has {list(streams)}. {REMEDY}")
+            return LoopPiece(graph, streams[name].text(*graph.inputs))
+
+        return Pieces(
+            stem=inside(STEM),
+            blocks=tuple(inside(block_name(b)) for b in range(len(self.manifest.blocks))),
+            tail=inside(TAIL),
+            condition=self.graph(CONDITION),
+            step=self.graphs.get(STEP),
+            pruner=self.graphs.get(PRUNER),
             tables=self.tables,
-            bindings={name: context.binding for name, context in manifest.contexts.items()},
-            features=manifest.features,
-        )
-        blocks = tuple(
-            Block(
-                i,
-                b.kind,
-                stream="",
-                result="",
-                residual=None,
-                type=b.type,
-                group=b.group,
-                flops=b.flops,
-                reason=b.reason,
-            )
-            for i, b in enumerate(manifest.blocks)
-        )
-        return Program(
-            spec=manifest.spec,
-            denoiser=Graph(inputs={}, constants={}, nodes=(), outputs=()),
-            weights={**self.weights, **self.pruner},
-            blocks=blocks,
-            pieces=pieces,
-            reuse=manifest.reuse,
-            dense_flops=manifest.flops.dense,
+            bindings={name: context.binding for name, context in self.manifest.contexts.items()},
+            features=self.manifest.features,
         )
 
     def _check_constants(self, graph: Graph, where: str) -> None:
@@ -308,7 +294,7 @@ def _check_tables(artifact: Artifact) -> None:
 
 def _check_schedules(artifact: Artifact) -> None:
     manifest = artifact.manifest
-    names = {name for name, plan in manifest.plans.items() if plan.kind == "schedule"}
+    names = {name for name, plan in manifest.plans.items() if not plan.pruned}
     where = artifact.path / (manifest.stores.plans or MANIFEST)
     if names != set(artifact.schedules):
         raise ArtifactError(

@@ -14,16 +14,14 @@ from ..core.lattice import PlanArray, plan_flops
 from ..core.rules import NotNegative, Positive, Rule, Sha256, Share
 from ..core.spec import FP32, PolicySpec
 from ..ir.graph import TensorType
-from ..ir.joint import OF_ALL_BLOCKS
-from ..ir.program import Binding, Reuse
+from ..ir.pieces import OF_ALL_BLOCKS, PRUNER
+from ..ir.program import Binding
 
 FORMAT = "ttscompile artifact"
 SCHEMA_VERSION = 4
 MANIFEST = "manifest.json"
 DENSE = "dense"
 """The plan that computes every cell; every artifact has it without listing it."""
-PRUNER = "pruner"
-"""The pruner's piece, and the plan that it makes where that is not called otherwise."""
 UNIFORM = "uniform"
 """The plan that calibration adds for comparisons alone: as many steps computed, evenly spaced. Not for a robot."""
 
@@ -135,7 +133,8 @@ class PlanRecord:
     """A plan that ``predict_action(plan=name)`` knows.
 
     Attributes:
-        kind: ``schedule`` (in ``Artifact.schedules``) or ``pruner`` (made for each observation).
+        kind: ``schedule`` (in ``Artifact.schedules``) or ``pruner`` (made for each observation; also the name of such a
+            plan where it is not called otherwise).
         sparsity: share of reused cells; of a pruner the measured mean, None if it was not measured.
         flops_sparsity: the same with each cell weighed by its FLOPs.
     """
@@ -143,6 +142,11 @@ class PlanRecord:
     kind: Literal["schedule", "pruner"]
     sparsity: Share | None
     flops_sparsity: Share | None
+
+    @property
+    def pruned(self) -> bool:
+        """Whether the pruner makes it."""
+        return self.kind == PRUNER
 
 
 @dataclass(frozen=True)
@@ -239,7 +243,6 @@ class Manifest:
         model_identity: the same without plans and pruner weights: what a calibration belongs to.
         spec: the policy beside its network.
         blocks: block table, in order of execution.
-        reuse: reuse branch of each block.
         pieces: ONNX graphs: ``condition``, ``step``, ``pruner``, ``stem``, ``advance``, ``block_00``...; those that the
             policy has; and ``blocks``, all of its blocks in one (``ir.joint``).
         contexts: binding and type of every context.
@@ -260,7 +263,6 @@ class Manifest:
     model_identity: Sha256
     spec: PolicySpec
     blocks: tuple[BlockRecord, ...]
-    reuse: tuple[Reuse, ...]
     pieces: Mapping[str, PieceRecord]
     contexts: Mapping[str, ContextRecord]
     features: tuple[str, ...]

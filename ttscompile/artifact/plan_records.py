@@ -11,8 +11,9 @@ import numpy.typing as npt
 
 from ..core.lattice import plan_flops, sparsity
 from ..errors import ArtifactError
+from ..ir.pieces import PRUNER
 from .load import check_schedule
-from .manifest import DENSE, PRUNER, Manifest, PlanRecord
+from .manifest import DENSE, Manifest, PlanRecord
 from .strict_json import Value, dump_compact, parse
 
 _PLAN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.%-]{0,63}")
@@ -53,7 +54,7 @@ def plan_records(
         name = PRUNER if default_plan in {DENSE, *plans} else default_plan
         if name in plans or _PLAN_NAME.fullmatch(name) is None:
             raise ArtifactError(f"the pruner's plan cannot be called {name!r}. Give the schedule another name.")
-        plans[name] = PlanRecord("pruner", _share(record, "sparsity"), _share(record, "flops_sparsity"))
+        plans[name] = PlanRecord(PRUNER, _share(record, "sparsity"), _share(record, "flops_sparsity"))
     if default_plan not in {DENSE, *plans}:
         raise ArtifactError(f"default plan {default_plan!r}: expected one of {[DENSE, *plans]}.")
     return plans

@@ -3,20 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy.typing as npt
 
-from ..core.spec import SamplerTable
 from ..core.update import update_flops
 from ..errors import ArtifactError
-from ..ir.advance import outputs, own_inputs
 from ..ir.flops import graph_flops
 from ..ir.graph import Graph, TensorType
-from ..ir.idle import IDLE, TOTAL
-from ..ir.idle import OUTPUTS as IDLE_OUTPUTS
-from ..ir.joint import CONTEXT, DENSE_STEP, JOINT, OF_ALL_BLOCKS, RESIDUAL, STREAM, dense_step_outputs, join
-from ..ir.pieces import block_name
+from ..ir.joint import join
+from ..ir.pieces import (
+    ADVANCE,
+    CONDITION,
+    CONTEXT,
+    DENSE_STEP,
+    IDLE,
+    IDLE_OUTPUTS,
+    JOINT,
+    PRUNER,
+    RESIDUAL,
+    STEM,
+    STEP,
+    STREAM,
+    TAIL,
+    TOTAL,
+    advance_context,
+    advance_inputs,
+    advance_outputs,
+    dense_step_outputs,
+)
 from ..ir.program import Binding, Pieces, Program
 from .manifest import BlockRecord, ContextRecord, FlopsRecord, PieceRecord, Requires
 
@@ -29,19 +45,6 @@ MAX_OPSET, MAX_IR = 23, 11
 
 PRUNER_PREFIX = "pruner."
 _REPORT = "This is an error in ttscompile; please report it."
-
-
-def piece_graphs(program: Program) -> dict[str, Graph]:
-    """Graphs of all pieces by name: ``condition``, ``step``, ``pruner``, ``stem``, ``block_00``..., ``tail``.
-
-    Raises:
-        ArtifactError: the passes have not run.
-    """
-    pieces = _pieces(program)
-    graphs = {"condition": pieces.condition, "step": pieces.step, "pruner": pieces.pruner, "stem": pieces.stem}
-    graphs.update({block_name(i): graph for i, graph in enumerate(pieces.blocks)})
-    graphs["tail"] = pieces.tail
-    return {name: graph for name, graph in graphs.items() if graph is not None}
 
 
 def constants(program: Program, graphs: Mapping[str, Graph]) -> dict[str, npt.NDArray[Any]]:
@@ -67,7 +70,7 @@ def block_records(program: Program) -> tuple[BlockRecord, ...]:
     Raises:
         ArtifactError: table and pieces differ in number.
     """
-    graphs = _pieces(program).blocks
+    graphs = [piece.graph for piece in program.pieces.blocks]
     if len(graphs) != len(program.blocks):
         raise ArtifactError(f"the program has {len(program.blocks)} blocks and {len(graphs)} block graphs. {_REPORT}")
     return tuple(
@@ -78,30 +81,32 @@ def block_records(program: Program) -> tuple[BlockRecord, ...]:
 
 def flops_record(program: Program) -> FlopsRecord:
     """FLOPs of one call's parts for one stream."""
-    pieces = _pieces(program)
+    pieces = program.pieces
     step = 0 if pieces.step is None else graph_flops(pieces.step) * program.spec.sampler.steps
     return FlopsRecord(
         dense=program.dense_flops,
         prologue=graph_flops(pieces.condition) + step,
         pruner=0 if pieces.pruner is None else graph_flops(pieces.pruner),
-        stem=graph_flops(pieces.stem),
-        tail=graph_flops(pieces.tail) + update_flops(program.spec.sampler, program.spec.sample),
-        blocks=tuple(map(graph_flops, pieces.blocks)),
+        stem=graph_flops(pieces.stem.graph),
+        tail=graph_flops(pieces.tail.graph) + update_flops(program.spec.sampler, program.spec.sample),
+        blocks=tuple(graph_flops(piece.graph) for piece in pieces.blocks),
     )
 
 
-def context_records(program: Program, graphs: Mapping[str, Graph]) -> dict[str, ContextRecord]:
+def context_records(program: Program) -> dict[str, ContextRecord]:
     """Binding and type of every context, in order of first use.
 
     Raises:
         ArtifactError: a context without binding, value or table, or of two types.
     """
-    pieces = _pieces(program)
+    pieces = program.pieces
+    readers = {name: piece.contexts for name, piece in pieces.loop.items()}
+    if pieces.step is not None:
+        readers = {STEP: dict(pieces.step.inputs), **readers}
     records: dict[str, ContextRecord] = {}
-    for piece, graph in graphs.items():
-        for name in _contexts(piece, graph):
-            kind, binding = graph.inputs[name], pieces.bindings.get(name)
-            known = records.get(name)
+    for piece, contexts in readers.items():
+        for name, kind in contexts.items():
+            binding, known = pieces.bindings.get(name), records.get(name)
             if known is not None and known.type != kind:
                 raise ArtifactError(f"{piece}: context {name!r} is {kind} here and {known.type} elsewhere. {_REPORT}")
             if binding is None or not _available(name, binding, kind, pieces, program.spec.sampler.steps):
@@ -114,42 +119,34 @@ def context_records(program: Program, graphs: Mapping[str, Graph]) -> dict[str, 
 
 
 def piece_records(
-    graphs: Mapping[str, Graph], models: Mapping[str, ModelProto], files: Mapping[str, str], sampler: SamplerTable
+    program: Program, models: Mapping[str, ModelProto], files: Mapping[str, str]
 ) -> dict[str, PieceRecord]:
     """One record an ONNX model.
 
     Args:
-        graphs: see ``piece_graphs``.
-        models: from ``lower_program``: the same names, but ``advance`` in place of ``tail``, ``blocks``,
+        program: in its pieces.
+        models: from ``lower_program``: of the same names, but ``advance`` in place of ``tail``, ``blocks``,
             ``dense_step``, and perhaps ``idle``.
         files: file name of each model.
-        sampler: of the policy.
 
     Raises:
-        ArtifactError: models and graphs do not have the same names, inputs or outputs.
+        ArtifactError: models and pieces do not have the same names, inputs or outputs.
     """
-    expected = [*(name for name in graphs if name != "tail"), "advance", *OF_ALL_BLOCKS, *[IDLE] * (IDLE in models)]
+    expected = {name: one for name, one in _interfaces(program).items() if name != IDLE or IDLE in models}
     if set(models) != set(expected):
         raise ArtifactError(f"expected the ONNX models {sorted(expected)}; found {sorted(models)}. {_REPORT}")
     records = {}
-    for name in expected:
+    for name, wanted in expected.items():
         model = models[name].graph
         initialized = {tensor.name for tensor in model.initializer}
         inputs = tuple(value.name for value in model.input if value.name not in initialized)
         results = tuple(value.name for value in model.output)
-        wanted = _interface(name, graphs, sampler)
-        if (set(inputs), results) != (set(wanted[0]), wanted[1]):
+        if (set(inputs), results) != (set(wanted.inputs), wanted.outputs):
             raise ArtifactError(
-                f"ONNX model {name!r}: expected inputs {list(wanted[0])} and outputs {list(wanted[1])}; found"
+                f"ONNX model {name!r}: expected inputs {list(wanted.inputs)} and outputs {list(wanted.outputs)}; found"
                 f" {list(inputs)} and {list(results)}. {_REPORT}"
             )
-        records[name] = PieceRecord(
-            file=files[name],
-            inputs=inputs,
-            stream=_stream(name, graphs),
-            contexts=_all_contexts(name, graphs),
-            outputs=results,
-        )
+        records[name] = replace(wanted, file=files[name], inputs=inputs)
     return records
 
 
@@ -169,54 +166,34 @@ def requirements(models: Mapping[str, ModelProto]) -> Requires:
     return Requires(onnxruntime=ONNXRUNTIME, opset=opset)
 
 
-def _pieces(program: Program) -> Pieces:
-    if program.pieces is None:
-        raise ArtifactError(
-            "the program has no pieces. Run the passes on it before writing (ttscompile.compile_denoiser)."
-        )
-    return program.pieces
+def _interfaces(program: Program) -> dict[str, PieceRecord]:
+    """What the model of each piece reads and gives; without its file."""
+    pieces, sampler = program.pieces, program.spec.sampler
 
+    def record(
+        inputs: Iterable[str], outputs: tuple[str, ...], stream: str | None = None, contexts: Iterable[str] = ()
+    ) -> PieceRecord:
+        return PieceRecord("", tuple(inputs), stream, tuple(dict.fromkeys(contexts)), outputs)
 
-def _contexts(piece: str, graph: Graph) -> tuple[str, ...]:
-    """Inputs that are contexts: all of ``step``, all but the first of a loop piece, none of what runs before."""
-    if piece in ("condition", "pruner"):
-        return ()
-    return tuple(graph.inputs) if piece == "step" else tuple(graph.inputs)[1:]
-
-
-def _all_contexts(name: str, graphs: Mapping[str, Graph]) -> tuple[str, ...]:
-    parts: Iterable[str] = (name,)
-    if name in ("advance", JOINT, IDLE, DENSE_STEP):
-        parts = {"advance": ("tail", "stem"), DENSE_STEP: filter(_is_block, graphs)}.get(name, ())
-    return tuple(dict.fromkeys(context for part in parts for context in _contexts(part, graphs[part])))
-
-
-def _stream(name: str, graphs: Mapping[str, Graph]) -> str | None:
-    if name in ("advance", *OF_ALL_BLOCKS):
-        return STREAM
-    return None if name in ("condition", "step", "pruner", IDLE) else next(iter(graphs[name].inputs))
-
-
-def _interface(
-    name: str, graphs: Mapping[str, Graph], sampler: SamplerTable
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    if name == JOINT:
-        return join([tuple(graphs[block].inputs.values())[1:] for block in filter(_is_block, graphs)]).inputs, (
-            RESIDUAL,
-        )
-    if name == DENSE_STEP:
-        contexts = [CONTEXT + context for context in _all_contexts(name, graphs)]
-        return (STREAM, *contexts), dense_step_outputs(sum(map(_is_block, graphs)))
-    if name == IDLE:
-        return (TOTAL,), IDLE_OUTPUTS
-    if name != "advance":
-        return tuple(graphs[name].inputs), graphs[name].outputs
-    contexts = [f"{part}.{context}" for part in ("tail", "stem") for context in _contexts(part, graphs[part])]
-    return (*own_inputs(sampler), *contexts), outputs(sampler)
-
-
-def _is_block(piece: str) -> bool:
-    return piece.startswith("block_")
+    condition, step, pruner, tail, stem = pieces.condition, pieces.step, pieces.pruner, pieces.tail, pieces.stem
+    found = {CONDITION: record(condition.inputs, condition.outputs)}
+    if step is not None:
+        found[STEP] = record(step.inputs, step.outputs, contexts=step.inputs)
+    if pruner is not None:
+        found[PRUNER] = record(pruner.inputs, pruner.outputs)
+    for name, piece in pieces.loop.items():
+        if piece is not tail:
+            found[name] = record(piece.graph.inputs, piece.graph.outputs, piece.stream, piece.contexts)
+    own = [advance_context(name, n) for name, piece in ((TAIL, tail), (STEM, stem)) for n in piece.contexts]
+    around = (*advance_inputs(sampler), *own)
+    found[ADVANCE] = record(around, advance_outputs(sampler), STREAM, (*tail.contexts, *stem.contexts))
+    joint = join([tuple(piece.contexts.values()) for piece in pieces.blocks])
+    found[JOINT] = record(joint.inputs, (RESIDUAL,), STREAM)
+    read = dict.fromkeys(name for piece in pieces.blocks for name in piece.contexts)
+    whole = (STREAM, *(CONTEXT + name for name in read))
+    found[DENSE_STEP] = record(whole, dense_step_outputs(len(pieces.blocks)), STREAM, read)
+    found[IDLE] = record((TOTAL,), IDLE_OUTPUTS)
+    return found
 
 
 def _available(name: str, binding: Binding, kind: TensorType, pieces: Pieces, steps: int) -> bool:

@@ -49,9 +49,7 @@ def _bytes(manifest: Manifest) -> Iterator[int]:
     for context in manifest.contexts.values():
         yield _nbytes(context.type) * (1 if context.binding is Binding.CONDITION else steps)
     for block in manifest.blocks:
-        yield 3 * _nbytes(block.type)
-    for reuse in manifest.reuse:
-        yield _nbytes(reuse.type)
+        yield 4 * _nbytes(block.type)
 
 
 def _nbytes(kind: TensorType) -> int:

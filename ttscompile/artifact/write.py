@@ -17,6 +17,7 @@ import numpy.typing as npt
 from ..artifact import tensors
 from ..core.correction import Correction
 from ..errors import ArtifactError
+from ..ir.pieces import PRUNER
 from ..ir.program import Binding, Program
 from ..ir.serialize import graph_to_json
 from ..measure.versions import VERSION
@@ -43,7 +44,7 @@ from .load import (
     load_artifact,
     read_manifest,
 )
-from .manifest import DENSE, FORMAT, MANIFEST, PRUNER, SCHEMA_VERSION, Manifest, Stores, abbreviated
+from .manifest import DENSE, FORMAT, MANIFEST, SCHEMA_VERSION, Manifest, Stores, abbreviated
 from .plan_records import calibration_record, plan_records
 from .precision import LoweredBlocks, store_blocks
 from .records import (
@@ -52,7 +53,6 @@ from .records import (
     constants,
     context_records,
     flops_record,
-    piece_graphs,
     piece_records,
     requirements,
 )
@@ -199,16 +199,15 @@ def _fill(
     golden: Golden | None,
 ) -> Manifest:
     """Write all files of a new artifact into an empty folder."""
-    graphs = piece_graphs(program)
+    graphs = program.pieces.graphs()
     values = constants(program, graphs)
-    contexts = context_records(program, graphs)
+    contexts = context_records(program)
     requires = requirements(models)
     files = {name: f"{name}.onnx" for name in models}
 
-    pieces_tables = {} if program.pieces is None else program.pieces.tables
     pruner = {name: value for name, value in values.items() if name.startswith(PRUNER_PREFIX)}
     stored = {name: value for name, value in values.items() if name not in pruner}
-    tables = {TABLE_PREFIX + n: pieces_tables[n] for n, c in contexts.items() if c.binding is Binding.TABLE}
+    tables = {TABLE_PREFIX + n: program.pieces.tables[n] for n, c in contexts.items() if c.binding is Binding.TABLE}
     write_synced(folder / WEIGHTS, tensors.serialize({**stored, **tables}))
     places = _places(folder / WEIGHTS, stored)
     pruner_file = None
@@ -218,13 +217,16 @@ def _fill(
         write_synced(folder / pruner_file, content)
         places.update(_places(folder / pruner_file, pruner))
 
-    pieces = piece_records(graphs, models, files, program.spec.sampler)
+    pieces = piece_records(program, models, files)
     for name in pieces:
         write_synced(folder / files[name], bind(models[name], places, name).SerializeToString(deterministic=True))
     precision = None if blocks is None else store_blocks(folder, blocks, pieces, places)
     if golden is not None:
         write_synced(folder / GOLDEN, tensors.serialize(golden.arrays()))
-    document = {"graphs": {name: graph_to_json(graph) for name, graph in graphs.items()}}
+    document = {
+        "graphs": {name: graph_to_json(graph) for name, graph in graphs.items()},
+        "streams": {name: piece.stream for name, piece in program.pieces.loop.items()},
+    }
     write_synced(folder / PROGRAM, dump_compact(document))
 
     manifest = _identified(
@@ -235,10 +237,9 @@ def _fill(
             model_identity="",
             spec=program.spec,
             blocks=block_records(program),
-            reuse=program.reuse,
             pieces=pieces,
             contexts=contexts,
-            features=() if program.pieces is None else program.pieces.features,
+            features=program.pieces.features,
             flops=flops_record(program),
             plans={},
             default_plan=DENSE,

@@ -47,11 +47,12 @@ class Executor:
     def __init__(self, artifact: Artifact) -> None:
         blocks = artifact.manifest.blocks
         self.model = ReferenceModel.from_artifact(artifact)
-        self.selector = Selector(graph for name, graph in artifact.graphs.items() if name in ("condition", "step"))
+        pieces = artifact.pieces
+        self.selector = Selector(graph for graph in (pieces.condition, pieces.step) if graph is not None)
         self.types = [block.type for block in blocks]
         self.axes = [block.type.batch_axis or 0 for block in blocks]
         self.alike = len({block.type for block in blocks}) == 1
-        self.pruner_graph = artifact.graphs.get("pruner")
+        self.pruner_graph = pieces.pruner
         self.correction: Correction | None = None
         self._dense = dense_plan(self.model.steps, self.model.blocks)[None]
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ..artifact.load import Artifact
-from ..artifact.manifest import PRUNER, UNIFORM, Manifest
+from ..artifact.manifest import UNIFORM, Manifest
 from ..core.lattice import PlanArray, uniform_plan
 from ..errors import CalibrationFailedError
+from ..ir.pieces import PRUNER
 from ..runtimes.settle import pruner_plan
 from .budget import ERROR, FLOPS, Goal
 from .calls import LARGEST, Actions, Calls, FloatArray

@@ -14,11 +14,12 @@ import numpy as np
 
 from ..artifact.ceiling import few_steps, usual_sparsity
 from ..artifact.load import Artifact, load_artifact
-from ..artifact.manifest import PRUNER, UNIFORM
+from ..artifact.manifest import UNIFORM
 from ..artifact.write import update_calibration
 from ..core.correction import FEATURES
 from ..core.lattice import sparsity
 from ..errors import CalibrationError
+from ..ir.pieces import PRUNER
 from ..trajectories.episodes import Episode
 from ..verification.record_golden import record_plans
 from .budget import ERROR, LATENCY, Budget, Goal, cells_of, goal_of

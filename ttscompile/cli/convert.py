@@ -65,8 +65,7 @@ from ttscompile.report.summary import document
     type=click.Choice(PRECISIONS),
     default=FP32,
     show_default=True,
-    help="Of the weights of residual blocks. int8 is faster on processors with VNNI; its error is measured and shown."
-    " bf16 is refused: onnxruntime's CPU provider multiplies no bfloat16 matrices.",
+    help="Of the weights of residual blocks. int8 is faster on processors with VNNI; its error is measured and shown.",
 )
 @click.option(
     "--single-file",

@@ -17,8 +17,8 @@ from .rules import DType, Positive
 
 FloatArray = npt.NDArray[np.float32]
 
-FP32, BF16, INT8 = "fp32", "bf16", "int8"
-PRECISIONS = (FP32, BF16, INT8)
+FP32, INT8 = "fp32", "int8"
+PRECISIONS = (FP32, INT8)
 """Names of what the weights of residual blocks can be asked for in."""
 
 

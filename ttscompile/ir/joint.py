@@ -19,24 +19,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from .graph import TensorType
-
-JOINT = "blocks"
-"""Name of the piece."""
-
-STREAM, RESIDUAL = "stream", "residual"
-
-DENSE_STEP = "dense_step"
-"""Name of the piece of whole steps. Its inputs are ``stream`` and the contexts of all blocks, as ``context.NAME``."""
-
-STREAM_NEXT, CONTEXT = "stream_next", "context."
-
-OF_ALL_BLOCKS = (JOINT, DENSE_STEP)
-"""Pieces that hold all blocks once more."""
-
-
-def dense_step_outputs(blocks: int) -> tuple[str, ...]:
-    """The stream after the last block, and what each of them added."""
-    return (STREAM_NEXT, *(f"{RESIDUAL}.{b:02d}" for b in range(blocks)))
+from .pieces import STREAM
 
 
 @dataclass(frozen=True)

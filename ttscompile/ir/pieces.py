@@ -1,16 +1,26 @@
 """Names and interfaces of the pieces that a compiled denoiser is cut into.
 
 A piece is a graph that runs as a whole. Its name is the key of its graph in a program, of its ONNX model, of its record
-in the manifest and of its session.
+in the manifest and of its session. Values between pieces have the names that they have in the captured denoiser;
+inputs and outputs that no denoiser has are named here.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from ..core.spec import SamplerTable
+from .graph import Graph, TensorType
 
 CONDITION = "condition"
 """Observations -> condition values, once a call."""
 
 STEP = "step"
 """Condition values and table rows -> step values, for all K steps in one batch."""
+
+PRUNER: Final = "pruner"
+"""Condition values -> logits of the plan, once a call."""
 
 STEM = "stem"
 """Sample -> residual stream."""
@@ -19,12 +29,100 @@ TAIL = "tail"
 """Residual stream -> prediction."""
 
 ADVANCE = "advance"
-"""Tail, sampler update and the next step's stem in one."""
+"""Tail, sampler update and the next step's stem in one (``lower.advance``)."""
 
-PRUNER = "pruner"
-"""Condition values -> logits of the plan."""
+JOINT = "blocks"
+"""Any one of the blocks, chosen at each run (``ir.joint``)."""
+
+DENSE_STEP = "dense_step"
+"""All blocks, one after the other (``ir.joint``)."""
+
+IDLE = "idle"
+"""What steps need of the sum that they add where they compute no block (``lower.idle``); not every network has it."""
+
+OF_ALL_BLOCKS = (JOINT, DENSE_STEP)
+"""Pieces that hold all blocks once more."""
+
+_BLOCK = "block_"
 
 
 def block_name(index: int) -> str:
     """``block_07``: the piece of one residual block."""
-    return f"block_{index:02d}"
+    return f"{_BLOCK}{index:02d}"
+
+
+def is_block(piece: str) -> bool:
+    """Whether a piece is a residual block."""
+    return piece.startswith(_BLOCK)
+
+
+# Values that several pieces of the loop have.
+STREAM, STREAM_NEXT, RESIDUAL = "stream", "stream_next", "residual"
+
+# ``advance``: what is carried from a step to the next comes in pairs NAME and NAME_next.
+SAMPLE, SAMPLE_NEXT = "sample", "sample_next"
+MEMORY, MEMORY_NEXT = "memory", "memory_next"
+OFFSET, HISTORY, UPDATE, PREDICTION = "offset", "history", "update", "prediction"
+X0_COLUMNS = ("sample_to_x0", "out_to_x0")
+"""Columns of the sampler's table that are inputs of their own."""
+
+
+def advance_inputs(sampler: SamplerTable) -> tuple[str, ...]:
+    """Inputs of ``advance`` that are no contexts, in order."""
+    return (STREAM, SAMPLE, OFFSET, HISTORY, UPDATE, *X0_COLUMNS, *[MEMORY] * bool(sampler.memories))
+
+
+def advance_outputs(sampler: SamplerTable) -> tuple[str, ...]:
+    """Outputs of ``advance``, in order."""
+    return (SAMPLE_NEXT, STREAM_NEXT, PREDICTION, *[MEMORY_NEXT] * bool(sampler.memories))
+
+
+def advance_context(piece: str, name: str) -> str:
+    """The input of ``advance`` for a context of its tail or its stem: ``tail.NAME``."""
+    return f"{piece}.{name}"
+
+
+CONTEXT = "context."
+"""Before the name of a context it is the name of an input of ``dense_step``."""
+
+
+def dense_step_outputs(blocks: int) -> tuple[str, ...]:
+    """Outputs of ``dense_step``: the stream after the last block, and what each of them added."""
+    return (STREAM_NEXT, *(f"{RESIDUAL}.{b:02d}" for b in range(blocks)))
+
+
+TOTAL = "total"
+"""Input of ``idle``: the sum of a step's residuals, of the type of the residual stream."""
+
+BASE, PRODUCT, SHIFT = "base", "product", "shift"
+IDLE_OUTPUTS = (BASE, PRODUCT, SHIFT)
+"""``base [2 D + 1, B, T]``, what is added to ``product [2 D + 1, D] @ x``: rows of y, then those of the numerator; and
+``shift [D, 1, T]``, what is added to the quotient. The last two depend on nothing. ``lower.idle`` says what y is."""
+
+
+@dataclass(frozen=True)
+class LoopPiece:
+    """A piece that runs at every step: stem, a block, or tail.
+
+    Attributes:
+        graph: of one output.
+        stream: the input that carries the sample (of the stem) or the residual stream; the others are contexts.
+    """
+
+    graph: Graph
+    stream: str
+
+    @property
+    def type(self) -> TensorType:
+        """Of the stream that flows in."""
+        return self.graph.inputs[self.stream]
+
+    @property
+    def contexts(self) -> dict[str, TensorType]:
+        """Name and type of the values that it reads beside the stream, in order."""
+        return {name: type_ for name, type_ in self.graph.inputs.items() if name != self.stream}
+
+    @property
+    def result(self) -> str:
+        """Name of the output."""
+        return self.graph.outputs[0]

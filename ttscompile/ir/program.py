@@ -1,17 +1,21 @@
-"""The program that the passes rewrite: a denoiser, and step by step the pieces it becomes."""
+"""What a policy is between the passes: captured, cut into pieces, and hoisted. Each phase is a record of its own."""
 
 from __future__ import annotations
 
 import enum
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from ..core.spec import PolicySpec
 from .graph import Graph, TensorType
+from .pieces import CONDITION, PRUNER, STEM, STEP, TAIL, LoopPiece, block_name
+
+DENOISER, PROLOGUE = "denoiser", "prologue"
+"""Graphs that are no pieces: one whole evaluation; and what it does before it reads the sample, until it is hoisted."""
 
 
 class Binding(enum.Enum):
@@ -36,7 +40,6 @@ class Block:
         residual: value that is added; None for a coarse block, whose residual is ``result - stream``.
         type: of stream, residual and result.
         group: number of its FORWARD group: blocks of one kind and one shape.
-        flops: of one evaluation for one stream, after hoisting.
         reason: why it is coarse; empty for a plain residual.
     """
 
@@ -47,70 +50,151 @@ class Block:
     residual: str | None
     type: TensorType
     group: int
-    flops: int = 0
     reason: str = ""
 
 
 @dataclass(frozen=True)
-class Reuse:
-    """The reuse branch of one block: where its residual may be cached and read.
+class Loop:
+    """The pieces that run at every step. What they read beside the stream are contexts.
 
     Attributes:
-        type: of the cached residual.
-        forward: number of the ``forward[group]`` cache that it writes, and reads when FORWARD.
-        forward_blocks: blocks whose residuals that cache can hold.
-    """
-
-    type: TensorType
-    forward: int
-    forward_blocks: tuple[int, ...]
-
-
-@dataclass(frozen=True)
-class Pieces:
-    """The denoiser cut up. ``contexts`` of a loop piece are its inputs beside sample or stream.
-
-    Attributes:
-        condition: observations -> condition values, once a call. Before ``hoist`` it holds the whole prologue.
-        step: condition values and table rows -> step values; run with a batch of K*B, step-major.
         stem: sample -> residual stream.
         blocks: residual stream -> residual.
         tail: residual stream -> prediction.
-        pruner: condition values -> logits ``[B, K, blocks, 4]``; None before ``insert_pruner``.
+    """
+
+    stem: LoopPiece
+    blocks: tuple[LoopPiece, ...]
+    tail: LoopPiece
+
+    @property
+    def loop(self) -> dict[str, LoopPiece]:
+        """Stem, blocks and tail by name, in the order of execution."""
+        return {STEM: self.stem, **{block_name(b): piece for b, piece in enumerate(self.blocks)}, TAIL: self.tail}
+
+    @property
+    def contexts(self) -> tuple[str, ...]:
+        """Names of all contexts, in the order of first use."""
+        return tuple(dict.fromkeys(name for piece in self.loop.values() for name in piece.contexts))
+
+    def graphs(self) -> dict[str, Graph]:
+        """Every graph by name."""
+        return {name: piece.graph for name, piece in self.loop.items()}
+
+    def mapped(self, function: Callable[[Graph], Graph]) -> Self:
+        """With another graph in place of every one; inputs that carry the stream keep their names."""
+
+        def inside(piece: LoopPiece) -> LoopPiece:
+            return replace(piece, graph=function(piece.graph))
+
+        return replace(self, stem=inside(self.stem), blocks=tuple(map(inside, self.blocks)), tail=inside(self.tail))
+
+
+@dataclass(frozen=True)
+class Pieces(Loop):
+    """All pieces of a hoisted program.
+
+    Attributes:
+        condition: observations -> condition values, once a call.
+        step: condition values and table rows -> step values; run with a batch of K*B, step-major. None if there are
+            no step values.
+        pruner: condition values -> logits ``[B, K, blocks, 4]``; None before ``InsertPruner``.
         tables: value of each TABLE context for every step, ``[K, ...]`` with a batch of one in its batch axis.
         bindings: binding of every context of the loop pieces and of ``step``.
         features: condition values that the pruner reads.
     """
 
     condition: Graph
-    step: Graph | None
-    stem: Graph
-    blocks: tuple[Graph, ...]
-    tail: Graph
+    step: Graph | None = None
     pruner: Graph | None = None
     tables: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
     bindings: Mapping[str, Binding] = field(default_factory=dict)
     features: tuple[str, ...] = ()
 
+    def graphs(self) -> dict[str, Graph]:
+        """Every graph by the name of its piece."""
+        once = {CONDITION: self.condition, STEP: self.step, PRUNER: self.pruner}
+        return {**{name: graph for name, graph in once.items() if graph is not None}, **super().graphs()}
+
+    def mapped(self, function: Callable[[Graph], Graph]) -> Self:
+        """With another graph in place of every one; inputs that carry the stream keep their names."""
+        return replace(
+            super().mapped(function),
+            condition=function(self.condition),
+            step=None if self.step is None else function(self.step),
+            pruner=None if self.pruner is None else function(self.pruner),
+        )
+
 
 @dataclass(frozen=True)
-class Program:
-    """What passes take and give.
+class Phase:
+    """What every phase has.
 
     Attributes:
         spec: the policy beside its network.
         denoiser: graph of one evaluation: inputs sample, timestep, observations; output the prediction.
         weights: value of every constant of every graph.
-        blocks: block table; empty before ``find_residual_blocks`` ran.
-        pieces: None before ``partition``.
-        reuse: one a block; empty before ``insert_reuse``.
         dense_flops: of one call of the captured denoiser as it was, K evaluations, one stream.
     """
 
     spec: PolicySpec
     denoiser: Graph
     weights: Mapping[str, npt.NDArray[np.generic]]
-    blocks: tuple[Block, ...] = ()
-    pieces: Pieces | None = None
-    reuse: tuple[Reuse, ...] = ()
-    dense_flops: int = 0
+    dense_flops: int = field(default=0, kw_only=True)
+
+    def graphs(self) -> dict[str, Graph]:
+        """Every graph by name."""
+        return {DENOISER: self.denoiser}
+
+    def mapped(self, function: Callable[[Graph], Graph]) -> Self:
+        """With another graph in place of every one, of the same names of inputs and outputs."""
+        return replace(self, denoiser=function(self.denoiser))
+
+
+@dataclass(frozen=True)
+class Captured(Phase):
+    """The denoiser as capture gives it, in one graph."""
+
+
+@dataclass(frozen=True)
+class Cut(Phase):
+    """The denoiser cut along its residual stream (``Partition``).
+
+    Attributes:
+        blocks: block table.
+        prologue: observations and timestep -> contexts: what the loop reads and does not compute.
+        loop: the pieces that read the sample.
+    """
+
+    blocks: tuple[Block, ...]
+    prologue: Graph
+    loop: Loop
+
+    def graphs(self) -> dict[str, Graph]:
+        """Every graph by name."""
+        return {**super().graphs(), PROLOGUE: self.prologue, **self.loop.graphs()}
+
+    def mapped(self, function: Callable[[Graph], Graph]) -> Self:
+        """With another graph in place of every one, of the same names of inputs and outputs."""
+        return replace(super().mapped(function), prologue=function(self.prologue), loop=self.loop.mapped(function))
+
+
+@dataclass(frozen=True)
+class Program(Phase):
+    """The denoiser in pieces that each run when what they read is known (``Hoist``): what is lowered and executed.
+
+    Attributes:
+        blocks: block table.
+        pieces: the denoiser cut up.
+    """
+
+    blocks: tuple[Block, ...]
+    pieces: Pieces
+
+    def graphs(self) -> dict[str, Graph]:
+        """Every graph by name."""
+        return {**super().graphs(), **self.pieces.graphs()}
+
+    def mapped(self, function: Callable[[Graph], Graph]) -> Self:
+        """With another graph in place of every one, of the same names of inputs and outputs."""
+        return replace(super().mapped(function), pieces=self.pieces.mapped(function))

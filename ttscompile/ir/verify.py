@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterable, Mapping
 
 from ..errors import PassError
-from .graph import Graph, Node
-from .program import Binding, Program
+from .graph import Graph, Node, TensorType
+from .pieces import STEM, STEP, TAIL
+from .program import Binding, Block, Cut, Loop, Phase, Pieces, Program
 
 
 def verify_graph(graph: Graph, what: str) -> None:
@@ -33,7 +34,7 @@ def verify_graph(graph: Graph, what: str) -> None:
             raise PassError(f"{what}: the output %{name} is not defined; {len(graph.nodes)} nodes.")
 
 
-def verify(program: Program) -> None:
+def verify(program: Phase) -> None:
     """Check a whole program: every graph, every weight, and how the pieces fit together.
 
     Raises:
@@ -43,7 +44,7 @@ def verify(program: Program) -> None:
     expected = [spec.sample_argument, spec.timestep_argument, *spec.observations]
     if list(denoiser.inputs) != expected:
         raise PassError(f"denoiser: inputs {list(denoiser.inputs)}; expected {expected}.")
-    for what, graph in graphs(program):
+    for what, graph in program.graphs().items():
         verify_graph(graph, what)
         for name, type_ in graph.constants.items():
             weight = program.weights.get(name)
@@ -52,59 +53,50 @@ def verify(program: Program) -> None:
             if weight.shape != type_.shape or str(weight.dtype) != type_.dtype:
                 found = f"{weight.dtype}{list(weight.shape)}"
                 raise PassError(f"{what}: constant %{name} is {found}; its type says {type_}.")
-    for i, block in enumerate(program.blocks):
+    match program:
+        case Cut(blocks=blocks, loop=loop):
+            _verify_loop(loop, blocks, denoiser.inputs[spec.sample_argument])
+            _verify_contexts(_contexts(loop), program.prologue.outputs)
+        case Program(blocks=blocks, pieces=pieces):
+            _verify_loop(pieces, blocks, denoiser.inputs[spec.sample_argument])
+            _verify_bindings(pieces)
+
+
+def _verify_loop(loop: Loop, blocks: tuple[Block, ...], sample: TensorType) -> None:
+    for i, block in enumerate(blocks):
         if block.index != i:
             raise PassError(f"block table: entry {i} calls itself block {block.index}.")
-    if program.pieces is not None:
-        _verify_pieces(program)
-    if program.reuse and len(program.reuse) != len(program.blocks):
-        raise PassError(f"{len(program.reuse)} reuse branches for {len(program.blocks)} blocks.")
+    if len(loop.blocks) != len(blocks):
+        raise PassError(f"{len(loop.blocks)} block graphs for {len(blocks)} rows of the block table.")
+    stream = blocks[0].type
+    for what, piece in loop.loop.items():
+        flows_in, flows_out = sample if what == STEM else stream, sample if what == TAIL else stream
+        if piece.graph.inputs.get(piece.stream) != flows_in:
+            found = piece.graph.inputs.get(piece.stream)
+            raise PassError(f"{what}: its stream %{piece.stream} is {found}; expected {flows_in}.")
+        given = [piece.graph.types()[output] for output in piece.graph.outputs]
+        if given != [flows_out]:
+            raise PassError(f"{what}: gives {list(map(str, given))}; expected one {flows_out}.")
 
 
-def graphs(program: Program) -> Iterator[tuple[str, Graph]]:
-    """Every graph of a program with its name."""
-    yield "denoiser", program.denoiser
-    pieces = program.pieces
-    if pieces is None:
-        return
-    yield "condition", pieces.condition
-    if pieces.step is not None:
-        yield "step", pieces.step
-    yield "stem", pieces.stem
-    for i, block in enumerate(pieces.blocks):
-        yield f"block {i}", block
-    yield "tail", pieces.tail
-    if pieces.pruner is not None:
-        yield "pruner", pieces.pruner
+def _contexts(loop: Loop) -> dict[str, Iterable[str]]:
+    return {what: piece.contexts for what, piece in loop.loop.items()}
 
 
-def _verify_pieces(program: Program) -> None:
-    pieces = program.pieces
-    assert pieces is not None
-    if len(pieces.blocks) != len(program.blocks):
-        raise PassError(f"{len(pieces.blocks)} block graphs for {len(program.blocks)} rows of the block table.")
-    stream = program.blocks[0].type
-    loop = [("stem", pieces.stem, program.denoiser.inputs[program.spec.sample_argument], stream)]
-    loop += [(f"block {i}", graph, stream, stream) for i, graph in enumerate(pieces.blocks)]
-    loop += [("tail", pieces.tail, stream, program.denoiser.inputs[program.spec.sample_argument])]
-    for what, graph, flows_in, flows_out in loop:
-        first = next(iter(graph.inputs.values()), None)
-        if first != flows_in:
-            raise PassError(f"{what}: its first input is {first}; expected {flows_in}.")
-        if len(graph.outputs) != 1 or graph.types()[graph.outputs[0]] != flows_out:
-            given = [str(graph.types()[o]) for o in graph.outputs]
-            raise PassError(f"{what}: gives {given}; expected one {flows_out}.")
-    provided = {Binding.CONDITION: set(pieces.condition.outputs), Binding.TABLE: set(pieces.tables)}
-    provided[Binding.STEP] = set(pieces.step.outputs) if pieces.step is not None else set()
-    consumers = [(what, list(graph.inputs)[1:]) for what, graph, _, _ in loop]
-    if pieces.step is not None:
-        consumers.append(("step", list(pieces.step.inputs)))
-    for what, contexts in consumers:
+def _verify_contexts(readers: Mapping[str, Iterable[str]], given: Container[str]) -> None:
+    for what, contexts in readers.items():
         for name in contexts:
-            # Before hoist every context comes from the prologue.
-            binding = pieces.bindings.get(name) if pieces.bindings else Binding.CONDITION
-            if binding is None or name not in provided.get(binding, ()):
-                raise PassError(f"{what}: nothing provides its context %{name} (binding {binding}).")
+            if name not in given:
+                raise PassError(f"{what}: nothing provides its context %{name} when it is read.")
+
+
+def _verify_bindings(pieces: Pieces) -> None:
+    """Contexts and features are there when they are read."""
+    step = () if pieces.step is None else pieces.step.outputs
+    provided = {Binding.CONDITION: pieces.condition.outputs, Binding.TABLE: pieces.tables, Binding.STEP: step}
+    given = {name for name, binding in pieces.bindings.items() if name in provided.get(binding, ())}
+    readers = _contexts(pieces) if pieces.step is None else {STEP: pieces.step.inputs, **_contexts(pieces)}
+    _verify_contexts(readers, given)
     for name in pieces.features:
         if name not in pieces.condition.outputs:
             raise PassError(f"pruner: its feature %{name} is not an output of the condition graph.")

@@ -8,6 +8,7 @@ from onnx import ModelProto
 
 from ..errors import LoweringError
 from ..ir.graph import Batch, TensorType
+from ..ir.pieces import CONDITION, STEP
 from ..ir.program import Binding, Pieces
 from .graph_writer import GraphWriter, Weights
 
@@ -37,12 +38,12 @@ class Contexts:
     ) -> None:
         self._main, self._pieces, self._streams, self._steps = main, pieces, streams, steps
         self._sizes: dict[str, str] = {}
-        condition = models["condition"]
+        condition = models[CONDITION]
         made = main.inline(condition, {v.name: observations[v.name] for v in condition.graph.input}, weights)
         self._conditions: dict[str, str] = dict(zip([v.name for v in condition.graph.output], made, strict=True))
         self._rows = {name: main.constant(table, table.dtype) for name, table in pieces.tables.items()}
         if pieces.step is not None:
-            self._rows.update(self._step_values(models["step"], weights))
+            self._rows.update(self._step_values(models[STEP], weights))
 
     def value(self, w: GraphWriter, name: str, k: str, type_: TensorType) -> str:
         """A context at step k.

@@ -1,4 +1,19 @@
-"""The ONNX model of what idle steps need of a total; see ``ir.idle``."""
+"""The ONNX model of what a step without a computed block comes to where stem and tail are simple.
+
+Such an *idle* step adds a known sum of residuals to the stream, so that sample and prediction are bound by::
+
+    stream     = stem(sample) + total          affine in the sample, each token for itself
+    prediction = head(normalise(stream))       a LayerNorm, then affine, each token for itself
+
+The stream of a token has W numbers, but moves in as many directions as a sample has dimensions, D. With an orthonormal
+basis E of these directions, u what the total and the stem's constants say of the token, centred, and x its sample::
+
+    y          = [x R + u E, rest] / sqrt(W)   rest^2 = |u - (u E) E'|^2 + W eps; its squares add up to the variance
+    prediction = (x A H + u H) / |y| + h
+
+All but x is known as soon as the total is, which many steps in a row share. So a step is arithmetic on numbers of the
+size of the sample, in place of tensors of T x W and of seventeen operations of a session.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +27,8 @@ from onnx import ModelProto, helper
 
 from ..ir.evaluate import evaluate
 from ..ir.graph import Argument, Batch, Graph, Node, Ref, TensorType
-from ..ir.idle import BASE, IDLE, PRODUCT, SHIFT, TOTAL
 from ..ir.operations import Linear, operation
+from ..ir.pieces import BASE, IDLE, PRODUCT, SHIFT, TOTAL
 from ..ir.program import Pieces
 from .graph_writer import GraphWriter, tensor
 from .onnx_model import IR_VERSION
@@ -56,15 +71,15 @@ def lower_idle(pieces: Pieces, weights: Weights, opset: int) -> tuple[ModelProto
 
 
 def _lower(pieces: Pieces, weights: Weights, opset: int) -> ModelProto:
-    if len(pieces.stem.inputs) > 1 or len(pieces.tail.inputs) > 1:
+    if pieces.stem.contexts or pieces.tail.contexts:
         raise _Declined("stem or tail read values of the observation or the step")
-    (sample,), (kind,) = pieces.stem.inputs.values(), pieces.tail.inputs.values()
+    sample, kind = pieces.stem.type, pieces.tail.type
     tokens = sample.shape[1] if len(sample.shape) == 3 else None
     if kind.shape[:2] not in ((Batch(), tokens), (tokens, Batch())) or len(kind.shape) != 3:
         raise _Declined(f"the residual stream is {kind}, and the sample {sample}: not one vector for each token")
     turned = kind.shape[0] != Batch()  # tokens first
-    stem = _affine(_wide(pieces.stem), weights, turned_out=turned)
-    norm, rest = _split_at_norm(pieces.tail)
+    stem = _affine(_wide(pieces.stem.graph), weights, turned_out=turned)
+    norm, rest = _split_at_norm(pieces.tail.graph, pieces.tail.stream)
     head = _affine(_wide(rest), weights, turned_in=turned)
     dimensions, width = stem.matrix.shape
     if dimensions >= width:
@@ -166,11 +181,10 @@ def _require_affine(graph: Graph) -> None:
         raise _Declined(f"{graph.outputs[0]} does not depend on {next(iter(graph.inputs))}")
 
 
-def _split_at_norm(tail: Graph) -> tuple[Node, Graph]:
+def _split_at_norm(tail: Graph, stream: str) -> tuple[Node, Graph]:
     """The LayerNorm that the stream enters first, and the tail after it."""
-    ((name, _),) = tail.inputs.items()
-    users = tail.users()[name]
-    if len(users) != 1 or users[0].op != _NORM or users[0].args[0] != Ref(name):
+    users = tail.users()[stream]
+    if len(users) != 1 or users[0].op != _NORM or users[0].args[0] != Ref(stream):
         raise _Declined(f"the tail does not begin with a LayerNorm of its input, but with {users[0]}")
     norm = users[0]
     rest = tuple(node for node in tail.nodes if node is not norm)

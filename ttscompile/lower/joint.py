@@ -6,25 +6,36 @@ from collections.abc import Mapping, Sequence
 
 from onnx import GraphProto, ModelProto, NodeProto, TensorProto, ValueInfoProto, helper
 
-from ..ir.graph import Graph, TensorType
-from ..ir.joint import CONTEXT, DENSE_STEP, JOINT, RESIDUAL, STREAM, dense_step_outputs, halves, join
+from ..ir.graph import TensorType
+from ..ir.joint import halves, join
+from ..ir.pieces import (
+    CONTEXT,
+    DENSE_STEP,
+    JOINT,
+    RESIDUAL,
+    STREAM,
+    LoopPiece,
+    block_name,
+    dense_step_outputs,
+)
 from .onnx_model import opsets, value_info
 
 
-def join_blocks(blocks: Sequence[Graph], models: Mapping[str, ModelProto]) -> ModelProto:
-    """The model of all blocks.
+def lower_all_blocks(blocks: Sequence[LoopPiece], models: Mapping[str, ModelProto]) -> dict[str, ModelProto]:
+    """The two models by name, given the models of the blocks; others in ``models`` are not looked at."""
+    own = [models[block_name(b)] for b in range(len(blocks))]
+    return {JOINT: _join_blocks(blocks, own), DENSE_STEP: _chain_blocks(blocks, own)}
+
+
+def _join_blocks(blocks: Sequence[LoopPiece], own: Sequence[ModelProto]) -> ModelProto:
+    """The model that runs any of the blocks.
 
     Weights stay in the branch that reads them: onnxruntime packs them only there, and without it a block takes twice
-    as long. They are initializers without data, as in ``models``, and of the same names.
-
-    Args:
-        blocks: their graphs, in order; the stream is the first input, contexts the others.
-        models: of the blocks, by name; others are not looked at.
+    as long. They are initializers without data, as in the models of the blocks, and of the same names.
     """
-    joint = join([tuple(graph.inputs.values())[1:] for graph in blocks])
-    own = [models[f"block_{i:02d}"] for i in range(len(blocks))]
+    joint = join([tuple(piece.contexts.values()) for piece in blocks])
     # Runtimes refuse a stream that changes its type; the sizes that are declared here then are those of every block.
-    stream = next(iter(blocks[0].inputs.values()))
+    stream = blocks[0].type
 
     result = value_info(RESIDUAL, stream)
 
@@ -32,7 +43,8 @@ def join_blocks(blocks: Sequence[Graph], models: Mapping[str, ModelProto]) -> Mo
         name = f"{RESIDUAL}.{first}.{stop}" if depth else RESIDUAL
         output = value_info(name, stream)
         if stop - first == 1:
-            return _leaf(own[first], tuple(blocks[first].inputs), [STREAM, *joint.places[first]], output, f"b{first}")
+            places = dict(zip(blocks[first].contexts, joint.places[first], strict=True))
+            return _leaf(own[first], {blocks[first].stream: STREAM, **places}, output, f"b{first}")
         middle = halves(first, stop)
         node = helper.make_node(
             "If",
@@ -51,23 +63,17 @@ def join_blocks(blocks: Sequence[Graph], models: Mapping[str, ModelProto]) -> Mo
     return _model(own, graph)
 
 
-def chain_blocks(blocks: Sequence[Graph], models: Mapping[str, ModelProto]) -> ModelProto:
-    """The model of a step that computes all blocks.
-
-    Args:
-        blocks: their graphs, in order; the stream is the first input, contexts the others.
-        models: of the blocks, by name; others are not looked at.
-    """
-    own = [models[f"block_{i:02d}"] for i in range(len(blocks))]
-    stream = next(iter(blocks[0].inputs.values()))
-    contexts = {name: type_ for graph in blocks for name, type_ in list(graph.inputs.items())[1:]}
+def _chain_blocks(blocks: Sequence[LoopPiece], own: Sequence[ModelProto]) -> ModelProto:
+    """The model of a step that computes all blocks."""
+    stream = blocks[0].type
+    contexts = {name: type_ for piece in blocks for name, type_ in piece.contexts.items()}
     nodes: list[NodeProto] = []
     weights: dict[str, TensorProto] = {}
     before = STREAM
     last, *residuals = dense_step_outputs(len(blocks))
     for b, (block, model, residual) in enumerate(zip(blocks, own, residuals, strict=True)):
-        inputs = [before, *(CONTEXT + name for name in list(block.inputs)[1:])]
-        leaf = _leaf(model, tuple(block.inputs), inputs, value_info(residual, stream), f"b{b}")
+        inputs = {block.stream: before, **{name: CONTEXT + name for name in block.contexts}}
+        leaf = _leaf(model, inputs, value_info(residual, stream), f"b{b}")
         small = {tensor.name: f"b{b}.{tensor.name}" for tensor in leaf.initializer if tensor.raw_data}
         for tensor in leaf.initializer:
             tensor.name = small.get(tensor.name, tensor.name)
@@ -92,13 +98,11 @@ def _model(own: Sequence[ModelProto], graph: GraphProto) -> ModelProto:
     )
 
 
-def _leaf(
-    model: ModelProto, own: Sequence[str], inputs: Sequence[str], output: ValueInfoProto, prefix: str
-) -> GraphProto:
+def _leaf(model: ModelProto, inputs: Mapping[str, str], output: ValueInfoProto, prefix: str) -> GraphProto:
     """A block as a branch: in place of its own inputs it reads those of the graph around it."""
     graph = model.graph
     weights = {tensor.name for tensor in graph.initializer}
-    names = {"": "", **dict(zip(own, inputs, strict=True)), **{name: name for name in weights}}
+    names = {"": "", **inputs, **{name: name for name in weights}}
     names[graph.output[0].name] = output.name
     nodes = []
     for node in graph.node:

@@ -9,8 +9,9 @@
         for each step that follows without a computed block:                 Loop
             stream += the step's sum, made again if it is another;  advance
 
-Each block is in the model once. Weights lie in the branch that reads them, where onnxruntime packs them.
-The loop is written anew here on purpose: the file runs without the package, and its tests hold it against the runtimes.
+Each block is in the model once, as the branch ``block_07`` beside the branch ``block_07_reused``. Weights lie in the
+branch that reads them, where onnxruntime packs them. The loop is written anew here on purpose: the file runs without
+the package, and its tests hold it against the runtimes.
 """
 
 from __future__ import annotations
@@ -21,7 +22,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from onnx import GraphProto, ModelProto
 
-from ..ir.advance import MEMORY, X0_COLUMNS
+from ..ir.pieces import (
+    ADVANCE,
+    HISTORY,
+    MEMORY,
+    OFFSET,
+    SAMPLE,
+    STEM,
+    STREAM,
+    TAIL,
+    UPDATE,
+    X0_COLUMNS,
+    LoopPiece,
+    advance_context,
+    block_name,
+)
 from ..ir.program import Program
 from .contexts import Contexts
 from .graph_writer import GraphWriter, Weights, sequence, tensor
@@ -101,7 +116,6 @@ class DenoisingLoop:
         weights: Weights,
         contexts: Contexts,
     ) -> None:
-        assert program.pieces is not None
         self._main, self._models, self._weights, self._contexts = main, models, weights, contexts
         self._pieces, self._sampler = program.pieces, program.spec.sampler
         self._groups = [block.group for block in program.blocks]
@@ -116,8 +130,8 @@ class DenoisingLoop:
         self._plan, self._inputs = plan, inputs
         columns = {name: getattr(self._sampler, name)[:, None] for name in X0_COLUMNS}
         self._x0_columns = {name: main.constant(column, np.float32) for name, column in columns.items()}
-        stem = self._feeds(main, "stem", inputs.initial, main.constant(0))
-        (stream,) = main.inline(self._models["stem"], stem, self._weights)
+        stem = self._feeds(main, self._pieces.stem, inputs.initial, main.constant(0))
+        (stream,) = main.inline(self._models[STEM], stem, self._weights)
         self._shape = main.op("Shape", stream)
         width = main.op("ReduceProd", self._shape, keepdims=1)
         self._none = main.op("ConstantOfShape", main.op("Concat", main.constant([0]), width, axis=0))
@@ -151,7 +165,9 @@ class DenoisingLoop:
             starts, _flags(w, w.op("Gather", plan.any_of_group, k), range(len(starts))), strict=True
         ):
             members = range(start, min(start + GROUP, len(self._groups)))
-            value, residuals = w.choose(flag, self._group(step, value, made, members), self._skipped(w, value))
+            value, residuals = w.choose(
+                flag, self._group(step, value, made, members), self._reused(w, value, f"group_{start}")
+            )
             made.append(residuals)
         last = w.op("Gather", step.sums, w.constant(-1))
         value = w.op("Add", value, w.op("Reshape", last, self._shape))
@@ -216,7 +232,9 @@ class DenoisingLoop:
         w = self._main.inner()
         value, made = stream, list[str]()
         for b, flag in zip(members, _flags(w, step.computed, members), strict=True):
-            value, residual = w.choose(flag, self._block(step, value, [*before, *made], b), self._skipped(w, value))
+            value, residual = w.choose(
+                flag, self._block(step, value, [*before, *made], b), self._reused(w, value, block_name(b))
+            )
             made.append(residual)
         return w.graph(f"group_{members.start}", [tensor(n, np.float32) for n in (value, _joined(w, made))])
 
@@ -226,17 +244,17 @@ class DenoisingLoop:
         gap = w.op("Gather", step.sums, w.op("Gather", step.position, w.constant(b)))
         value = w.op("Add", stream, w.op("Reshape", gap, self._shape))
         value = self._add_in_step(w, step, value, before, b)
-        name = f"block_{b:02d}"
-        (residual,) = w.inline(self._models[name], self._feeds(w, name, value, step.k), self._weights)
+        name, piece = block_name(b), self._pieces.blocks[b]
+        (residual,) = w.inline(self._models[name], self._feeds(w, piece, value, step.k), self._weights)
         value = w.op("Add", value, residual)
         row = w.op("Reshape", residual, w.constant([1, -1]))
         return w.graph(name, [tensor(n, np.float32) for n in (value, row)])
 
-    def _skipped(self, w: GraphWriter, stream: str) -> GraphProto:
-        """Nothing computed: the stream as it is, and no residuals."""
+    def _reused(self, w: GraphWriter, stream: str, name: str) -> GraphProto:
+        """The other branch: the stream as it is, and no residuals. What is reused is in the sums of the gaps."""
         inner = w.inner()
         results = [inner.op("Identity", value) for value in (stream, self._none)]
-        return inner.graph("skipped", [tensor(n, np.float32) for n in results])
+        return inner.graph(f"{name}_reused", [tensor(n, np.float32) for n in results])
 
     def _add_in_step(self, w: GraphWriter, step: _Step, stream: str, before: Sequence[str], b: int) -> str:
         """Add FORWARD reads, in the gap before block b, of residuals that the step itself has computed.
@@ -271,16 +289,15 @@ class DenoisingLoop:
 
     def _advance(self, w: GraphWriter, state: _State, k: str) -> _State:
         """Tail, sampler and the next step's stem."""
-        by_step = {"offset": self._inputs.offset, "update": self._inputs.update, **self._x0_columns}
-        feeds = {"stream": state.stream, "sample": state.sample, "history": state.history}
+        by_step = {OFFSET: self._inputs.offset, UPDATE: self._inputs.update, **self._x0_columns}
+        feeds = {STREAM: state.stream, SAMPLE: state.sample, HISTORY: state.history}
         feeds |= zip([MEMORY] * len(state.memory), state.memory, strict=True)
         feeds |= {name: w.op("Gather", values, k) for name, values in by_step.items()}
-        for value in self._models["advance"].graph.input:
-            if value.name not in feeds:
-                where, _, name = value.name.partition(".")
-                graph, at = (self._pieces.tail, k) if where == "tail" else (self._pieces.stem, self._following(w, k))
-                feeds[value.name] = self._contexts.value(w, name, at, graph.inputs[name])
-        sample, stream, prediction, *memory = w.inline(self._models["advance"], feeds, self._weights)
+        for name, piece in ((TAIL, self._pieces.tail), (STEM, self._pieces.stem)):
+            for context, type_ in piece.contexts.items():
+                at = k if name == TAIL else self._following(w, k)
+                feeds[advance_context(name, context)] = self._contexts.value(w, context, at, type_)
+        sample, stream, prediction, *memory = w.inline(self._models[ADVANCE], feeds, self._weights)
         is_anchor = w.op("Gather", self._inputs.anchors, k)
         history = self._remembered(w, is_anchor, state.sample, prediction, state.history)
         return _State(sample, stream, history, tuple(memory))
@@ -302,11 +319,10 @@ class DenoisingLoop:
         """The next step; of the last one itself, whose stream nobody reads."""
         return w.op("Min", w.op("Add", k, w.constant(1)), w.constant(self._sampler.steps - 1))
 
-    def _feeds(self, w: GraphWriter, piece: str, stream: str, k: str) -> dict[str, str]:
+    def _feeds(self, w: GraphWriter, piece: LoopPiece, stream: str, k: str) -> dict[str, str]:
         """A value for each input of the stem or a block: the sample or stream, then contexts."""
-        graph = self._pieces.stem if piece == "stem" else self._pieces.blocks[int(piece.removeprefix("block_"))]
-        first, *contexts = graph.inputs
-        return {first: stream, **{name: self._contexts.value(w, name, k, graph.inputs[name]) for name in contexts}}
+        contexts = {name: self._contexts.value(w, name, k, type_) for name, type_ in piece.contexts.items()}
+        return {piece.stream: stream, **contexts}
 
 
 def _flags(w: GraphWriter, vector: str, which: range) -> list[str]:

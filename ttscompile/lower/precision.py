@@ -15,8 +15,9 @@ import numpy as np
 import numpy.typing as npt
 from onnx import AttributeProto, ModelProto, NodeProto, TensorProto, helper
 
-from ..core.spec import BF16, FP32, INT8, PRECISIONS
+from ..core.spec import INT8, PRECISIONS
 from ..errors import LoweringError
+from ..ir.pieces import is_block
 from .onnx_model import live_nodes
 
 Array = npt.NDArray[Any]
@@ -56,7 +57,7 @@ def lower_precision(
     """The models of residual blocks again, with weights of another precision.
 
     Args:
-        models: from ``lower_program``; those called ``block_..`` are taken.
+        models: from ``lower_program``; the blocks among them are taken.
         weights: constants of the program, by name.
         precision: ``int8``; the models have ``fp32`` already.
 
@@ -70,7 +71,7 @@ def lower_precision(
     require_precision(precision)
     made: dict[str, ModelProto] = {}
     constants: dict[str, Array] = {}
-    blocks = [name for name in models if name.startswith("block_")]
+    blocks = [name for name in models if is_block(name)]
     replaced = 0
     for name in blocks:
         model, new = quantize_model(models[name], weights)
@@ -95,13 +96,7 @@ def require_precision(precision: str) -> None:
     Raises:
         LoweringError: says why not.
     """
-    if precision == BF16:
-        raise LoweringError(
-            "precision 'bf16': expected an onnxruntime whose CPU provider multiplies bfloat16 matrices; on x86 it has"
-            " no such kernel, whatever the processor has, and on ARM ttscompile has not been tried. Convert with"
-            " precision 'int8', which is faster and whose action error is measured, or 'fp32'."
-        )
-    if precision not in (FP32, INT8):
+    if precision not in PRECISIONS:
         raise LoweringError(f"precision {precision!r}: expected one of {', '.join(map(repr, PRECISIONS))}.")
 
 

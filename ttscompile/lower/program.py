@@ -19,16 +19,15 @@ import onnx
 import torch
 
 from ..errors import LoweringError
-from ..ir.advance import fuse_advance
 from ..ir.evaluate import resolve_op, without_stack_traces
 from ..ir.graph import Argument, Batch, Enum, Graph, Node, Ref, TensorType
-from ..ir.idle import IDLE
-from ..ir.joint import DENSE_STEP, JOINT
-from ..ir.layout import sink_layout
-from ..ir.program import Pieces, Program
+from ..ir.pieces import ADVANCE, IDLE, TAIL
+from ..ir.program import Program
+from .advance import fuse_advance
 from .attention import flatten_attention
 from .idle import lower_idle
-from .joint import chain_blocks, join_blocks
+from .joint import lower_all_blocks
+from .layout import sink_layout
 from .onnx_model import name_model, only
 
 OPSET = 23
@@ -59,20 +58,18 @@ def lower_program(program: Program) -> dict[str, onnx.ModelProto]:
 
     Returns:
         By name: ``condition``, ``step`` (if any), ``pruner`` (if any), ``stem``, ``block_00``, ``block_01``..,
-        ``advance`` (tail, sampler update and stem in one; see ``ir.advance``), ``blocks`` and ``dense_step`` (all
-        blocks in one; see ``ir.joint``) and, if stem and tail allow it, ``idle`` (see ``ir.idle``). Graphs of the same
+        ``advance`` (tail, sampler update and stem in one; see ``lower.advance``), ``blocks`` and ``dense_step`` (all
+        blocks in one; see ``ir.joint``) and, if stem and tail allow it, ``idle`` (see ``lower.idle``). Graphs of one
         structure are exported once.
 
     Raises:
-        LoweringError: as ``lower_graph``; or the program has not been partitioned.
+        LoweringError: as ``lower_graph``.
     """
-    if program.pieces is None:
-        raise LoweringError("the program has no pieces to lower: run the passes up to insert_reuse first.")
-    advance = fuse_advance(program.pieces.tail, program.pieces.stem, program.spec)
-    models = _lower({**_pieces(program.pieces), "advance": advance})
-    whole = {JOINT: join_blocks(program.pieces.blocks, models), DENSE_STEP: chain_blocks(program.pieces.blocks, models)}
-    idle, _ = lower_idle(program.pieces, program.weights, OPSET)
-    return {**models, **whole} if idle is None else {**models, **whole, IDLE: idle}
+    pieces = program.pieces
+    graphs = {name: graph for name, graph in pieces.graphs().items() if name != TAIL}
+    models = _lower({**graphs, ADVANCE: fuse_advance(pieces.tail, pieces.stem, program.spec)})
+    idle, _ = lower_idle(pieces, program.weights, OPSET)
+    return {**models, **lower_all_blocks(pieces.blocks, models), **({} if idle is None else {IDLE: idle})}
 
 
 def structural_key(graph: Graph) -> str:
@@ -86,16 +83,6 @@ def structural_key(graph: Graph) -> str:
             repr(canonical.outputs),
         ]
     )
-
-
-def _pieces(pieces: Pieces) -> dict[str, Graph]:
-    optional = {"step": pieces.step, "pruner": pieces.pruner}
-    return {
-        "condition": pieces.condition,
-        **{name: graph for name, graph in optional.items() if graph is not None},
-        "stem": pieces.stem,
-        **{f"block_{i:02d}": block for i, block in enumerate(pieces.blocks)},
-    }
 
 
 def _lower(graphs: dict[str, Graph]) -> dict[str, onnx.ModelProto]:

@@ -70,8 +70,6 @@ def lower_single_file(program: Program, models: Mapping[str, ModelProto], weight
         LoweringError: an observation has the name of another input or output; the residual stream changes its type; a
             context cannot be repeated for a batch; or the file would have 2 GB.
     """
-    if program.pieces is None:
-        raise LoweringError("the program has no pieces to lower: run the passes up to insert_reuse first.")
     spec, types = program.spec, sorted({str(block.type) for block in program.blocks})
     if len(types) != 1 or program.blocks[0].type.dtype != "float32":
         raise LoweringError(f"the residual stream changes its type, or is not float32: {types}. Convert without it.")

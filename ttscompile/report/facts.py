@@ -69,7 +69,7 @@ def hoisting(artifact: Artifact) -> Section:
     for context in manifest.contexts.values():
         bound[context.binding].append(context.type)
     table_bytes = sum(table.nbytes for table in artifact.tables.values())
-    condition = graph_flops(artifact.graphs["condition"]) if "condition" in artifact.graphs else 0
+    condition = graph_flops(artifact.pieces.condition)
     loop = steps * (record.stem + record.tail + sum(record.blocks))
     dense = record.prologue + loop
 
@@ -132,7 +132,7 @@ def plan_flops(artifact: Artifact, name: str) -> float | None:
     """FLOPs of a call with a plan; a pruner's blocks cost what was measured on average, None if they were not."""
     manifest = artifact.manifest
     own = manifest.plans.get(name)
-    dense = manifest.flops.call(artifact.schedule(DENSE), pruned=own is not None and own.kind == "pruner")
+    dense = manifest.flops.call(artifact.schedule(DENSE), pruned=own is not None and own.pruned)
     if own is None:
         return dense
     share_saved = own.flops_sparsity
@@ -238,7 +238,7 @@ def limits(artifact: Artifact) -> Section:
         points.append("Weights are in fp32. On processors with integer dot products, --precision int8 may be faster.")
     else:
         points.append(f"Blocks compute with {manifest.precision_name} weights: dense calls differ from fp32 as well.")
-    if any(plan.kind == "pruner" for plan in plans.values()):
+    if any(plan.pruned for plan in plans.values()):
         points.append("A plan that is made for each observation costs a different time each call.")
     needs = rollout_needs(artifact)
     if needs.read:

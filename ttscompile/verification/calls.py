@@ -203,7 +203,7 @@ def _replay(
         Executed plans ``[2, B, K, blocks]``; the cells ``[K, blocks]`` that are not those of the record; whether these
         may differ; and the error of the samples, with the stored plan where cells differ.
     """
-    pruned = artifact.manifest.plans[name].kind == "pruner"
+    pruned = artifact.manifest.plans[name].pruned
     schedule = None if pruned else artifact.schedule(name)
     made, samples = _two_calls(artifact, golden, runtime, name, (schedule, schedule), True)
     differ = (made != record.plan).any((0, 1))

@@ -17,7 +17,7 @@ from ..core.correction import HISTORY, Correction, no_correction
 from ..core.lattice import PlanArray, Source
 from ..core.spec import FloatArray, Noise
 from ..core.update import clips, matrices
-from ..ir.pieces import block_name
+from ..ir.pieces import ADVANCE, CONDITION, PREDICTION, STEM, STEP, STREAM, TAIL, advance_context, block_name
 from ..ir.program import Binding
 from ..runtimes.onnxruntime.sessions import open_sessions, repeat_streams, run_named
 
@@ -42,15 +42,15 @@ class Probe:
             if context.binding is Binding.TABLE
             for axis in (context.type.batch_axis,)
         }
-        piece = self._manifest.pieces["condition"]
+        piece = self._manifest.pieces[CONDITION]
         arguments = self._manifest.spec.arguments
         named = {**obs, **{arguments[key]: value for key, value in obs.items()}}
         feed = {name: np.ascontiguousarray(named[name]) for name in piece.inputs}
-        self._condition = run_named(self._sessions["condition"], piece.outputs, feed) if piece.outputs else {}
+        self._condition = run_named(self._sessions[CONDITION], piece.outputs, feed) if piece.outputs else {}
         self._steps = [self._step(k) for k in range(self._manifest.steps)]
         self._tail_blanks = {
             one.name: np.zeros([n if isinstance(n, int) else self.streams for n in one.shape], np.float32)
-            for one in self._sessions["advance"].get_inputs()
+            for one in self._sessions[ADVANCE].get_inputs()
         }
 
     def evaluate(self, sample: FloatArray, k: int) -> FloatArray:
@@ -62,7 +62,7 @@ class Probe:
 
     def stem(self, sample: FloatArray, k: int) -> FloatArray:
         """The residual stream of step k."""
-        return self._run("stem", np.ascontiguousarray(sample), k)
+        return self._run(STEM, np.ascontiguousarray(sample), k)
 
     def block(self, b: int, k: int, stream: FloatArray) -> FloatArray:
         """The residual of block b at step k."""
@@ -71,9 +71,10 @@ class Probe:
     def tail(self, stream: FloatArray, k: int) -> FloatArray:
         """The prediction at step k, ``[B, T, D]``; what else ``advance`` computes is left aside."""
         feed = dict(self._tail_blanks)
-        feed["stream"] = stream
-        feed |= {name: self._value(name.removeprefix("tail."), k) for name in feed if name.startswith("tail.")}
-        return run_named(self._sessions["advance"], ["prediction"], feed)["prediction"].transpose(1, 2, 0)
+        feed[STREAM] = stream
+        own = {name: advance_context(TAIL, name) for name in self._manifest.pieces[ADVANCE].contexts}
+        feed |= {own[name]: self._value(name, k) for name in own if own[name] in feed}
+        return run_named(self._sessions[ADVANCE], [PREDICTION], feed)[PREDICTION].transpose(1, 2, 0)
 
     def trace(self, noise: Noise, plan: PlanArray, correction: Correction | None) -> tuple[FloatArray, FloatArray]:
         """One call, the first of its episode, by the definitions in ``docs/design.md`` section 2.
@@ -136,11 +137,11 @@ class Probe:
 
     def _step(self, k: int) -> dict[str, Array]:
         """Step values of step k."""
-        piece = self._manifest.pieces.get("step")
+        piece = self._manifest.pieces.get(STEP)
         if piece is None:
             return {}
         feed = {n: self._tables[n][k, ...] if n in self._tables else self._condition[n] for n in piece.inputs}
-        return run_named(self._sessions["step"], piece.outputs, feed)
+        return run_named(self._sessions[STEP], piece.outputs, feed)
 
     def _value(self, name: str, k: int) -> Array:
         if name in self._tables:

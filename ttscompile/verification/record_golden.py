@@ -135,7 +135,7 @@ def _episode(
     artifact: Artifact, model: ReferenceModel, name: str, golden: Golden, obs: Mapping[str, npt.NDArray[Any]]
 ) -> GoldenPlan:
     """Two calls with one plan; see ``GoldenPlan``."""
-    pruned = artifact.manifest.plans[name].kind == "pruner"
+    pruned = artifact.manifest.plans[name].pruned
     cache, calls = model.empty_cache(golden.streams), []
     for order in (1, -1):
         contexts = model.prologue({key: torch.from_numpy(value[::order].copy()) for key, value in obs.items()})

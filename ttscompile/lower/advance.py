@@ -10,49 +10,43 @@ Push-T, 1 thread: 41 us with samples ``[B, T, D]``, a product for each coefficie
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from dataclasses import replace
 
-from ttscompile.core.correction import HISTORY as HISTORY_ENTRIES
-from ttscompile.core.correction import groups_of
-from ttscompile.core.spec import PolicySpec, SamplerTable
-from ttscompile.core.update import clips, columns, rows
-from ttscompile.errors import LoweringError
-
-from .graph import Argument, Batch, Graph, Node, Ref, TensorType
-
-STREAM = "stream"
-SAMPLE = "sample"
-OFFSET = "offset"
-HISTORY = "history"
-UPDATE = "update"
-MEMORY = "memory"
-SAMPLE_NEXT = "sample_next"
-STREAM_NEXT = "stream_next"
-PREDICTION = "prediction"
-MEMORY_NEXT = "memory_next"
-X0_COLUMNS = ("sample_to_x0", "out_to_x0")
-"""Columns of the sampler's table that are inputs of their own."""
-
-
-def own_inputs(sampler: SamplerTable) -> tuple[str, ...]:
-    """Inputs that are no contexts, in order."""
-    return (STREAM, SAMPLE, OFFSET, HISTORY, UPDATE, *X0_COLUMNS, *[MEMORY] * bool(sampler.memories))
-
-
-def outputs(sampler: SamplerTable) -> tuple[str, ...]:
-    """Outputs, in order."""
-    return (SAMPLE_NEXT, STREAM_NEXT, PREDICTION, *[MEMORY_NEXT] * bool(sampler.memories))
+from ..core.correction import HISTORY as HISTORY_ENTRIES
+from ..core.correction import groups_of
+from ..core.spec import PolicySpec, SamplerTable
+from ..core.update import clips, columns, rows
+from ..errors import LoweringError
+from ..ir.graph import Argument, Batch, Graph, Node, Ref, TensorType
+from ..ir.pieces import (
+    HISTORY,
+    MEMORY,
+    MEMORY_NEXT,
+    OFFSET,
+    PREDICTION,
+    SAMPLE,
+    SAMPLE_NEXT,
+    STEM,
+    STREAM,
+    STREAM_NEXT,
+    TAIL,
+    UPDATE,
+    X0_COLUMNS,
+    LoopPiece,
+    advance_context,
+    advance_outputs,
+)
 
 
-def fuse_advance(tail: Graph, stem: Graph, spec: PolicySpec) -> Graph:
+def fuse_advance(tail: LoopPiece, stem: LoopPiece, spec: PolicySpec) -> Graph:
     """Concatenate tail, sampler update and stem.
 
     The update is that of ``core.update``, with what belongs to the step as inputs. A term of the denoised sample
     whose column of the sampler's table is zero at every step is left out.
 
     Args:
-        tail: residual stream (its first input) and contexts -> prediction ``[B, T, D]``.
-        stem: sample (its first input) ``[B, T, D]`` and contexts -> residual stream.
+        tail: residual stream and contexts -> prediction ``[B, T, D]``.
+        stem: sample ``[B, T, D]`` and contexts -> residual stream.
         spec: gives the shape of the sample, the clip and the columns.
 
     Returns:
@@ -65,31 +59,25 @@ def fuse_advance(tail: Graph, stem: Graph, spec: PolicySpec) -> Graph:
     Raises:
         LoweringError: a constant of the program has the name of one of these inputs.
     """
-    (stream, *tail_contexts), (sample, *stem_contexts) = tail.inputs, stem.inputs
-    inputs = {STREAM: tail.inputs[stream], **_update_types(spec)}
-    inputs |= {f"tail.{name}": tail.inputs[name] for name in tail_contexts}
-    inputs |= {f"stem.{name}": stem.inputs[name] for name in stem_contexts}
-    constants = {**tail.constants, **stem.constants}
-    results = outputs(spec.sampler)
+    inputs = {STREAM: tail.type, **_update_types(spec)}
+    for name, piece in ((TAIL, tail), (STEM, stem)):
+        inputs |= {advance_context(name, context): type_ for context, type_ in piece.contexts.items()}
+    constants = {**tail.graph.constants, **stem.graph.constants}
+    results = advance_outputs(spec.sampler)
     if clash := sorted((constants.keys() & inputs.keys()) | (constants.keys() & set(results))):
         raise LoweringError(
             f"the module has weights called {clash}, which are names of the compiled loop's own values."
             " Rename these parameters or buffers in the module."
         )
     taken = {*inputs, *constants, *results}
-    first = {n: n for n in tail.constants} | {n: f"tail.{n}" for n in tail_contexts} | {stream: STREAM}
-    nodes, names = _moved(tail, "tail", first, taken)
+    nodes, prediction = _moved(tail, TAIL, STREAM, taken)
     turned = inputs[SAMPLE]
-    nodes.append(Node(PREDICTION, "aten.permute.default", (Ref(names[tail.outputs[0]]), (2, 0, 1)), (), (turned,)))
+    nodes.append(Node(PREDICTION, "aten.permute.default", (Ref(prediction), (2, 0, 1)), (), (turned,)))
     nodes += _Update(taken, turned).nodes_for(spec)
     following = _fresh("stem.sample", taken)
-    nodes.append(Node(following, "aten.permute.default", (Ref(SAMPLE_NEXT), (1, 2, 0)), (), (stem.inputs[sample],)))
-    second = {n: n for n in stem.constants} | {n: f"stem.{n}" for n in stem_contexts} | {sample: following}
-    more, names = _moved(stem, "stem", second, taken)
-    nodes += more
-    result = names[stem.outputs[0]]
-    stream_type = stem.types()[stem.outputs[0]]
-    nodes.append(Node(STREAM_NEXT, "aten.clone.default", (Ref(result),), (), (stream_type,)))
+    nodes.append(Node(following, "aten.permute.default", (Ref(SAMPLE_NEXT), (1, 2, 0)), (), (stem.type,)))
+    more, stream = _moved(stem, STEM, following, taken)
+    nodes += [*more, Node(STREAM_NEXT, "aten.clone.default", (Ref(stream),), (), (stem.graph.types()[stem.result],))]
     return Graph(inputs, constants, tuple(nodes), results)
 
 
@@ -109,15 +97,15 @@ def _update_types(spec: PolicySpec) -> dict[str, TensorType]:
     return types
 
 
-def _moved(graph: Graph, prefix: str, names: Mapping[str, str], taken: set[str]) -> tuple[list[Node], dict[str, str]]:
-    """The nodes of a piece under new names, and the new name of each of its values."""
-    renamed = dict(names)
+def _moved(piece: LoopPiece, prefix: str, stream: str, taken: set[str]) -> tuple[list[Node], str]:
+    """The nodes of a piece under new names, reading ``stream``; and the new name of its result."""
+    renamed = {name: name for name in piece.graph.constants} | {piece.stream: stream}
+    renamed |= {name: advance_context(prefix, name) for name in piece.contexts}
     nodes = []
-    for node in graph.nodes:
+    for node in piece.graph.nodes:
         renamed[node.name] = _fresh(f"{prefix}.{node.name}", taken)
-        moved = node.renamed(renamed.__getitem__)
-        nodes.append(Node(renamed[node.name], moved.op, moved.args, moved.kwargs, moved.types, moved.source))
-    return nodes, renamed
+        nodes.append(replace(node.renamed(renamed.__getitem__), name=renamed[node.name]))
+    return nodes, renamed[piece.result]
 
 
 class _Update:

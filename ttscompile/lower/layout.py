@@ -25,8 +25,8 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-from .graph import Argument, Batch, Graph, Node, Ref, Size, TensorType
-from .operations import Movement, operation, permutation
+from ..ir.graph import Argument, Batch, Graph, Node, Ref, Size, TensorType
+from ..ir.operations import Movement, operation, permutation
 
 
 @dataclass(frozen=True)

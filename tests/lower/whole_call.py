@@ -1,0 +1,77 @@
+"""Calls of a policy through its single ONNX file, with the state of an episode kept by hand."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+
+import ttscompile
+from ttscompile import Noise
+from ttscompile.artifact import load_artifact
+from ttscompile.artifact.write import write_artifact
+from ttscompile.ir.program import Program
+from ttscompile.lower.program import lower_program
+from ttscompile.lower.single_file import lower_single_file
+from ttscompile.runtimes.policy import CompiledPolicy
+
+Arrays = dict[str, np.ndarray]
+
+
+@lru_cache(maxsize=1)
+def opened(model: str | bytes) -> onnxruntime.InferenceSession:
+    """A session, which keeps nothing from call to call: the episodes of a test share it."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    options.log_severity_level = 3  # optional inputs have values in the model, which is worth a warning to it
+    return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+
+
+class Episode:
+    """Calls of the single file that hand the rollout cache on, as its user would."""
+
+    def __init__(self, model: str | bytes, streams: int) -> None:
+        self.session = opened(model)
+        shapes = {value.name: value.shape for value in self.session.get_inputs()}
+        self.takes_noise = "step_noise" in shapes
+        row = [streams if n == "B" else n for n in shapes["rollout_rows"][1:]]
+        self.rows = np.zeros((0, *row), np.float32)
+        self.index = np.full(shapes["rollout_index"], -1, np.int64)
+
+    def call(self, obs: Arrays, noise: Noise, plan: np.ndarray, keep: bool = True, **more: Any) -> Arrays:
+        feeds = {**obs, **more, "initial_noise": noise.initial, "plan": plan.astype(np.int8)}
+        if self.takes_noise:
+            feeds["step_noise"] = noise.steps
+        feeds |= {"rollout_rows": self.rows, "rollout_index": self.index}
+        feeds["rollout_keep"] = np.full(self.index.shape, keep)
+        names = [value.name for value in self.session.get_outputs()]
+        out = dict(zip(names, self.session.run(names, feeds), strict=True))
+        self.rows, self.index = out["rollout_rows_next"], out["rollout_index_next"]
+        return out
+
+
+def make(program: Program, folder: Path) -> tuple[CompiledPolicy, bytes]:
+    models = lower_program(program)
+    write_artifact(program, models, folder / "artifact")
+    model = lower_single_file(program, models, program.weights)
+    onnx.checker.check_model(model, full_check=True)
+    return ttscompile.load(folder / "artifact", "reference"), model.SerializeToString(deterministic=True)
+
+
+def inputs(policy: CompiledPolicy, rng: np.random.Generator, streams: int) -> tuple[Arrays, Noise]:
+    info = policy.info
+    obs = {k: rng.standard_normal((streams, *o.shape)).astype(o.dtype) for k, o in info.observation.items()}
+    draws = rng.standard_normal((info.K, streams, *info.sample), dtype=np.float32) if info.stochastic else None
+    return obs, Noise(rng.standard_normal((streams, *info.sample), dtype=np.float32), draws)
+
+
+def policy_groups(artifact: Path) -> tuple[int, ...]:
+    return load_artifact(artifact).manifest.groups
+
+
+def groups(program: Program) -> list[int]:
+    return [block.group for block in program.blocks]

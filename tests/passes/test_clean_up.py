@@ -1,0 +1,11 @@
+"""Simplification of every graph of a program."""
+
+from __future__ import annotations
+
+from tests.passes.modules import compiled
+from ttscompile.passes.clean_up import CleanUp
+
+
+def test_clean_up_is_idempotent() -> None:
+    _, program = compiled("tokens")
+    assert CleanUp()(program).program is program
