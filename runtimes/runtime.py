@@ -162,8 +162,10 @@ class Runtime:
         stop = time.perf_counter()
         computed = settled.plans == Source.COMPUTE
         self._written, self._dropped = np.where(computed, keep, written), np.where(computed, ~keep, dropped)
+        executed = settled.plans.copy()  # the caller's plan is the caller's
+        executed.flags.writeable = False
         report = CallReport(
-            plan=_frozen(settled.plans),
+            plan=executed,
             plan_name=plan_name or (PRUNER if plan is None else GIVEN),
             computed=tuple(int(n) for n in np.count_nonzero(computed, axis=(1, 2))),
             legalised=settled.legalised,
@@ -225,13 +227,6 @@ def _prune(
     plans, legalised = settle_plan(pruner_plan(backend.logits()), groups, written, repair=True)
     lowered = tuple(lowering.lower(one) for one in plans)
     return _Settled(plans, lowered, legalised, _milliseconds(start, time.perf_counter()))
-
-
-def _frozen(plans: PlanArray) -> PlanArray:
-    """A read-only copy: what a report holds must not change after the call, and the caller's plan is the caller's."""
-    copied = plans.copy()
-    copied.flags.writeable = False
-    return copied
 
 
 def _milliseconds(start: float, stop: float) -> float:
