@@ -29,7 +29,7 @@ from .arrays import check_noise
 from .backend import Backend, Call
 from .inpainting import known_samples
 from .report import GIVEN, CallReport, Timings
-from .settle import LoweringCache, pruner_plan, settle_plan
+from .settle import LoweringCache, pruner_plan, repair_plan
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,7 +198,7 @@ class Runtime:
         """
         streams, steps, blocks = written.shape
         if repair:
-            plans, legalised = settle_plan(plan, self._groups, written, repair)
+            plans, legalised = repair_plan(plan, self._groups, written)
         else:
             plans, legalised = check_plan(plan, steps, blocks, streams), (0,) * streams
         rollout = plans == Source.ROLLOUT.value  # numpy takes five times as long to compare with the enum itself
@@ -224,7 +224,7 @@ def _prune(
 ) -> _Settled:
     """The pruner's plan and its instructions. Not a method: the helper must not keep the runtime alive."""
     start = time.perf_counter()
-    plans, legalised = settle_plan(pruner_plan(backend.logits()), groups, written, repair=True)
+    plans, legalised = repair_plan(pruner_plan(backend.logits()), groups, written)
     lowered = tuple(lowering.lower(one) for one in plans)
     return _Settled(plans, lowered, legalised, _milliseconds(start, time.perf_counter()))
 
