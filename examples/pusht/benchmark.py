@@ -50,12 +50,14 @@ class Contestant:
         policy: of its own; no caches are shared.
         plan: as in ``predict_action``; None for the default.
         dense_flops: FLOPs of a call without a report, which computes everything.
+        noise: sizes of the random numbers of a call. Contestants with another sampler share the initial noise.
     """
 
     label: str
     policy: Policy
     plan: Plan | None
     dense_flops: float
+    noise: NoiseShape
 
 
 @dataclass(frozen=True)
@@ -125,7 +127,6 @@ def scripted_windows(count: int) -> list[FloatArray]:
 
 def measure(
     contestants: Sequence[Contestant],
-    shape: NoiseShape,
     runs: int,
     on_run: Callable[[], None] = lambda: None,
 ) -> list[Measurement]:
@@ -133,7 +134,6 @@ def measure(
 
     Args:
         contestants: at least one.
-        shape: sizes of their noise.
         runs: counted calls of each.
         on_run: called after each round.
 
@@ -146,9 +146,9 @@ def measure(
     for contestant in contestants:
         contestant.policy.reset()
     for call, window in enumerate(windows):
-        noise = seeded_noise(shape, [0], call)
         for i in timer.round():
             contestant = contestants[i]
+            noise = seeded_noise(contestant.noise, [0], call)
             plan = "dense" if call == 0 and contestant.plan is not None else contestant.plan
             timer.time(i, partial(contestant.policy.predict_action, {"obs": window}, noise=noise, plan=plan))
             if timer.counted:
@@ -211,8 +211,8 @@ def contestants_for(
     """Eager, dense, a given plan if there is one, and the artifact's own plan; each with a policy of its own.
 
     Args:
-        artifact: what ``ttscompile.convert`` made of the checkpoint.
-        checkpoint: for the eager policy.
+        artifact: what ``ttscompile.convert`` made of the checkpoint, with the checkpoint's own sampler or another.
+        checkpoint: for the eager policy, which keeps the checkpoint's own sampler.
         threads: of each.
         given: int8 ``[K, blocks]``, legal for warm calls.
 
@@ -225,19 +225,22 @@ def contestants_for(
         plans.append((f"given plan, {np.mean(given != Source.COMPUTE):.0%} reused", given))
     if info.default_plan != "dense":
         plans.append(("compiled", None))
-    eager = Contestant("eager PyTorch", EagerPolicy(checkpoint, threads), None, info.dense_flops)
+    original, noise = EagerPolicy(checkpoint, threads), noise_shape(info)
+    flops = info.dense_flops * original.noise.steps / info.K  # an evaluation costs the same, whatever the sampler
+    eager = Contestant("eager PyTorch", original, None, flops, original.noise)
     others = [
-        Contestant(label, ttscompile.load(artifact, threads=threads), plan, info.dense_flops) for label, plan in plans
+        Contestant(label, ttscompile.load(artifact, threads=threads), plan, info.dense_flops, noise)
+        for label, plan in plans
     ]
     return [eager, *others], info
 
 
 def time_calls(artifact: Path, checkpoint: Path, runs: int, threads: int) -> list[Measurement]:
     """Time eager, dense and compiled, with a progress bar on standard error."""
-    contestants, info = contestants_for(artifact, checkpoint, threads, None)
+    contestants, _ = contestants_for(artifact, checkpoint, threads, None)
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("timing", total=WARM_UP + runs)
-        return measure(contestants, noise_shape(info), runs, lambda: progress.advance(task))
+        return measure(contestants, runs, lambda: progress.advance(task))
 
 
 def fixed_shares(artifact: Path) -> dict[str, float]:
@@ -285,7 +288,7 @@ def main(
     contestants, info = contestants_for(artifact, checkpoint, threads, given)
     with Progress(console=Console(stderr=True)) as progress:
         task = progress.add_task("timing", total=WARM_UP + runs)
-        measurements = measure(contestants, noise_shape(info), runs, lambda: progress.advance(task))
+        measurements = measure(contestants, runs, lambda: progress.advance(task))
     shares = fixed_shares(artifact)
     if as_json:
         click.echo(json.dumps({"identity": info.identity, **to_json(measurements, shares, threads)}, indent=2))

@@ -250,7 +250,8 @@ def opened(artifact: Path, threads: int, checkpoint: Path | None) -> list[tuple[
     if checkpoint is not None:
         from original import EagerPolicy
 
-        found.append((EAGER, NumberedNoise(EagerPolicy(checkpoint, threads), info, shape, takes_plan=False)))
+        eager = EagerPolicy(checkpoint, threads)
+        found.append((EAGER, NumberedNoise(eager, info, eager.noise, takes_plan=False)))
     return found
 
 

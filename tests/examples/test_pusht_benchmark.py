@@ -52,10 +52,10 @@ def test_contestants_take_turns_on_the_same_noise():
     log = []
     given = np.zeros((4, 2), np.int8)
     contestants = [
-        Contestant("eager", Scripted("a", log, reports=False), None, 80.0),
-        Contestant("given", Scripted("b", log, reports=True), given, 80.0),
+        Contestant("eager", Scripted("a", log, reports=False), None, 80.0, SHAPE),
+        Contestant("given", Scripted("b", log, reports=True), given, 80.0, SHAPE),
     ]
-    first, second = measure(contestants, SHAPE, runs=4)
+    first, second = measure(contestants, runs=4)
     assert log[:2] == [("a", "reset", None), ("b", "reset", None)]
     rounds = [log[i : i + 2] for i in range(2, len(log), 2)]
     assert len(rounds) == WARM_UP + 4

@@ -11,7 +11,7 @@ from benchmark import contestants_for, fixed_shares, measure, random_plan
 from environment import PushT
 from original import EagerPolicy
 from rollout import seeded_noise
-from variants import noise_shape, open_variant
+from variants import open_variant
 
 from tests.rounding import PROMISED
 
@@ -55,7 +55,7 @@ def test_contestants_of_the_benchmark(compiled_pusht, pusht_checkpoint, monkeypa
     given = random_plan(100, 24, 0.05, seed=0)
     contestants, info = contestants_for(compiled_pusht, pusht_checkpoint, 1, given)
     assert [c.label for c in contestants] == ["eager PyTorch", "dense onnxruntime", "given plan, 95% reused"]
-    eager, dense, sparse = measure(contestants, noise_shape(info), runs=1)
+    eager, dense, sparse = measure(contestants, runs=1)
     assert eager.flops == info.dense_flops
     assert dense.sparsity == 0.0
     assert sparse.sparsity == pytest.approx(0.95)

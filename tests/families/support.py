@@ -18,6 +18,13 @@ from ttscompile.ir.program import Program
 ROOT = Path(__file__).resolve().parents[2]
 RECORD = ROOT / "docs" / "support.json"
 README = ROOT / "README.md"
+COLUMNS = (
+    "Policy",
+    "Compared with, and largest difference allowed",
+    "Sampler and steps",
+    "Residual blocks found",
+    "Arithmetic not repeated at every step",
+)
 BEGIN, END = "<!-- support:begin -->", "<!-- support:end -->"
 
 Row = dict[str, Any]
@@ -78,14 +85,14 @@ def render(content: dict[str, list[Row]]) -> str:
     """The table in Markdown, between its markers."""
     lines = [
         BEGIN,
-        "| family | checked against | sampler | blocks found | FLOPs hoisted |",
+        f"| {' | '.join(COLUMNS)} |",
         "| --- | --- | --- | --- | --- |",
     ]
     lines += [
         f"| {each['family']} | {each['verified_against']} | {each['sampler']} | {_blocks(each)} | {_hoisted(each)} |"
         for each in content["families"]
     ]
-    lines += ["", "| not compiled | because |", "| --- | --- |"]
+    lines += ["", "| Not compiled | Why, and what you can do |", "| --- | --- |"]
     lines += [f"| {each['family']} | {each['reason']} |" for each in content["not_compiled"]]
     return "\n".join([*lines, END])
 
@@ -98,7 +105,7 @@ def _blocks(each: Row) -> str:
 
 def _hoisted(each: Row) -> str:
     """What left the loop, and what is still computed for every step, in one batch."""
-    batched = f", {each['batched']:.1%} batched" if each["batched"] else ""
+    batched = f", and {each['batched']:.1%} done for all steps in one batch" if each["batched"] else ""
     return f"{each['hoisted']:.1%}{batched}"
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import cache
 
 import pytest
@@ -19,8 +21,8 @@ from ttscompile.capture.export import capture
 from ttscompile.errors import CaptureError
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.flops import graph_flops
-from ttscompile.ir.graph import Graph, TensorType
-from ttscompile.ir.operations import OPERATIONS, operation
+from ttscompile.ir.graph import Graph, Node, TensorType
+from ttscompile.ir.operations import OPERATIONS, Linear, Movement, axes_along, operation, permutation
 from ttscompile.lower.program import lower_graph
 
 LOWERED = [name for name, row in OPERATIONS.items() if row.onnx]
@@ -121,3 +123,113 @@ def test_a_network_with_an_operation_without_a_row_is_refused_at_capture() -> No
 
     with pytest.raises(CaptureError, match=r"ndtri.*test_operations.py:\d+ in forward.* has no row"):
         capture(Uncommon([]), toy_spec(sample=(4, 1), obs=(4, 6)))
+
+
+def _nodes(has: str) -> list[tuple[Graph, Node]]:
+    """Nodes of the examples whose row has this fact, each as a graph of its own that reads nothing but inputs."""
+    found: dict[str, tuple[Graph, Node]] = {}
+    for names in [*CHUNKS, UNLOWERED]:
+        whole = _captured(tuple(names))[0]
+        types = whole.types()
+        for node in whole.nodes:
+            row = operation(node.op)
+            if getattr(row, has) and list(node.refs()):
+                graph = Graph({name: types[name] for name in node.refs()}, {}, (node,), (node.name,))
+                found.setdefault(f"{row.name} {node.op}", (graph, node))
+    assert {node.op for _, node in found.values()}
+    return list(found.values())
+
+
+def _first(graph: Graph, inputs: dict[str, Tensor]) -> Tensor:
+    """The value of the one node, or the first of several."""
+    (value,) = evaluate(graph, {}, inputs)
+    return value if isinstance(value, Tensor) else value[0]
+
+
+def test_elementwise_is_elementwise() -> None:
+    """Numbers that change places together give results that change places."""
+    for graph, node in _nodes("elementwise"):
+        inputs = values(dict(graph.inputs))
+        shape = torch.broadcast_shapes(*(value.shape for value in inputs.values()))
+        assert shape == node.type.at(2), node
+        wide = {name: value.expand(shape) for name, value in inputs.items()}
+        order = torch.randperm(math.prod(shape), generator=torch.Generator().manual_seed(0))
+        types = {name: TensorType(shape, type_.dtype) for name, type_ in graph.inputs.items()}
+        bare = replace(graph, inputs=types)
+        moved = {name: value.flatten()[order].view(shape) for name, value in wide.items()}
+        expected = _first(bare, wide).flatten()[order].view(shape)
+        torch.testing.assert_close(_first(bare, moved), expected, equal_nan=True, msg=lambda m, n=node: f"{n}: {m}")
+
+
+def test_linear_is_linear() -> None:
+    """What is affine gives for a sum of inputs, less one, the sum of what it gives, less one."""
+    for graph, node in _nodes("linear"):
+        row, names = operation(node.op), list(graph.inputs)
+        if len(names) < len(list(node.refs())) or not node.type.dtype.startswith("float"):
+            continue  # of a value and itself, or of integers
+        moving = {Linear.JOINTLY: [names], Linear.IN_FIRST: [names[:1]], Linear.IN_EACH: [[name] for name in names]}
+        for together in moving[row.linear]:  # type: ignore[index]
+            left, right, zero = (values(dict(graph.inputs), seed=seed) for seed in (1, 2, 3))
+            for other in (right, zero):
+                other |= {name: value for name, value in left.items() if name not in together}
+            total = {name: left[name] + right[name] - zero[name] if name in together else left[name] for name in names}
+            expected = _first(graph, left) + _first(graph, right) - _first(graph, zero)
+            torch.testing.assert_close(_first(graph, total), expected, msg=lambda m, n=node: f"{n}: {m}")
+
+
+def test_movements_move() -> None:
+    for graph, node in _nodes("movement"):
+        ((name, type_),) = list(graph.inputs.items())[:1]
+        inputs = values(dict(graph.inputs))
+        x, y, rank = inputs[name], _first(graph, inputs), len(type_.shape)
+        match operation(node.op).movement:
+            case Movement.RESHAPE:
+                assert torch.equal(x.flatten(), y.flatten()), node
+            case Movement.PERMUTE:
+                assert torch.equal(x.permute(permutation(node, rank)), y), node
+            case Movement.PART | Movement.REPEAT as movement:
+                assert set(y.flatten().tolist()) <= set(x.flatten().tolist()), node
+                assert movement is Movement.REPEAT or y.numel() <= x.numel(), node
+
+
+@pytest.mark.parametrize("fact", ["along", "mixes"])
+def test_what_lies_across_is_treated_alike(fact: str) -> None:
+    """To turn around an axis that an operation does not work along is to turn around its result."""
+    for graph, node in _nodes(fact):
+        name, inputs = next(iter(graph.inputs)), values(dict(graph.inputs))
+        rank, y = inputs[name].dim(), _first(graph, inputs)
+        mixes = operation(node.op).mixes
+        mixed = axes_along(node, rank) if mixes is None else range(rank - (mixes(node, graph.types()) or rank), rank)
+        for axis in set(range(rank)) - set(mixed):
+            after = axis - (y.dim() < rank and min(mixed) < axis)
+            turned = _first(graph, {**inputs, name: inputs[name].flip(axis)})
+            torch.testing.assert_close(turned, y.flip(after), msg=lambda m, n=node: f"{n}: {m}")
+
+
+def test_filled_is_filled() -> None:
+    for graph, node in _nodes("filled"):
+        row = operation(node.op)
+        assert row.filled is not None
+        value = row.filled(node)
+        if isinstance(value, int | float):
+            assert torch.equal(_first(graph, values(dict(graph.inputs))), torch.full(node.type.at(2), float(value)))
+
+
+@pytest.mark.parametrize(
+    ("name", "flops"),
+    [
+        ("linear", 2 * 4 * 3 * 6), ("matmul", 2 * 4 * 4 * 6), ("mm", 2 * 6 * 2), ("mv", 2 * 6),
+        ("addmm", 2 * 6 * 2), ("baddbmm", 2 * 4 * 4 * 6), ("bilinear", 2 * 4 * 2 * 6 * 6),
+        ("einsum", 2 * 4 * 4 * 6), ("tensordot", 2 * 4 * 6 * 2), ("scaled_dot_product_attention", 2 * 2 * 4 * 4 * 6),
+        ("conv1d", 2 * 2 * 4 * 4 * 3), ("conv2d", 2 * 2 * 24 * 9), ("conv_transpose1d", 2 * (4 * 6) * (2 * 3)),
+        ("gru.input", 2 * 4 * 15 * (6 + 5)), ("gelu", 0), ("softmax", 0), ("dot", 2 * 3),
+    ],
+)  # fmt: skip
+def test_flops_are_those_of_a_hand(name: str, flops: int) -> None:
+    counts = set()
+    for names in CHUNKS:
+        whole = _captured(tuple(names))[0]
+        for node in whole.nodes:
+            if name in names and operation(node.op).name == name:
+                counts.add(graph_flops(Graph(whole.types(), {}, (node,), (node.name,))))
+    assert flops in counts

@@ -240,6 +240,7 @@ _GROUPS: tuple[tuple[str, Operation], ...] = (
     ("scaled_dot_product_attention", Operation(dropout=(4, "dropout_p"), flops=_attention)),
     ("softmax log_softmax cumsum", Operation(along=1)),
     ("cumprod", Operation(along=1, onnx=False)),
+    ("searchsorted", Operation(onnx=False)),
     ("gru.input lstm.input", _RECURRENT),
     # Values that read no number, and what only gives its shape and type.
     ("zeros zeros_like new_zeros zero", Operation(filled=lambda node: 0)),
@@ -251,7 +252,7 @@ _GROUPS: tuple[tuple[str, Operation], ...] = (
     ("arange linspace logspace eye empty empty_like new_empty scalar_tensor type_as copy meshgrid", Operation()),
     ("sum mean prod amax amin max min argmax argmin any all std var std_mean var_mean logsumexp", Operation()),
     ("norm linalg_vector_norm linalg_norm sort argsort topk diff trapezoid", Operation()),
-    ("index index_select gather take_along_dim embedding one_hot isin bucketize searchsorted", Operation()),
+    ("index index_select gather take_along_dim embedding one_hot isin bucketize", Operation()),
     ("index_put index_add index_copy index_fill scatter scatter_add select_scatter slice_scatter", Operation()),
     ("group_norm instance_norm _native_batch_norm_legit_no_training cosine_similarity pairwise_distance", Operation()),
     ("avg_pool1d avg_pool2d max_pool1d max_pool2d adaptive_avg_pool1d adaptive_avg_pool2d", Operation()),
