@@ -30,7 +30,7 @@ from .arrays import check_noise
 from .backend import Backend, Call
 from .inpainting import known_samples
 from .report import GIVEN, CallReport, Timings
-from .settle import LoweringCache, pruner_plan, settle_plan
+from .settle import LoweringCache, pruner_plan, repair_plan
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,8 +163,10 @@ class Runtime:
         stop = time.perf_counter()
         computed = settled.plans == Source.COMPUTE
         self._written, self._dropped = np.where(computed, keep, written), np.where(computed, ~keep, dropped)
+        executed = settled.plans.copy()  # the caller's plan is the caller's
+        executed.flags.writeable = False
         report = CallReport(
-            plan=_frozen(settled.plans),
+            plan=executed,
             plan_name=plan_name or (PRUNER if plan is None else GIVEN),
             computed=tuple(int(n) for n in np.count_nonzero(computed, axis=(1, 2))),
             legalised=settled.legalised,
@@ -197,7 +199,7 @@ class Runtime:
         """
         streams, steps, blocks = written.shape
         if repair:
-            plans, legalised = settle_plan(plan, self._groups, written, repair)
+            plans, legalised = repair_plan(plan, self._groups, written)
         else:
             plans, legalised = check_plan(plan, steps, blocks, streams), (0,) * streams
         rollout = plans == Source.ROLLOUT.value  # numpy takes five times as long to compare with the enum itself
@@ -223,16 +225,9 @@ def _prune(
 ) -> _Settled:
     """The pruner's plan and its instructions. Not a method: the helper must not keep the runtime alive."""
     start = time.perf_counter()
-    plans, legalised = settle_plan(pruner_plan(backend.logits()), groups, written, repair=True)
+    plans, legalised = repair_plan(pruner_plan(backend.logits()), groups, written)
     lowered = tuple(lowering.lower(one) for one in plans)
     return _Settled(plans, lowered, legalised, _milliseconds(start, time.perf_counter()))
-
-
-def _frozen(plans: PlanArray) -> PlanArray:
-    """A read-only copy: what a report holds must not change after the call, and the caller's plan is the caller's."""
-    copied = plans.copy()
-    copied.flags.writeable = False
-    return copied
 
 
 def _milliseconds(start: float, stop: float) -> float:

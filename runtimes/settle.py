@@ -9,34 +9,28 @@ from typing import Generic, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.core.lattice import BoolArray, PlanArray, check_plan, legalize, require_legal
+from ttscompile.core.lattice import BoolArray, PlanArray, check_plan, legalize
 from ttscompile.errors import IllegalPlanError
 
 Lowered = TypeVar("Lowered")
 
 
-def settle_plan(
-    plan: npt.ArrayLike, groups: Sequence[int], written: BoolArray, repair: bool
-) -> tuple[PlanArray, tuple[int, ...]]:
-    """The plan that will be executed.
+def repair_plan(plan: npt.ArrayLike, groups: Sequence[int], written: BoolArray) -> tuple[PlanArray, tuple[int, ...]]:
+    """The plan of every stream without illegal reads.
 
     Args:
         plan: ``[K, blocks]`` or ``[B, K, blocks]``.
         groups: FORWARD group of each block.
         written: bool ``[B, K, blocks]``; rollout entries that exist.
-        repair: replace illegal reads rather than refuse them.
 
     Returns:
         A legal plan, int8 ``[B, K, blocks]``, and the number of replaced cells of each stream.
 
     Raises:
-        IllegalPlanError: wrong shape, or illegal and not to be repaired.
+        IllegalPlanError: wrong dtype, shape or values.
     """
     streams, steps, blocks = written.shape
     plans = check_plan(plan, steps, blocks, streams)
-    if not repair:
-        require_legal(plans, groups, written)
-        return plans, (0,) * streams
     legal, _ = legalize(plans, groups, written)
     return legal, tuple(int(n) for n in np.count_nonzero(legal != plans, axis=(1, 2)))
 

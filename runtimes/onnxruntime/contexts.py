@@ -27,6 +27,7 @@ class ContextValues:
 
     Attributes:
         streams: B.
+        values: by name; of the condition as they are, of steps and tables ``[K, ...]``.
     """
 
     def __init__(
@@ -34,7 +35,7 @@ class ContextValues:
     ) -> None:
         self._manifest, self._sessions, self.streams = manifest, sessions, streams
         self._step_inputs: dict[str, Array] = {}
-        self._values: dict[str, Array] = {  # condition values; step and table values [K, ...]
+        self.values: dict[str, Array] = {
             name: repeat_streams(tables[name], _row_axis(context), streams)
             if context.binding is Binding.TABLE
             else np.zeros(_shape(context, manifest.steps, streams), context.type.dtype)
@@ -44,7 +45,7 @@ class ContextValues:
     @property
     def nbytes(self) -> int:
         """Memory of the values."""
-        return sum(array.nbytes for array in (*self._values.values(), *self._step_inputs.values()))
+        return sum(array.nbytes for array in (*self.values.values(), *self._step_inputs.values()))
 
     def fill(self, obs: Mapping[str, FloatArray]) -> None:
         """The prologue: what the normalised observations ``[B, ...]`` decide."""
@@ -52,20 +53,16 @@ class ContextValues:
         if piece.outputs:
             feed = {name: np.ascontiguousarray(obs[name]) for name in piece.inputs}
             for name, value in run_named(self._sessions[CONDITION], piece.outputs, feed).items():
-                if name in self._values:
-                    np.copyto(self._values[name], value)
+                if name in self.values:
+                    np.copyto(self.values[name], value)
                 else:
-                    self._values[name] = value  # a feature, which only the pruner reads
+                    self.values[name] = value  # a feature, which only the pruner reads
         if STEP in self._manifest.pieces:
             self._run_step(self._manifest.pieces[STEP])
 
-    def of_call(self, piece: PieceRecord) -> dict[str, Array]:
-        """The inputs of a piece that runs once a call."""
-        return {name: self._values[name] for name in piece.inputs}
-
     def at(self, name: str, k: int) -> Array:
         """The value of a context at step k."""
-        value = self._values[name]
+        value = self.values[name]
         if self._manifest.contexts[name].binding is Binding.CONDITION:
             return value
         row: Array = value[k, ...]  # an array still where it is one number
@@ -73,7 +70,7 @@ class ContextValues:
 
     def of_piece(self, piece: PieceRecord) -> dict[str, tuple[ContextRecord, Array]]:
         """Contexts that a piece of the loop reads, and their values: ``[K, ...]`` unless they are of the condition."""
-        return {name: (self._manifest.contexts[name], self._values[name]) for name in piece.contexts}
+        return {name: (self._manifest.contexts[name], self.values[name]) for name in piece.contexts}
 
     def _run_step(self, piece: PieceRecord) -> None:
         """The step values of all steps in one batch of K * B, step-major."""
@@ -82,7 +79,7 @@ class ContextValues:
             context = self._manifest.contexts[name]
             axis = context.type.batch_axis
             if context.binding is Binding.CONDITION:
-                value = self._values[name]
+                value = self.values[name]
                 feed[name] = value if axis is None else np.concatenate([value] * steps, axis=axis)
                 continue
             if name not in self._step_inputs:
@@ -91,10 +88,10 @@ class ContextValues:
                         f"table {name!r} : {context.type} of the step piece has no axis for the streams, so that the"
                         " steps cannot run as one batch. Convert the checkpoint again."
                     )
-                self._step_inputs[name] = np.concatenate(list(self._values[name]), axis=axis)
+                self._step_inputs[name] = np.concatenate(list(self.values[name]), axis=axis)
             feed[name] = self._step_inputs[name]
         for name, value in run_named(self._sessions[STEP], piece.outputs, feed).items():
-            np.copyto(self._values[name], self._by_step(name, value))
+            np.copyto(self.values[name], self._by_step(name, value))
 
     def _by_step(self, name: str, value: Array) -> Array:
         """``[..., K * B, ...]`` as ``[K, ..., B, ...]``."""

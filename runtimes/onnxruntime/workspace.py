@@ -128,7 +128,8 @@ class Workspace:
     def logits(self) -> FloatArray:
         """The pruner: float32 ``[B, K, blocks, 4]``. Reads condition values alone, so the loop may run meanwhile."""
         piece = self._manifest.pieces[PRUNER]
-        made = run_named(self._sessions[PRUNER], piece.outputs, self._contexts.of_call(piece))
+        feed = {name: self._contexts.values[name] for name in piece.inputs}
+        made = run_named(self._sessions[PRUNER], piece.outputs, feed)
         return np.asarray(made[piece.outputs[0]], dtype=np.float32)
 
     def advance(self, k: int) -> None:

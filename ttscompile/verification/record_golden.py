@@ -27,7 +27,7 @@ from ..ir.graph import Graph, TensorType, backward_slice
 from ..ir.program import Block, Program
 from ..ir.rows import Rows
 from ..runtimes.reference.model import ReferenceModel
-from ..runtimes.settle import pruner_plan, settle_plan
+from ..runtimes.settle import pruner_plan, repair_plan
 
 STREAMS = 2
 """Streams of the call, so that what mixes streams up shows; one where that would take long or much room."""
@@ -140,7 +140,7 @@ def _episode(
     for order in (1, -1):
         contexts = model.prologue({key: torch.from_numpy(value[::order].copy()) for key, value in obs.items()})
         wanted = pruner_plan(model.logits(contexts).numpy()) if pruned else artifact.schedule(name)
-        plan, _ = settle_plan(wanted, model.groups, cache.written, repair=True)
+        plan, _ = repair_plan(wanted, model.groups, cache.written)
         draws = None if golden.draws is None else torch.from_numpy(golden.draws[:, ::order].copy())
         result = model.denoise(
             contexts,
