@@ -155,7 +155,11 @@ class Counted(TorchDispatchMode):
         self.terms, self.angle = 0, 0.0
 
     def __torch_dispatch__(self, op: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Run the operation, and count it."""
+        """Run the operation, and count it; one that consists of others, which inference mode leaves whole, by these."""
+        with self:
+            parts = op.decompose(*args, **(kwargs or {}))
+        if parts is not NotImplemented:
+            return parts
         result = op(*args, **(kwargs or {}))
         first = result[0] if isinstance(result, tuple | list) else result
         if isinstance(first, torch.Tensor) and first.is_floating_point() and not op.is_view:

@@ -111,12 +111,16 @@ def test_what_is_counted() -> None:
     """By hand: a convolution, a product, an attention, a norm, a mean, an addition, functions; angles of float32."""
     functional, x = nn.functional, torch.ones(1, 2, 4, 8)
     image, kernel, left, right = (torch.ones(shape) for shape in ((1, 3, 5, 5), (2, 3, 3, 3), (2, 7), (7, 5)))
+    wide = torch.ones(3, 18)
     with Counted() as counted:
         functional.conv2d(image, kernel)
     assert counted.terms == 27 + 1
     with Counted() as counted:
         left @ right
     assert counted.terms == 7
+    with torch.inference_mode(), Counted() as counted:
+        functional.linear(functional.conv2d(image, kernel).flatten(1), wide)
+    assert counted.terms == 28 + 18
     with Counted() as counted:
         functional.scaled_dot_product_attention(x, x, x)
     assert counted.terms == 8 + 4 + 16

@@ -15,7 +15,7 @@ import torch
 from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 
 import ttscompile
-from tests.rounding import PROMISED, Counted, assert_equal_but_for_rounding, bound
+from tests.rounding import PROMISED, Counted, allowed, assert_equal_but_for_rounding, bound
 from ttscompile.artifact import load_artifact
 from ttscompile.capture.export import capture
 from ttscompile.core.spec import ChunkSpec, Noise, ObservationSpec, PolicySpec
@@ -82,6 +82,9 @@ def test_the_original_gave_the_same(variant: str, tmp_path: Path) -> None:
         features = module.encoder(observation).flatten(0, 1)
     assert numbers["features"].std(axis=0).max() > 0.1
     assert_equal_but_for_rounding(features, numbers["features"], counted.terms)
+    with torch.inference_mode():
+        halved = copy.deepcopy(module.encoder).half().float()(observation).flatten(0, 1).numpy()
+    assert np.abs(halved - numbers["features"]).max() > 5 * allowed(numbers["features"], counted.terms)
     assert spec.sampler.timesteps.tolist() == numbers["timesteps"].tolist()
     sample = eager_policy(module, spec)(observation, Noise(*hybrid.noise(variant))).numpy()
     assert spec.chunk.normalizer is not None
