@@ -1,12 +1,15 @@
 """Runtimes: what executes a compiled policy. All take the same artifact and give the same answer.
 
+- ``runtime``: what all of them do alike; ``backend``: what each of them has to provide; ``open``: which there are.
 - ``reference``: torch, plain, differentiable; the definition of reuse.
-- ``onnxruntime_cpu``: numpy and onnxruntime only; what runs on the robot.
-- ``policy``: the object that users hold, around either.
+- ``onnxruntime``: numpy and onnxruntime only; what runs on the robot.
+- ``policy``: the object that users hold, around any of them.
 """
 
 from __future__ import annotations
 
-from .base import CallReport, Runtime, Timings, open_runtime
+from .open import open_runtime
+from .report import CallReport, Timings
+from .runtime import Runtime
 
 __all__ = ["CallReport", "Runtime", "Timings", "open_runtime"]

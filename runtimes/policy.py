@@ -19,10 +19,12 @@ from ttscompile.errors import IllegalPlanError, ObservationError, RuntimeUnavail
 from ttscompile.ir.graph import TensorType
 
 from .arrays import check_noise, check_observation, check_seed, is_tensor, like
-from .base import CallReport, Runtime, open_runtime
 from .inpainting import check_prefix, known_samples, prefix_refusal
 from .onnxruntime.liveness import RolloutNeeds, rollout_needs
+from .open import kind_of, open_runtime
 from .queues import Queues, is_window
+from .report import CallReport
+from .runtime import Runtime
 
 if TYPE_CHECKING:
     from ttscompile.artifact.load import Artifact
@@ -107,10 +109,10 @@ def load(
     """
     check_seed(seed)
     artifact = load_artifact(path)
-    if runtime == "reference":
+    if kind_of(runtime).fp32_only:
         if precision not in (None, FP32):
             raise RuntimeUnavailableError(
-                f"runtime 'reference' computes in {FP32!r} alone; found precision {precision!r}. Leave it out."
+                f"runtime {runtime!r} computes in {FP32!r} alone; found precision {precision!r}. Leave it out."
             )
         precision = FP32
     if precision is not None:

@@ -69,7 +69,7 @@ SHORTER = {
     "verify": "--calls 4",
     "report": "--runs 1",
     "bench": "--runs 1",
-    "plan": "--runs 1",
+    "realtime": "--runs 1",
     "record.py": "--episodes 2 --threads 1",
     "evaluate.py": "--episodes 1 --threads 1",
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import pytest
 import ttscompile
 
 from .imports import PACKAGES, Import, eager_closure, home, imports, modules
+from .structure import FLOORS, arrows_up, circles, doors_of, drawing
 
 ROOT = Path(__file__).resolve().parents[1]
 MODULES = modules(ROOT)
@@ -46,6 +48,9 @@ MAY_IMPORT = {
 }
 """Part of the package -> the other parts that it may import, anywhere in its code. Design, section 4."""
 
+MOST_DOORS = 12
+"""Other rooms that a room may import: a reader who opens more of them at once is lost."""
+
 COMPILERS_ONLY = {"diffusers", "matplotlib", "onnx", "onnx_ir", "onnxscript", "pydantic", "safetensors", "torch"}
 COMPILES = (
     "ttscompile.calibration",
@@ -72,7 +77,7 @@ def direction_errors(found: list[Import], known: set[str]) -> list[str]:
     errors = []
     for each in found:
         target = home(each.target, known)
-        if target is None or target == "ttscompile":  # the package itself: its version, and the public names
+        if target is None or target == "ttscompile":  # the package itself has the public names
             continue
         importer, imported = part(each.importer), part(target)
         if importer not in {"", "__main__", imported} and imported not in MAY_IMPORT[importer]:
@@ -100,10 +105,10 @@ def test_imports_go_one_way() -> None:
     ("importer", "target"),
     [
         ("ttscompile.ir.graph", "ttscompile.passes.hoist"),
-        ("ttscompile.passes.hoist", "ttscompile.runtimes.base"),
+        ("ttscompile.passes.hoist", "ttscompile.runtimes.runtime"),
         ("ttscompile.passes.hoist", "ttscompile.passes.partition"),
-        ("ttscompile.runtimes.base", "ttscompile.frontends"),
-        ("ttscompile.runtimes.base", "ttscompile.calibration"),
+        ("ttscompile.runtimes.runtime", "ttscompile.frontends"),
+        ("ttscompile.runtimes.runtime", "ttscompile.calibration"),
         ("ttscompile.artifact.load", "ttscompile.runtimes.policy.load"),
         ("ttscompile.errors", "ttscompile.core.spec"),
         ("ttscompile.driver", "ttscompile.cli"),
@@ -114,9 +119,50 @@ def test_an_import_the_wrong_way_is_found(importer: str, target: str) -> None:
     assert len(direction_errors([Import(importer, target, 1, True)], known)) == 1
 
 
+def test_the_rooms_stand_on_floors_without_circles_and_have_at_most_twelve_doors() -> None:
+    doors = doors_of()
+    assert sorted(doors) == sorted(name for floor in FLOORS for name in floor)
+    assert circles(doors) == []
+    assert arrows_up(doors) == []
+    assert {name: sorted(targets) for name, targets in doors.items() if len(targets) > MOST_DOORS} == {}
+
+
+def test_circles_and_arrows_up_are_found_and_drawn() -> None:
+    doors = {name: dict[str, int]() for floor in FLOORS for name in floor}
+    doors["cli"]["core"] = 1
+    assert (circles(doors), arrows_up(doors)) == ([], [])
+    doors["core"]["ir"], doors["ir"]["artifact"], doors["artifact"]["core"] = 1, 2, 3
+    assert circles(doors) == [("artifact", "core", "ir")]
+    assert arrows_up(doors) == ["core -> ir (1 imports)", "ir -> artifact (2 imports)"]
+    assert "circles: artifact - core - ir\narrows up: core -> ir (1 imports); ir" in drawing(doors)
+
+
+def test_the_drawing_can_be_had_as_a_command() -> None:
+    result = subprocess.run([sys.executable, ROOT / "tests" / "structure.py"], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.endswith("circles: none\narrows up: none\n")
+
+
+def leaving(module: str, source: str) -> list[int]:
+    """Lines of a module of ``passes`` or ``runtimes`` where a relative import leads out of that package."""
+    inside = module.count(".") - 1
+    tree = ast.walk(ast.parse(source))
+    return [node.lineno for node in tree if isinstance(node, ast.ImportFrom) and node.level > inside]
+
+
+def test_passes_and_runtimes_import_what_is_outside_of_them_by_whole_names() -> None:
+    """Their folders stand at the top of the tree: ``from ..`` would lead out of it where tools read it as it stands."""
+    assert leaving("ttscompile.runtimes.base", "from ..errors import X") == [1]
+    assert leaving("ttscompile.runtimes.executor.state", "from ..base import X\nfrom ...errors import X") == [2]
+    for name, path in MODULES.items():
+        if part(name) in ("passes", "runtimes"):
+            depth = name if path.name != "__init__.py" else f"{name}.__init__"
+            assert leaving(depth, path.read_text()) == [], name
+
+
 def test_the_runtime_side_needs_nothing_of_the_compilers() -> None:
     light = [name for name in MODULES if not compiles(name)]
-    assert "ttscompile.runtimes.base" in light
+    assert "ttscompile.runtimes.runtime" in light
     for name in light:
         chains = eager_closure(name, GRAPH)
         heavy = {foreign: " -> ".join(chain) for foreign, chain in chains.items() if foreign in COMPILERS_ONLY}

@@ -10,20 +10,20 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from .measure.versions import VERSION as __version__
+
 if TYPE_CHECKING:
     from .calibration import calibrate
     from .core.lattice import Source, legalize
     from .core.spec import Affine, ChunkSpec, Noise, ObservationSpec, PolicySpec, SamplerTable
     from .driver import compile_denoiser, convert
     from .errors import TtscompileError
-    from .runtimes.base import CallReport
     from .runtimes.executor import AsyncExecutor, ExecutorSettings, GuardLimits
     from .runtimes.policy import CompiledPolicy, PolicyInfo, load
+    from .runtimes.report import CallReport
     from .samplers.edm import EDMDenoiser, edm_table
     from .samplers.flow import flow_matching_table
     from .verification import Verification, verify
-
-__version__ = "0.1.0"
 
 __all__ = [
     "Affine",
@@ -56,7 +56,7 @@ __all__ = [
 _HOMES = {
     "Affine": "core.spec",
     "AsyncExecutor": "runtimes.executor",
-    "CallReport": "runtimes.base",
+    "CallReport": "runtimes.report",
     "ChunkSpec": "core.spec",
     "CompiledPolicy": "runtimes.policy",
     "EDMDenoiser": "samplers.edm",

@@ -18,7 +18,7 @@ from ttscompile.cli.timing import Contestant, Measurement
 from ttscompile.core.lattice import PlanArray, plan_flops
 from ttscompile.ir.pieces import block_name
 from ttscompile.runtimes.onnxruntime.idle import WORTH
-from ttscompile.runtimes.onnxruntime.instructions import lower_plan
+from ttscompile.runtimes.onnxruntime.instructions import instructions_of
 from ttscompile.runtimes.onnxruntime.sessions import Bound, open_sessions
 from ttscompile.runtimes.onnxruntime.workspace import Workspace
 from ttscompile.runtimes.random_calls import random_calls
@@ -53,7 +53,7 @@ def tails_contestant(directory: Path, threads: int, plan: PlanArray) -> Contesta
         obs[key] = obs[key] if spec.normalizer is None else spec.normalizer.normalize(obs[key])
     work.start(obs, noise, None)
 
-    lowered = lower_plan(plan, manifest.groups)
+    lowered = instructions_of(plan, manifest.groups)
 
     def call(*_: object) -> None:
         k = 0

@@ -13,8 +13,8 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import click
@@ -33,6 +33,7 @@ from ttscompile import Source
 from ttscompile.artifact.load import load_artifact
 from ttscompile.cli.output import print_identity
 from ttscompile.measure.machine import fingerprint, one_line
+from ttscompile.measure.timer import Timer, Times
 from ttscompile.runtimes.policy import PolicyInfo
 
 CHECKPOINT = Path(__file__).with_name("pusht_dpt_ema_fp16.ckpt")
@@ -84,13 +85,12 @@ class Measurement:
     @property
     def median(self) -> float:
         """Milliseconds a call."""
-        return float(np.median(self.ms))
+        return Times(self.ms).median
 
     @property
     def quartiles(self) -> tuple[float, float]:
         """First and third quartile, milliseconds."""
-        low, high = np.percentile(self.ms, [25, 75])
-        return float(low), float(high)
+        return Times(self.ms).quartiles
 
 
 def random_plan(steps: int, blocks: int, computed: float, seed: int) -> npt.NDArray[np.int8]:
@@ -141,32 +141,28 @@ def measure(
         One measurement a contestant.
     """
     windows = scripted_windows(WARM_UP + runs)
-    ms: list[list[float]] = [[] for _ in contestants]
+    timer = Timer(len(contestants), WARM_UP)
     reports: list[list[Any]] = [[] for _ in contestants]
     for contestant in contestants:
         contestant.policy.reset()
     for call, window in enumerate(windows):
-        for turn in range(len(contestants)):
-            i = (turn + call) % len(contestants)  # nobody always runs after the same one
+        for i in timer.round():
             contestant = contestants[i]
             noise = seeded_noise(contestant.noise, [0], call)
             plan = "dense" if call == 0 and contestant.plan is not None else contestant.plan
-            started = perf_counter()
-            contestant.policy.predict_action({"obs": window}, noise=noise, plan=plan)
-            elapsed = 1000 * (perf_counter() - started)
-            if call >= WARM_UP:
-                ms[i].append(elapsed)
+            timer.time(i, partial(contestant.policy.predict_action, {"obs": window}, noise=noise, plan=plan))
+            if timer.counted:
                 reports[i].append(getattr(contestant.policy, "last_report", None))
         on_run()
-    return [_summary(c, times, seen) for c, times, seen in zip(contestants, ms, reports, strict=True)]
+    return [_summary(c, times.ms, seen) for c, times, seen in zip(contestants, timer.times, reports, strict=True)]
 
 
-def _summary(contestant: Contestant, ms: Sequence[float], reports: Sequence[Any]) -> Measurement:
+def _summary(contestant: Contestant, ms: tuple[float, ...], reports: Sequence[Any]) -> Measurement:
     if reports[-1] is None:
-        return Measurement(contestant.label, tuple(ms), None, None, contestant.dense_flops, 0.0, None)
+        return Measurement(contestant.label, ms, None, None, contestant.dense_flops, 0.0, None)
     return Measurement(
         label=contestant.label,
-        ms=tuple(ms),
+        ms=ms,
         prologue_ms=float(np.median([report.timings.prologue for report in reports])),
         pruner_ms=float(np.median([report.timings.pruner for report in reports])),
         flops=float(np.median([report.flops[0] for report in reports])),

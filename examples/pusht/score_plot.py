@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from textwrap import fill
-from time import perf_counter
 
 import numpy as np
 from bootstrap import Estimate
 from rollout import seeded_noise
 from variants import Variant
 
+from ttscompile.measure.timer import Timer
 from ttscompile.measure.units import ms
 from ttscompile.plots.figure import plain_powers
 
@@ -38,21 +39,19 @@ def time_calls(variants: Sequence[Variant], window: np.ndarray, calls: int) -> l
         window: an observation ``[To, Do]``.
         calls: of each, warm-up apart.
     """
-    took: list[list[float]] = [[] for _ in variants]
     for variant in variants:
         variant.policy.reset()
+    timer = Timer(len(variants), WARM_UP)
     for number in range(WARM_UP + calls):
-        for variant, times in zip(variants, took, strict=True):
+        for i in timer.round():
+            variant = variants[i]
             noise = seeded_noise(variant.noise, [0], number)
             given = {} if variant.plan is None else {"plan": variant.plan}
-            began = perf_counter()
-            variant.policy.predict_action({"obs": window[None]}, noise=noise, **given)
-            times.append(1000 * (perf_counter() - began))
-    found = []
-    for variant, times in zip(variants, took, strict=True):
-        warm = times[WARM_UP:]
-        found.append(Timed(variant.label, float(np.median(warm)), float(np.quantile(warm, 0.9))))
-    return found
+            timer.time(i, partial(variant.policy.predict_action, {"obs": window[None]}, noise=noise, **given))
+    return [
+        Timed(variant.label, times.median, float(np.quantile(times.ms, 0.9)))
+        for variant, times in zip(variants, timer.times, strict=True)
+    ]
 
 
 def plot_scores(

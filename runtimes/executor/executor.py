@@ -107,7 +107,7 @@ class AsyncExecutor:
             self._closing = True
             raise ExecutorError(
                 f"the policy was not measured within {open_timeout:g} s: a call of it hangs, or is very slow. Look at"
-                " 'ttscompile plan DIR'."
+                " 'ttscompile realtime DIR'."
             )
         if self._failure is not None:
             self._thread.join()
@@ -326,7 +326,8 @@ class AsyncExecutor:
             pin(settings.cores)
         if self._given_latencies is None:
             self._policy.reset()
-            measured = measure_latencies(self._policy, self._clock, settings, resolved.tiers)
+            times = measure_latencies(self._policy, self._clock, settings, resolved.tiers)
+            measured = {name: [ms / 1e3 for ms in each.ms] for name, each in times.items()}
         else:
             missing = [name for name in resolved.tiers if name not in self._given_latencies]
             if missing:
@@ -344,7 +345,7 @@ class AsyncExecutor:
             raise InfeasibleError(
                 f"no plan is fast enough for this loop. {sums}. Use a plan whose calls take at most"
                 f" {1e3 * longest:.4g} ms, a lower rate, or more of each chunk (ExecutorSettings.horizon and reserve);"
-                " 'ttscompile plan DIR' says what is feasible."
+                " 'ttscompile realtime DIR' says what is feasible."
             )
         tiers = possible or resolved.tiers[-1:]
         with self._lock:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ttscompile.core.spec import ChunkSpec, FloatArray, ObservationSpec
+from ttscompile.measure.timer import Timer, Times
 
 from .clock import Clock
 from .settings import ExecutorSettings, Policy
@@ -43,20 +45,15 @@ def neutral_action(chunk: ChunkSpec) -> FloatArray:
 
 def measure_latencies(
     policy: Policy, clock: Clock, settings: ExecutorSettings, plans: Sequence[str]
-) -> dict[str, list[float]]:
-    """Seconds of each measured call of each plan, after the warm-up; with a prefix, if calls will have one.
+) -> dict[str, Times]:
+    """What the measured calls of each plan take on a neutral observation; with a prefix, if calls will have one.
 
-    The caller resets the policy before and after.
+    The plans take turns. The caller resets the policy before and after.
     """
     obs = neutral_observation(dict(policy.info.observation))
     known = {"prefix": neutral_action(policy.info.action)} if settings.seam == "prefix" else {}
-    latencies: dict[str, list[float]] = {}
-    for plan in plans:
-        for _ in range(settings.warm_up):
-            policy.predict_action(obs, plan=plan, **known)
-        latencies[plan] = []
-        for _ in range(settings.measured_calls):
-            start = clock.now()
-            policy.predict_action(obs, plan=plan, **known)
-            latencies[plan].append(clock.now() - start)
-    return latencies
+    timer = Timer(len(plans), settings.warm_up, clock.now)
+    for _ in range(settings.warm_up + settings.measured_calls):
+        for i in timer.round():
+            timer.time(i, partial(policy.predict_action, obs, plan=plans[i], **known))
+    return dict(zip(plans, timer.times, strict=True))

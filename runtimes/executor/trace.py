@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 if TYPE_CHECKING:
-    from ttscompile.runtimes.base import Timings
+    from ttscompile.runtimes.report import Timings
 
 Event: TypeAlias = tuple[str, str, int, float, float, Mapping[str, Any] | None]
 """Phase, name, thread, start and duration in seconds, arguments."""

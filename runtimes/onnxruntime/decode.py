@@ -10,7 +10,7 @@ import numpy as np
 from ttscompile.core.lattice import BoolArray
 
 from .idle import WORTH, IdleSteps
-from .instructions import Lowered
+from .instructions import Instructions
 from .sessions import Array
 from .workspace import Workspace
 
@@ -34,7 +34,7 @@ def _run_dense(work: Workspace, k: int, keep: BoolArray) -> None:
     work.advance(k)
 
 
-def decode_rest(work: Workspace, lowered: Sequence[Lowered], keep: BoolArray) -> None:
+def decode_rest(work: Workspace, lowered: Sequence[Instructions], keep: BoolArray) -> None:
     """The steps after step 0; the sample is then ``work.sample[K % 2]``.
 
     Args:
@@ -48,7 +48,7 @@ def decode_rest(work: Workspace, lowered: Sequence[Lowered], keep: BoolArray) ->
         _apart(work, lowered, keep)
 
 
-def _together(work: Workspace, lowered: Lowered, keep: BoolArray) -> None:
+def _together(work: Workspace, lowered: Instructions, keep: BoolArray) -> None:
     """All streams follow one plan: every instruction is one operation on the whole batch."""
     blocks = len(work.current)
     entries = {cell: work.rollout.entry(cell) for cell in np.flatnonzero(lowered.rollout).tolist()}
@@ -112,7 +112,7 @@ def _pass_idle(work: Workspace, idle: IdleSteps, lane: _Lane, k: int) -> int:
     return stop
 
 
-def _apart(work: Workspace, lowered: Sequence[Lowered], keep: BoolArray) -> None:
+def _apart(work: Workspace, lowered: Sequence[Instructions], keep: BoolArray) -> None:
     """Every stream follows its own plan; a block that several compute in a step runs once, on these."""
     blocks, everyone = len(work.current), work.streams
     room = work.sums(max(one.slots for one in lowered))
@@ -179,7 +179,7 @@ class _Lane:
     """
 
     def __init__(
-        self, lowered: Lowered, stream: Array, current: Array, table: Array, sums: Array, entries: dict[int, Array]
+        self, lowered: Instructions, stream: Array, current: Array, table: Array, sums: Array, entries: dict[int, Array]
     ) -> None:
         self.lowered, self.shape = lowered, stream.shape
         self.stream, self.current = _flat(stream, 0), _flat(current, 1)
@@ -189,7 +189,7 @@ class _Lane:
         self._entries = {cell: _flat(entry, 0) for cell, entry in entries.items()}
 
     @classmethod
-    def of_stream(cls, work: Workspace, s: int, lowered: Lowered, sums: Array) -> _Lane:
+    def of_stream(cls, work: Workspace, s: int, lowered: Instructions, sums: Array) -> _Lane:
         """The lane of one stream of the batch."""
         axis = work.axis
         current, table, sums = (np.moveaxis(array, axis + 1, 1)[:, s] for array in (work.current, work.table, sums))

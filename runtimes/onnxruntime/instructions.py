@@ -15,7 +15,6 @@ block by block in the order of the summation only.
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -27,14 +26,14 @@ from ttscompile.core.lattice import UNWRITTEN, BoolArray, PlanArray, Source, ori
 Add = tuple[int, int, int, int]
 """Add a sum to the stream, after making it if it is new: the slot where it is kept while it is needed; the first row
 that it sums; one past the last, which is the first if the sum is in its slot already; and how many of the entries of
-``Lowered.load_rows`` and ``load_from`` that are left to load before it is made."""
+``Instructions.load_rows`` and ``load_from`` that are left to load before it is made."""
 
 Cells = npt.NDArray[np.int32]
 Positions = npt.NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
-class Lowered:
+class Instructions:
     """The instructions of one stream's plan.
 
     Attributes:
@@ -73,8 +72,8 @@ class Lowered:
         return any(0 < count < self.computed.shape[1] for count in self.counts)
 
 
-def lower_plan(plan: PlanArray, groups: Sequence[int]) -> Lowered:
-    """Lower the plan of one stream.
+def instructions_of(plan: PlanArray, groups: Sequence[int]) -> Instructions:
+    """What executes the plan of one stream.
 
     Args:
         plan: int8 ``[K, blocks]``.
@@ -123,7 +122,7 @@ def lower_plan(plan: PlanArray, groups: Sequence[int]) -> Lowered:
         total[k] = maker.get(gap, gap)
         idle[k] = idle[k + 1] + 1
         alike[k] = alike[k + 1] + 1 if total[k] == total[k + 1] else 1
-    return Lowered(
+    return Instructions(
         counts=tuple(computed.sum(axis=1).tolist()),
         cells=tuple(np.flatnonzero(computed).tolist()),
         gaps=tuple(zip(slot, rows.tolist(), (rows + made).tolist(), loads, strict=True)),
@@ -192,36 +191,3 @@ def _changes(cells: Cells, made: Positions) -> BoolArray:
     held = np.maximum.accumulate(last, axis=0).reshape(-1)[made - cells.shape[1]]
     changed: BoolArray = flat[held] != flat[made]
     return changed
-
-
-class LoweringCache:
-    """The last plans that were lowered: schedules are lowered once, the pruner's plans when they change.
-
-    Args:
-        groups: FORWARD group of each block.
-        capacity: plans to keep.
-    """
-
-    def __init__(self, groups: Sequence[int], capacity: int = 64) -> None:
-        self._groups = tuple(groups)
-        self._capacity = capacity
-        self._plans: OrderedDict[bytes, Lowered] = OrderedDict()
-
-    def lower(self, plan: PlanArray) -> Lowered:
-        """``lower_plan``, remembered.
-
-        Args:
-            plan: int8 ``[K, blocks]``, contiguous.
-
-        Raises:
-            IllegalPlanError: see ``lower_plan``.
-        """
-        key = plan.tobytes()
-        found = self._plans.get(key)
-        if found is None:
-            found = self._plans[key] = lower_plan(plan, self._groups)
-            if len(self._plans) > self._capacity:
-                self._plans.popitem(last=False)
-        else:
-            self._plans.move_to_end(key)
-        return found

@@ -15,24 +15,24 @@ need, are opened when some plan does.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from ttscompile.artifact.files import verify
+from ttscompile.artifact.load import Artifact
 from ttscompile.artifact.manifest import PieceRecord
+from ttscompile.core.spec import FP32
 from ttscompile.errors import ArtifactError, RuntimeUnavailableError
 from ttscompile.ir.graph import TensorType
 from ttscompile.ir.idle import IDLE
 from ttscompile.ir.joint import JOINT, OF_ALL_BLOCKS, RESIDUAL, STREAM, Joint, join
 from ttscompile.ir.pieces import block_name
-from ttscompile.runtimes.precision import EXACT_INTEGERS, needs_care
-
-if TYPE_CHECKING:
-    from ttscompile.artifact.load import Artifact
+from ttscompile.measure.machine import has_integer_dot_product
 
 Array: TypeAlias = npt.NDArray[Any]
 
@@ -44,6 +44,11 @@ SPIN_US = 50
 """How long a thread of the blocks' session looks for work before it sleeps: longer than what lies between most blocks
 of a step, shorter than the end of a call. Push-T at 4 threads: 38.7 ms a call with 0, 27.7 with 50, 27.2 with 1000; and
 the processor time that threads take after the call: none, none, 20 ms; 94 ms with onnxruntime's own setting."""
+
+EXACT_INTEGERS = "session.x64quantprecision"
+"""Option of onnxruntime's sessions: sum products of integers exactly, slower than in fp32, rather than in 16 bits that
+saturate. It takes processors with VNNI for such that saturate, and costs them their speed; so it is only set where it
+is needed."""
 
 
 def import_onnxruntime() -> Any:
@@ -135,6 +140,28 @@ def _options(ort: Any, threads: int, spin: bool, careful: bool) -> Any:
     if careful:
         options.add_session_config_entry(EXACT_INTEGERS, "1")
     return options
+
+
+def needs_care(precision: str) -> bool:
+    """Whether sessions need ``EXACT_INTEGERS`` for blocks of this precision to be right; warns that they are slow then.
+
+    Args:
+        precision: of the artifact's blocks.
+    """
+    if precision == FP32:
+        return False
+    found = has_integer_dot_product()
+    if found:
+        return False
+    what = "nothing that says what this one has" if found is None else "one without them"
+    warnings.warn(
+        f"precision {precision!r} is fast on a processor with integer dot products (on x86 avx512_vnni, avx_vnni or"
+        f" amx_int8 among the flags in /proc/cpuinfo); found {what}. The actions are right, and take about as long as"
+        " in fp32. Load the policy with precision='fp32', or convert the checkpoint with --precision fp32.",
+        RuntimeWarning,
+        stacklevel=2,
+    )
+    return True
 
 
 _TURNS = (np.array(False), np.array(True))

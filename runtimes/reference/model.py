@@ -6,7 +6,7 @@ against this one, and calibration trains through it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +23,6 @@ from ttscompile.ir.evaluate import Evaluator
 from ttscompile.ir.graph import Graph, TensorType
 from ttscompile.ir.pieces import block_name
 from ttscompile.ir.program import Binding, Pieces, Program
-from ttscompile.runtimes.criterion import Criterion
 from ttscompile.runtimes.inpainting import Known
 
 from .reuse import Caches, Cell, RolloutCache, reuse, stream_axis
@@ -45,19 +44,26 @@ class Contexts:
     steps: tuple[Mapping[str, Tensor], ...]
 
 
+Blocks = Callable[[int, Tensor], Tensor]
+"""From a step and the residual stream after its stem to the stream after its last block."""
+
+
 @dataclass(frozen=True)
-class Rollout:
+class Denoised:
     """Result of one call.
 
     Attributes:
-        sample: the denoised sample ``[B, T, D]``.
+        samples: the sample ``[B, T, D]`` after each step, K of them.
         cache: for the next call of the episode.
-        samples: the sample after each step, K of them, if they were asked for.
     """
 
-    sample: Tensor
+    samples: tuple[Tensor, ...]
     cache: RolloutCache
-    samples: tuple[Tensor, ...] = ()
+
+    @property
+    def sample(self) -> Tensor:
+        """The denoised sample ``[B, T, D]``."""
+        return self.samples[-1]
 
 
 class ReferenceModel:
@@ -72,7 +78,6 @@ class ReferenceModel:
         types: type of each block's residual.
         groups: FORWARD group of each block.
         weights: value of every constant of the pieces.
-        override: tensors to use in place of constants of the same names.
 
     Attributes:
         steps: K.
@@ -88,10 +93,9 @@ class ReferenceModel:
         types: Sequence[TensorType],
         groups: Sequence[int],
         weights: Mapping[str, npt.NDArray[np.generic]],
-        override: Mapping[str, Tensor] | None = None,
     ) -> None:
         self._pieces, self._types, self._sampler = pieces, tuple(types), spec.sampler
-        self._weights = {**{name: _tensor(value) for name, value in weights.items()}, **(override or {})}
+        self._weights = {name: _tensor(value) for name, value in weights.items()}
         self._tables = {name: _tensor(value) for name, value in self._pieces.tables.items()}
         self._condition = Evaluator(self._pieces.condition, self._weights)
         self._step = Evaluator(self._pieces.step, self._weights) if self._pieces.step is not None else None
@@ -103,20 +107,20 @@ class ReferenceModel:
         self.groups = tuple(groups)
 
     @classmethod
-    def from_program(cls, program: Program, override: Mapping[str, Tensor] | None = None) -> ReferenceModel:
+    def from_program(cls, program: Program) -> ReferenceModel:
         """The model of a program in memory, after all passes.
 
         Raises:
             PassError: the program has not been partitioned.
         """
         if program.pieces is None:
-            raise PassError("the program has no pieces: run all passes (driver.compile_module) before executing it.")
+            raise PassError("the program has no pieces: run all passes (driver.transform) before executing it.")
         types = [block.type for block in program.blocks]
         groups = [block.group for block in program.blocks]
-        return cls(program.pieces, program.spec, types, groups, program.weights, override)
+        return cls(program.pieces, program.spec, types, groups, program.weights)
 
     @classmethod
-    def from_artifact(cls, artifact: Artifact, override: Mapping[str, Tensor] | None = None) -> ReferenceModel:
+    def from_artifact(cls, artifact: Artifact) -> ReferenceModel:
         """The model of an artifact.
 
         Raises:
@@ -135,7 +139,7 @@ class ReferenceModel:
             features=manifest.features,
         )
         weights = {**artifact.weights, **artifact.pruner}
-        return cls(pieces, manifest.spec, [b.type for b in manifest.blocks], manifest.groups, weights, override)
+        return cls(pieces, manifest.spec, [b.type for b in manifest.blocks], manifest.groups, weights)
 
     @property
     def pruner_weights(self) -> dict[str, Tensor]:
@@ -194,6 +198,10 @@ class ReferenceModel:
         """The network's output ``[B, T, D]`` at step k from the residual stream after the last block."""
         return self._tail(self._bind(self._pieces.tail, stream, k, contexts))[0]
 
+    def predict(self, sample: Tensor, k: int, contexts: Contexts, blocks: Blocks) -> Tensor:
+        """The network's output ``[B, T, D]`` at step k, from the sample ``[B, T, D]``."""
+        return self.tail(blocks(k, self.stem(sample, k, contexts)), k, contexts)
+
     def begin(self, initial: Tensor) -> Carried:
         """What the sampler carries to step 0, from the sample ``[B, T, D]``."""
         return begin(self._sampler, initial)
@@ -208,7 +216,33 @@ class ReferenceModel:
         """The rollout cache at the start of an episode."""
         return RolloutCache({}, np.zeros((streams, self.steps, self.blocks), dtype=np.bool_))
 
-    def rollout(
+    def steps_of(
+        self,
+        contexts: Contexts,
+        initial: Tensor,
+        noise: Tensor | None,
+        blocks: Blocks,
+        correction: Correction | None = None,
+        known: Known | None = None,
+    ) -> Iterator[Carried]:
+        """The denoising loop, whatever the blocks do: what is carried after each step.
+
+        Args:
+            contexts: from ``prologue``.
+            initial: the sample at step 0, ``[B, T, D]``.
+            noise: the draw used at each step, ``[K, B, T, D]``; None if the sampler is deterministic.
+            blocks: asked once a step, in order.
+            correction: of the sampler's steps; None for none.
+            known: what a prefix makes known of the samples; None for nothing.
+        """
+        carried = hold(self.begin(initial), known, 0)
+        for k in range(self.steps):
+            prediction = self.predict(carried.sample, k, contexts, blocks)
+            carried = self.advance(carried, prediction, None if noise is None else noise[k], k, correction)
+            carried = hold(carried, known, k + 1)
+            yield carried
+
+    def denoise(
         self,
         contexts: Contexts,
         initial: Tensor,
@@ -217,10 +251,9 @@ class ReferenceModel:
         cache: RolloutCache | None = None,
         *,
         write_gradients: bool = True,
-        keep_samples: bool = False,
         correction: Correction | None = None,
         known: Known | None = None,
-    ) -> Rollout:
+    ) -> Denoised:
         """One call: K steps from noise to sample.
 
         With gates that require a gradient every candidate of every cell is evaluated, since the gradient of a gate is
@@ -229,16 +262,15 @@ class ReferenceModel:
         evaluated for the streams that compute them, and nothing else.
 
         Args:
-            contexts: from ``prologue``.
-            initial: the sample at step 0, ``[B, T, D]``.
-            noise: the draw used at each step, ``[K, B, T, D]``; None if the sampler is deterministic.
+            contexts: see ``steps_of``.
+            initial: see ``steps_of``.
+            noise: see ``steps_of``.
             gates: one-hot ``[B, K, blocks, 4]``, float32; or a plan, int8 ``[K, blocks]`` or ``[B, K, blocks]``.
             cache: what the previous call of the episode left; None at its start.
             write_gradients: let the gradient of a COMPUTE gate include what writing the caches does to later steps,
                 by taking the written value to be ``g * computed + (1 - g) * old``. Values do not change.
-            keep_samples: return the sample after every step.
-            correction: of the sampler's steps; None for none.
-            known: what a prefix makes known of the samples; None for nothing.
+            correction: see ``steps_of``.
+            known: see ``steps_of``.
 
         Raises:
             IllegalPlanError: gates that are not one-hot, of the wrong shape, or that read what was never computed.
@@ -247,55 +279,16 @@ class ReferenceModel:
         one_hot, plan = self._gates(gates, contexts.streams)
         require_legal(plan, self.groups, cache.written)
         caches = Caches(rollout=dict(cache.residuals))
-        carried, samples = hold(self.begin(initial), known, 0), []
-        for k in range(self.steps):
-            stream = self.stem(carried.sample, k, contexts)
+
+        def blocks(k: int, stream: Tensor) -> Tensor:
             for b in range(self.blocks):
                 cell = Cell(k, b, self.groups[b], plan[:, k, b], one_hot[:, k, b], self._types[b])
                 stream = stream + reuse(cell, self._candidate(cell, stream, contexts), caches, write_gradients)
-            prediction = self.tail(stream, k, contexts)
-            carried = self.advance(carried, prediction, None if noise is None else noise[k], k, correction)
-            carried = hold(carried, known, k + 1)
-            if keep_samples:
-                samples.append(carried.sample)
-        kept = RolloutCache(caches.rollout, cache.written | (plan == Source.COMPUTE))
-        return Rollout(carried.sample, kept, tuple(samples))
+            return stream
 
-    def decided_rollout(
-        self,
-        contexts: Contexts,
-        initial: Tensor,
-        noise: Tensor | None,
-        criterion: Criterion,
-        cache: RolloutCache | None = None,
-    ) -> tuple[Rollout, PlanArray]:
-        """One call whose plan is decided step by step; see ``criterion``.
-
-        Otherwise as ``rollout``, and never corrected: a correction belongs to a schedule.
-
-        Returns:
-            The result, and the plan that was decided, int8 ``[B, K, blocks]``: ``rollout`` with it gives the result.
-        """
-        cache = cache if cache is not None else self.empty_cache(contexts.streams)
-        decisions = criterion.begin(self.steps, self.blocks, contexts.streams)
-        plan = np.full((contexts.streams, self.steps, self.blocks), Source.COMPUTE, np.int8)
-        caches = Caches(rollout=dict(cache.residuals))
-        carried, axis = self.begin(initial), stream_axis(self._types[0])
-        for k in range(self.steps):
-            stream = self.stem(carried.sample, k, contexts)
-            feature = stream if criterion.always == 0 else torch.zeros_like(stream)
-            for b in range(self.blocks):
-                if b == criterion.always:
-                    plan[:, k] = decisions.decide(k, feature.movedim(axis, 0).detach().numpy())
-                gates = torch.nn.functional.one_hot(torch.from_numpy(plan[:, k, b].astype(np.int64)), 4).float()
-                cell = Cell(k, b, self.groups[b], plan[:, k, b], gates, self._types[b])
-                residual = reuse(cell, self._candidate(cell, stream, contexts), caches, write_gradients=False)
-                stream = stream + residual
-                if b < criterion.always:
-                    feature = feature + residual
-            prediction = self.tail(stream, k, contexts)
-            carried = self.advance(carried, prediction, None if noise is None else noise[k], k)
-        return Rollout(carried.sample, RolloutCache(caches.rollout, cache.written | (plan == Source.COMPUTE))), plan
+        loop = self.steps_of(contexts, initial, noise, blocks, correction, known)
+        samples = tuple(carried.sample for carried in loop)
+        return Denoised(samples, RolloutCache(caches.rollout, cache.written | (plan == Source.COMPUTE)))
 
     def _candidate(self, cell: Cell, stream: Tensor, contexts: Contexts) -> Tensor | None:
         """The computed residual of all streams, or of those that take it with zeros for the others; None if none do."""
@@ -358,7 +351,7 @@ class ReferenceModel:
 
 
 def noise_tensors(noise: Noise, stochastic: bool) -> tuple[Tensor, Tensor | None]:
-    """``Noise`` as tensors for ``rollout``; the draws of the steps are dropped if the sampler uses none."""
+    """Noise as ``ReferenceModel.denoise`` takes it, without the draws of the steps if the sampler uses none."""
     steps = _tensor(noise.steps) if stochastic and noise.steps is not None else None
     return _tensor(noise.initial), steps
 

@@ -96,7 +96,7 @@ def reuse(cell: Cell, computed: Tensor | None, caches: Caches, write_gradients: 
         computed: the block's residual, right for the streams that compute it, and where gates train for the others too;
             None if nobody needs it.
         caches: changed.
-        write_gradients: see ``ReferenceModel.rollout``.
+        write_gradients: see ``ReferenceModel.denoise``.
     """
     forward, timestep = caches.forward.get(cell.group), caches.timestep.get(cell.b)
     rollout = caches.rollout.get((cell.k, cell.b))

@@ -7,11 +7,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ttscompile.core.correction import Correction
+from ttscompile.core.correction import HISTORY, Correction
 from ttscompile.core.spec import SamplerTable
 from ttscompile.runtimes.inpainting import Known
-
-from .correction import correct, empty_history, remember
 
 
 class Carried(NamedTuple):
@@ -30,8 +28,9 @@ class Carried(NamedTuple):
 
 def begin(table: SamplerTable, initial: Tensor) -> Carried:
     """What is carried to step 0: the sample ``[B, T, D]``, and zeros."""
-    streams, *shape = initial.shape
-    return Carried(initial, initial.new_zeros(streams, table.memories, *shape), empty_history(initial))
+    streams, horizon, channels = initial.shape
+    memory = initial.new_zeros(streams, table.memories, horizon, channels)
+    return Carried(initial, memory, initial.new_zeros(streams, HISTORY * horizon, channels))
 
 
 def advance(
@@ -42,7 +41,7 @@ def advance(
     k: int,
     correction: Correction | None = None,
 ) -> Carried:
-    """What is carried to step k + 1 (``config.SamplerTable`` has the formula).
+    """What is carried to step k + 1 (``core.spec.SamplerTable`` has the formula).
 
     Args:
         table: of the sampler.
@@ -65,11 +64,36 @@ def advance(
     if table.memories:
         terms = torch.cat([torch.stack([clean, sample, prediction], 1), memory], 1)
         memory = torch.einsum("sr,brtd->bstd", torch.from_numpy(table.to_memory[k].copy()), terms)
-    if correction is not None:
-        weights, bias = torch.tensor(correction.weights[k]), torch.tensor(correction.bias[k])
-        following = following + correct(weights, bias, sample, prediction, history)
-        history = remember(sample, prediction, history) if correction.anchors[k] else history
-    return Carried(following, memory, history)
+    if correction is None:
+        return Carried(following, memory, history)
+    weights, bias = torch.tensor(correction.weights[k]), torch.tensor(correction.bias[k])
+    uncorrected = Carried(following, memory, history)
+    return correct(carried, prediction, uncorrected, weights, bias, bool(correction.anchors[k]))
+
+
+def features(carried: Carried, prediction: Tensor) -> Tensor:
+    """What the correction of a step is linear in, ``[D, B, 6 T]``: see ``core.correction``."""
+    return torch.cat([carried.sample, prediction, carried.history], dim=1).permute(2, 0, 1)
+
+
+def correct(
+    carried: Carried, prediction: Tensor, following: Carried, weights: Tensor, bias: Tensor, anchor: bool
+) -> Carried:
+    """What is carried to step k + 1 with the correction of step k.
+
+    Args:
+        carried: to step k.
+        prediction: the network's output at step k, ``[B, T, D]``.
+        following: what is carried to step k + 1 without a correction.
+        weights: of the correction at step k, ``[G, 6 T, T]``.
+        bias: of the correction at step k, ``[G, 1, T]``.
+        anchor: whether step k enters the history.
+    """
+    added = (features(carried, prediction) @ weights + bias).permute(1, 2, 0)
+    history = carried.history
+    if anchor:
+        history = torch.cat([carried.sample, prediction, history[:, : history.shape[1] // 2]], dim=1)
+    return Carried(following.sample + added, following.memory, history)
 
 
 def hold(carried: Carried, known: Known | None, k: int) -> Carried:

@@ -2,7 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from ttscompile.artifact.strict_json import MAX_DEPTH, Value, dump, parse
+from ttscompile.artifact.strict_json import Value, dump, parse
+from ttscompile.core.untrusted_json import MAX_DEPTH
 from ttscompile.errors import ArtifactError
 
 
@@ -22,7 +23,7 @@ def test_a_document_comes_back() -> None:
         (b"", "expected a JSON document"),
         (b'{"a": 1', "expected a JSON document"),
         (b'{"a": 1} x', "expected a JSON document"),
-        (b'{"a": 1, "b": 2, "a": 3}', "'a' twice"),
+        (b'{"a": 1, "b": 2, "a": 3}', "'a' is twice"),
         (b'{"a": NaN}', "number NaN"),
         (b"[-Infinity]", "number -Infinity"),
         (b"\xff\xfe", "expected a JSON document"),
@@ -39,7 +40,7 @@ def test_what_is_refused(content: bytes, message: str) -> None:
 def test_depth_and_size_at_the_limit() -> None:
     parse(nested(MAX_DEPTH + 1), "f")  # the root itself is level 0
     parse(b"[1]", "f", limit=3)
-    with pytest.raises(ArtifactError, match="at most 2 bytes"):
+    with pytest.raises(ArtifactError, match="more than 2 bytes"):
         parse(b"[1]", "f", limit=2)
 
 

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from ttscompile.artifact.load import load_artifact
-from ttscompile.calibration import correction
-from ttscompile.calibration.correction import anchors_of, fit_correction
+from ttscompile.calibration import fit_correction as fitting
+from ttscompile.calibration.fit_correction import anchors_of, fit_correction
 from ttscompile.calibration.strategies import Task
 from ttscompile.core.lattice import PlanArray, Source, dense_plan, uniform_plan
 
@@ -47,7 +47,7 @@ def test_a_linear_policy_is_corrected_to_its_own_noise(
     linear_policy: Path, recording: Path, plan: PlanArray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Everything between anchors is linear in the features, but for how the observation enters: nearly exact."""
-    monkeypatch.setattr(correction, "RIDGE", 1e-9)
+    monkeypatch.setattr(fitting, "RIDGE", 1e-9)
     task = tasks.make_task(linear_policy, recording, calls=300)
     assert fitted(task, plan).error(plan, task.calls) < 0.05 * task.error(plan, task.calls)
 
@@ -66,7 +66,7 @@ def test_the_reference_runtime_does_the_same(make_task: MakeTask, plan: PlanArra
     executor, calls = fitted(task, plan).executor, task.calls
     ours = executor.run(plan, calls)
     with torch.no_grad():
-        theirs = executor.model.rollout(
+        theirs = executor.model.denoise(
             calls.contexts, calls.initial, calls.noise, plan, correction=executor.correction
         )
     torch.testing.assert_close(ours, theirs.sample, rtol=0, atol=2e-5)

@@ -27,7 +27,7 @@ def test_plans_on_calls_equal_the_reference(make_task: MakeTask, computed: float
     plans = random_plans(12, computed)
     plans[1, 1:] = Source.TIMESTEP  # nothing computed after step 0
     for plan in plans:
-        expected = executor.model.rollout(calls.contexts, calls.initial, calls.noise, plan).sample
+        expected = executor.model.denoise(calls.contexts, calls.initial, calls.noise, plan).sample
         torch.testing.assert_close(executor.run(plan, calls), expected, rtol=0, atol=2e-6)
 
 
@@ -38,7 +38,7 @@ def test_a_plan_for_each_call_equals_the_reference(
     monkeypatch.setattr(execute, "STREAMS", streams)
     task, plans = make_task(calls=5), random_plans(5, 0.3)
     executor, calls = task.executor, task.calls
-    expected = executor.model.rollout(calls.contexts, calls.initial, calls.noise, plans).sample
+    expected = executor.model.denoise(calls.contexts, calls.initial, calls.noise, plans).sample
     torch.testing.assert_close(executor.run(plans, calls), expected, rtol=0, atol=2e-6)
 
 

@@ -12,7 +12,7 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.head import capacity, has_head, head_features, head_weights
 from ttscompile.calibration.switches import Switch, fit_switches
 from ttscompile.core.lattice import PlanArray, Source, whole_steps_plan
-from ttscompile.runtimes.base import pruner_plan
+from ttscompile.runtimes.settle import pruner_plan
 
 from .tasks import MakeTask
 

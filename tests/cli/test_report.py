@@ -206,7 +206,7 @@ def test_a_check_that_failed_is_told_and_is_the_exit_status(
     assert result.exit_code == 1
     text = Reader((tmp_path / "r.html").read_text()).text
     assert "FAILED at one block. Convert it again." in text
-    assert "First at step 1, blocks 2." in text
+    assert "First at step 1, block 2." in text
 
 
 def test_arrays_of_other_names_reach_the_episode_and_the_checks(

@@ -69,7 +69,7 @@ def test_the_floor_runs_every_block_as_often_as_it_says(
     flops = artifact.manifest.flops.blocks
     assert contestant.dense_flops == floor.SEQUENCES * sum(flops)
     # At 5 sequences in 20 ms, the eight steps of a dense call take 32 ms, and half of its cells half of that.
-    blocks = Measurement("", "", (20.0,), 20.0, (20.0, 20.0), None, None, contestant.dense_flops, 0.0, 0)
+    blocks = Measurement("", "", (20.0,), flops=contestant.dense_flops)
     assert floor.floor_ms(plans[0.0], artifact, blocks) == pytest.approx(32.0)
     assert floor.floor_ms(plans[0.5], artifact, blocks) == pytest.approx(16.0)
 

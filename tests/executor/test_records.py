@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ttscompile.runtimes.base import Timings
 from ttscompile.runtimes.executor.statistics import Counts, ExecutorStatistics, Recorder, Samples, statistics, summary
 from ttscompile.runtimes.executor.trace import CONTROL, WORKER, Trace
+from ttscompile.runtimes.report import Timings
 
 from .simulation import World
 

@@ -21,7 +21,7 @@ from ttscompile.ir.evaluate import evaluate
 from ttscompile.lower.precision import lower_precision, quantize_matrix, quantize_model
 from ttscompile.lower.program import lower_graph
 from ttscompile.measure.machine import has_integer_dot_product
-from ttscompile.runtimes.precision import EXACT_INTEGERS
+from ttscompile.runtimes.onnxruntime.sessions import EXACT_INTEGERS
 
 Array = npt.NDArray[Any]
 

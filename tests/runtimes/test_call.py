@@ -19,7 +19,7 @@ from ttscompile.artifact.write import update_calibration
 from ttscompile.core.lattice import dense_plan, uniform_plan
 from ttscompile.errors import ArtifactError, IllegalPlanError
 from ttscompile.runtimes import Runtime, open_runtime
-from ttscompile.runtimes.onnxruntime.runtime import OnnxRuntime
+from ttscompile.runtimes.onnxruntime.backend import OnnxBackend
 from ttscompile.runtimes.onnxruntime.workspace import Workspace
 from ttscompile.runtimes.reference.model import ReferenceModel
 
@@ -188,8 +188,8 @@ def test_a_first_call_with_a_schedule_binds_nothing(
     update_calibration(path, None, {"mine": schedule}, "mine", {"strategy": "tts"})
     artifact = load_artifact(path)
     runtime = open_runtime(artifact)
-    assert isinstance(runtime, OnnxRuntime)
-    assert ("block_00" in runtime._sessions) is not whole_steps
+    assert isinstance(runtime.backend, OnnxBackend)
+    assert ("block_00" in runtime.backend.sessions) is not whole_steps
     obs, noise = random_inputs(artifact, np.random.default_rng(0), 1)
 
     def bind(*_: object) -> None:
@@ -204,27 +204,27 @@ def test_a_first_call_with_a_schedule_binds_nothing(
 
 def test_single_blocks_are_opened_by_the_first_plan_that_needs_them(toy_artifact: Artifact) -> None:
     runtime, other = open_runtime(toy_artifact), open_runtime(toy_artifact, "reference")
-    assert isinstance(runtime, OnnxRuntime)
+    assert isinstance(runtime.backend, OnnxBackend)
     obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), 1)
     runtime.predict(obs, noise, uniform_plan(5, 5, 3))
-    assert "block_00" not in runtime._sessions
+    assert "block_00" not in runtime.backend.sessions
     runtime.reset()
     partial = uniform_plan(5, 5, 3)
     partial[4, 2] = Source.COMPUTE
     np.testing.assert_allclose(
         runtime.predict(obs, noise, partial)[0], other.predict(obs, noise, partial)[0], rtol=1e-5, atol=1e-6
     )
-    assert "block_00" in runtime._sessions
+    assert "block_00" in runtime.backend.sessions
 
 
 def test_streams_that_compute_whole_steps_need_no_single_blocks(toy_artifact: Artifact) -> None:
     runtime, other = open_runtime(toy_artifact), open_runtime(toy_artifact, "reference")
-    assert isinstance(runtime, OnnxRuntime)
+    assert isinstance(runtime.backend, OnnxBackend)
     obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), 3)
     plans = np.stack([uniform_plan(5, 5, n) for n in (1, 2, 3)])
     found, expected = (each.predict(obs, noise, plans)[0] for each in (runtime, other))
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
-    assert "block_00" not in runtime._sessions
+    assert "block_00" not in runtime.backend.sessions
 
 
 def test_single_blocks_of_an_artifact_that_has_changed_since_are_refused(own_artifact: Artifact) -> None:
@@ -249,23 +249,23 @@ def test_a_batch_that_finds_no_memory_leaves_a_runtime_that_works(
         raise MemoryError
 
     with monkeypatch.context() as patched:
-        patched.setattr("ttscompile.runtimes.onnxruntime.runtime.Workspace", full)
+        patched.setattr("ttscompile.runtimes.onnxruntime.backend.Workspace", full)
         with pytest.raises(MemoryError):
             runtime.predict(obs, noise, dense_plan(5, 5))
-    assert isinstance(runtime, OnnxRuntime)
-    assert runtime.nbytes == runtime.rollout_nbytes == 0
+    assert isinstance(runtime.backend, OnnxBackend)
+    assert runtime.backend.nbytes == runtime.backend.rollout_nbytes == 0
     assert runtime.predict(obs, noise, dense_plan(5, 5))[1].computed == (25, 25)
 
 
 def test_a_workspace_is_given_back_when_the_batch_changes(toy_artifact: Artifact) -> None:
     runtime = open_runtime(toy_artifact)
-    assert isinstance(runtime, OnnxRuntime)
-    assert runtime.rollout_nbytes == 0
+    assert isinstance(runtime.backend, OnnxBackend)
+    assert runtime.backend.rollout_nbytes == 0
     sizes = []
     for streams in (1, 4, 2):
         obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), streams)
         runtime.predict(obs, Noise(noise.initial, noise.steps), dense_plan(5, 5))
-        assert runtime.rollout_nbytes == 25 * streams * 3 * 4 * 4
-        sizes.append(runtime.nbytes)
+        assert runtime.backend.rollout_nbytes == 25 * streams * 3 * 4 * 4
+        sizes.append(runtime.backend.nbytes)
         runtime.reset()
     assert sizes[0] < sizes[2] < sizes[1] <= 4 * sizes[0]

@@ -13,8 +13,8 @@ from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import legalize, uniform_plan
 from ttscompile.ir.idle import IDLE
 from ttscompile.runtimes import open_runtime
+from ttscompile.runtimes.onnxruntime.backend import OnnxBackend
 from ttscompile.runtimes.onnxruntime.idle import IdleSteps
-from ttscompile.runtimes.onnxruntime.runtime import OnnxRuntime
 
 from .agreement import random_inputs
 from .conftest import MakeArtifact
@@ -106,8 +106,9 @@ def test_runs_of_idle_steps_go_through_numpy_and_prepare_once(
 def test_a_network_of_another_form_has_no_such_steps(toy_artifact: Artifact) -> None:
     assert IDLE not in toy_artifact.manifest.pieces
     runtime = open_runtime(toy_artifact)
-    assert isinstance(runtime, OnnxRuntime)
-    assert runtime._workspace.idle is None
+    assert isinstance(runtime.backend, OnnxBackend)
+    assert runtime.backend.workspace is not None
+    assert runtime.backend.workspace.idle is None
     obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), 1)
     theirs = open_runtime(toy_artifact, "reference").predict(obs, noise, uniform_plan(5, 5, 1))[0]
     np.testing.assert_allclose(runtime.predict(obs, noise, uniform_plan(5, 5, 1))[0], theirs, rtol=1e-5, atol=1e-6)

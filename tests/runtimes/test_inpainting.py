@@ -24,7 +24,7 @@ from ttscompile.ir.program import Program
 from ttscompile.lower.program import lower_program
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.inpainting import MaskedUpdates, known_samples, noise_levels, prefix_refusal
-from ttscompile.runtimes.reference.runtime import ReferenceRuntime
+from ttscompile.runtimes.reference.model import ReferenceModel
 from ttscompile.samplers.flow import flow_matching_table
 from ttscompile.samplers.multistep import set_timesteps
 from ttscompile.samplers.table import sampler_table
@@ -151,14 +151,14 @@ def test_both_runtimes_agree_on_prefixes(artifacts: dict[str, Artifact], name: s
 
 def test_between_steps_the_committed_actions_have_the_noise_of_the_step(artifact: Artifact) -> None:
     table, made = diffusion(DDPMScheduler)
-    model = ReferenceRuntime(artifact).model
+    model = ReferenceModel.from_artifact(artifact)
     obs, noise = random_inputs(artifact, np.random.default_rng(0), 2)
     prefix = np.random.default_rng(1).uniform(-1, 1, (2, 3, 2)).astype(np.float32)
     known = known_samples(artifact.manifest.spec, prefix, noise.initial)
     contexts = model.prologue({key: torch.from_numpy(value) for key, value in obs.items()})
     initial, draws = torch.from_numpy(noise.initial), torch.from_numpy(noise.steps)
     plan = dense_plan(STEPS, BLOCKS)
-    result = model.rollout(contexts, initial, draws, plan, known=known, keep_samples=True)
+    result = model.denoise(contexts, initial, draws, plan, known=known)
     here = slice(START, START + 3)
     for k, sample in enumerate(result.samples[:-1]):
         expected = made.add_noise(torch.from_numpy(prefix), initial[:, here], torch.tensor(int(table.timesteps[k + 1])))
@@ -180,7 +180,7 @@ def test_a_network_inpaints_as_the_loop_of_its_scheduler(make_artifact: MakeArti
     program = toy(table)
     program = replace(program, spec=replace(program.spec, chunk=ChunkSpec(1, START, HORIZON - 1, normalizer)))
     artifact = make_artifact(program)
-    model = ReferenceRuntime(artifact).model
+    model = ReferenceModel.from_artifact(artifact)
     rng = np.random.default_rng(0)
     obs, noise = random_inputs(artifact, rng, 2)
     committed = rng.uniform(-1, 1, (2, 3, 1)).astype(np.float32)

@@ -12,10 +12,9 @@ from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.write import update_calibration
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import IllegalPlanError
+from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.onnxruntime.liveness import readable_rollout, rollout_needs
-from ttscompile.runtimes.onnxruntime.runtime import OnnxRuntime
 from ttscompile.runtimes.policy import load
-from ttscompile.runtimes.reference.runtime import ReferenceRuntime
 
 from .agreement import random_inputs
 
@@ -71,9 +70,9 @@ def test_a_pruner_is_known_by_the_bounds_of_its_logits(
 
 
 def test_calls_with_the_artifacts_plans_keep_what_these_read(scheduled: Artifact) -> None:
-    runtime, reference = OnnxRuntime(scheduled), ReferenceRuntime(scheduled)
+    runtime, reference = open_runtime(scheduled), open_runtime(scheduled, "reference")
     rng = np.random.default_rng(0)
-    assert runtime.rollout_nbytes == 2 * ENTRY
+    assert runtime.backend.rollout_nbytes == 2 * ENTRY
     for name in ("plain", "reads", "dense", "plain", "reads"):
         obs, noise = random_inputs(scheduled, rng, 1)
         plan = scheduled.schedule(name)
@@ -82,14 +81,14 @@ def test_calls_with_the_artifacts_plans_keep_what_these_read(scheduled: Artifact
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
         assert report.legalised == wanted.legalised
         if name == "plain":
-            kept = runtime.rollout_nbytes
+            kept = runtime.backend.rollout_nbytes
             assert kept in (2 * ENTRY, 25 * ENTRY)
     assert report.legalised == (0,)
-    assert runtime.rollout_nbytes == 25 * ENTRY  # the dense call kept all
+    assert runtime.backend.rollout_nbytes == 25 * ENTRY  # the dense call kept all
 
 
 def test_a_matrix_may_read_what_dense_calls_and_matrices_computed(scheduled: Artifact) -> None:
-    runtime = OnnxRuntime(scheduled)
+    runtime = open_runtime(scheduled)
     obs, noise = random_inputs(scheduled, np.random.default_rng(0), 1)
     reads = uniform_plan(5, 5, 2)
     reads[1] = R
@@ -102,7 +101,7 @@ def test_a_matrix_may_read_what_dense_calls_and_matrices_computed(scheduled: Art
 
 def test_a_matrix_reads_no_older_residual_than_the_last_computed(scheduled: Artifact) -> None:
     """A dense call keeps all; a plan of the artifact then computes cells anew, and does not keep them."""
-    runtime, reference = OnnxRuntime(scheduled), ReferenceRuntime(scheduled)
+    runtime, reference = open_runtime(scheduled), open_runtime(scheduled, "reference")
     rng = np.random.default_rng(0)
     plain = scheduled.schedule("plain")
     for name in ("dense", "plain"):
@@ -121,7 +120,7 @@ def test_a_matrix_reads_no_older_residual_than_the_last_computed(scheduled: Arti
 
 
 def test_a_first_matrix_after_a_plan_of_the_artifact_is_told_what_was_not_kept(scheduled: Artifact) -> None:
-    runtime = OnnxRuntime(scheduled)
+    runtime = open_runtime(scheduled)
     obs, noise = random_inputs(scheduled, np.random.default_rng(0), 1)
     plain = scheduled.schedule("plain")
     (k,) = np.flatnonzero((plain == C).all(axis=1))[1:]

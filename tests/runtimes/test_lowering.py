@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,8 +13,9 @@ from ttscompile import Source
 from ttscompile.core.lattice import PlanArray, dense_plan, uniform_plan
 from ttscompile.errors import IllegalPlanError
 from ttscompile.runtimes.onnxruntime.decode import decode_first, decode_rest
-from ttscompile.runtimes.onnxruntime.instructions import Lowered, LoweringCache, lower_plan
+from ttscompile.runtimes.onnxruntime.instructions import Instructions, instructions_of
 from ttscompile.runtimes.onnxruntime.rollout_store import RolloutStore
+from ttscompile.runtimes.settle import LoweringCache
 
 from .literal import Episode, Toy
 from .plans import random_plan
@@ -133,7 +136,7 @@ def test_instructions_do_what_section_2_says(
 ) -> None:
     rng = np.random.default_rng(seed)
     work = FakeWorkspace(rng, steps, groups, streams, axis)
-    cache = LoweringCache(groups)
+    cache = LoweringCache(partial(instructions_of, groups=groups))
     episodes = [Episode(work.toy(s)) for s in range(streams)]
     written = np.zeros((streams, steps, len(groups)), np.bool_)
     keep = rng.random((steps, len(groups))) < rng.choice([0.0, 0.5, 1.0])
@@ -160,7 +163,7 @@ def test_instructions_do_what_section_2_says(
         written |= (plans == C) & keep
 
 
-def sums(lowered: Lowered) -> list[list[tuple[str, int]]]:
+def sums(lowered: Instructions) -> list[list[tuple[str, int]]]:
     """Instructions by step, readable: ``("run", b)``, ``("new", slot)``, ``("old", slot)``."""
     listed = []
     gaps = iter(lowered.gaps)
@@ -180,20 +183,20 @@ def sums(lowered: Lowered) -> list[list[tuple[str, int]]]:
     return listed
 
 
-def loads(lowered: Lowered) -> list[tuple[int, int]]:
+def loads(lowered: Instructions) -> list[tuple[int, int]]:
     return list(zip(lowered.load_rows, lowered.load_from, strict=True))
 
 
 def test_the_docstrings_example() -> None:
     plan = np.array([[C] * 7, [C, T, T, C, F, T, T]], np.int8)
-    lowered = lower_plan(plan, [0, 1, 2, 0, 0, 1, 2])
+    lowered = instructions_of(plan, [0, 1, 2, 0, 0, 1, 2])
     assert sums(lowered)[1] == [("run", 0), ("new", 0), ("run", 3), ("new", 0)]
     assert loads(lowered) == [(1, ~1), (2, ~2), (4, ~3), (5, ~5), (6, ~6)]
     assert (lowered.segments, lowered.slots) == (2, 1)
 
 
 def test_steps_that_compute_nothing_are_one_addition_of_one_sum() -> None:
-    lowered = lower_plan(uniform_plan(100, 24, 5), [0, 1, 2] * 8)
+    lowered = instructions_of(uniform_plan(100, 24, 5), [0, 1, 2] * 8)
     assert lowered.segments == 5
     assert [line for line in sums(lowered) if ("old", 0) not in line and ("new", 0) not in line] == [
         [("run", b) for b in range(24)]
@@ -203,7 +206,7 @@ def test_steps_that_compute_nothing_are_one_addition_of_one_sum() -> None:
 
 def test_a_sum_is_made_again_when_one_of_its_residuals_is() -> None:
     plan = np.array([[C, C, C], [T, T, T], [C, T, T], [T, T, T], [R, T, T]], np.int8)
-    lowered = lower_plan(plan, [0, 1, 2])
+    lowered = instructions_of(plan, [0, 1, 2])
     assert sums(lowered) == [
         [("run", 0), ("run", 1), ("run", 2)],
         [("new", 0)],
@@ -218,42 +221,42 @@ def test_a_sum_is_made_again_when_one_of_its_residuals_is() -> None:
 
 def test_the_same_residuals_by_another_way_are_the_same_sum() -> None:
     plan = np.array([[C, C], [F, T], [T, F]], np.int8)  # F of block 0 is block 1's residual, and F of block 1 too
-    assert lower_plan(plan, [0, 0]).segments == 2
+    assert instructions_of(plan, [0, 0]).segments == 2
     crossed = np.array([[C, C, C], [T, F, T], [T, T, F]], np.int8)  # residuals {0, 2, 2} and {0, 1, 2}
-    assert lower_plan(crossed, [0, 1, 1]).segments == 2
+    assert instructions_of(crossed, [0, 1, 1]).segments == 2
     same = np.array([[C, C, C], [T, F, T], [T, F, F]], np.int8)
-    assert lower_plan(same, [0, 1, 1]).segments == 1
+    assert instructions_of(same, [0, 1, 1]).segments == 1
 
 
 def test_slots_are_kept_while_their_sum_is_needed() -> None:
     plan = np.array([[C, C, C], [T, C, T], [T, C, T]], np.int8)
-    assert sums(lower_plan(plan, [0, 1, 2]))[1:] == [
+    assert sums(instructions_of(plan, [0, 1, 2]))[1:] == [
         [("new", 0), ("run", 1), ("new", 1)],
         [("old", 0), ("run", 1), ("old", 1)],
     ]
 
 
 def test_a_dense_plan_has_no_sums() -> None:
-    lowered = lower_plan(dense_plan(3, 2), [0, 1])
+    lowered = instructions_of(dense_plan(3, 2), [0, 1])
     assert sums(lowered) == [[("run", 0), ("run", 1)]] * 3
     assert (lowered.segments, lowered.slots, loads(lowered)) == (0, 0, [])
 
 
 def test_a_plan_of_timestep_alone_sums_residuals_where_they_are() -> None:
     plan = np.array([[C, C, C], [T, C, T], [T, T, T]], np.int8)
-    assert (lower_plan(plan, [0, 0, 1]).table, loads(lower_plan(plan, [0, 0, 1]))) == (False, [])
+    assert (instructions_of(plan, [0, 0, 1]).table, loads(instructions_of(plan, [0, 0, 1]))) == (False, [])
     plan[2, 1] = F
-    assert lower_plan(plan, [0, 0, 1]).table
+    assert instructions_of(plan, [0, 0, 1]).table
 
 
 @pytest.mark.parametrize("plan", [[[T, C], [C, C]], [[C, R], [C, C]], [[F, C], [C, C]]])
 def test_an_illegal_plan_is_refused(plan: list[list[Source]]) -> None:
     with pytest.raises(IllegalPlanError, match="step 0 must be dense"):
-        lower_plan(np.array(plan, np.int8), [0, 0])
+        instructions_of(np.array(plan, np.int8), [0, 0])
 
 
 def test_the_cache_keeps_the_plans_used_last() -> None:
-    cache = LoweringCache([0, 0], capacity=2)
+    cache = LoweringCache(partial(instructions_of, groups=[0, 0]), capacity=2)
 
     def plan(b: int) -> PlanArray:
         return np.array([[C, C], [C if b == 0 else T, C if b == 1 else F]], np.int8)

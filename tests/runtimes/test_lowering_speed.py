@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from ttscompile.core.lattice import Source, uniform_plan
-from ttscompile.runtimes.onnxruntime.instructions import LoweringCache, lower_plan
+from ttscompile.runtimes.onnxruntime.instructions import instructions_of
+from ttscompile.runtimes.settle import LoweringCache
 
 from .plans import random_plan
 
@@ -25,12 +28,12 @@ def test_lower_a_plan(benchmark: BenchmarkFixture, kind: str) -> None:
         plan = uniform_plan(STEPS, 24, 5)
     elif kind == "scattered, timestep only":
         plan = np.where(plan == Source.COMPUTE, Source.COMPUTE, Source.TIMESTEP).astype(np.int8)
-    lowered = benchmark(lower_plan, plan, GROUPS)
+    lowered = benchmark(instructions_of, plan, GROUPS)
     assert sum(lowered.counts) == np.count_nonzero(plan == Source.COMPUTE)
 
 
 @pytest.mark.benchmark(group="lowering, K = 100, 24 blocks")
 def test_lower_a_plan_again(benchmark: BenchmarkFixture) -> None:
-    cache, plan = LoweringCache(GROUPS), uniform_plan(STEPS, 24, 5)
+    cache, plan = LoweringCache(partial(instructions_of, groups=GROUPS)), uniform_plan(STEPS, 24, 5)
     first = cache.lower(plan)
     assert benchmark(cache.lower, plan) is first

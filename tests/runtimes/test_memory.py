@@ -15,8 +15,8 @@ from tests.lower.test_single_file import inputs, make
 from ttscompile import Noise, SamplerTable, Source, flow_matching_table
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.calibration.calls import Calls
-from ttscompile.calibration.correction import fit_correction
 from ttscompile.calibration.execute import Executor
+from ttscompile.calibration.fit_correction import fit_correction
 from ttscompile.core.correction import correction_flops
 from ttscompile.core.update import update_flops
 from ttscompile.ir.program import Program
@@ -78,7 +78,7 @@ def test_the_memory_with_a_pencil() -> None:
     model = ReferenceModel.from_program(replace(program, spec=replace(program.spec, sampler=table)))
     contexts = model.prologue({"obs": torch.tensor([[-32.0]])})
     for plan, expected in (([C, C], 25), ([C, T], 22)):
-        rollout = model.rollout(contexts, torch.full((1, 1, 1), 35.0), None, np.array(plan, np.int8)[:, None])
+        rollout = model.denoise(contexts, torch.full((1, 1, 1), 35.0), None, np.array(plan, np.int8)[:, None])
         assert float(rollout.sample) == expected
 
 
@@ -93,7 +93,7 @@ def test_the_reference_is_the_formula(name: str) -> None:
         toy = as_functions(program, obs[0], steps[:, 0])
         with torch.no_grad():
             tensors = torch.from_numpy(initial), torch.from_numpy(steps)
-            result = model.rollout(model.prologue({"obs": torch.from_numpy(obs)}), *tensors, plan)
+            result = model.denoise(model.prologue({"obs": torch.from_numpy(obs)}), *tensors, plan)
         expected = Episode(toy).call(initial[0].astype(np.float64), plan)
         np.testing.assert_allclose(result.sample[0].numpy(), expected, rtol=2e-5, atol=2e-5)
 
@@ -184,7 +184,7 @@ def test_calibration_runs_the_same_loop_and_its_corrections_help(made: Made) -> 
     corrected = executor.corrected(fit_correction(executor, plan, calls))
     for each in (executor, corrected):
         with torch.no_grad():
-            expected = executor.model.rollout(contexts, initial, steps, plan, correction=each.correction)
+            expected = executor.model.denoise(contexts, initial, steps, plan, correction=each.correction)
         torch.testing.assert_close(each.run(plan, calls), expected.sample, rtol=0, atol=2e-5)
         if each.correction is None:
             torch.testing.assert_close(each.run(0 * plan, calls), calls.targets, rtol=0, atol=2e-5)

@@ -17,7 +17,6 @@ from ttscompile.errors import ArtifactError, IllegalPlanError, ObservationError,
 from ttscompile.ir.program import Binding
 from ttscompile.runtimes import Runtime, open_runtime
 from ttscompile.runtimes.onnxruntime.workspace import Workspace
-from ttscompile.runtimes.reference.runtime import ReferenceRuntime
 
 from .agreement import largest_difference, random_inputs
 from .conftest import MakeArtifact
@@ -120,7 +119,7 @@ def test_the_report_says_what_was_done(runtime: Runtime, toy_artifact: Artifact)
 
 
 def test_the_pruners_plan_is_legalised_and_counted(runtime: Runtime, toy_artifact: Artifact) -> None:
-    reference = ReferenceRuntime(toy_artifact)
+    reference = open_runtime(toy_artifact, "reference")
     manifest = toy_artifact.manifest
     rng = np.random.default_rng(1)
     written = np.zeros((2, 5, 5), np.bool_)
@@ -129,7 +128,7 @@ def test_the_pruners_plan_is_legalised_and_counted(runtime: Runtime, toy_artifac
         obs, noise = random_inputs(toy_artifact, rng, 2)
         _, report = runtime.predict(obs, noise)
         reference.predict(obs, noise, report.plan)  # refuses an illegal plan
-        model = reference.model
+        model = reference.backend.model
         import torch
 
         wanted = model.logits(model.prologue({"obs": torch.from_numpy(obs["obs"])})).argmax(-1).numpy().astype(np.int8)

@@ -14,8 +14,10 @@ from tests.once import Once
 from ttscompile import Noise, TtscompileError
 from ttscompile.artifact import load_artifact
 from ttscompile.errors import ArtifactError, RuntimeUnavailableError
-from ttscompile.runtimes import open_runtime, precision
+from ttscompile.runtimes import open_runtime
+from ttscompile.runtimes.onnxruntime import sessions
 from ttscompile.runtimes.random_calls import random_calls
+from ttscompile.verification import against_fp32
 
 from .agreement import largest_difference, random_inputs
 
@@ -51,7 +53,7 @@ def test_the_measured_error_is_what_the_public_interface_gives(int8: Path) -> No
     policies_ = [ttscompile.load(int8), ttscompile.load(int8, precision="fp32")]
     assert [one.info.precision for one in policies_] == ["int8", "fp32"]
     errors = []
-    for obs, noise in random_calls(policies.spec(), record.error.calls, precision.SEED):
+    for obs, noise in random_calls(policies.spec(), record.error.calls, against_fp32.SEED):
         actions = []
         for policy in policies_:
             policy.reset()
@@ -99,7 +101,7 @@ def test_where_sums_saturate_they_are_made_exact_and_a_warning_says_that_it_is_s
     artifact = load_artifact(int8)
     obs, noise = random_inputs(artifact, np.random.default_rng(3), 1)
     expected = open_runtime(artifact).predict(obs, noise, artifact.schedule("dense"))[0]
-    monkeypatch.setattr(precision, "has_integer_dot_product", lambda: found)
+    monkeypatch.setattr(sessions, "has_integer_dot_product", lambda: found)
     with pytest.warns(RuntimeWarning, match=rf"avx512_vnni.*{told}.*precision='fp32'"):
         careful = open_runtime(artifact, threads=threads)
     np.testing.assert_allclose(careful.predict(obs, noise, artifact.schedule("dense"))[0], expected, rtol=1e-5)
@@ -111,7 +113,7 @@ def test_a_policy_that_gives_no_numbers_is_not_measured(int8: Path, monkeypatch:
     broken = {"obs": np.full((1, 2, 3), np.nan, np.float32)}
     noise = Noise(np.zeros((1, 8, 2), np.float32), np.zeros((10, 1, 8, 2), np.float32))
     with pytest.raises(TtscompileError, match="not a number"):
-        precision.compare(artifact, artifact.schedule("dense"), [(broken, noise)])
+        against_fp32.compare(artifact, artifact.schedule("dense"), [(broken, noise)])
 
 
 def test_nothing_to_lower_and_unknown_precisions_are_refused_before_anything_is_written(tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ def pencil(
 ) -> tuple[float, RolloutCache]:
     """One call of ``pencil_program``, whose block is ``f(h) = h - 32``."""
     contexts = model.prologue({"obs": torch.tensor([[-32.0]])})
-    result = model.rollout(contexts, torch.full((1, 1, 1), float(x)), None, np.array(plan, np.int8)[:, None], cache)
+    result = model.denoise(contexts, torch.full((1, 1, 1), float(x)), None, np.array(plan, np.int8)[:, None], cache)
     return float(result.sample), result.cache
 
 
@@ -78,7 +78,7 @@ def test_every_stream_does_what_section_2_says(seed: int, streams: int, computed
             toy = as_functions(TOY, obs["obs"][s].numpy(), noise.steps[:, s])
             expected.append(Episode(toy, literal[s]).call(noise.initial[s].astype(np.float64), plans[s]))
         with torch.no_grad():
-            result = MODEL.rollout(
+            result = MODEL.denoise(
                 MODEL.prologue(obs), torch.from_numpy(noise.initial), torch.from_numpy(noise.steps), plans, cache
             )
         cache = result.cache
@@ -122,12 +122,12 @@ def test_gradients_are_those_of_the_whole_formula(write_gradients: bool) -> None
     contexts = MODEL.prologue(obs)
     dense = np.zeros((2, MODEL.steps, MODEL.blocks), np.int8)
     initial, steps = torch.from_numpy(noise.initial), torch.from_numpy(noise.steps)
-    cache = MODEL.rollout(contexts, initial, steps, dense).cache
+    cache = MODEL.denoise(contexts, initial, steps, dense).cache
     plans = np.stack([random_plan(rng, MODEL.steps, MODEL.groups, cells) for cells in cache.written])
     assert len(set(map(int, plans[:, 1:].reshape(-1)))) == 4
 
     gates = one_hot(plans).requires_grad_()
-    result = MODEL.rollout(contexts, initial, steps, gates, cache, write_gradients=write_gradients, keep_samples=True)
+    result = MODEL.denoise(contexts, initial, steps, gates, cache, write_gradients=write_gradients)
     result.sample.square().sum().backward()
     whole = one_hot(plans).requires_grad_()
     sample = everything_recorded(contexts, noise, whole, cache, write_gradients)
@@ -158,7 +158,7 @@ def test_without_gradients_only_computed_blocks_are_evaluated(monkeypatch: pytes
         return block(self, b, k, stream, contexts, streams)
 
     monkeypatch.setattr(ReferenceModel, "block", counting)
-    MODEL.rollout(MODEL.prologue(obs), torch.from_numpy(noise.initial), None, plans)
+    MODEL.denoise(MODEL.prologue(obs), torch.from_numpy(noise.initial), None, plans)
     assert evaluated == [*((0, b, 2) for b in range(MODEL.blocks)), (2, 3, 1)]
 
 
@@ -181,9 +181,9 @@ def test_gates_that_are_not_one_hot_are_refused() -> None:
     soft = gates.clone()
     soft[0, 2, 1] = torch.tensor([0.5, 0, 0.5, 0])
     with pytest.raises(IllegalPlanError, match="one-hot"):
-        MODEL.rollout(contexts, initial, None, soft)
+        MODEL.denoise(contexts, initial, None, soft)
     with pytest.raises(IllegalPlanError, match=r"\(1, 4, 5, 4\); expected"):
-        MODEL.rollout(contexts, initial, None, gates[:, :-1])
+        MODEL.denoise(contexts, initial, None, gates[:, :-1])
 
 
 def test_a_program_without_pieces_or_pruner_is_refused() -> None:
@@ -201,6 +201,6 @@ def test_an_artifact_gives_the_model_of_its_program(toy_artifact: Artifact) -> N
     plan = np.full((MODEL.steps, MODEL.blocks), T, np.int8)
     plan[0] = C
     stored = ReferenceModel.from_artifact(toy_artifact)
-    samples = [m.rollout(m.prologue(obs), torch.from_numpy(noise.initial), None, plan).sample for m in (stored, MODEL)]
+    samples = [m.denoise(m.prologue(obs), torch.from_numpy(noise.initial), None, plan).sample for m in (stored, MODEL)]
     assert torch.equal(*samples)
     assert torch.equal(stored.logits(stored.prologue(obs)), MODEL.logits(MODEL.prologue(obs)))

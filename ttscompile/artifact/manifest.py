@@ -12,6 +12,7 @@ from typing import Any
 from ..core.lattice import PlanArray, plan_flops
 from ..core.spec import FP32, PolicySpec
 from ..ir.graph import TensorType
+from ..ir.joint import OF_ALL_BLOCKS
 from ..ir.program import Binding, Reuse
 
 FORMAT = "ttscompile artifact"
@@ -206,6 +207,11 @@ class PrecisionRecord:
     weights: str
     models: Mapping[str, str]
     error: PrecisionError | None
+
+    @property
+    def blocks(self) -> int:
+        """How many residual blocks have such weights."""
+        return len(set(self.models) - set(OF_ALL_BLOCKS))
 
 
 @dataclass(frozen=True)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
+from ..core.untrusted_json import parse_json
 from ..errors import ArtifactError
 
 MAX_BYTES = 256 * 2**20
-MAX_DEPTH = 64
 REMEDY = "The file was changed or damaged; copy the artifact again, or convert the checkpoint again."
 
 
@@ -102,7 +102,7 @@ class Value:
 
 
 def parse(content: bytes, where: str, limit: int = MAX_BYTES) -> Value:
-    """Parse UTF-8 JSON without duplicate keys, NaN, or absurd size or depth.
+    """Parse a file of an artifact; see ``core.untrusted_json`` for what is refused.
 
     Args:
         content: the document.
@@ -112,30 +112,10 @@ def parse(content: bytes, where: str, limit: int = MAX_BYTES) -> Value:
     Raises:
         ArtifactError: not such a document.
     """
-    if len(content) > limit:
-        raise ArtifactError(f"{where}: expected at most {limit} bytes of JSON; found {len(content)}. {REMEDY}")
     try:
-        data = json.loads(content.decode("utf-8"), object_pairs_hook=_unique, parse_constant=_no_constant)
-    except RecursionError:
-        raise ArtifactError(f"{where}: expected JSON at most {MAX_DEPTH} levels deep; found more. {REMEDY}") from None
-    except ValueError as error:  # UnicodeDecodeError and JSONDecodeError among them
-        raise ArtifactError(f"{where}: expected a JSON document; found {error}. {REMEDY}") from None
-    check_depth(data, where)
-    return Value(data, where)
-
-
-def check_depth(data: object, where: str) -> None:
-    """Raise if a document is deeper than ``MAX_DEPTH``.
-
-    Raises:
-        ArtifactError: it is.
-    """
-    level = [data]
-    for _ in range(MAX_DEPTH + 1):
-        level = [child for item in level for child in _children(item)]
-        if not level:
-            return
-    raise ArtifactError(f"{where}: expected JSON at most {MAX_DEPTH} levels deep; found more. {REMEDY}")
+        return Value(parse_json(content, limit), where)
+    except ValueError as error:
+        raise ArtifactError(f"{where}: expected a JSON document; {error}. {REMEDY}") from None
 
 
 def dump(data: object) -> bytes:
@@ -146,24 +126,6 @@ def dump(data: object) -> bytes:
 def dump_compact(data: object) -> bytes:
     """A document for hashing: no white space, order of the keys kept."""
     return json.dumps(data, separators=(",", ":"), allow_nan=False).encode("ascii")
-
-
-def _children(item: object) -> Sequence[object]:
-    if isinstance(item, Mapping):
-        return list(item.values())
-    return item if isinstance(item, list) else ()
-
-
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    members = dict(pairs)
-    if len(members) != len(pairs):
-        names = [key for key, _ in pairs]
-        raise ValueError(f"the key {next(key for key in names if names.count(key) > 1)!r} twice in one object")
-    return members
-
-
-def _no_constant(name: str) -> NoReturn:
-    raise ValueError(f"the number {name}, which is not JSON")
 
 
 def _shorten(data: object) -> str:

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from .. import __version__
 from ..artifact import tensors
 from ..core.correction import Correction
 from ..errors import ArtifactError
 from ..ir.program import Binding, Program
 from ..ir.serialize import graph_to_json
+from ..measure.versions import VERSION
 from .bind import Place, bind, rebind
 from .codec import decode, encode
 from .files import (
@@ -230,7 +230,7 @@ def _fill(
     manifest = _identified(
         Manifest(
             schema_version=SCHEMA_VERSION,
-            ttscompile_version=__version__,
+            ttscompile_version=VERSION,
             identity="",
             model_identity="",
             spec=program.spec,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..core.lattice import PlanArray, Source
-from ..runtimes.base import pruner_plan
+from ..runtimes.settle import pruner_plan
 from .head import capacity, has_head, head_features, head_weights
 from .linear import Matrix, linearise
 from .switches import fit_switches

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,14 +15,15 @@ from ..artifact.manifest import DENSE
 from ..core.lattice import Source
 from ..core.spec import FP32, Noise
 from ..measure.points import MeasuredPoint
-from ..runtimes.base import open_runtime
+from ..measure.timer import Timer, Times
+from ..runtimes.open import open_runtime
 from ..runtimes.policy import CompiledPolicy
 from ..runtimes.random_calls import random_noise
 from ..trajectories.episodes import Episode
 from .calls import LARGEST
 
 WARM_UP = 2
-"""Rounds that are not timed; their actions count."""
+"""Rounds whose times do not count, where there are more than these; their actions count."""
 
 Array = npt.NDArray[Any]
 Progress = Callable[[str, int, int], None]
@@ -76,9 +77,9 @@ def measure(
     exact = artifact.at_precision(FP32)
     truth = CompiledPolicy(exact, open_runtime(exact, "onnxruntime", threads))
     errors: list[list[float]] = [[] for _ in entrants]
-    times: list[list[float]] = [[] for _ in entrants]
     reports: list[list[tuple[float, float]]] = [[] for _ in entrants]
     apart: dict[str, list[float]] = {"all": [], **({"steps": []} if spec.sampler.stochastic else {})}
+    timer = Timer(len(entrants), WARM_UP if len(chosen) > WARM_UP else 0)
     for number, (episode, row) in enumerate(chosen):
         obs = {key: array[row : row + 1] for key, array in episodes[episode].observations.items()}
         one, two = random_noise(spec, draw), random_noise(spec, draw)
@@ -87,26 +88,21 @@ def measure(
         if "steps" in apart:
             mixed = Noise(one.initial, two.steps)
             apart["steps"].append(_error(_call(truth, obs, mixed, DENSE), dense))
-        for turn in range(len(entrants)):
-            i = (turn + number) % len(entrants)  # nobody always runs after the same one
-            noise = one if entrants[i].paired else _adapted(one, entrants[i].policy, draw)
-            start = time.perf_counter()
-            actions = _call(entrants[i].policy, obs, noise, entrants[i].plan)
-            times[i].append(1000 * (time.perf_counter() - start))
-            errors[i].append(_error(actions, dense))
-            report = entrants[i].policy.last_report
+        for i in timer.round():
+            policy = entrants[i].policy
+            call = partial(
+                _call, policy, obs, one if entrants[i].paired else _adapted(one, policy, draw), entrants[i].plan
+            )
+            errors[i].append(_error(timer.time(i, call), dense))
+            report = policy.last_report
             assert report is not None
             reports[i].append((float(np.mean(report.plan != Source.COMPUTE)), report.flops[0]))
         progress("held-out calls", number + 1, len(chosen))
-    points = tuple(map(_point, entrants, errors, times, reports))
+    points = tuple(map(_point, entrants, errors, timer.times, reports))
     return points, {name: float(np.mean(found)) for name, found in apart.items()}
 
 
-def _point(
-    entrant: Entrant, errors: list[float], times: list[float], reports: list[tuple[float, float]]
-) -> MeasuredPoint:
-    timed = times[WARM_UP:] or times
-    low, high = np.percentile(timed, [25, 75])
+def _point(entrant: Entrant, errors: list[float], times: Times, reports: list[tuple[float, float]]) -> MeasuredPoint:
     sparsity, flops = np.mean(reports, axis=0)
     return MeasuredPoint(
         series=entrant.series,
@@ -115,8 +111,8 @@ def _point(
         flops=float(flops),
         error=float(np.mean(errors)),
         error_p90=float(np.quantile(errors, 0.9)),
-        latency_ms=float(np.median(timed)),
-        quartiles_ms=(float(low), float(high)),
+        latency_ms=times.median,
+        quartiles_ms=times.quartiles,
         noise="all" if entrant.paired else "initial",
     )
 

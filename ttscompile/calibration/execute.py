@@ -2,12 +2,13 @@
 
 A search tries thousands of plans, on calls that go through the loop together; a step in which nothing is computed costs
 one addition. No plan here reads the rollout cache: what one call leaves for the next is the reference runtime's
-business. Tests hold this against ``ReferenceModel.rollout``.
+business. Tests hold this against ``ReferenceModel.denoise``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping
 from copy import copy
 from typing import Any
 
@@ -20,8 +21,7 @@ from ..artifact.load import Artifact
 from ..core.correction import Correction
 from ..core.lattice import BoolArray, PlanArray, Source, dense_plan
 from ..errors import IllegalPlanError
-from ..runtimes.reference.model import ReferenceModel
-from ..runtimes.reference.sampler import Carried
+from ..runtimes.reference.model import Blocks, ReferenceModel
 from .calls import Calls, Selector
 
 STREAMS = 256
@@ -53,6 +53,7 @@ class Executor:
         self.alike = len({block.type for block in blocks}) == 1
         self.pruner_graph = artifact.graphs.get("pruner")
         self.correction: Correction | None = None
+        self._dense = dense_plan(self.model.steps, self.model.blocks)[None]
 
     def corrected(self, correction: Correction | None) -> Executor:
         """The same executor with another correction, or none."""
@@ -77,29 +78,26 @@ class Executor:
             raise IllegalPlanError("expected plans with a dense step 0 that read nothing of an earlier call.")
         with torch.no_grad():
             if plan.ndim == 2:
-                return self._loop(plan[None], calls)
+                return last(self._samples(plan[None], calls))
             parts = [np.arange(i, min(i + STREAMS, len(plan))) for i in range(0, len(plan), STREAMS)]
-            return torch.cat([self._loop(plan[part], self.selector.calls(calls, part)) for part in parts])
+            return torch.cat([last(self._samples(plan[part], self.selector.calls(calls, part))) for part in parts])
 
     def run_dense(self, calls: Calls) -> Tensor:
         """What the dense policy answers, and how it gets there: the sample after each step, ``[N, K, T, D]``."""
-        path: list[Tensor] = []
         with torch.no_grad():
-            self.corrected(None)._loop(dense_plan(self.model.steps, self.model.blocks)[None], calls, path)
-        return torch.stack(path, 1)
+            return torch.stack(list(self.corrected(None)._samples(self._dense, calls)), 1)
 
     @torch.no_grad()
     def dense_steps(self, calls: Calls) -> Iterator[tuple[Tensor, list[Tensor]]]:
         """Step by step, the stream after the stem of dense calls, and what each block adds to it."""
-        dense, carried = self.corrected(None), self.model.begin(calls.initial)
-        for k in range(self.model.steps):
-            stem = stream = self.model.stem(carried.sample, k, calls.contexts)
-            residuals = []
-            for b in range(self.model.blocks):
-                residuals.append(self.model.block(b, k, stream, calls.contexts))
-                stream = stream + residuals[-1]
-            yield stem, residuals
-            carried = dense.advance(carried, self.model.tail(stream, k, calls.contexts), calls, k)
+        state, stems = State(), list[Tensor]()
+
+        def blocks(k: int, stem: Tensor) -> Tensor:
+            stems.append(stem)
+            return self.step(self._dense[:, k], k, stem, calls, state)
+
+        for _ in self.corrected(None).samples(calls, blocks):
+            yield stems.pop(), [state.timestep[b] for b in range(self.model.blocks)]
 
     def logits(self, calls: Calls, weights: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[np.float32]:
         """What the pruner says with these constants, ``[N, K, blocks, 4]``."""
@@ -107,36 +105,50 @@ class Executor:
         with torch.no_grad():
             return np.asarray(self.model.logits(calls.contexts, tensors).numpy(), dtype=np.float32)
 
-    def _loop(self, plans: PlanArray, calls: Calls, path: list[Tensor] | None = None) -> Tensor:
-        """All steps, with one plan for all calls or one for each; the sample after each goes to ``path``."""
-        state, carried = State(len(self.axes)), self.model.begin(calls.initial)
+    def samples(self, calls: Calls, blocks: Blocks) -> Iterator[Tensor]:
+        """The sample ``[N, T, D]`` after each step, with the executor's correction.
+
+        Args:
+            calls: N of them.
+            blocks: from a step and the stream after its stem to the stream after its last block.
+        """
+        loop = self.model.steps_of(calls.contexts, calls.initial, calls.noise, blocks, self.correction)
+        return (carried.sample for carried in loop)
+
+    def _samples(self, plans: PlanArray, calls: Calls) -> Iterator[Tensor]:
+        """The same with one plan for all calls, or one for each: ``[1 or N, K, blocks]``."""
+        state = State()
         total: Tensor | None = None  # what all blocks add together, as long as nothing is computed
         previous: PlanArray | None = None
-        for k in range(self.model.steps):
+
+        def blocks(k: int, stem: Tensor) -> Tensor:
+            nonlocal total, previous
             row = plans[:, k]
-            stem = self.model.stem(carried.sample, k, calls.contexts)
             if total is not None and previous is not None and np.array_equal(row, previous):
-                stream = stem + total
-            else:
-                stream = self.step(row, k, stem, calls, state)
-                computes = bool((row == Source.COMPUTE).any())
-                total = None if computes or not self.alike else stream - stem
-                previous = None if computes else row
-            prediction = self.model.tail(stream, k, calls.contexts)
-            carried = self.advance(carried, prediction, calls, k)
-            if path is not None:
-                path.append(carried.sample)
-        return carried.sample
+                return stem + total
+            stream = self.step(row, k, stem, calls, state)
+            computes = bool((row == Source.COMPUTE).any())
+            total = None if computes or not self.alike else stream - stem
+            previous = None if computes else row
+            return stream
 
-    def advance(self, carried: Carried, prediction: Tensor, calls: Calls, k: int) -> Carried:
-        """What the sampler carries to step k + 1."""
-        noise = None if calls.noise is None else calls.noise[k]
-        return self.model.advance(carried, prediction, noise, k, self.correction)
+        return self.samples(calls, blocks)
 
-    def step(self, row: PlanArray, k: int, stream: Tensor, calls: Calls, state: State) -> Tensor:
-        """All blocks of one step, where ``row [1, blocks]`` or ``[N, blocks]`` says what to do."""
-        for b, axis in enumerate(self.axes):
-            group, column = self.model.groups[b], row[:, b]
+    def step(
+        self, row: PlanArray, k: int, stream: Tensor, calls: Calls, state: State, blocks: range | None = None
+    ) -> Tensor:
+        """The stream after the blocks of step k, where ``row [1, blocks]`` or ``[N, blocks]`` says what to do.
+
+        Args:
+            row: of the plan.
+            k: step.
+            stream: before the blocks.
+            calls: N of them.
+            state: of the loop; changed.
+            blocks: which blocks; None for all.
+        """
+        for b in range(self.model.blocks) if blocks is None else blocks:
+            group, column, axis = self.model.groups[b], row[:, b], self.axes[b]
             computing, forwarding = column == Source.COMPUTE, column == Source.FORWARD
             if computing.all():
                 residual = self.model.block(b, k, stream, calls.contexts)
@@ -153,20 +165,20 @@ class Executor:
 
 
 class State:
-    """Caches of all streams, before step 0.
+    """Caches of all streams; what step 0 has to write is there after it, since it is dense.
 
-    Args:
-        blocks: number of residual blocks.
+    Attributes:
+        forward: by group.
+        timestep: by block.
     """
 
-    def __init__(self, blocks: int) -> None:
+    def __init__(self) -> None:
         self.forward: dict[int, Tensor] = {}
-        self.timestep: list[Tensor | None] = [None] * blocks
+        self.timestep: dict[int, Tensor] = {}
 
     def reused(self, b: int, group: int, forwarding: BoolArray, axis: int) -> Tensor:
         """What block b adds where it is not computed."""
         own, other = self.timestep[b], self.forward[group]
-        assert own is not None  # step 0 is dense
         if not forwarding.any():
             return own
         if forwarding.all():
@@ -176,10 +188,13 @@ class State:
 
     def write(self, b: int, group: int, axis: int, streams: Tensor, residual: Tensor) -> None:
         """Put computed residuals of some streams into the caches."""
-        own = self.timestep[b]
-        assert own is not None
-        self.timestep[b] = own.index_copy(axis, streams, residual)
+        self.timestep[b] = self.timestep[b].index_copy(axis, streams, residual)
         self.forward[group] = self.forward[group].index_copy(axis, streams, residual)
+
+
+def last(samples: Iterable[Tensor]) -> Tensor:
+    """The denoised sample: that after the last step."""
+    return deque(samples, maxlen=1).pop()
 
 
 def _numbers(streams: BoolArray) -> Tensor:

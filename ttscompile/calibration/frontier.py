@@ -23,7 +23,7 @@ from ..artifact.manifest import DENSE
 from ..core.correction import FEATURES
 from ..errors import CalibrationError
 from ..measure.points import Frontier
-from ..runtimes.base import open_runtime
+from ..runtimes.open import open_runtime
 from ..runtimes.policy import CompiledPolicy
 from ..trajectories.episodes import Episode, load_trajectories
 from .budget import cells_of, goal_of

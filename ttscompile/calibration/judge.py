@@ -8,7 +8,7 @@ from ..artifact.load import Artifact
 from ..artifact.manifest import UNIFORM, Manifest
 from ..core.lattice import PlanArray, uniform_plan
 from ..errors import CalibrationFailedError
-from ..runtimes.base import pruner_plan
+from ..runtimes.settle import pruner_plan
 from .budget import ERROR, FLOPS, Goal
 from .calls import LARGEST, Actions, Calls
 from .execute import Executor

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
@@ -14,8 +13,10 @@ from ..core.correction import Correction
 from ..core.lattice import PlanArray, sparsity, uniform_plan
 from ..core.spec import Noise
 from ..errors import CalibrationError
-from ..runtimes.base import Runtime, open_runtime
+from ..measure.timer import Timer
+from ..runtimes.open import open_runtime
 from ..runtimes.policy import CompiledPolicy
+from ..runtimes.runtime import Runtime
 from .budget import LATENCY, Budget, Goal
 
 WARM_UP, FEWEST, MOST, SECONDS = 2, 5, 25, 2.0
@@ -92,15 +93,11 @@ def measure_budget(artifact: Artifact, goal: Goal, pruned: bool) -> Budget:
 
 def median_ms(call: Callable[[], object]) -> float:
     """Median wall time of a call, in milliseconds."""
-    for _ in range(WARM_UP):
-        call()
-    times: list[float] = []
-    begun = time.perf_counter()
-    while len(times) < FEWEST or (len(times) < MOST and time.perf_counter() - begun < SECONDS):
-        start = time.perf_counter()
-        call()
-        times.append(1000 * (time.perf_counter() - start))
-    return float(np.median(times))
+    timer = Timer(1, WARM_UP)
+    while timer.counted < FEWEST or (timer.counted < MOST and timer.seconds < SECONDS):
+        timer.round()
+        timer.time(0, call)
+    return timer.times[0].median
 
 
 def _pruner_ms(artifact: Artifact, runtime: Runtime) -> float:

@@ -11,9 +11,9 @@ from ..artifact.load import Artifact
 from ..artifact.manifest import DENSE
 from ..core.correction import Correction
 from ..core.lattice import PlanArray, Source
-from ..runtimes.precision import Call, action_errors, compare
 from ..runtimes.random_calls import normalized, random_noise
 from ..trajectories.episodes import Episode
+from ..verification.against_fp32 import Call, action_errors, compare
 from .calls import sample_calls
 
 HELD_OUT = 8

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ..core.lattice import PlanArray, Source
 from .calls import Calls, IntArray
-from .execute import Executor
+from .execute import Executor, last
 
 BYTES = 2**28
 """Memory for what the blocks compute; gradients and what they need take three to four times as much."""
@@ -56,13 +56,13 @@ def sensitivity(
     """
     model, count = executor.model, calls.count
     streams = executor.selector.calls(calls, np.tile(np.arange(count), copies))
-    carried = model.begin(streams.initial.requires_grad_())
     cache: dict[int, Tensor] = {}
     computed: list[Tensor] = []
     passed: list[Tensor] = []  # the stream after additions: its gradient is that of what was added just before
     position: list[int] = []
-    for k, row in enumerate(plan):
-        stream = model.stem(carried.sample, k, streams.contexts)
+
+    def blocks(k: int, stream: Tensor) -> Tensor:
+        row = plan[k]
         computes = bool((row == Source.COMPUTE).any()) or not executor.alike
         for b, axis in enumerate(executor.axes):
             key = model.groups[b] if reuse == Source.FORWARD else b
@@ -78,10 +78,12 @@ def sensitivity(
                 position.append(len(passed))
                 passed.append(stream)
         if not computes:  # nothing but additions: one gradient serves all blocks
-            position += [len(passed)] * len(row)
+            position.extend([len(passed)] * len(row))
             passed.append(stream)
-        carried = executor.advance(carried, model.tail(stream, k, streams.contexts), streams, k)
-    gradients = torch.autograd.grad(figure(carried.sample), passed)
+        return stream
+
+    streams.initial.requires_grad_()
+    gradients = torch.autograd.grad(figure(last(executor.samples(streams, blocks))), passed)
     axes = executor.axes * model.steps
     return Sensitivity(computed, [_rows(gradients[i], axis) for i, axis in zip(position, axes, strict=True)])
 

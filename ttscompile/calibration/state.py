@@ -14,7 +14,8 @@ import numpy.typing as npt
 
 from ..artifact import tensors
 from ..artifact.files import replace_file
-from ..artifact.strict_json import Value, check_depth
+from ..artifact.strict_json import Value
+from ..core.untrusted_json import parse_json
 from ..errors import ArtifactError, CalibrationError
 
 Array = npt.NDArray[Any]
@@ -146,13 +147,10 @@ def _checksum(arrays: Mapping[str, Array]) -> bytes:
 def _members(array: Array | None, name: str) -> dict[str, Any]:
     """The JSON object that an array holds as bytes; errors of plans may be NaN in it."""
     content = b"" if array is None else array.tobytes()
-    if len(content) > MAX_TEXT_BYTES:
-        raise ArtifactError(f"{name}: expected at most {MAX_TEXT_BYTES} bytes; found {len(content)}")
     try:
-        document = json.loads(content)
-    except RecursionError as error:
-        raise ArtifactError(f"{name}: is nested too deeply") from error
-    check_depth(document, name)
+        document = parse_json(content, MAX_TEXT_BYTES, allow_nan=True)
+    except ValueError as error:
+        raise ArtifactError(f"{name}: expected a JSON document; {error}") from error
     return {key: value.data for key, value in Value(document, name).members().items()}
 
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 from ..core.correction import Correction
 from ..core.lattice import PlanArray, whole_steps_plan
-from .correction import fit_correction
 from .crowded import CROWDING, crowded_family
+from .fit_correction import fit_correction
 
 if TYPE_CHECKING:
     from .strategies.base import Task

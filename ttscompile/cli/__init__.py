@@ -18,7 +18,7 @@ from ttscompile.cli.compare import compare
 from ttscompile.cli.convert import convert
 from ttscompile.cli.doctor import doctor
 from ttscompile.cli.inspect import inspect
-from ttscompile.cli.plan import plan
+from ttscompile.cli.realtime import realtime
 from ttscompile.cli.report import report
 from ttscompile.cli.serve import serve
 from ttscompile.cli.verify import verify
@@ -65,7 +65,7 @@ for _command, _what in (
     (report, "All about an artifact on one page."),
     (bench, "Time calls, beside what they replace."),
     (compare, "Action error against latency, of plans and strategies."),
-    (plan, "Which plans keep up with a control loop on this machine."),
+    (realtime, "Which plans keep up with a control loop on this machine."),
     (serve, "Drive a robot from another process, over a local WebSocket."),
 ):
     _command.short_help = _what

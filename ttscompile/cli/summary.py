@@ -12,7 +12,6 @@ from rich.console import Console
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import DENSE, Manifest, abbreviated
 from ttscompile.cli.output import flops, marked, share, table
-from ttscompile.ir.joint import OF_ALL_BLOCKS
 from ttscompile.measure.units import plain
 from ttscompile.runtimes.onnxruntime.liveness import rollout_needs
 
@@ -79,7 +78,7 @@ def _precision(manifest: Manifest) -> dict[str, Any]:
         return {"name": manifest.precision_name, "blocks": 0, "bytes": 0, "error": None}
     size = sum(manifest.files[name].bytes for name in (record.weights, *record.models.values()))
     error = None if record.error is None else dict(vars(record.error))
-    return {"name": record.name, "blocks": len(set(record.models) - set(OF_ALL_BLOCKS)), "bytes": size, "error": error}
+    return {"name": record.name, "blocks": record.blocks, "bytes": size, "error": error}
 
 
 def _told_precision(precision: dict[str, Any], blocks: int) -> str:

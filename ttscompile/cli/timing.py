@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.core.lattice import Source
 from ttscompile.core.spec import FP32, Affine, Noise, PolicySpec
 from ttscompile.errors import RuntimeUnavailableError, SpecError
+from ttscompile.measure.timer import Timer, Times
 from ttscompile.runtimes.random_calls import Observation, normalized, random_calls
 
 if TYPE_CHECKING:
@@ -57,8 +58,6 @@ class Measurement:
         label: of the contestant.
         plan: that it ran.
         times_ms: wall time of each call.
-        median_ms: their median.
-        quartiles_ms: their first and third quartile.
         prologue_ms: median of the report's timing; None without reports.
         pruner_ms: likewise.
         flops: median over the calls; None where they are not known.
@@ -69,17 +68,25 @@ class Measurement:
     label: str
     plan: str
     times_ms: tuple[float, ...]
-    median_ms: float
-    quartiles_ms: tuple[float, float]
-    prologue_ms: float | None
-    pruner_ms: float | None
-    flops: float | None
-    sparsity: float
-    legalised: int
+    prologue_ms: float | None = None
+    pruner_ms: float | None = None
+    flops: float | None = None
+    sparsity: float = 0.0
+    legalised: int = 0
+
+    @property
+    def median_ms(self) -> float:
+        """Median of the times."""
+        return Times(self.times_ms).median
+
+    @property
+    def quartiles_ms(self) -> tuple[float, float]:
+        """First and third quartile of the times."""
+        return Times(self.times_ms).quartiles
 
     def to_json(self) -> dict[str, Any]:
         """As plain JSON values."""
-        return asdict(self)
+        return asdict(self) | {"median_ms": self.median_ms, "quartiles_ms": self.quartiles_ms}
 
 
 def contestants(
@@ -130,22 +137,18 @@ def measure(
     Returns:
         One measurement a contestant.
     """
-    times: list[list[float]] = [[] for _ in entered]
+    timer = Timer(len(entered), warm_up)
     reports: list[list[Any]] = [[] for _ in entered]
     specs = {id(one.spec): one.spec for one in entered}
     calls = {name: random_calls(spec, warm_up + runs, seed) for name, spec in specs.items()}
     for number in range(warm_up + runs):
-        for turn in range(len(entered)):
-            i = (turn + number) % len(entered)  # nobody always runs after the same one
-            obs, noise = calls[id(entered[i].spec)][number]
-            started = perf_counter()
-            entered[i].call(obs, noise)
-            elapsed = 1000 * (perf_counter() - started)
-            if number >= warm_up:
-                times[i].append(elapsed)
-                reports[i].append(entered[i].report())
+        for i in timer.round():
+            one = entered[i]
+            timer.time(i, partial(one.call, *calls[id(one.spec)][number]))
+            if timer.counted:
+                reports[i].append(one.report())
         on_round(number + 1, warm_up + runs)
-    return [_summary(*one) for one in zip(entered, times, reports, strict=True)]
+    return [_summary(*one) for one in zip(entered, timer.times, reports, strict=True)]
 
 
 def _compiled(label: str, directory: Path, threads: int, plan: str, spec: PolicySpec, precision: str) -> Contestant:
@@ -260,18 +263,16 @@ def _same(left: Affine | None, right: Affine | None) -> bool:
     return np.array_equal(left.scale, right.scale) and np.array_equal(left.offset, right.offset)
 
 
-def _summary(contestant: Contestant, times: Sequence[float], reports: Sequence[Any]) -> Measurement:
-    reported = reports[0] is not None
-    low, high = np.percentile(times, [25, 75])
+def _summary(contestant: Contestant, times: Times, reports: Sequence[Any]) -> Measurement:
+    if reports[0] is None:
+        return Measurement(contestant.label, contestant.plan, times.ms, flops=contestant.dense_flops)
     return Measurement(
         label=contestant.label,
         plan=contestant.plan,
-        times_ms=tuple(times),
-        median_ms=float(np.median(times)),
-        quartiles_ms=(float(low), float(high)),
-        prologue_ms=float(np.median([r.timings.prologue for r in reports])) if reported else None,
-        pruner_ms=float(np.median([r.timings.pruner for r in reports])) if reported else None,
-        flops=float(np.median([r.flops[0] for r in reports])) if reported else contestant.dense_flops,
-        sparsity=float(np.mean([np.mean(r.plan != Source.COMPUTE) for r in reports])) if reported else 0.0,
-        legalised=sum(sum(r.legalised) for r in reports) if reported else 0,
+        times_ms=times.ms,
+        prologue_ms=float(np.median([r.timings.prologue for r in reports])),
+        pruner_ms=float(np.median([r.timings.pruner for r in reports])),
+        flops=float(np.median([r.flops[0] for r in reports])),
+        sparsity=float(np.mean([np.mean(r.plan != Source.COMPUTE) for r in reports])),
+        legalised=sum(sum(r.legalised) for r in reports),
     )

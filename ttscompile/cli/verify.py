@@ -14,8 +14,6 @@ from ttscompile.cli.output import table as make_table
 from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.plots.errors import plot_errors
-from ttscompile.verification import Verification
-from ttscompile.verification.rung import FAILED, SKIPPED, Rung
 
 
 @click.command(cls=FilesCommand)
@@ -56,10 +54,8 @@ def verify(
             threads=threads,
             progress=lambda what: status.update(f"verifying: {what}"),
         )
-    for rung in found.rungs:
-        if rung.status == SKIPPED:
-            told = f"warning: {rung.name} was skipped: {rung.told.rstrip('.')}. {rung.remedy}"
-            console.print(told, soft_wrap=True)
+    for rung in found.skipped:
+        console.print(f"warning: {rung.name} was skipped: {rung.told.rstrip('.')}. {rung.remedy}", soft_wrap=True)
     if as_json:
         print_json({"machine": fingerprint(), "threads": threads, **found.to_json()})
     else:
@@ -70,7 +66,7 @@ def verify(
         context.exit(1)
 
 
-def _draw(found: Verification, picture: Path) -> str:
+def _draw(found: ttscompile.Verification, picture: Path) -> str:
     """Draw, and say so."""
     errors = found.map
     if errors is None:
@@ -82,7 +78,7 @@ def _draw(found: Verification, picture: Path) -> str:
     return f"wrote {picture}"
 
 
-def _print(found: Verification, output: Console) -> None:
+def _print(found: ttscompile.Verification, output: Console) -> None:
     """The ladder as a table, and what to do."""
     made = make_table("rung", "", "error", "allowed", "of what")
     made.columns[1].justify = made.columns[4].justify = "left"
@@ -94,23 +90,14 @@ def _print(found: Verification, output: Console) -> None:
     for rung in found.rungs:
         output.print(f"{rung.name}: {rung.told.rstrip('.')}.", soft_wrap=True)
     failure = found.first_failure
-    skipped = sum(rung.status == SKIPPED for rung in found.rungs)
     if failure is None:
-        told = f"All rungs hold{f', {skipped} skipped' if skipped else ''}; {found.seconds:.1f} s."
+        told = f"All rungs hold{f', {len(found.skipped)} skipped' if found.skipped else ''}; {found.seconds:.1f} s."
     else:
-        told = f"FAILED at {failure.name}{_place(failure)}. {failure.remedy}"
-        if above := [rung.name for rung in found.rungs if rung.status == FAILED and rung is not failure]:
+        told = f"FAILED at {failure.name}{f' ({failure.place})' if failure.place else ''}. {failure.remedy}"
+        if above := [rung.name for rung in found.failed[1:]]:
             told += f" What fails above it may only follow from it: {', '.join(above)}."
     output.print(told, soft_wrap=True)
     output.print(one_line(fingerprint()), soft_wrap=True)
-
-
-def _place(rung: Rung) -> str:
-    parts = [f"step {rung.step}"] if rung.step is not None else []
-    if rung.blocks:
-        shown = ", ".join(map(str, rung.blocks[:8])) + ", .." * (len(rung.blocks) > 8)
-        parts.append(f"block{'s' * (len(rung.blocks) > 1)} {shown}")
-    return f" ({', '.join(parts)})" if parts else ""
 
 
 def _number(figure: float | None) -> str:

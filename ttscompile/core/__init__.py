@@ -4,4 +4,5 @@
 - ``lattice``: sources, plans and which of them are legal.
 - ``correction``: the linear correction of a plan.
 - ``update``: sampler and correction of one step as one matrix product.
+- ``untrusted_json``: the one reader of JSON that somebody else wrote.
 """

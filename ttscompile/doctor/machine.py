@@ -133,7 +133,7 @@ def _clock(root: Path) -> list[Finding]:
         found.append(Finding.judged(part, "source", source, source not in _FAST_CLOCKS, remedy))
     late = _lateness_ms()
     told = f"{late:.2f} ms late in the median, of 20 sleeps of 1 ms"
-    remedy = "A control loop will jitter: look with ttscompile plan DIR --control-hz HZ --jitter 10."
+    remedy = "A control loop will jitter: look with ttscompile realtime DIR --control-hz HZ --jitter 10."
     return [*found, Finding.judged(part, "sleep", told, late > _LATE_MS, remedy)]
 
 

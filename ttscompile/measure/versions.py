@@ -1,8 +1,11 @@
-"""Versions of packages, to compare them; the standard library alone, for the doctor."""
+"""This package's version, and versions to compare; the standard library alone, for the doctor."""
 
 from __future__ import annotations
 
 import re
+
+VERSION = "0.1.0"
+"""Of ttscompile."""
 
 
 def release(text: str) -> tuple[int, ...]:

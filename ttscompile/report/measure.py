@@ -10,9 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.lattice import PlanArray, Source
-from ..runtimes.base import CallReport
+from ..measure.timer import Timer, Times
 from ..runtimes.executor.measure import neutral_observation
 from ..runtimes.policy import CompiledPolicy
+from ..runtimes.report import CallReport
 from ..trajectories.episodes import Episode
 
 PARTS = ("prologue", "wait_pruner", "decode")
@@ -69,9 +70,7 @@ class Course:
 
 
 def measure_parts(policy: CompiledPolicy, plans: Sequence[str], runs: int) -> list[Latency]:
-    """What calls spend their time on, by their reports; plans in turn, so that whatever else the machine does hits all.
-
-    Not what ``runtimes.executor.measure`` does: that takes wall time by the executor's clock, of any policy.
+    """What calls spend their time on, by their own reports; plans take turns.
 
     Args:
         policy: loaded; it is reset before and after.
@@ -79,30 +78,31 @@ def measure_parts(policy: CompiledPolicy, plans: Sequence[str], runs: int) -> li
         runs: counted calls of each.
     """
     obs = neutral_observation(dict(policy.info.observation))
-    reports: dict[str, list[CallReport]] = {plan: [] for plan in plans}
+    reports: list[list[CallReport]] = [[] for _ in plans]
     policy.reset()
-    for turn in range(WARM_UP + runs):
-        for i in range(len(plans)):
-            plan = plans[(i + turn) % len(plans)]  # nobody always runs after the same one
-            report = _call(policy, obs, plan)
-            if turn >= WARM_UP:
-                reports[plan].append(report)
+    timer = Timer(len(plans), WARM_UP)
+    for _ in range(WARM_UP + runs):
+        for i in timer.round():
+            report = _call(policy, obs, plans[i])
+            if timer.counted:
+                reports[i].append(report)
     policy.reset()
-    found = []
-    for plan, made in reports.items():
-        totals = [report.timings.total for report in made]
-        low, high = np.percentile(totals, [25, 75])
-        found.append(
-            Latency(
-                plan=plan,
-                total=float(np.median(totals)),
-                quartiles=(float(low), float(high)),
-                parts={part: float(np.median([getattr(r.timings, part) for r in made])) for part in PARTS},
-                pruner=float(np.median([r.timings.pruner for r in made])),
-                flops=float(np.median([r.flops[0] for r in made])),
-            )
-        )
-    return found
+    return [_latency(plan, made) for plan, made in zip(plans, reports, strict=True)]
+
+
+def _latency(plan: str, made: Sequence[CallReport]) -> Latency:
+    def middle(part: str) -> float:
+        return float(np.median([getattr(report.timings, part) for report in made]))
+
+    total = Times(tuple(report.timings.total for report in made))
+    return Latency(
+        plan=plan,
+        total=total.median,
+        quartiles=total.quartiles,
+        parts={part: middle(part) for part in PARTS},
+        pruner=middle("pruner"),
+        flops=float(np.median([report.flops[0] for report in made])),
+    )
 
 
 def run_episode(policy: CompiledPolicy, episode: Episode) -> Course:

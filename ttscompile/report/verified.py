@@ -50,10 +50,7 @@ def _map(found: Verification) -> tuple[Picture, ...]:
 
 
 def _told(rung: Rung) -> str:
-    place = [f"step {rung.step}"] if rung.step is not None else []
-    if rung.blocks:
-        place.append("blocks " + ", ".join(map(str, rung.blocks[:8])) + ("…" if len(rung.blocks) > 8 else ""))
-    return f"{rung.told}." + (f" First at {', '.join(place)}." if place else "")
+    return f"{rung.told}." + (f" First at {rung.place}." if rung.place else "")
 
 
 def _number(figure: float | None) -> str:

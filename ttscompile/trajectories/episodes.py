@@ -8,10 +8,10 @@ replay buffer of Diffusion Policy, an HDF5 file of robomimic and a LeRobot data 
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.spec import ObservationSpec
+from ..core.untrusted_json import parse_json
 from ..errors import TrajectoryError
 from .apart import frames_apart
 from .frames import Frames, few, observation_frames, require_proportion
@@ -27,6 +28,8 @@ from .frames import Frames, few, observation_frames, require_proportion
 Array = npt.NDArray[Any]
 
 ENDS, META = "episode_ends", "meta"
+MAX_META = 2**20
+"""Bytes of ``meta``."""
 
 
 @dataclass(frozen=True)
@@ -200,11 +203,11 @@ def _meta(path: Path, value: Array | None) -> bool:
     """Whether the rows are frames rather than calls."""
     if value is None:
         return False
-    text = value.item() if value.ndim == 0 and value.dtype.kind in "SU" else None
-    try:
-        meta = json.loads(text) if text is not None else None
-    except (ValueError, RecursionError):
-        meta = None
+    meta = None
+    if value.ndim == 0 and value.dtype.kind in "SU":
+        text = value.item()
+        with suppress(ValueError):
+            meta = parse_json(text if isinstance(text, bytes) else text.encode(), MAX_META)
     frames = meta.get("frames", False) if isinstance(meta, dict) else None
     if not isinstance(frames, bool):
         raise TrajectoryError(

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ..core.untrusted_json import parse_json
 from ..errors import TrajectoryError
 from .frames import Array, Recording, missing_package, one_error, require_files, require_proportion
 
 EPISODE, FRAME = "episode_index", "frame_index"
+MAX_INFO = 64 * 2**20
+"""Bytes of ``meta/info.json``."""
 ROWS, IMAGES = 4096, 8
 """Rows that are decoded at once: a table of rows that are all the same is a thousandth of what it holds."""
 
@@ -127,5 +129,5 @@ def _videos(path: Path) -> list[str]:
     """Names of the features that are videos; they are not read, and the error says so."""
     hint = "; expected a LeRobot data set, whose features it names"
     with one_error(f"{path}: meta/info.json cannot be read", hint):
-        features = json.loads((path / "meta" / "info.json").read_text("utf-8"))["features"]
+        features = parse_json((path / "meta" / "info.json").read_bytes(), MAX_INFO)["features"]
         return [name for name, feature in features.items() if feature.get("dtype") == "video"]

@@ -15,8 +15,9 @@ from ..core.correction import Correction
 from ..core.lattice import PlanArray, Source
 from ..core.spec import Noise
 from ..errors import RuntimeUnavailableError
-from ..runtimes.base import Runtime, open_runtime
+from ..runtimes.open import open_runtime
 from ..runtimes.policy import CompiledPolicy
+from ..runtimes.runtime import Runtime
 from .network import block_errors, describe_blocks, largest
 from .probe import Probe
 from .rung import FAILED, PASSED, SKIPPED, Rung, finite, verdict
@@ -88,7 +89,7 @@ def check_runtimes(artifact: Artifact, golden: Golden, runtime: Runtime) -> Rung
         told = "onnxruntime and the reference runtime give the same denoised sample"
         return Rung(RUNTIMES, PASSED, told, error, SAMPLE, "of the largest value")
     rows = np.unique(np.linspace(0, len(golden.steps) - 1, REFERENCE_STEPS).round().astype(np.int64))
-    errors = block_errors(manifest, golden, _reference_blocks(reference, obs), rows)
+    errors = block_errors(manifest, golden, _reference_blocks(reference.backend, obs), rows)
     kinds = tuple(block.kind for block in manifest.blocks)
     wrong, step, where = describe_blocks(errors, golden, kinds, rows)
     found = f"in the reference runtime {where}" if wrong else "every block is the original's in both"

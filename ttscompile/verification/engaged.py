@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from time import perf_counter
 
 import numpy as np
@@ -13,6 +14,7 @@ from ..artifact.load import Artifact
 from ..artifact.manifest import DENSE
 from ..core.lattice import Source
 from ..core.spec import Noise
+from ..measure.timer import Timer
 from ..runtimes.policy import CompiledPolicy
 from .rung import FAILED, PASSED, SKIPPED, Rung
 
@@ -105,31 +107,30 @@ def _measure(
     obs = {key: value[:1] for key, value in golden.raw_observations(manifest.spec).items()}
     noise = Noise(golden.initial[:1], None if golden.draws is None else golden.draws[:, :1].copy())
     names = (DENSE, *manifest.plans)
-    times: dict[str, list[float]] = {name: [] for name in names}
     executed, legalised, flops = dict[str, float](), dict[str, int](), dict[str, float]()
 
-    def call(name: str) -> float:
-        """Seconds of a call in the middle of an episode."""
-        policy.reset()
-        if name != DENSE:
-            policy.predict_action(obs, noise=noise, plan=name)  # what an episode's first call cannot read
-        start = clock()
-        policy.predict_action(obs, noise=noise, plan=name)
-        seconds = clock() - start
-        report = policy.last_report
-        assert report is not None
-        executed[name] = float(np.mean(report.plan != Source.COMPUTE))
-        legalised[name], flops[name] = report.legalised[0], report.flops[0]
-        return seconds
+    timer = Timer(len(names), warm_up=1, clock=clock)
+
+    def call_all() -> None:
+        """Time a call of each plan in the middle of an episode."""
+        for i in timer.round():
+            name = names[i]
+            call = partial(policy.predict_action, obs, noise=noise, plan=name)
+            policy.reset()
+            if name != DENSE:
+                call()  # what an episode's first call cannot read
+            timer.time(i, call)
+            report = policy.last_report
+            assert report is not None
+            executed[name] = float(np.mean(report.plan != Source.COMPUTE))
+            legalised[name], flops[name] = report.legalised[0], report.flops[0]
 
     begun = clock()
-    for name in names:  # warms up, and tells how long a round takes
-        call(name)
+    call_all()  # warms up, and tells how long a round takes
     rounds = int(PATIENCE / max(clock() - begun, 1e-9))
-    for number in range(min(max(rounds, FEWEST_ROUNDS), MOST_ROUNDS)):
-        for name in names[:: 1 if number % 2 else -1]:  # nobody always runs after the same one
-            times[name].append(1e3 * call(name))
-    medians = {name: float(np.median(taken)) for name, taken in times.items()}
+    for _ in range(min(max(rounds, FEWEST_ROUNDS), MOST_ROUNDS)):
+        call_all()
+    medians = {name: times.median for name, times in zip(names, timer.times, strict=True)}
     return {
         name: Engagement(
             planned=plan.sparsity,

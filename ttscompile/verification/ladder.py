@@ -16,7 +16,7 @@ from ..artifact.golden import load_golden, load_golden_plans
 from ..artifact.load import Artifact
 from ..core.spec import FP32
 from ..errors import ArtifactError, TtscompileError
-from ..runtimes.base import open_runtime
+from ..runtimes.open import open_runtime
 from ..runtimes.policy import CompiledPolicy
 from ..trajectories.episodes import load_trajectories
 from .calls import (

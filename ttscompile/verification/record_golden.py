@@ -26,8 +26,8 @@ from ..ir.evaluate import Evaluator
 from ..ir.graph import Graph, TensorType, backward_slice
 from ..ir.program import Block, Program
 from ..ir.rows import Rows
-from ..runtimes.base import pruner_plan, settle_plan
 from ..runtimes.reference.model import ReferenceModel
+from ..runtimes.settle import pruner_plan, settle_plan
 
 STREAMS = 2
 """Streams of the call, so that what mixes streams up shows; one where that would take long or much room."""
@@ -144,13 +144,12 @@ def _episode(
         wanted = pruner_plan(model.logits(contexts).numpy()) if pruned else artifact.schedule(name)
         plan, _ = settle_plan(wanted, model.groups, cache.written, repair=True)
         draws = None if golden.draws is None else torch.from_numpy(golden.draws[:, ::order].copy())
-        result = model.rollout(
+        result = model.denoise(
             contexts,
             torch.from_numpy(golden.initial[::order].copy()),
             draws,
             plan,
             cache,
-            keep_samples=True,
             correction=artifact.corrections.get(name),
         )
         cache = result.cache

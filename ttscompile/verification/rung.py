@@ -40,6 +40,15 @@ class Rung:
     blocks: tuple[int, ...] = ()
     details: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def place(self) -> str:
+        """Where it first differs, for people: ``step 3, blocks 0, 2``; empty if nowhere."""
+        parts = [f"step {self.step}"] if self.step is not None else []
+        if self.blocks:
+            shown = ", ".join(map(str, self.blocks[:8])) + ", .." * (len(self.blocks) > 8)
+            parts.append(f"block{'s' * (len(self.blocks) > 1)} {shown}")
+        return ", ".join(parts)
+
 
 @dataclass(frozen=True, eq=False)
 class ErrorMap:
@@ -85,12 +94,22 @@ class Verification:
     @property
     def passed(self) -> bool:
         """Whether no rung failed."""
-        return all(rung.status != FAILED for rung in self.rungs)
+        return not self.failed
 
     @property
     def first_failure(self) -> Rung | None:
-        """The lowest rung that failed: those above it stand on it."""
-        return next((rung for rung in self.rungs if rung.status == FAILED), None)
+        """The lowest rung that failed."""
+        return self.failed[0] if self.failed else None
+
+    @property
+    def failed(self) -> list[Rung]:
+        """The rungs that failed, from the lowest: those above it stand on it."""
+        return [rung for rung in self.rungs if rung.status == FAILED]
+
+    @property
+    def skipped(self) -> list[Rung]:
+        """The rungs that could not be tried."""
+        return [rung for rung in self.rungs if rung.status == SKIPPED]
 
     def rung(self, name: str) -> Rung:
         """The rung of this name."""

@@ -98,7 +98,7 @@ def test_the_residuals_are_those_of_the_reference(make_task: MakeTask) -> None:
     task = make_task(20)
     calls = task.executor.selector.calls(task.calls, [3])
     dense = np.zeros((10, 6), np.int8)
-    rollout = task.executor.model.rollout(calls.contexts, calls.initial, calls.noise, dense)
+    rollout = task.executor.model.denoise(calls.contexts, calls.initial, calls.noise, dense)
     residuals = dense_residuals(task.executor, calls)
     for (k, b), expected in rollout.cache.residuals.items():
         torch.testing.assert_close(residuals[b][0, k], expected.flatten())

@@ -26,7 +26,7 @@ def gradients(task: Task, plan: PlanArray, reuse: Source) -> np.ndarray:
     calls = task.calls
     one_hot = torch.nn.functional.one_hot(torch.from_numpy(plan.astype(np.int64)), 4).float()
     gates = one_hot.repeat(calls.count, 1, 1, 1).requires_grad_()
-    sample = task.executor.model.rollout(calls.contexts, calls.initial, calls.noise, gates).sample
+    sample = task.executor.model.denoise(calls.contexts, calls.initial, calls.noise, gates).sample
     executed, expected = task.actions.executed(sample), task.actions.executed(calls.targets)
     (executed - expected).abs().mean().backward()
     assert gates.grad is not None

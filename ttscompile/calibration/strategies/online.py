@@ -22,7 +22,7 @@ from ...core.lattice import PlanArray, Source
 from ...errors import CalibrationFailedError
 from ...runtimes.criterion import Criterion
 from ..calls import Calls
-from ..execute import Executor
+from ..execute import Executor, State, last
 from .base import Array, Task
 from .fixed import COMPARED, Chosen, best_of
 
@@ -62,31 +62,21 @@ def decide(executor: Executor, criterion: Criterion, calls: Calls) -> Decided:
         criterion: decides.
         calls: N of them.
     """
-    model, axes = executor.model, executor.axes
+    model, state = executor.model, State()
     decisions = criterion.begin(model.steps, model.blocks, calls.count)
-    cache: list[Tensor] = []
+    first, others = range(criterion.always), range(criterion.always, model.blocks)
+    computed = np.full((1, model.blocks), Source.COMPUTE, np.int8)
     rows: list[PlanArray] = []
-    carried = model.begin(calls.initial)
+
+    def blocks(k: int, stem: Tensor) -> Tensor:
+        stream = executor.step(computed, k, stem, calls, state, first)
+        feature = torch.stack([state.timestep[b] for b in first]).sum(0) if first else stem
+        rows.append(decisions.decide(k, np.ascontiguousarray(feature.movedim(executor.axes[0], 0).numpy())))
+        return executor.step(rows[-1], k, stream, calls, state, others)
+
     with torch.no_grad():
-        for k in range(model.steps):
-            stem = stream = model.stem(carried.sample, k, calls.contexts)
-            first: list[Tensor] = []
-            for b in range(criterion.always):
-                first.append(model.block(b, k, stream, calls.contexts))
-                stream = stream + first[-1]
-            feature = (torch.stack(first).sum(0) if first else stem).movedim(axes[0], 0)
-            rows.append(decisions.decide(k, np.ascontiguousarray(feature.numpy())))
-            cache[: criterion.always] = first
-            streams = torch.from_numpy(np.flatnonzero(rows[-1][:, -1] == Source.COMPUTE))
-            for b in range(criterion.always, model.blocks):
-                if k == 0:
-                    cache.append(model.block(b, k, stream, calls.contexts))
-                elif len(streams):
-                    part = model.block(b, k, stream, calls.contexts, streams.tolist())
-                    cache[b] = cache[b].index_copy(axes[b], streams, part)
-                stream = stream + cache[b]
-            carried = executor.advance(carried, model.tail(stream, k, calls.contexts), calls, k)
-    return Decided(np.stack(rows, 1), carried.sample)
+        sample = last(executor.samples(calls, blocks))
+    return Decided(np.stack(rows, 1), sample)
 
 
 def fit_threshold(

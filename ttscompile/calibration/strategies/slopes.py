@@ -8,7 +8,7 @@ changes the error to first order by::
     sum over i <= j < next(i) of  <dE/dr[j], f[i] - f[o]>
 
 where ``r[j]`` is what cell j adds and ``f[i]`` what its block computes there; ``o`` is the last computed cell before i,
-whether i itself is computed or not. That is the gradient of the gate of cell i in ``ReferenceModel.rollout``.
+whether i itself is computed or not. That is the gradient of the gate of cell i in ``ReferenceModel.denoise``.
 """
 
 from __future__ import annotations

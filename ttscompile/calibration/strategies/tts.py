@@ -1,6 +1,6 @@
 """Test-time sparsity, after arXiv 2605.13316: a schedule with a correction, from which the pruner may depart.
 
-The search places whole steps, because with a correction (``calibration.correction``) it is they that carry information
+The search places whole steps, because with a correction (``fit_correction``) it is they that carry information
 about the observation and the noise, and everything in between is nearly linear. Every candidate gets a correction of
 its own, fitted on some of the calls, and is judged by the true error of its actions on others. It starts with the best
 of a family of crowded schedules, and then moves one step at a time, far at first, until no move helps. The winner's

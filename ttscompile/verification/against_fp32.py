@@ -1,30 +1,19 @@
-"""Residual blocks in eight bits: what the processor must have, and what they do to the actions."""
+"""What blocks of another precision than fp32 do to the actions: calls in both, with equal noise."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.artifact.manifest import DENSE, PrecisionError
-from ttscompile.core.correction import Correction
-from ttscompile.core.spec import FP32, ChunkSpec, FloatArray, Noise
-from ttscompile.errors import ObservationError
-from ttscompile.measure.machine import has_integer_dot_product
-
-from .base import open_runtime
-from .random_calls import normalized, random_calls
-
-if TYPE_CHECKING:
-    from ttscompile.artifact.load import Artifact
-
-EXACT_INTEGERS = "session.x64quantprecision"
-"""Option of onnxruntime's sessions: sum products of integers exactly, slower than in fp32, rather than in 16 bits that
-saturate. It takes processors with VNNI for such that saturate, and costs them their speed; so it is only set where it
-is needed."""
+from ..artifact.load import Artifact
+from ..artifact.manifest import DENSE, PrecisionError
+from ..core.correction import Correction
+from ..core.spec import FP32, ChunkSpec, FloatArray, Noise
+from ..errors import ObservationError
+from ..runtimes.open import open_runtime
+from ..runtimes.random_calls import normalized, random_calls
 
 CALLS = 8
 """Random observations that a precision is measured on. On Push-T at K = 100 that takes some seconds."""
@@ -36,28 +25,6 @@ MARGIN = 4.0
 """Tolerance over the largest difference that was measured."""
 
 Call = tuple[Mapping[str, FloatArray], Noise]
-
-
-def needs_care(precision: str) -> bool:
-    """Whether sessions need ``EXACT_INTEGERS`` for blocks of this precision to be right; warns that they are slow then.
-
-    Args:
-        precision: of the artifact's blocks.
-    """
-    if precision == FP32:
-        return False
-    found = has_integer_dot_product()
-    if found:
-        return False
-    what = "nothing that says what this one has" if found is None else "one without them"
-    warnings.warn(
-        f"precision {precision!r} is fast on a processor with integer dot products (on x86 avx512_vnni, avx_vnni or"
-        f" amx_int8 among the flags in /proc/cpuinfo); found {what}. The actions are right, and take about as long as"
-        " in fp32. Load the policy with precision='fp32', or convert the checkpoint with --precision fp32.",
-        RuntimeWarning,
-        stacklevel=2,
-    )
-    return True
 
 
 def measure_precision(artifact: Artifact) -> PrecisionError:

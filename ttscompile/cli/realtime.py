@@ -1,4 +1,4 @@
-"""``ttscompile plan``: at which rates this machine can run which plans of an artifact in a control loop."""
+"""``ttscompile realtime``: at which rates this machine can run which plans of an artifact in a control loop."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from ttscompile.cli.output import (
 )
 from ttscompile.errors import DeadlineMissedError
 from ttscompile.measure.machine import fingerprint, one_line
+from ttscompile.measure.timer import Times
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings, Feasibility, GuardLimits, MonotonicClock
 from ttscompile.runtimes.executor.jitter import Jitter, measure_jitter
 from ttscompile.runtimes.executor.measure import measure_latencies, neutral_observation
@@ -49,7 +50,7 @@ JITTER_HZ = 200
 )
 @json_option
 @click.pass_context
-def plan(
+def realtime(
     context: click.Context,
     directory: Path,
     control_hz: float,
@@ -81,7 +82,7 @@ def plan(
     with console.status("timing"):
         policy.reset()
         measured = measure_latencies(policy, MonotonicClock(), settings, resolved.tiers)
-    judged = {name: feasibility(settings, resolved, max(values)) for name, values in measured.items()}
+    judged = {name: feasibility(settings, resolved, max(times.ms) / 1e3) for name, times in measured.items()}
     jitter = None
     if jitter_seconds is not None:
         beside = _run_on_a_robot(judged, policy.info.default_plan)
@@ -94,10 +95,7 @@ def plan(
                 "machine": fingerprint(),
                 "threads": threads,
                 "runs": runs,
-                "plans": {
-                    name: {"median_ms": 1e3 * float(np.median(measured[name]))} | each.to_json()
-                    for name, each in judged.items()
-                },
+                "plans": {name: {"median_ms": measured[name].median} | each.to_json() for name, each in judged.items()},
                 "jitter": None if jitter is None else {name: each.to_json() for name, each in jitter.items()},
             }
         )
@@ -109,7 +107,7 @@ def plan(
 
 
 def _print(
-    measured: dict[str, list[float]],
+    measured: dict[str, Times],
     judged: dict[str, Feasibility],
     jitter: dict[str, Jitter] | None,
     runs: int,
@@ -120,7 +118,7 @@ def _print(
     for name, each in judged.items():
         made.add_row(
             marked(name),
-            ms(1e3 * float(np.median(measured[name])), 4),
+            ms(measured[name].median, 4),
             ms(1e3 * each.latency, 4),
             ms(max(1e3 * each.max_latency, 0), 4),
             f"{each.max_policy_hz:.3g}",

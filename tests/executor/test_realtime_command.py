@@ -1,4 +1,4 @@
-"""``ttscompile plan``."""
+"""``ttscompile realtime``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ttscompile.core.lattice import dense_plan, uniform_plan
 
 
 def run(*arguments: object) -> tuple[int, str, str]:
-    result = CliRunner().invoke(main, ["plan", *map(str, arguments)])
+    result = CliRunner().invoke(main, ["realtime", *map(str, arguments)])
     return result.exit_code, result.stdout, result.stderr
 
 

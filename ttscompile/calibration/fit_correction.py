@@ -16,8 +16,7 @@ from torch import Tensor
 
 from ..core.correction import Correction, groups_of
 from ..core.lattice import BoolArray, PlanArray, Source
-from ..runtimes.reference.correction import correct, features, remember
-from ..runtimes.reference.sampler import Carried
+from ..runtimes.reference.sampler import correct, features
 from .calls import Calls
 from .execute import Executor, State
 from .workers import workers
@@ -69,28 +68,26 @@ class _Lane:
     def __init__(self, executor: Executor, plan: PlanArray, calls: Calls) -> None:
         assert calls.path is not None
         self._executor, self._plan, self._calls, self._path = executor, plan, calls, calls.path
-        self._state = State(len(executor.axes))
+        self._state = State()
         self._carried = self._following = executor.model.begin(calls.initial)
         self._prediction = calls.initial
 
     def predict(self, k: int) -> tuple[Tensor, Tensor]:
         """Features of step k, ``[D, n, 6 T]``, and what is missing after it without a correction, ``[D, n, T]``."""
-        model, contexts, noise = self._executor.model, self._calls.contexts, self._calls.noise
-        sample, _, history = self._carried
-        stream = model.stem(sample, k, contexts)
-        stream = self._executor.step(self._plan[k][None], k, stream, self._calls, self._state)
-        self._prediction = model.tail(stream, k, contexts)
-        self._following = model.advance(self._carried, self._prediction, None if noise is None else noise[k], k)
+        model, calls = self._executor.model, self._calls
+
+        def blocks(k: int, stem: Tensor) -> Tensor:
+            return self._executor.step(self._plan[k][None], k, stem, calls, self._state)
+
+        self._prediction = model.predict(self._carried.sample, k, calls.contexts, blocks)
+        noise = None if calls.noise is None else calls.noise[k]
+        self._following = model.advance(self._carried, self._prediction, noise, k)
         missing = (self._path[:, k] - self._following.sample).permute(2, 0, 1)
-        return features(sample, self._prediction, history), missing
+        return features(self._carried, self._prediction), missing
 
     def advance(self, weight: Tensor, bias: Tensor, anchor: bool) -> None:
         """Go on with the correction of the step."""
-        (sample, _, history), prediction, following = self._carried, self._prediction, self._following
-        corrected = following.sample + correct(weight, bias, sample, prediction, history)
-        self._carried = Carried(
-            corrected, following.memory, remember(sample, prediction, history) if anchor else history
-        )
+        self._carried = correct(self._carried, self._prediction, self._following, weight, bias, anchor)
 
 
 def _solve(read: Tensor, missing: Tensor, groups: int) -> tuple[Tensor, Tensor]:

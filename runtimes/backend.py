@@ -1,0 +1,112 @@
+"""What differs from one kind of machine to another: executing the pieces of an artifact. ``Runtime`` does the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+from ttscompile.artifact.load import Artifact
+from ttscompile.core.correction import Correction
+from ttscompile.core.lattice import BoolArray, PlanArray
+from ttscompile.core.spec import FloatArray, Noise
+from ttscompile.errors import ArtifactError, TtscompileError
+
+from .inpainting import Known
+
+Lowered = TypeVar("Lowered")
+"""What a backend makes of the plan of one stream, to execute it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Call:
+    """What a backend is given for one call. Everything was checked.
+
+    Attributes:
+        obs: normalised observation by key, ``[B, ...]`` each.
+        noise: ``initial [B, T, D]``; ``steps [K, B, T, D]`` if the sampler is stochastic.
+        correction: of the sampler's steps; None for none.
+        known: what a prefix makes known of the samples; None for nothing.
+        keep: bool ``[K, blocks]``; computed residuals that have to go into the rollout cache.
+        written: bool ``[B, K, blocks]``; entries of the rollout cache that the plan may read. All others are of an
+            earlier episode, or were never made; none is True in the first call of an episode.
+    """
+
+    obs: Mapping[str, FloatArray]
+    noise: Noise
+    correction: Correction | None
+    known: Known | None
+    keep: BoolArray
+    written: BoolArray
+
+
+class Backend(Protocol[Lowered]):
+    """Executes the calls of one artifact.
+
+    ``Runtime`` calls the methods in this order::
+
+        prepare    start    first_step                                other_steps -> sample
+                            logits, where the plan is the pruner's
+
+    Methods may raise anything: the runtime then ends the episode. ``lower`` and ``logits`` are called on a thread of
+    their own while ``first_step`` runs; nothing else is.
+
+    Attributes:
+        keeps: bool ``[K, blocks]``; entries of the rollout cache that are worth keeping when a plan of the artifact is
+            executed. Those that none of these plans reads may be left out.
+    """
+
+    keeps: BoolArray
+
+    def lower(self, plan: PlanArray) -> Lowered:
+        """What ``other_steps`` needs of the plan of one stream. The runtime keeps it, and gives it again.
+
+        Args:
+            plan: int8 ``[K, blocks]``, legal.
+        """
+
+    def prepare(self, streams: int, plans: Sequence[Lowered] | None) -> None:
+        """Have everything that a call needs beside its inputs: memory, for the most part. It is not timed.
+
+        Args:
+            streams: B of the calls from here on, at least until the episode ends.
+            plans: of each stream; None for the pruner's, which are not known yet.
+        """
+
+    def start(self, call: Call) -> None:
+        """Take in a call, and run what the observation decides before the loop: the prologue."""
+
+    def logits(self) -> FloatArray:
+        """The pruner's logits for the call, float32 ``[B, K, blocks, 4]``; asked for only if there is a pruner."""
+
+    def first_step(self) -> None:
+        """Step 0, which is dense in every plan. A backend that cannot begin without a plan does nothing here."""
+
+    def other_steps(self, plans: Sequence[Lowered]) -> FloatArray:
+        """The rest of the call.
+
+        Args:
+            plans: of each stream.
+
+        Returns:
+            The denoised sample, float32 ``[B, T, D]``: an array that no later call changes.
+        """
+
+
+@contextmanager
+def fitting(artifact: Artifact) -> Iterator[None]:
+    """Within the block whatever fails is an error of the artifact: its hashes are right, and its parts do not fit.
+
+    Raises:
+        ArtifactError: in place of any exception that is not the package's own, but for a package that is missing.
+    """
+    try:
+        yield
+    except (TtscompileError, ModuleNotFoundError):
+        raise
+    except Exception as error:
+        raise ArtifactError(
+            f"{artifact.path}: its manifest, tables and graphs do not fit each other"
+            f" ({type(error).__name__}: {str(error)[:300]}). Convert the checkpoint again."
+        ) from error

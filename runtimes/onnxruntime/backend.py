@@ -1,0 +1,121 @@
+"""The product on the CPU: numpy and onnxruntime, a session a piece, plans lowered to short lists of instructions.
+
+Its loop (``decode``, ``workspace``) shares nothing with the reference's on purpose: each is the other's test.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ttscompile.artifact.load import Artifact
+from ttscompile.core.lattice import PlanArray
+from ttscompile.core.spec import FloatArray, Noise
+from ttscompile.runtimes.backend import Call
+
+from .decode import decode_first, decode_rest
+from .instructions import Instructions, instructions_of
+from .liveness import readable_rollout
+from .sessions import open_blocks, open_sessions
+from .workspace import Workspace
+
+
+class OnnxBackend:
+    """A ``Backend`` on onnxruntime.
+
+    Args:
+        artifact: loaded and checked.
+        threads: threads of arithmetic; one runs on the caller's thread.
+
+    Attributes:
+        keeps: entries of the rollout cache that some plan of the artifact can read.
+        sessions: by piece; those of single blocks only once a plan needs them.
+        workspace: of the batch size under way; None after one that found no memory.
+
+    Raises:
+        RuntimeUnavailableError: onnxruntime is missing, or other code has made its global thread pool.
+        ArtifactError: onnxruntime refuses a graph.
+    """
+
+    def __init__(self, artifact: Artifact, threads: int = 1) -> None:
+        self._manifest = artifact.manifest
+        self._artifact, self._threads = artifact, threads
+        self._schedules = tuple(self.lower(plan) for plan in artifact.schedules.values())
+        self._pruned = any(plan.kind == "pruner" for plan in self._manifest.plans.values())
+        self._blocks = self._pruned or any(one.partial for one in self._schedules)  # whether these have sessions
+        self.sessions = open_sessions(artifact, threads, self._blocks)
+        self.keeps = readable_rollout(artifact)
+        self.workspace: Workspace | None = self._open_workspace(1)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the buffers of the batch size under way, the rollout cache included; weights are onnxruntime's."""
+        return 0 if self.workspace is None else self.workspace.nbytes
+
+    @property
+    def rollout_nbytes(self) -> int:
+        """Memory of the rollout cache."""
+        return 0 if self.workspace is None else self.workspace.rollout.nbytes
+
+    def lower(self, plan: PlanArray) -> Instructions:
+        """See ``Backend.lower``."""
+        return instructions_of(plan, self._manifest.groups)
+
+    def prepare(self, streams: int, plans: Sequence[Instructions] | None) -> None:
+        """Make the workspace of a batch size, and the sessions of single blocks for the first plans that need them."""
+        if self.workspace is None or self.workspace.streams != streams:
+            self.workspace = None  # give the old memory back first; there may be too little for the new
+            self.workspace = self._open_workspace(streams)
+        if not self._blocks and (plans is None or any(one.partial for one in plans)):
+            self.sessions |= open_blocks(self._artifact, self._threads)
+            self.workspace.bind_blocks()
+            self._blocks = True
+
+    def start(self, call: Call) -> None:
+        """See ``Backend.start``."""
+        self._keep = call.keep
+        self._work.start(call.obs, call.noise, call.correction, call.known)
+
+    def logits(self) -> FloatArray:
+        """See ``Backend.logits``."""
+        return self._work.logits()
+
+    def first_step(self) -> None:
+        """See ``Backend.first_step``."""
+        decode_first(self._work, self._keep)
+
+    def other_steps(self, plans: Sequence[Instructions]) -> FloatArray:
+        """See ``Backend.other_steps``."""
+        decode_rest(self._work, plans, self._keep)
+        return self._work.result()
+
+    @property
+    def _work(self) -> Workspace:
+        assert self.workspace is not None  # ``prepare``
+        return self.workspace
+
+    def _open_workspace(self, streams: int) -> Workspace:
+        """The workspace of a batch size, after a step on zeros.
+
+        So the first call costs what the others do: sessions have their memory, and pages are committed.
+        """
+        work = Workspace(self._manifest, self.sessions, self._artifact.tables, streams)
+        work.sums(max((one.slots for one in self._schedules), default=0))
+        for correction in self._artifact.corrections.values():
+            work.prepare(correction)
+        for lowered in self._schedules:
+            for k in np.flatnonzero(lowered.computed.all(axis=1)).tolist():
+                work.bind_dense(k)
+        for cell in np.flatnonzero(self.keeps).tolist():
+            work.rollout.entry(cell)
+        spec = self._manifest.spec
+        obs = {key: np.zeros((streams, *one.shape), one.dtype) for key, one in spec.observations.items()}
+        with np.errstate(all="ignore"):  # zeros need not be in the range of the policy
+            work.start(obs, Noise(np.zeros((streams, *spec.sample), np.float32)), None)
+            decode_first(work, np.zeros_like(self.keeps))
+            for k in range(spec.sampler.steps):
+                work.advance(k)
+            if self._pruned:
+                work.logits()
+        return work

@@ -1,0 +1,75 @@
+"""The reference as a backend: an artifact in, the same calls as every other runtime."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ttscompile.artifact.load import Artifact
+from ttscompile.core.lattice import PlanArray
+from ttscompile.core.spec import FloatArray
+from ttscompile.runtimes.backend import Call, fitting
+
+from .model import ReferenceModel, noise_tensors
+from .reuse import RolloutCache
+
+
+class ReferenceBackend:
+    """A ``Backend`` on ``ReferenceModel``.
+
+    Args:
+        artifact: loaded and checked.
+
+    Attributes:
+        keeps: all entries of the rollout cache.
+        model: what it runs.
+    """
+
+    def __init__(self, artifact: Artifact) -> None:
+        self._artifact = artifact
+        self.model = ReferenceModel.from_artifact(artifact)
+        self.keeps = np.ones((self.model.steps, self.model.blocks), dtype=np.bool_)
+        self._residuals: Mapping[tuple[int, int], Tensor] = {}
+
+    def lower(self, plan: PlanArray) -> PlanArray:
+        """The plan as it is."""
+        return plan
+
+    def prepare(self, streams: int, plans: Sequence[PlanArray] | None) -> None:
+        """Nothing: torch takes memory as it goes."""
+
+    def start(self, call: Call) -> None:
+        """See ``Backend.start``."""
+        self._call = call
+        with self._computing():
+            self._contexts = self.model.prologue({key: torch.from_numpy(np.array(a)) for key, a in call.obs.items()})
+
+    def logits(self) -> FloatArray:
+        """See ``Backend.logits``."""
+        with self._computing():
+            return np.asarray(self.model.logits(self._contexts).numpy(), dtype=np.float32)
+
+    def first_step(self) -> None:
+        """Nothing: the model takes all steps at once."""
+
+    def other_steps(self, plans: Sequence[PlanArray]) -> FloatArray:
+        """See ``Backend.other_steps``."""
+        call = self._call
+        cache = RolloutCache(self._residuals if call.written.any() else {}, call.written)
+        noise = noise_tensors(call.noise, self._artifact.manifest.spec.sampler.stochastic)
+        with self._computing():
+            made = self.model.denoise(
+                self._contexts, *noise, np.stack(plans), cache, correction=call.correction, known=call.known
+            )
+        self._residuals = made.cache.residuals
+        return np.asarray(made.sample.numpy(), dtype=np.float32)
+
+    @contextmanager
+    def _computing(self) -> Iterator[None]:
+        """Without gradients, which belong to a thread; what fails is an error of the artifact."""
+        with fitting(self._artifact), torch.no_grad():
+            yield

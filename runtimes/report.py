@@ -1,0 +1,50 @@
+"""What a runtime says about a call that it made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ttscompile.core.lattice import PlanArray
+
+GIVEN = "given"
+"""``CallReport.plan_name`` of a matrix that the caller gave no name."""
+
+
+@dataclass(frozen=True)
+class Timings:
+    """Wall time of one call in milliseconds.
+
+    Attributes:
+        prologue: condition values and step values from the observation.
+        pruner: the pruner network and what makes a plan of its logits; 0 if the plan was given.
+        wait_pruner: how long the denoising loop stood still for the pruner's plan; 0 if the plan was given.
+        decode: the denoising loop, without that wait.
+        total: from the normalised observation to the denoised sample.
+    """
+
+    prologue: float
+    pruner: float
+    wait_pruner: float
+    decode: float
+    total: float
+
+
+@dataclass(frozen=True)
+class CallReport:
+    """What one call did.
+
+    Attributes:
+        plan: int8 ``[B, K, blocks]`` of ``Source``, as executed. Read-only.
+        plan_name: ``dense``, the name of a plan of the artifact, or ``given`` for a matrix of the caller's.
+        computed: computed cells of each stream.
+        legalised: cells of each stream that were replaced because their residual was never computed.
+        flops: FLOPs of each stream, multiply and add counted as two, prologue and pruner included.
+        timings: wall time in milliseconds.
+    """
+
+    plan: PlanArray
+    plan_name: str
+    computed: tuple[int, ...]
+    legalised: tuple[int, ...]
+    flops: tuple[float, ...]
+    timings: Timings

@@ -1,0 +1,256 @@
+"""What every runtime does alike: settle the plan of a call, know what may be reused, and say what was done.
+
+    caller's thread    start | first_step                                        | other_steps
+    helper             ----- | logits, the plan that they make, its instructions  ------------
+
+The helper is one thread that lives as long as the runtime, and only where a pruner makes the plan; it sleeps on a
+queue. Everything else runs on the caller's thread. What executes the pieces is a ``Backend``.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ttscompile.artifact.load import Artifact
+from ttscompile.artifact.manifest import DENSE, PRUNER
+from ttscompile.core.correction import Correction
+from ttscompile.core.lattice import BoolArray, PlanArray, Source, check_plan, require_legal
+from ttscompile.core.spec import FloatArray, Noise, PolicySpec
+from ttscompile.errors import IllegalPlanError, ObservationError
+
+from .backend import Backend, Call
+from .inpainting import Known
+from .report import GIVEN, CallReport, Timings
+from .settle import LoweringCache, pruner_plan, settle_plan
+
+
+@dataclass(frozen=True, eq=False)
+class _Settled:
+    """The plan that a call executes, and what it took to have it.
+
+    Attributes:
+        plans: int8 ``[B, K, blocks]``.
+        lowered: of each stream, by the backend.
+        legalised: replaced cells of each stream.
+        pruner: ms that the pruner took, from the condition values to the instructions; 0 if the plan was given.
+    """
+
+    plans: PlanArray
+    lowered: tuple[Any, ...]
+    legalised: tuple[int, ...]
+    pruner: float = 0.0
+
+
+class Runtime:
+    """One episode at a time on a fixed number of streams.
+
+    Nothing here locks: a runtime belongs to one thread (``CompiledPolicy`` sees to that).
+
+    Which entries of the rollout cache are kept: of a call with a plan of the artifact, those that the backend says. A
+    dense call, and one whose plan is a matrix of the caller's, keeps all that it computes; and from the first such
+    matrix on every call does, since another may read any of it.
+
+    Args:
+        artifact: loaded and checked.
+        backend: opened on the same artifact.
+
+    Attributes:
+        backend: as given.
+    """
+
+    def __init__(self, artifact: Artifact, backend: Backend[Any]) -> None:
+        self._manifest, self._groups = artifact.manifest, artifact.manifest.groups
+        self.backend = backend
+        self._lowering = LoweringCache(backend.lower)
+        for schedule in artifact.schedules.values():
+            self._lowering.lower(schedule)
+        self._helper = ThreadPoolExecutor(1, "ttscompile-pruner") if PRUNER in self._manifest.pieces else None
+        if self._helper is not None and any(plan.kind == PRUNER for plan in self._manifest.plans.values()):
+            self._helper.submit(lambda: None).result()  # the thread is there before the first call
+        self._matrices = False  # whether one was ever given
+        self._written: BoolArray | None = None
+        self._dropped: BoolArray | None = None  # computed in this episode, and not kept
+
+    @property
+    def streams(self) -> int | None:
+        """B of the episode under way; None after ``reset`` and before the first call."""
+        return None if self._written is None else len(self._written)
+
+    def reset(self) -> None:
+        """Forget the rollout cache: a new episode, of any number of streams. Its memory is kept."""
+        self._written = self._dropped = None
+
+    def predict(
+        self,
+        obs: Mapping[str, FloatArray],
+        noise: Noise,
+        plan: npt.ArrayLike | None = None,
+        *,
+        plan_name: str | None = None,
+        repair: bool = False,
+        correction: Correction | None = None,
+        known: Known | None = None,
+    ) -> tuple[FloatArray, CallReport]:
+        """Denoise one chunk. A call that fails after its arguments were checked ends the episode, as ``reset`` does.
+
+        Args:
+            obs: normalised observation by key, ``[B, ...]`` each, of the dtype of its specification.
+            noise: ``initial [B, T, D]``; ``steps [K, B, T, D]``, needed by a stochastic sampler.
+            plan: ``[K, blocks]`` or ``[B, K, blocks]`` of ``Source``; None asks the pruner.
+            plan_name: for the report; None for ``pruner`` or ``given``.
+            repair: legalise ``plan`` and count it, rather than refuse it when it is illegal.
+            correction: of the sampler's steps, which belongs to this plan; None for none.
+            known: what a prefix makes known of the samples, see ``inpainting``; None for nothing.
+
+        Returns:
+            The denoised sample, float32 ``[B, T, D]``, and the report.
+
+        Raises:
+            IllegalPlanError: ``plan`` has the wrong shape, or is illegal and not to be repaired; or no plan was given
+                and the artifact has no pruner.
+            ObservationError: the number of streams differs from the episode's, or ``noise`` does not fit.
+        """
+        backend = self.backend
+        streams = check_call(self.streams, noise, self._manifest.spec)
+        cells = (streams, self._manifest.steps, len(self._groups))
+        written = np.zeros(cells, dtype=np.bool_) if self._written is None else self._written
+        dropped = np.zeros(cells, dtype=np.bool_) if self._dropped is None else self._dropped
+        if plan is None and self._helper is None:
+            raise IllegalPlanError(
+                "no plan was given and the artifact has no pruner to make one. Give plan='dense', the name of a plan of"
+                " the artifact, or a matrix; or calibrate the artifact with strategy='tts'."
+            )
+        settled = None if plan is None else self._settle(plan, written, dropped, repair)
+        if plan_name not in (DENSE, *self._manifest.plans):
+            self._matrices = True
+        keep = np.ones_like(backend.keeps) if self._matrices or plan_name == DENSE else backend.keeps
+        backend.prepare(streams, None if settled is None else settled.lowered)
+
+        start = time.perf_counter()
+        self.reset()  # a call that fails ends the episode: its residuals stand beside those of earlier ones
+        backend.start(Call(obs, noise, correction, known, keep, written))
+        prologue = time.perf_counter()
+        waited = 0.0
+        if settled is None:
+            settled, waited = self._prune_beside_first_step(written)
+        else:
+            backend.first_step()
+        sample = backend.other_steps(settled.lowered)
+        stop = time.perf_counter()
+        computed = settled.plans == Source.COMPUTE
+        self._written, self._dropped = np.where(computed, keep, written), np.where(computed, ~keep, dropped)
+        report = CallReport(
+            plan=_frozen(settled.plans),
+            plan_name=plan_name or (PRUNER if plan is None else GIVEN),
+            computed=tuple(int(n) for n in np.count_nonzero(computed, axis=(1, 2))),
+            legalised=settled.legalised,
+            flops=tuple(self._manifest.flops.call(one, plan is None) for one in settled.plans),
+            timings=Timings(
+                prologue=_milliseconds(start, prologue),
+                pruner=settled.pruner,
+                wait_pruner=waited,
+                decode=_milliseconds(prologue, stop) - waited,
+                total=_milliseconds(start, stop),
+            ),
+        )
+        return sample, report
+
+    def _prune_beside_first_step(self, written: BoolArray) -> tuple[_Settled, float]:
+        """Step 0, and meanwhile the plan of the steps after it; ms that the loop stood still for it."""
+        assert self._helper is not None
+        pruning: Future[_Settled] = self._helper.submit(_prune, self.backend, self._lowering, self._groups, written)
+        try:
+            self.backend.first_step()
+            ready = time.perf_counter()
+            return pruning.result(), _milliseconds(ready, time.perf_counter())
+        finally:
+            wait([pruning])  # it reads the backend's memory: nobody may go on before it is done, not even with an error
+
+    def _settle(self, plan: npt.ArrayLike, written: BoolArray, dropped: BoolArray, repair: bool) -> _Settled:
+        """The plan of a caller.
+
+        Whether a plan that was lowered before is legal depends on its ROLLOUT reads alone, which is quickly checked.
+        """
+        streams, steps, blocks = written.shape
+        if repair:
+            plans, legalised = settle_plan(plan, self._groups, written, repair)
+        else:
+            plans, legalised = check_plan(plan, steps, blocks, streams), (0,) * streams
+        rollout = plans == Source.ROLLOUT.value  # numpy takes five times as long to compare with the enum itself
+        if (rollout & dropped).any():
+            _, k, b = np.argwhere(rollout & dropped)[0].tolist()
+            raise IllegalPlanError(
+                f"the plan reads the ROLLOUT residual of step {k}, block {b}, which an earlier call of this episode"
+                " computed with a plan of the artifact, and did not keep: no plan of the artifact reads it."
+                " Begin the episode with a matrix (one of zeros computes all, as plan='dense' does): from a first"
+                " matrix on every call keeps what it computes."
+            )
+
+        def check() -> None:
+            require_legal(plans, self._groups, written)
+
+        if (rollout & ~written).any():
+            check()
+        return _Settled(plans, tuple(self._lowering.lower(one, check) for one in plans), legalised)
+
+
+def _prune(
+    backend: Backend[Any], lowering: LoweringCache[Any], groups: tuple[int, ...], written: BoolArray
+) -> _Settled:
+    """The pruner's plan and its instructions. Not a method: the helper must not keep the runtime alive."""
+    start = time.perf_counter()
+    plans, legalised = settle_plan(pruner_plan(backend.logits()), groups, written, repair=True)
+    lowered = tuple(lowering.lower(one) for one in plans)
+    return _Settled(plans, lowered, legalised, _milliseconds(start, time.perf_counter()))
+
+
+def check_call(streams: int | None, noise: Noise, spec: PolicySpec) -> int:
+    """Number of streams of a call whose noise fits it.
+
+    Args:
+        streams: B of the episode under way, or None.
+        noise: of the call.
+        spec: of the policy; its sampler says whether the draws of the steps are read.
+
+    Raises:
+        ObservationError: see ``Runtime.predict``.
+    """
+    sampler, (horizon, channels) = spec.sampler, spec.sample
+    initial: tuple[int, ...] = np.shape(noise.initial)
+    if len(initial) != 3 or initial[1:] != spec.sample or initial[0] < 1:
+        raise ObservationError(f"noise.initial has shape {initial}; expected [B, T, D] = (B, {horizon}, {channels}).")
+    found = initial[0]
+    expected = (sampler.steps, *initial)
+    draws = noise.steps if sampler.stochastic else None
+    if sampler.stochastic and draws is None:
+        raise ObservationError(
+            f"noise.steps is None, and the sampler {sampler.name!r} draws noise at its steps; expected float32"
+            f" [K, B, T, D] = {expected}."
+        )
+    if draws is not None and np.shape(draws) != expected:
+        raise ObservationError(f"noise.steps has shape {np.shape(draws)}; expected [K, B, T, D] = {expected}.")
+    if streams is not None and streams != found:
+        raise ObservationError(
+            f"the call has {found} streams, and the episode under way has {streams}: the rollout cache is kept for"
+            " each stream. Call reset() before changing the number of streams."
+        )
+    return found
+
+
+def _frozen(plans: PlanArray) -> PlanArray:
+    """A read-only copy: what a report holds must not change after the call, and the caller's plan is the caller's."""
+    copied = plans.copy()
+    copied.flags.writeable = False
+    return copied
+
+
+def _milliseconds(start: float, stop: float) -> float:
+    """Milliseconds between two readings of ``time.perf_counter``."""
+    return 1000.0 * (stop - start)

@@ -1,0 +1,87 @@
+"""The plan that a call executes: a caller's that is legal, a named one that was repaired, or the pruner's."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from typing import Generic, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from ttscompile.core.lattice import BoolArray, PlanArray, check_plan, legalize, require_legal
+from ttscompile.errors import IllegalPlanError
+
+Lowered = TypeVar("Lowered")
+
+
+def settle_plan(
+    plan: npt.ArrayLike, groups: Sequence[int], written: BoolArray, repair: bool
+) -> tuple[PlanArray, tuple[int, ...]]:
+    """The plan that will be executed.
+
+    Args:
+        plan: ``[K, blocks]`` or ``[B, K, blocks]``.
+        groups: FORWARD group of each block.
+        written: bool ``[B, K, blocks]``; rollout entries that exist.
+        repair: replace illegal reads rather than refuse them.
+
+    Returns:
+        A legal plan, int8 ``[B, K, blocks]``, and the number of replaced cells of each stream.
+
+    Raises:
+        IllegalPlanError: wrong shape, or illegal and not to be repaired.
+    """
+    streams, steps, blocks = written.shape
+    plans = check_plan(plan, steps, blocks, streams)
+    if not repair:
+        require_legal(plans, groups, written)
+        return plans, (0,) * streams
+    legal, _ = legalize(plans, groups, written)
+    return legal, tuple(int(n) for n in np.count_nonzero(legal != plans, axis=(1, 2)))
+
+
+def pruner_plan(logits: npt.NDArray[np.float32]) -> PlanArray:
+    """Plans from the pruner's logits ``[B, K, blocks, 4]``: the largest of the four sources, int8 ``[B, K, blocks]``.
+
+    Raises:
+        IllegalPlanError: the logits are not numbers.
+    """
+    if np.isnan(logits).any():
+        raise IllegalPlanError(
+            "the pruner's logits hold NaN, so there is no plan to execute: its weights are broken."
+            " Calibrate the artifact again, or use plan='dense'."
+        )
+    plan: PlanArray = np.argmax(logits, axis=-1).astype(np.int8)
+    return plan
+
+
+class LoweringCache(Generic[Lowered]):
+    """The last plans that were lowered: schedules are lowered once, the pruner's plans when they change.
+
+    Args:
+        lower: what a backend makes of a plan ``[K, blocks]``.
+        capacity: plans to keep.
+    """
+
+    def __init__(self, lower: Callable[[PlanArray], Lowered], capacity: int = 64) -> None:
+        self._lower, self._capacity = lower, capacity
+        self._plans: OrderedDict[bytes, Lowered] = OrderedDict()
+
+    def lower(self, plan: PlanArray, check: Callable[[], object] = lambda: None) -> Lowered:
+        """The plan lowered, or what an equal one was lowered to.
+
+        Args:
+            plan: int8 ``[K, blocks]``, contiguous.
+            check: called before a plan is lowered that is not remembered; raises if it may not be.
+        """
+        key = plan.tobytes()
+        found = self._plans.get(key)
+        if found is None:
+            check()
+            found = self._plans[key] = self._lower(plan)
+            if len(self._plans) > self._capacity:
+                self._plans.popitem(last=False)
+        else:
+            self._plans.move_to_end(key)
+        return found

@@ -1,0 +1,94 @@
+"""The structure of the package, read from its imports: ``python tests/structure.py`` draws it.
+
+A *room* is a folder, or a module, at the top of the package; a *door* of a room is another room that it imports,
+wherever the import stands: in a function and under ``TYPE_CHECKING`` too.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+if __name__ == "__main__":
+    sys.path.insert(0, str(ROOT))
+
+from tests.imports import home, imports, modules  # noqa: E402
+
+FLOORS = (
+    ("errors",),
+    ("core", "measure"),
+    ("ir", "plots", "samplers", "trajectories"),
+    ("artifact", "frontends", "lower", "passes"),
+    ("capture", "runtimes"),
+    ("doctor", "verification"),
+    ("calibration", "driver", "report"),
+    ("ttscompile",),
+    ("cli",),
+    ("__main__",),
+)
+"""The rooms from the ground up: each may import those on floors below its own. ``ttscompile`` is the package's own
+module, which has the public names."""
+
+Doors = Mapping[str, Mapping[str, int]]
+"""Room -> the rooms that it imports, and by how many imports."""
+
+
+def room(module: str) -> str:
+    """``ttscompile.ir.graph`` -> ``ir``; ``ttscompile`` itself is a room too."""
+    return module.removeprefix("ttscompile").lstrip(".").partition(".")[0] or "ttscompile"
+
+
+def doors_of(root: Path = ROOT) -> dict[str, dict[str, int]]:
+    """The doors of every room."""
+    known = modules(root)
+    found: dict[str, dict[str, int]] = {room(name): {} for name in known}
+    for name, path in known.items():
+        for each in imports(name, path):
+            target = home(each.target, known)
+            if target is not None and room(target) != room(name):
+                doors = found[room(name)]
+                doors[room(target)] = doors.get(room(target), 0) + 1
+    return found
+
+
+def circles(doors: Doors) -> list[tuple[str, ...]]:
+    """Sets of rooms that import each other, directly or through others; none in a house that can be read."""
+
+    def reached(start: str) -> set[str]:
+        seen: set[str] = set()
+        pending = [start]
+        while pending:
+            for target in doors[pending.pop()]:
+                if target not in seen:
+                    seen.add(target)
+                    pending.append(target)
+        return seen
+
+    reach = {name: reached(name) for name in doors}
+    return sorted({tuple(sorted(b for b in reach[a] if a in reach[b])) for a in doors if a in reach[a]})
+
+
+def arrows_up(doors: Doors) -> list[str]:
+    """Imports that do not lead to a floor below, one line each."""
+    floor = {name: i for i, rooms in enumerate(FLOORS) for name in rooms}
+    pairs = ((a, b, n) for a, targets in doors.items() for b, n in targets.items())
+    return [f"{a} -> {b} ({n} imports)" for a, b, n in pairs if floor[b] >= floor[a]]
+
+
+def drawing(doors: Doors) -> str:
+    """Floors from the top down; beside each room the number of its doors, and where they lead."""
+    lines = []
+    for number in reversed(range(len(FLOORS))):
+        lines.append(f"floor {number}")
+        for name in FLOORS[number]:
+            targets = ", ".join(f"{target} {n}" for target, n in sorted(doors[name].items(), key=lambda each: -each[1]))
+            lines.append(f"  {name:<13}{len(doors[name]):>3} doors" + (f": {targets}" if targets else ""))
+    for what, found in (("circles", [" - ".join(c) for c in circles(doors)]), ("arrows up", arrows_up(doors))):
+        lines.append(f"{what}: " + ("; ".join(found) or "none"))
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    print(drawing(doors_of()))

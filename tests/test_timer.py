@@ -1,0 +1,44 @@
+"""The one timer: what is timed, who goes first, and what counts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ttscompile.measure.timer import Timer, Times
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+    def wait(self, seconds: float) -> float:
+        self.now += seconds
+        return seconds
+
+
+def test_candidates_take_turns_and_warm_up_does_not_count() -> None:
+    clock, order = Clock(), []
+    timer = Timer(3, warm_up=1, clock=clock)
+    for number in range(4):
+        for i in timer.round():
+            order.append(i)
+            clock.wait(100.0)  # what the caller prepares is not timed
+            assert timer.time(i, lambda: clock.wait(number + 0.1 * i)) == number + 0.1 * i  # noqa: B023
+        assert timer.counted == number
+    assert order == [0, 1, 2, 1, 2, 0, 2, 0, 1, 0, 1, 2]
+    assert [times.ms for times in timer.times] == [
+        pytest.approx([1e3 * (n + 0.1 * i) for n in (1, 2, 3)]) for i in range(3)
+    ]
+    assert timer.seconds == pytest.approx(3 * (1 + 2 + 3) + 3 * 0.3)
+
+
+def test_medians_and_quartiles_are_numpys() -> None:
+    for count in (1, 2, 3, 4, 7, 50):
+        ms = tuple(np.random.default_rng(count).exponential(size=count).tolist())
+        times = Times(ms)
+        assert times.median == pytest.approx(np.median(ms))
+        assert times.quartiles == pytest.approx(np.percentile(ms, [25, 75]))
