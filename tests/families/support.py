@@ -76,8 +76,8 @@ def render(content: dict[str, list[Row]]) -> str:
     """The table in Markdown, between its markers."""
     lines = [
         BEGIN,
-        "| Policy | Compared with, and largest difference allowed | Sampler and steps | Residual blocks found"
-        " | Arithmetic not repeated at every step |",
+        "| Policy | Compared with, and largest difference allowed | Sampler and steps | Residual blocks found |"
+        " Arithmetic not repeated at every step |",
         "| --- | --- | --- | --- | --- |",
     ]
     lines += [
