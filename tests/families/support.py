@@ -17,6 +17,13 @@ from ttscompile.ir.program import Program
 ROOT = Path(__file__).resolve().parents[2]
 RECORD = ROOT / "docs" / "support.json"
 README = ROOT / "README.md"
+COLUMNS = (
+    "Policy",
+    "Compared with, and largest difference allowed",
+    "Sampler and steps",
+    "Residual blocks found",
+    "Arithmetic not repeated at every step",
+)
 BEGIN, END = "<!-- support:begin -->", "<!-- support:end -->"
 
 Row = dict[str, Any]
@@ -76,8 +83,7 @@ def render(content: dict[str, list[Row]]) -> str:
     """The table in Markdown, between its markers."""
     lines = [
         BEGIN,
-        "| Policy | Compared with, and largest difference allowed | Sampler and steps | Residual blocks found |"
-        " Arithmetic not repeated at every step |",
+        f"| {' | '.join(COLUMNS)} |",
         "| --- | --- | --- | --- | --- |",
     ]
     lines += [
