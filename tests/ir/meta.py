@@ -8,8 +8,7 @@ import torch
 
 from ttscompile.ir.evaluate import Evaluator
 from ttscompile.ir.graph import GETITEM, Graph, Ref, TensorType
-from ttscompile.ir.program import Program
-from ttscompile.ir.verify import graphs
+from ttscompile.ir.program import Phase
 
 
 def assert_types(graph: Graph, what: str) -> None:
@@ -38,9 +37,9 @@ def assert_types(graph: Graph, what: str) -> None:
             assert found == (node.type.at(streams), node.type.dtype), f"{what}: {node}, {streams} streams: {found}"
 
 
-def assert_types_of(program: Program) -> None:
+def assert_types_of(program: Phase) -> None:
     """The same of the denoiser and of every piece of it."""
-    for what, graph in graphs(program):
+    for what, graph in program.graphs().items():
         assert_types(graph, what)
 
 
