@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 from animate import save_animation
@@ -33,9 +32,6 @@ import ttscompile
 from ttscompile.calibration.result import CalibrationResult
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.plots.plan import plot_plan
-
-if TYPE_CHECKING:
-    from ttscompile.calibration import CalibrationResult
 
 BUILD = Path(__file__).resolve().parents[2] / "build" / "pusht"
 SAMPLER, STEPS, HORIZON = "dpmsolver++", 16, 12
