@@ -18,10 +18,6 @@ from ..trajectories.episodes import Episode
 from .rung import SKIPPED, Rung, finite, judged
 
 SPARSITY, UNIT = "sparsity error", "action units"
-_REMEDY = (
-    "These episodes are unlike those of the calibration, or the plan is too sparse: calibrate with such episodes, or"
-    " with a lower --target-sparsity."
-)
 
 AS_CALIBRATED, FEW_AS_CALIBRATED = 2.0, 3.0
 """How often the mean error that calibration measured on held-out calls a plan's may be; and with ``FEW`` calls or less,
@@ -83,9 +79,8 @@ def check_episodes(
     details = {"plan": name, "calls": calls, "episodes": len(episodes), "plans": figures, "other_noise": other_noise}
     others = ", ".join(f"{n!r} {np.mean(e):.3g}" for n, e in errors.items() if n != name)
     found = f"executed actions of plan {name!r} are {error:.3g} from the dense policy's with the same noise, in their"
-    found += (
-        f" units{f' ({others})' if others else ''}; two dense calls with different noise are {other_noise:.3g} apart"
-    )
+    found += f" units{f' ({others})' if others else ''}"
+    found += f"; two dense calls with different noise are {other_noise:.3g} apart"
     if not episodes:
         found += f". No trajectories were given: these are {calls} calls on random observations, and not judged"
         remedy = "Give recorded episodes with --trajectories to have this judged."
@@ -104,7 +99,9 @@ def check_episodes(
     made = f"{calls} call{'s' * (calls != 1)} of {len(episodes)} episode{'s' * (len(episodes) != 1)}: {found}"
     if reasons:
         made += f". This is {'; and '.join(reasons)}"
-    return judged(SPARSITY, error, min(beyond, worse), UNIT, made, _REMEDY, details=details)
+    remedy = "These episodes are unlike those of the calibration, or the plan is too sparse: calibrate with such"
+    remedy += " episodes, or with a lower --target-sparsity."
+    return judged(SPARSITY, error, min(beyond, worse), UNIT, made, remedy, details=details)
 
 
 def _run(
