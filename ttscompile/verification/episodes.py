@@ -31,9 +31,9 @@ NEGLIGIBLE = 0.05
 Progress = Callable[[str], None]
 """Told what is being done."""
 
-Errors = dict[str, list[float]]
+Errors = dict[str | None, list[float]]
 """By plan, for each call: mean absolute difference of the executed actions from the dense call's with the same noise,
-in their units. Of the dense plan: with other noise."""
+in their units. None: of a dense call with other noise."""
 
 
 def choose(episodes: Sequence[Episode], calls: int) -> list[Episode]:
@@ -63,13 +63,13 @@ def check_episodes(
     if not manifest.plans:
         return Rung(SPARSITY, SKIPPED, "the artifact is not calibrated: every call is dense")
     spec, draw = manifest.spec, np.random.default_rng(0)
-    errors: Errors = {name: [] for name in (*manifest.plans, DENSE)}
+    errors: Errors = {name: [] for name in (*manifest.plans, None)}
     for i, obs in enumerate([one.observations for one in episodes] or [golden.raw_observations(spec)]):
         rows = [{k: a[r : r + 1] for k, a in obs.items()} for r in range(len(next(iter(obs.values()))))]
         if episodes:
             told(f"episode {i + 1} of {len(episodes)}, {len(rows)} call{'s' * (len(rows) != 1)}")
         _run(policy, spec, rows, draw, errors)
-    calls, other_noise = len(errors[DENSE]), float(np.mean(errors.pop(DENSE)))
+    calls, other_noise = len(errors[None]), float(np.mean(errors.pop(None)))
     figures = {
         name: {"error": finite(float(np.mean(e))), "error_p90": finite(float(np.quantile(e, 0.9)))}
         for name, e in errors.items()
@@ -121,7 +121,7 @@ def _run(
 
     dense = actions(DENSE, noises)
     for name, found in errors.items():
-        made = actions(name, others if name == DENSE else noises)
+        made = actions(DENSE, others) if name is None else actions(name, noises)
         found += [float(np.abs(one - other).mean()) for one, other in zip(made, dense, strict=True)]
 
 
