@@ -112,8 +112,8 @@ def _read(
         raise TrajectoryError(f"{path}: observations differ in length: {lengths}. Each needs a row for every call.")
     count = rows.pop()
     if ends[-1] > count:
-        told = f"{ENDS} says that the last episode ends at row {ends[-1]}, but there are {count} rows: it is incomplete"
-        raise TrajectoryError(f"{path}: {told}. Record it again, or leave it out of {ENDS}.")
+        told = f"{path}: {ENDS} says that the last episode ends at row {ends[-1]}, but there are {count} rows: no such"
+        raise TrajectoryError(f"{told} episode is complete. Record it again, or leave the episode out of {ENDS}.")
     if ends[-1] < count:
         warnings.warn(f"{path}: {count - ends[-1]} rows after the last end of an episode are not used.", stacklevel=4)
     checked = {key: _checked(path, key, arrays[key], spec, frames) for key, spec in observations.items()}
@@ -138,7 +138,7 @@ def _npz(path: Path) -> tuple[Frames, bool]:
 
 
 _ENDS_ARE = "for each episode the row after its last, increasing"
-_SAVEZ = "Record it again. Use np.savez and plain arrays."
+_SAVEZ = "Use np.savez with plain arrays."
 
 
 def read_npz(path: Path) -> dict[str, Array]:
@@ -167,10 +167,8 @@ def read_npz(path: Path) -> dict[str, Array]:
     except TrajectoryError:
         raise
     except Exception as error:  # numpy parses the headers as Python text, and raises whatever its parts raise
-        told = (
-            f"{path}: cannot be read as .npz ({str(error)[:200]}): no such file, truncated, or with Python objects in"
-        )
-        raise TrajectoryError(f"{told} it, which are never loaded. {_SAVEZ}") from error
+        told = f"{path}: cannot be read as .npz ({str(error)[:200]}): no such file, truncated, or with Python objects"
+        raise TrajectoryError(f"{told} in it, which are never loaded. Record it again. {_SAVEZ}") from error
 
 
 def _other_format(path: Path) -> str | None:

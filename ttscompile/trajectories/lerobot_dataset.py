@@ -36,13 +36,12 @@ def lerobot_recording(path: Path) -> Recording:
     if not files:
         raise TrajectoryError(f"{path}: has meta/info.json and no data/**/*.parquet; expected a LeRobot data set.")
     size = sum(file.stat().st_size for file in files)
+    hint = "; expected a LeRobot data set, whose features it names"
+    with one_error(f"{path}: meta/info.json cannot be read", hint):
+        features = parse_json((path / "meta" / "info.json").read_bytes(), MAX_INFO)["features"]
+        videos = [name for name, feature in features.items() if feature.get("dtype") == "video"]
     hint = f"; expected tables with the columns {EPISODE} and {FRAME}"
     with one_error(f"{path}: cannot be read as a LeRobot data set", hint):
-        with one_error(
-            f"{path}: meta/info.json cannot be read", "; expected a LeRobot data set, whose features it names"
-        ):
-            features = parse_json((path / "meta" / "info.json").read_bytes(), MAX_INFO)["features"]
-            videos = [name for name, feature in features.items() if feature.get("dtype") == "video"]
         tables = [parquet.ParquetFile(file) for file in files]
         names = [name for name in tables[0].schema_arrow.names if name not in (EPISODE, FRAME)]
         episodes, numbers = (_index(path, tables, name, size) for name in (EPISODE, FRAME))
@@ -53,10 +52,8 @@ def lerobot_recording(path: Path) -> Recording:
 
     def read(name: str) -> tuple[int, Iterator[Array]]:
         if name in videos:
-            told = (
-                f"{path}: {name!r} is a video, which is not decoded. Save its frames as images (LeRobot records a data"
-            )
-            raise TrajectoryError(f"{told} set so with --dataset.video=false), or {AS_NPZ}")
+            told = f"{path}: {name!r} is a video, which is not decoded. Save its frames as images (LeRobot records a"
+            raise TrajectoryError(f"{told} data set so with --dataset.video=false), or {AS_NPZ}")
         return len(order), _column(path, tables, name, size)
 
     sorted_already = bool((order == np.arange(len(order))).all())

@@ -60,10 +60,9 @@ def _require_plain(path: Path, array: Any, size: int) -> None:
     kind, codecs = np.dtype(array.dtype).kind, _codecs(array.metadata)
     if kind not in "biuf" or not codecs <= CODECS or not array.shape:
         what = f"compressed by {', '.join(sorted(codecs - CODECS))}" if kind in "biuf" else f"of dtype {array.dtype}"
-        raise TrajectoryError(
-            f"{path}: {array.path!r} is {what if array.shape else 'a single value'}; expected rows of numbers, compressed"
-            f" by one of {', '.join(sorted(CODECS))}. Write it again with another compressor, or {AS_NPZ}"
-        )
+        told = f"{what if array.shape else 'a single value'}; expected rows of numbers, compressed by one of"
+        told += f" {', '.join(sorted(CODECS))}. Write it again with another compressor, or {AS_NPZ}"
+        raise TrajectoryError(f"{path}: {array.path!r} is {told}")
     require_proportion(path, math.prod(array.shape) * array.dtype.itemsize, size)
 
 
