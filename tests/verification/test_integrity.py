@@ -12,7 +12,7 @@ import ttscompile
 from tests.artifact.folders import flip
 from ttscompile.artifact.manifest import MANIFEST
 from ttscompile.errors import ArtifactError
-from ttscompile.verification.integrity import check_integrity
+from ttscompile.verification.ladder import check_integrity
 from ttscompile.verification.rung import FAILED, PASSED
 
 FLIPS = 1000

@@ -51,20 +51,15 @@ class Correction:
     bias: npt.NDArray[np.float32]
 
     def __post_init__(self) -> None:
-        if self.weights.ndim != 4 or self.anchors.ndim != 1:
-            raise IllegalPlanError(
-                "a correction has anchors [K], weights [K, G, 6 T, T] and a bias [K, G, 1, T]; found"
-                f" {self.anchors.shape}, {self.weights.shape} and {self.bias.shape}."
-            )
-        steps, groups, _, horizon = self.weights.shape
+        steps, groups, _, horizon = self.weights.shape if self.weights.ndim == 4 else (0, 0, 0, 0)
         shapes = ((steps,), (steps, groups, FEATURES * horizon, horizon), (steps, groups, 1, horizon))
-        found = (self.anchors.shape, self.weights.shape, self.bias.shape)
-        types = tuple(str(array.dtype) for array in (self.anchors, self.weights, self.bias))
-        if found != shapes or types != ("bool", "float32", "float32"):
-            shown = ", ".join(f"{type_}{list(shape)}" for type_, shape in zip(types, found, strict=True))
+        arrays = (self.anchors, self.weights, self.bias)
+        types = tuple(str(array.dtype) for array in arrays)
+        if tuple(array.shape for array in arrays) != shapes or types != ("bool", "float32", "float32"):
+            shown = ", ".join(f"{array.dtype}{list(array.shape)}" for array in arrays)
             raise IllegalPlanError(
-                f"a correction of K = {steps} steps and T = {horizon} has bool{list(shapes[0])}, float32"
-                f"{list(shapes[1])} and float32{list(shapes[2])}; found {shown}."
+                "a correction has anchors bool[K], weights float32[K, G, 6 T, T] and a bias float32[K, G, 1, T]; found"
+                f" {shown}."
             )
         if not (np.isfinite(self.weights).all() and np.isfinite(self.bias).all()):
             raise IllegalPlanError("a correction holds numbers that are not finite. Calibrate the artifact again.")
@@ -83,13 +78,7 @@ class Correction:
 
 
 def remember(history: FloatArray, sample: FloatArray, prediction: FloatArray) -> None:
-    """Enter an anchor into the history, in place.
-
-    Args:
-        history: ``[D, B, 4 T]``.
-        sample: of the anchor, ``[D, B, T]``.
-        prediction: of the anchor, ``[D, B, T]``.
-    """
+    """Enter sample and prediction of an anchor, ``[D, B, T]`` each, into the history ``[D, B, 4 T]``, in place."""
     horizon = sample.shape[2]
     history[:, :, 2 * horizon :] = history[:, :, : 2 * horizon]
     history[:, :, :horizon] = sample
@@ -97,33 +86,19 @@ def remember(history: FloatArray, sample: FloatArray, prediction: FloatArray) ->
 
 
 def correction_flops(sample: tuple[int, int]) -> int:
-    """FLOPs of one step of one stream, multiply and add counted as two.
-
-    Args:
-        sample: ``(T, D)``.
-    """
+    """FLOPs of one step of one stream of samples ``(T, D)``, multiply and add counted as two."""
     horizon, dimensions = sample
     return 2 * FEATURES * horizon * horizon * dimensions
 
 
 def groups_of(steps: int, sample: tuple[int, int]) -> int:
-    """Into how many groups the action dimensions of a policy fall: each for itself, or all in one.
-
-    Args:
-        steps: K.
-        sample: ``(T, D)``.
-    """
+    """Into how many groups the action dimensions of samples ``(T, D)`` fall: each for itself, or all in one."""
     horizon, dimensions = sample
     return dimensions if steps * dimensions * FEATURES * horizon * horizon <= LARGEST else 1
 
 
 def no_correction(steps: int, sample: tuple[int, int]) -> Correction:
-    """The correction that changes nothing.
-
-    Args:
-        steps: K.
-        sample: ``(T, D)``.
-    """
+    """The correction of K steps and samples ``(T, D)`` that changes nothing."""
     groups, horizon = groups_of(steps, sample), sample[0]
     return Correction(
         anchors=np.zeros(steps, np.bool_),

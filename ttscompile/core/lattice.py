@@ -47,13 +47,7 @@ class Origins:
 
 
 def check_plan(plan: npt.ArrayLike, steps: int, blocks: int, streams: int) -> PlanArray:
-    """Validate the shape and values of a plan and give it a row per stream.
-
-    Args:
-        plan: ``[K, blocks]`` or ``[B, K, blocks]`` of ``Source``, any integer dtype.
-        steps: K.
-        blocks: number of residual blocks.
-        streams: B.
+    """A plan ``[K, blocks]`` or ``[B, K, blocks]`` of ``Source``, of any integer dtype, with a row for each stream.
 
     Returns:
         int8 ``[B, K, blocks]``, contiguous.
@@ -69,14 +63,11 @@ def check_plan(plan: npt.ArrayLike, steps: int, blocks: int, streams: int) -> Pl
     if array.ndim == 2:
         array = np.broadcast_to(array, (streams, *array.shape))
     if array.shape != (streams, steps, blocks):
-        raise IllegalPlanError(
-            f"plan has shape {np.shape(plan)}; expected [K, blocks] = ({steps}, {blocks}) or"
-            f" [B, K, blocks] = ({streams}, {steps}, {blocks})."
-        )
+        expected = f"[K, blocks] = ({steps}, {blocks}) or [B, K, blocks] = ({streams}, {steps}, {blocks})"
+        raise IllegalPlanError(f"plan has shape {np.shape(plan)}; expected {expected}.")
     if array.size and (array.min() < 0 or array.max() > 3):
-        raise IllegalPlanError(
-            f"plan holds values {int(array.min())}..{int(array.max())}; expected ttscompile.Source, 0..3."
-        )
+        found = f"{int(array.min())}..{int(array.max())}"
+        raise IllegalPlanError(f"plan holds values {found}; expected ttscompile.Source, 0..3.")
     return np.ascontiguousarray(array, dtype=np.int8)
 
 
@@ -141,12 +132,9 @@ def require_legal(plans: PlanArray, groups: Sequence[int], written: BoolArray) -
     for stream, (plan, cells) in enumerate(zip(plans, written, strict=True)):
         bad = np.argwhere(illegal_cells(plan, groups, cells))
         if len(bad):
-            step, block = (int(i) for i in bad[0])
-            what = (
-                "step 0 must be dense"
-                if step == 0
-                else f"its {Source(int(plan[step, block])).name} residual was never computed"
-            )
+            step, block = bad[0].tolist()
+            what = f"its {Source(int(plan[step, block])).name} residual was never computed"
+            what = "step 0 must be dense" if step == 0 else what
             raise IllegalPlanError(
                 f"plan of stream {stream} is illegal at step {step}, block {block} ({what});"
                 f" {len(bad)} illegal cells in all. Pass it through ttscompile.legalize first, or use plan='dense'"
@@ -191,11 +179,7 @@ def whole_steps_plan(steps: int, blocks: int, chosen: Iterable[int]) -> PlanArra
 
 
 def uniform_plan(steps: int, blocks: int, full_steps: int) -> PlanArray:
-    """Every block computed at ``full_steps`` evenly spaced steps (step 0 among them), TIMESTEP elsewhere.
-
-    Returns:
-        int8 ``[K, blocks]``.
-    """
+    """The same with ``full_steps`` evenly spaced steps, step 0 among them."""
     return whole_steps_plan(steps, blocks, (step * steps // full_steps for step in range(full_steps)))
 
 

@@ -160,9 +160,8 @@ class ObservationSpec:
         if not self.shape or min(self.shape) < 1:
             raise SpecError(f"an observation needs a shape of positive sizes; found {self.shape}.")
         if self.normalizer is not None and self.normalizer.scale.shape != self.shape[-1:]:
-            raise SpecError(
-                f"normaliser has {len(self.normalizer.scale)} entries for an observation of shape {self.shape}."
-            )
+            found = len(self.normalizer.scale)
+            raise SpecError(f"normaliser has {found} entries for an observation of shape {self.shape}.")
         if self.bounds is not None:
             low, high = (np.atleast_1d(np.asarray(value, np.float64)) for value in self.bounds)
             fits = low.shape == high.shape and low.shape in ((1,), self.shape[-1:])
@@ -279,14 +278,12 @@ class PolicySpec:
                     f" argument {argument!r} none of {sorted(taken)}."
                 )
             taken.add(argument)
-        horizon, channels = self.sample
         if self.left_out < 0:
             raise SpecError(f"left_out is {self.left_out}; expected a number of steps, 0 for none.")
+        horizon, channels = self.sample
         if self.chunk.stop > horizon or self.chunk.action_dim > channels:
-            raise SpecError(
-                f"chunk [{self.chunk.start}:{self.chunk.stop}] of {self.chunk.action_dim} channels does not fit a"
-                f" sample of {horizon} steps and {channels} channels."
-            )
+            told = f"chunk [{self.chunk.start}:{self.chunk.stop}] of {self.chunk.action_dim} channels does not fit a"
+            raise SpecError(f"{told} sample of {horizon} steps and {channels} channels.")
         normalizer = self.chunk.normalizer
         if normalizer is not None and len(normalizer.scale) != self.chunk.action_dim:
             found = len(normalizer.scale)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from contextlib import suppress
 from typing import Any, NoReturn
 
 MAX_DEPTH = 64
@@ -24,20 +25,14 @@ def parse_json(content: bytes, limit: int, *, allow_nan: bool = False) -> Any:
     if len(content) > limit:
         raise ValueError(f"it has more than {limit:,} bytes")
     numbers: dict[str, Any] = {} if allow_nan else {"parse_constant": _no_constant, "parse_float": _finite}
-    try:
+    with suppress(RecursionError):
         data = json.loads(content.decode("utf-8"), object_pairs_hook=_unique, **numbers)
-    except RecursionError:
-        raise _too_deep() from None
-    level = [data]
-    for _ in range(MAX_DEPTH + 1):
-        level = [child for item in level for child in _children(item)]
-        if not level:
-            return data
-    raise _too_deep()
-
-
-def _too_deep() -> ValueError:
-    return ValueError(f"it is more than {MAX_DEPTH} levels deep")
+        level = [data]
+        for _ in range(MAX_DEPTH + 1):
+            level = [child for item in level for child in _children(item)]
+            if not level:
+                return data
+    raise ValueError(f"it is more than {MAX_DEPTH} levels deep")
 
 
 def _children(item: object) -> Any:

@@ -37,12 +37,7 @@ def columns(sampler: SamplerTable, horizon: int) -> int:
 
 
 def update_flops(sampler: SamplerTable, sample: tuple[int, int]) -> int:
-    """FLOPs of one update of one stream with its correction, multiply and add counted as two.
-
-    Args:
-        sampler: of the policy.
-        sample: ``(T, D)``.
-    """
+    """FLOPs of one update of one stream of samples ``(T, D)`` with its correction, counted as its."""
     memories = sampler.memories
     return correction_flops(sample) * (FEATURES + memories) * (1 + memories) // FEATURES
 
@@ -69,12 +64,7 @@ def diagonals(sampler: SamplerTable) -> dict[tuple[int, int], FloatArray]:
 
 
 def matrices(sampler: SamplerTable, correction: Correction) -> FloatArray:
-    """The matrix of each step, float32 ``[K, G, R, (1 + S) T]``.
-
-    Args:
-        sampler: of the policy.
-        correction: of the plan.
-    """
+    """The matrix of each step, float32 ``[K, G, R, (1 + S) T]``."""
     steps, groups, linear, horizon = correction.weights.shape
     result = np.zeros((steps, groups, rows(sampler, horizon), columns(sampler, horizon)), np.float32)
     result[:, :, :linear, :horizon] = correction.weights

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,10 @@ def fingerprint() -> dict[str, Any]:
     """
     fields = cpuinfo()
     flags = fields.get("flags", fields.get("Features", "")).split()
+    versions = {}
+    for name in PACKAGES:
+        with suppress(PackageNotFoundError):
+            versions[name] = version(name)
     return {
         "processor": fields.get("model name", platform.processor() or platform.machine()),
         "instructions": [name for name in _INSTRUCTIONS if name in flags],
@@ -30,7 +35,7 @@ def fingerprint() -> dict[str, Any]:
         "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
-        **_versions(),
+        **versions,
     }
 
 
@@ -64,13 +69,3 @@ def cpuinfo(path: Path | None = None) -> dict[str, str]:
     first = text.split("\n\n", 1)[0]
     pairs = (line.split(":", 1) for line in first.splitlines() if ":" in line)
     return {name.strip(): value.strip() for name, value in pairs}
-
-
-def _versions() -> dict[str, str]:
-    found = {}
-    for name in PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return found

@@ -11,19 +11,19 @@ import importlib
 import json
 import os
 import signal
-import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from subprocess import DEVNULL, PIPE, Popen
 from typing import IO, Any, BinaryIO
 
 import numpy as np
 
 from ..errors import TrajectoryError
-from .frames import Array, Frames, Recording, bytes_of, one_error, require_proportion
+from .frames import AS_NPZ, Array, Frames, Recording, bytes_of, one_error, require_proportion
 from .hdf5_file import hdf5_recording
 from .lerobot_dataset import lerobot_recording
 from .zarr_buffer import zarr_recording
@@ -31,13 +31,9 @@ from .zarr_buffer import zarr_recording
 MORE_BYTES, MORE_SECONDS = 2**30, 4
 """Memory and processor time of a reader beyond what its imports take; more for large files, see ``limit``."""
 FORMATS = {"hdf5": hdf5_recording, "lerobot": lerobot_recording, "zarr": zarr_recording}
-_OPENED = ("Bmp", "Gif", "Jpeg", "Ppm", "Png")
+_OPENED = [f"PIL.{name}ImagePlugin" for name in ("Bmp", "Gif", "Jpeg", "Ppm", "Png")]
 """What Pillow imports when an image is opened, whatever formats are allowed."""
-IMPORTS = {
-    "hdf5": ("h5py",),
-    "lerobot": ("pyarrow.parquet", "pyarrow.compute", *(f"PIL.{name}ImagePlugin" for name in _OPENED)),
-    "zarr": ("zarr",),
-}
+IMPORTS = {"hdf5": ["h5py"], "lerobot": ["pyarrow.parquet", "pyarrow.compute", *_OPENED], "zarr": ["zarr"]}
 """What a reader imports before it is limited."""
 _CODE = """
 import json, sys
@@ -49,19 +45,21 @@ serve_alone(request)
 
 
 def frames_apart(path: Path, kind: str, wanted: Sequence[str]) -> Frames:
-    """Read a data set.
-
-    Args:
-        path: of a file or a directory.
-        kind: one of ``FORMATS``.
-        wanted: the arrays to read; those that it lacks are left out.
+    """The wanted arrays of a data set that is one of ``FORMATS``; those that it lacks are left out.
 
     Raises:
         TrajectoryError: it cannot be read, or the process that reads it ended.
     """
-    request = {"path": os.fsdecode(path), "kind": kind, "wanted": list(wanted)}
-    with reader(request) as stream:
-        return _received(path, stream)
+    arrays, own = dict[str, Array](), dict[str, Array]()
+    with reader({"path": os.fsdecode(path), "kind": kind, "wanted": list(wanted)}) as stream:
+        names = _line(stream)["names"]
+        while "end" not in (line := _line(stream)):
+            array = _array(stream, line)
+            if "own" in line:
+                own[line["own"]] = array
+            else:
+                arrays[line["array"]] = array[own["order"]] if "order" in own else array
+    return Frames(names, arrays.__getitem__, own["ends"])
 
 
 @contextmanager
@@ -74,13 +72,8 @@ def reader(request: Mapping[str, Any]) -> Iterator[IO[bytes]]:
     told = {**request, "sys_path": [each for each in sys.path if isinstance(each, str)]}
     command = [sys.executable, "-I", "-c", _CODE]
     env = {**os.environ, "ARROW_DEFAULT_MEMORY_POOL": "system"}  # the other one takes a gigabyte when it begins
-    with subprocess.Popen(  # noqa: S603 -- this python and the code above
-        command,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        env=env,
-        start_new_session=True,
+    with Popen(  # noqa: S603 -- this python and the code above
+        command, stdin=PIPE, stdout=PIPE, stderr=DEVNULL, env=env, start_new_session=True
     ) as process:
         assert process.stdin is not None
         assert process.stdout is not None
@@ -93,54 +86,27 @@ def reader(request: Mapping[str, Any]) -> Iterator[IO[bytes]]:
             yield process.stdout
         except (EOFError, BrokenPipeError) as error:
             process.kill()  # it may have sent nonsense, and be alive
-            raise TrajectoryError(_ended(request["path"], process.wait())) from error
+            raise _ended(request["path"], process.wait()) from error
         finally:
             timer.cancel()
             process.kill()
 
 
-def _ended(path: str, status: int) -> str:
-    """What to say of a reader that ended before its answer did."""
-    limits = (getattr(signal, "SIGXCPU", None), getattr(signal, "SIGKILL", None))
+def _ended(path: str, status: int) -> TrajectoryError:
+    """The error of a reader that ended before its answer did."""
     how = f"with exit status {status}"
     if status < 0:
-        how = f"by {signal.Signals(-status).name}" + (", at its limit of time or memory" if -status in limits else "")
-    return (
-        f"{path}: the process that read it ended {how}: it is damaged, or made to do that. Copy it again, or save the"
-        " observations as an .npz."
-    )
+        name = signal.Signals(-status).name
+        how = f"by {name}" + (", at its limit of time or memory" if name in ("SIGXCPU", "SIGKILL") else "")
+    told = f"{path}: the process that read it ended {how}: it is damaged, or made to do that. Copy it again, or"
+    return TrajectoryError(f"{told} {AS_NPZ}")
 
 
-def _received(path: Path, stream: IO[bytes]) -> Frames:
-    """What a reader sends.
-
-    Raises:
-        TrajectoryError: it refused the file.
-        EOFError: the stream ends before the answer does.
-    """
-    head = _line(stream)
-    if "error" in head:
-        raise TrajectoryError(head["error"])
-    arrays: dict[str, Array] = {}
-    own: dict[str, Array] = {}
-    while "end" not in (line := _line(stream)):
-        if "error" in line:
-            raise TrajectoryError(line["error"])
-        array = _array(path, stream, line)
-        if "own" in line:
-            own[line["own"]] = array
-        else:
-            arrays[line["array"]] = array[own["order"]] if "order" in own else array
-    return Frames(head["names"], arrays.__getitem__, own["ends"])
-
-
-def _array(path: Path, stream: IO[bytes], line: Mapping[str, Any]) -> Array:
+def _array(stream: IO[bytes], line: Mapping[str, Any]) -> Array:
     array = np.empty(line["shape"], line["dtype"])
     done = 0
     while done < len(array):
         head = _line(stream)
-        if "error" in head:
-            raise TrajectoryError(head["error"])
         part = array[done : done + head["rows"]]
         flat = part.reshape(-1).view(np.uint8)
         if stream.readinto(flat) != flat.nbytes:  # type: ignore[attr-defined]
@@ -150,10 +116,18 @@ def _array(path: Path, stream: IO[bytes], line: Mapping[str, Any]) -> Array:
 
 
 def _line(stream: IO[bytes]) -> dict[str, Any]:
+    """The next line of an answer.
+
+    Raises:
+        TrajectoryError: the reader refused the file.
+        EOFError: the stream ends before the answer does.
+    """
     line = stream.readline()
     if not line.endswith(b"\n"):
         raise EOFError
     found: dict[str, Any] = json.loads(line)
+    if "error" in found:
+        raise TrajectoryError(found["error"])
     return found
 
 
@@ -206,11 +180,10 @@ def _send_array(path: Path, out: BinaryIO, head: Mapping[str, str], rows: int, b
                 f"{path}: frames of {name!r} are {first.dtype}{list(first.shape[1:])} and {block.dtype}"
                 f"{list(block.shape[1:])}, or more than {rows} are left; expected one shape, and a row for each frame."
             )
-        if not len(block):
-            continue
-        rows -= len(block)
-        _send(out, rows=len(block))
-        out.write(np.ascontiguousarray(block).reshape(-1).view(np.uint8).data)
+        if len(block):
+            rows -= len(block)
+            _send(out, rows=len(block))
+            out.write(np.ascontiguousarray(block).reshape(-1).view(np.uint8).data)
     if rows or first is None:
         raise TrajectoryError(f"{path}: {name!r} lacks {rows} frames; expected a row for each.")
 
@@ -229,21 +202,16 @@ def limit(size: int) -> None:
         import resource
     except ModuleNotFoundError:  # Windows
         return
+    limits = {resource.RLIMIT_CORE: 0, resource.RLIMIT_FSIZE: 0}
+    limits[resource.RLIMIT_CPU] = int(time.process_time()) + 1 + _seconds(size)
     statm = Path("/proc/self/statm")
     if statm.exists():
         held = int(statm.read_text().split()[5]) * resource.getpagesize()
-        _lower(resource.RLIMIT_DATA, held + MORE_BYTES + 4 * size)  # not what allocators reserve and do not use
-    _lower(resource.RLIMIT_CPU, int(time.process_time()) + 1 + _seconds(size))
-    _lower(resource.RLIMIT_CORE, 0)
-    _lower(resource.RLIMIT_FSIZE, 0)
-
-
-def _lower(which: int, value: int) -> None:
-    import resource
-
-    hard = resource.getrlimit(which)[1]
-    value = value if hard == resource.RLIM_INFINITY else min(value, hard)
-    resource.setrlimit(which, (value, value))
+        limits[resource.RLIMIT_DATA] = held + MORE_BYTES + 4 * size  # not what allocators reserve and do not use
+    for which, value in limits.items():
+        hard = resource.getrlimit(which)[1]
+        value = value if hard == resource.RLIM_INFINITY else min(value, hard)
+        resource.setrlimit(which, (value, value))
 
 
 def _seconds(size: int) -> int:

@@ -76,24 +76,18 @@ def load_trajectories(
         paths = [paths]
     if not paths:
         raise TrajectoryError("no trajectory files were given. Name at least one .npz with recorded episodes.")
-    read = [episode for path in paths for episode in _read(Path(path), observations, action_steps, sources or {})]
-    return _different(read)
-
-
-def _different(episodes: Sequence[Episode]) -> list[Episode]:
-    """The episodes without those that were there before: they could be learned from and held out at once."""
-    found: dict[bytes, Episode] = {}
+    different: dict[bytes, Episode] = {}  # one that is there twice could be learned from and held out at once
     again = []
-    for episode in episodes:
+    for episode in [each for path in paths for each in _read(Path(path), observations, action_steps, sources or {})]:
         digest = hashlib.sha256()
         for _, array in sorted(episode.observations.items()):
             digest.update(np.ascontiguousarray(array).data)
-        if found.setdefault(digest.digest(), episode) is not episode:
+        if different.setdefault(digest.digest(), episode) is not episode:
             again.append(episode.name)
     if again:
         told = ", ".join(again[:5]) + ", .." * (len(again) > 5)
-        warnings.warn(f"episodes that were given before are left out: {told}.", stacklevel=3)
-    return list(found.values())
+        warnings.warn(f"episodes that were given before are left out: {told}.", stacklevel=2)
+    return list(different.values())
 
 
 def _read(
@@ -104,10 +98,8 @@ def _read(
     used = {part.partition(":")[0] for key in observations for part in sources.get(key, (key,))}
     held, frames = _npz(path) if other is None else (frames_apart(path, other, sorted(used)), True)
     if sources and not frames:
-        raise TrajectoryError(
-            f"{path}: its rows are calls of the policy, and {sorted(sources)} are to be made of other arrays, which is"
-            " for frames. Save each key of the observation as an array of its own."
-        )
+        told = f"{path}: its rows are calls of the policy, and {sorted(sources)} are to be made of other arrays, which"
+        raise TrajectoryError(f"{told} is for frames. Save each key of the observation as an array of its own.")
     if unknown := sorted(set(sources) - set(observations)):
         raise TrajectoryError(f"the policy observes {sorted(observations)}; found arrays for {unknown}.")
     ends = _ends(path, held.ends)
@@ -120,10 +112,8 @@ def _read(
         raise TrajectoryError(f"{path}: observations differ in length: {lengths}. Each needs a row for every call.")
     count = rows.pop()
     if ends[-1] > count:
-        raise TrajectoryError(
-            f"{path}: {ENDS} says that the last episode ends at row {ends[-1]}, but there are {count} rows: no such"
-            " episode is complete. Record it again, or leave the incomplete episode out of episode_ends."
-        )
+        told = f"{path}: {ENDS} says that the last episode ends at row {ends[-1]}, but there are {count} rows: no such"
+        raise TrajectoryError(f"{told} episode is complete. Record it again, or leave the episode out of {ENDS}.")
     if ends[-1] < count:
         warnings.warn(f"{path}: {count - ends[-1]} rows after the last end of an episode are not used.", stacklevel=4)
     checked = {key: _checked(path, key, arrays[key], spec, frames) for key, spec in observations.items()}
@@ -141,14 +131,14 @@ def _npz(path: Path) -> tuple[Frames, bool]:
     arrays = read_npz(path)
     frames = _meta(path, arrays.pop(META, None))
     if ENDS not in arrays:
-        raise TrajectoryError(
-            f"{path}: has no array {ENDS!r}; it has {few(sorted(arrays))}. Add {ENDS} [E]: {_ENDS_ARE}."
-        )
+        told = f"{path}: has no array {ENDS!r}; it has {few(sorted(arrays))}"
+        raise TrajectoryError(f"{told}. Add {ENDS} [E]: {_ENDS_ARE}.")
     ends = arrays.pop(ENDS)
     return Frames(sorted(arrays), arrays.__getitem__, ends), frames
 
 
 _ENDS_ARE = "for each episode the row after its last, increasing"
+_SAVEZ = "Use np.savez with plain arrays."
 
 
 def read_npz(path: Path) -> dict[str, Array]:
@@ -168,9 +158,7 @@ def read_npz(path: Path) -> dict[str, Array]:
         with path.open("rb") as handle:  # numpy leaves it open where it finds no archive
             file = np.load(handle, allow_pickle=False)
             if not isinstance(file, np.lib.npyio.NpzFile):
-                raise TrajectoryError(
-                    f"{path}: expected an .npz with several arrays; found a single one. Use np.savez."
-                )
+                raise TrajectoryError(f"{path}: expected an .npz with several arrays; found a single one. {_SAVEZ}")
             with file:
                 archive: Any = file.zip  # nothing has been decompressed yet
                 total = sum(entry.file_size for entry in archive.infolist())
@@ -179,10 +167,8 @@ def read_npz(path: Path) -> dict[str, Array]:
     except TrajectoryError:
         raise
     except Exception as error:  # numpy parses the headers as Python text, and raises whatever its parts raise
-        raise TrajectoryError(
-            f"{path}: cannot be read as .npz ({str(error)[:200]}): no such file, truncated, or with Python objects in"
-            " it, which are never loaded. Record it again with np.savez and plain arrays."
-        ) from error
+        told = f"{path}: cannot be read as .npz ({str(error)[:200]}): no such file, truncated, or with Python objects"
+        raise TrajectoryError(f"{told} in it, which are never loaded. Record it again. {_SAVEZ}") from error
 
 
 def _other_format(path: Path) -> str | None:
@@ -194,9 +180,7 @@ def _other_format(path: Path) -> str | None:
         return "zarr"
     if name.endswith((".hdf5", ".h5")):
         return "hdf5"
-    if (path / "meta" / "info.json").exists():
-        return "lerobot"
-    return None
+    return "lerobot" if (path / "meta" / "info.json").exists() else None
 
 
 def _meta(path: Path, value: Array | None) -> bool:
@@ -233,13 +217,10 @@ def _checked(path: Path, key: str, array: Array, spec: ObservationSpec, frames: 
     frames = frames and spec.frames is not None
     shape, what = (spec.shape[1:], "[F, *frame]") if frames else (spec.shape, "[N, *shape]")
     if array.shape[1:] != shape:
-        hint = ""
+        told = f"{path}: {key!r} has shape {list(array.shape)}; expected {what} = [.., {', '.join(map(str, shape))}]."
         if array.shape[1:] == spec.shape[1:] and not frames:
-            hint = " If its rows are frames, say so: np.savez(..., meta=np.array('{\"frames\": true}'))."
-        raise TrajectoryError(
-            f"{path}: {key!r} has shape {list(array.shape)};"
-            f" expected {what} = [.., {', '.join(map(str, shape))}].{hint}"
-        )
+            told += " If its rows are frames, say so: np.savez(..., meta=np.array('{\"frames\": true}'))."
+        raise TrajectoryError(told)
     wanted = np.dtype(spec.dtype)
     allowed = "fiu" if wanted.kind == "f" else wanted.kind if wanted.kind not in "iu" else "iu"
     if array.dtype.kind not in allowed:
@@ -248,13 +229,10 @@ def _checked(path: Path, key: str, array: Array, spec: ObservationSpec, frames: 
         cast = array.astype(wanted)
     if wanted.kind != "f" and not np.array_equal(cast, array):
         raise TrajectoryError(f"{path}: {key!r} holds numbers that {wanted} cannot; expected values of that dtype.")
-    if wanted.kind == "f":
-        bad = np.flatnonzero(~np.isfinite(cast.reshape(len(cast), -1)).all(1))
-        if len(bad):
-            raise TrajectoryError(
-                f"{path}: {key!r} holds NaN or infinity in {len(bad)} rows, the first of them row {bad[0]}."
-                " Leave the episodes with broken sensors out."
-            )
+    bad = np.flatnonzero(~np.isfinite(cast.reshape(len(cast), -1)).all(1)) if wanted.kind == "f" else []
+    if len(bad):
+        told = f"{path}: {key!r} holds NaN or infinity in {len(bad)} rows, the first of them row {bad[0]}"
+        raise TrajectoryError(f"{told}. Leave the episodes with broken sensors out.")
     return cast
 
 

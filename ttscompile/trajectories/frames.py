@@ -24,6 +24,9 @@ on zeros; recorded images 10."""
 BLOCK_BYTES = 32 * 2**20
 """Rows are read so many bytes at a time, or one chunk."""
 
+AS_NPZ = "save the observations as an .npz."
+"""What can be done about any recording that is not read."""
+
 _SHOWN = 8
 
 
@@ -84,13 +87,11 @@ def observation_frames(
         arrays = [_part(path, frames, key, part) for part in parts]
         if len(arrays) == 1 and ":" not in parts[0]:
             found[key] = _as_image(arrays[0], spec.shape[1:] if spec.frames is not None else spec.shape)
-        else:
-            if len({array.shape[:1] for array in arrays}) != 1:
-                shapes = {part: list(array.shape) for part, array in zip(parts, arrays, strict=True)}
-                raise TrajectoryError(f"{path}: what the observation {key!r} is made of differs in length: {shapes}.")
-            found[key] = np.concatenate(
-                [_flat(path, part, array) for part, array in zip(parts, arrays, strict=True)], axis=1
-            )
+            continue
+        if len({array.shape[:1] for array in arrays}) != 1:
+            shapes = {part: list(array.shape) for part, array in zip(parts, arrays, strict=True)}
+            raise TrajectoryError(f"{path}: what the observation {key!r} is made of differs in length: {shapes}.")
+        found[key] = np.concatenate([_flat(path, *each) for each in zip(parts, arrays, strict=True)], axis=1)
     return found
 
 
@@ -129,9 +130,7 @@ def _flat(path: Path, name: str, array: Array) -> Array:
 
 def _as_image(array: Array, frame: tuple[int, ...]) -> Array:
     """Channels first and in 0..1 where the policy takes images so, and the recording has them last and in 0..255."""
-    if array.ndim != 4 or len(frame) != 3 or array.shape[1:] == frame:
-        return array
-    if array.shape[1:] != (*frame[1:], frame[0]):
+    if array.ndim != 4 or len(frame) != 3 or array.shape[1:] == frame or array.shape[1:] != (*frame[1:], frame[0]):
         return array
     whole = array.dtype.kind in "iu" or bool(array.size and array.max() > 1.5)
     turned = np.moveaxis(array, -1, 1)
@@ -139,12 +138,7 @@ def _as_image(array: Array, frame: tuple[int, ...]) -> Array:
 
 
 def require_proportion(path: Path, total: int, size: int) -> None:
-    """Raise if arrays are out of proportion to their file.
-
-    Args:
-        path: of the file, for messages.
-        total: bytes of the arrays.
-        size: bytes of the file.
+    """Raise if so many bytes of arrays are out of proportion to the bytes of their file.
 
     Raises:
         TrajectoryError: they are.
@@ -157,13 +151,7 @@ def require_proportion(path: Path, total: int, size: int) -> None:
 
 
 def block_rows(shape: Sequence[int], itemsize: int, chunk: int) -> int:
-    """How many rows of an array are read at once: about ``BLOCK_BYTES``, and whole chunks.
-
-    Args:
-        shape: ``[F, ...]``.
-        itemsize: bytes of a number.
-        chunk: rows of a chunk.
-    """
+    """How many rows of an array ``[F, ...]`` are read at once: about ``BLOCK_BYTES``, and whole chunks of rows."""
     whole = BLOCK_BYTES // max(1, math.prod(shape[1:]) * itemsize * chunk)
     return max(1, whole) * chunk
 
@@ -201,9 +189,7 @@ def require_files(path: Path) -> None:
 def one_error(what: str, hint: str = "") -> Iterator[None]:
     """Within the block every error is a ``TrajectoryError``: libraries that decode raise whatever their parts raise.
 
-    Args:
-        what: went wrong; the error's own words follow it in brackets.
-        hint: follows the brackets: what to do.
+    It says what went wrong, the error's own words in brackets, and a hint of what to do.
     """
     try:
         yield
@@ -215,7 +201,5 @@ def one_error(what: str, hint: str = "") -> Iterator[None]:
 
 def missing_package(path: Path, package: str) -> TrajectoryError:
     """The error of a package that is not installed."""
-    return TrajectoryError(
-        f"{path}: reading this takes the package {package!r}, which is not installed. Install 'ttscompile[recordings]',"
-        " or save the observations as an .npz."
-    )
+    told = f"{path}: reading this takes the package {package!r}, which is not installed"
+    return TrajectoryError(f"{told}. Install 'ttscompile[recordings]', or {AS_NPZ}")

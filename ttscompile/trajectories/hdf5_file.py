@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import TrajectoryError
-from .frames import Array, Recording, block_rows, missing_package, one_error, require_files, require_proportion
+from .frames import AS_NPZ, Array, Recording, block_rows, missing_package, one_error, require_files, require_proportion
 
 FILTERS = frozenset({"gzip", "lzf", "shuffle", "fletcher32"})
 """Compression that h5py has itself; others are libraries of their own."""
@@ -88,14 +88,13 @@ def _length(path: Path, group: Any) -> int:
 
 def _require_plain(path: Path, array: Any) -> None:
     """Raise unless an array is numbers that are in the file itself, compressed by what is known."""
-    if np.dtype(array.dtype).kind not in "biuf" or array.is_virtual or array.external:
-        where = "" if np.dtype(array.dtype).kind not in "biuf" else ", with its data in other files"
+    numbers = np.dtype(array.dtype).kind in "biuf"
+    if not numbers or array.is_virtual or array.external:
+        where = ", with its data in other files" if numbers else ""
         raise TrajectoryError(f"{path}: {array.name!r} is {array.dtype}{where}; expected numbers in the file itself.")
     if unknown := sorted({str(name) for name in array._filters} - FILTERS):
-        raise TrajectoryError(
-            f"{path}: {array.name!r} is compressed by {', '.join(unknown)}; expected {', '.join(sorted(FILTERS))}."
-            " Write it again (h5repack), or save the observations as an .npz."
-        )
+        told = f"compressed by {', '.join(unknown)}; expected {', '.join(sorted(FILTERS))}"
+        raise TrajectoryError(f"{path}: {array.name!r} is {told}. Write it again (h5repack), or {AS_NPZ}")
 
 
 def _number(demo: str) -> tuple[int, str]:

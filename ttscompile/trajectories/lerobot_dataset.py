@@ -11,7 +11,7 @@ import numpy as np
 
 from ..core.untrusted_json import parse_json
 from ..errors import TrajectoryError
-from .frames import Array, Recording, missing_package, one_error, require_files, require_proportion
+from .frames import AS_NPZ, Array, Recording, missing_package, one_error, require_files, require_proportion
 
 EPISODE, FRAME = "episode_index", "frame_index"
 MAX_INFO = 64 * 2**20
@@ -36,9 +36,12 @@ def lerobot_recording(path: Path) -> Recording:
     if not files:
         raise TrajectoryError(f"{path}: has meta/info.json and no data/**/*.parquet; expected a LeRobot data set.")
     size = sum(file.stat().st_size for file in files)
+    hint = "; expected a LeRobot data set, whose features it names"
+    with one_error(f"{path}: meta/info.json cannot be read", hint):
+        features = parse_json((path / "meta" / "info.json").read_bytes(), MAX_INFO)["features"]
+        videos = [name for name, feature in features.items() if feature.get("dtype") == "video"]
     hint = f"; expected tables with the columns {EPISODE} and {FRAME}"
     with one_error(f"{path}: cannot be read as a LeRobot data set", hint):
-        videos = _videos(path)
         tables = [parquet.ParquetFile(file) for file in files]
         names = [name for name in tables[0].schema_arrow.names if name not in (EPISODE, FRAME)]
         episodes, numbers = (_index(path, tables, name, size) for name in (EPISODE, FRAME))
@@ -49,10 +52,8 @@ def lerobot_recording(path: Path) -> Recording:
 
     def read(name: str) -> tuple[int, Iterator[Array]]:
         if name in videos:
-            raise TrajectoryError(
-                f"{path}: {name!r} is a video, which is not decoded. Save its frames as images (LeRobot records a data"
-                " set so with --dataset.video=false), or the observations as an .npz."
-            )
+            told = f"{path}: {name!r} is a video, which is not decoded. Save its frames as images (LeRobot records a"
+            raise TrajectoryError(f"{told} data set so with --dataset.video=false), or {AS_NPZ}")
         return len(order), _column(path, tables, name, size)
 
     sorted_already = bool((order == np.arange(len(order))).all())
@@ -123,11 +124,3 @@ def _image(path: Path, name: str, value: Any) -> Array:
     with Image.open(io.BytesIO(content), formats=("PNG", "JPEG")) as image:
         require_proportion(path, image.width * image.height * 3, len(content))
         return np.asarray(image.convert("RGB"))
-
-
-def _videos(path: Path) -> list[str]:
-    """Names of the features that are videos; they are not read, and the error says so."""
-    hint = "; expected a LeRobot data set, whose features it names"
-    with one_error(f"{path}: meta/info.json cannot be read", hint):
-        features = parse_json((path / "meta" / "info.json").read_bytes(), MAX_INFO)["features"]
-        return [name for name, feature in features.items() if feature.get("dtype") == "video"]

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..errors import TrajectoryError
 from .frames import (
+    AS_NPZ,
     Array,
     Recording,
     block_rows,
@@ -59,12 +60,9 @@ def _require_plain(path: Path, array: Any, size: int) -> None:
     kind, codecs = np.dtype(array.dtype).kind, _codecs(array.metadata)
     if kind not in "biuf" or not codecs <= CODECS or not array.shape:
         what = f"compressed by {', '.join(sorted(codecs - CODECS))}" if kind in "biuf" else f"of dtype {array.dtype}"
-        what = what if array.shape else "a single value"
-        raise TrajectoryError(
-            f"{path}: {array.path!r} is {what}; expected rows of numbers, compressed by one of"
-            f" {', '.join(sorted(CODECS))}. Write it again with another compressor, or save the observations as an"
-            " .npz."
-        )
+        told = f"{what if array.shape else 'a single value'}; expected rows of numbers, compressed by one of"
+        told += f" {', '.join(sorted(CODECS))}. Write it again with another compressor, or {AS_NPZ}"
+        raise TrajectoryError(f"{path}: {array.path!r} is {told}")
     require_proportion(path, math.prod(array.shape) * array.dtype.itemsize, size)
 
 

@@ -38,13 +38,8 @@ def measure_precision(artifact: Artifact) -> PrecisionError:
     differences = compare(artifact, artifact.schedule(DENSE), calls)
     errors = np.array([action_errors(spec.chunk, one, other) for one, other in differences])
     shares = [float(np.abs(one - other).max() / np.abs(other).max()) for one, other in differences]
-    return PrecisionError(
-        calls=CALLS,
-        mean=_rounded(errors.mean()),
-        p90=_rounded(np.quantile(errors.mean(axis=1), 0.9)),
-        largest=_rounded(errors.max()),
-        tolerance=_rounded(MARGIN * max(shares)),
-    )
+    p90 = np.quantile(errors.mean(axis=1), 0.9)
+    return PrecisionError(CALLS, *(float(f"{n:.4g}") for n in (errors.mean(), p90, errors.max(), MARGIN * max(shares))))
 
 
 def compare(
@@ -58,7 +53,7 @@ def compare(
         artifact: with blocks of another precision.
         plan: ``[K, blocks]``, without reads of earlier calls.
         calls: normalised observation and noise of one stream each.
-        correction: of the sampler's steps, which belongs to the plan; None for none.
+        correction: of the plan.
 
     Raises:
         ObservationError: an action is not a number.
@@ -71,10 +66,11 @@ def compare(
             runtime.reset()
             samples.append(runtime.predict(obs, noise, plan, correction=correction)[0][0])
         if not np.isfinite(samples).all():
+            own, exact = (np.count_nonzero(~np.isfinite(sample)) for sample in samples)
             raise ObservationError(
-                f"the policy's action is not a number: {_count_bad(samples[1])} of its values in precision {FP32!r},"
-                f" {_count_bad(samples[0])} in that of the artifact. Convert with precision {FP32!r}; where it fails"
-                " too, look for NaN in the checkpoint and in the recorded observations."
+                f"the policy's action is not a number: {exact} of its values in precision {FP32!r}, {own} in that of"
+                f" the artifact. Convert with precision {FP32!r}; where it fails too, look for NaN in the checkpoint"
+                " and in the recorded observations."
             )
         pairs.append((samples[0], samples[1]))
     return pairs
@@ -87,11 +83,3 @@ def action_errors(chunk: ChunkSpec, one: FloatArray, other: FloatArray) -> npt.N
     if chunk.normalizer is not None:
         difference /= np.abs(chunk.normalizer.scale)
     return difference.ravel()
-
-
-def _count_bad(sample: FloatArray) -> int:
-    return int(np.count_nonzero(~np.isfinite(sample)))
-
-
-def _rounded(number: float) -> float:
-    return float(f"{number:.4g}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,9 +18,9 @@ from ..errors import RuntimeUnavailableError
 from ..runtimes.open import open_runtime
 from ..runtimes.policy import CompiledPolicy
 from ..runtimes.runtime import Runtime
-from .network import block_errors, describe_blocks, largest
+from .network import CONVERT, block_errors, describe_blocks, largest
 from .probe import Probe
-from .rung import FAILED, PASSED, SKIPPED, Rung, finite, verdict
+from .rung import FAILED, PASSED, SKIPPED, Rung, finite, judged
 
 DENSE_CALL, PRECISION, RUNTIMES, PLANS = "dense call", "precision", "runtimes", "plans"
 PLANS_PRECISION = "precision of plans"
@@ -39,6 +39,9 @@ is reused in those after it. Push-T in int8: 1.8 to 4.6 times a dense call's, wh
 REFERENCE_STEPS = 3
 """Steps at which the reference runtime's blocks are looked at."""
 
+ACTION, VALUE = "of the largest action", "of the largest value"
+"""Of what errors are shares."""
+
 
 def check_dense(policy: CompiledPolicy, artifact: Artifact, golden: Golden, probe: Probe) -> Rung:
     """A dense call against the original network in eager PyTorch with the same noise: the error of the export."""
@@ -48,13 +51,14 @@ def check_dense(policy: CompiledPolicy, artifact: Artifact, golden: Golden, prob
     error = max(largest(made["action_pred"], golden.actions), largest(made["action"], golden.executed))
     units = float(np.abs(made["action"].astype(np.float64) - golden.executed).max())
     told = f"a dense call of {golden.streams} streams: its executed actions are within {units:.2g} of the original's"
+    step = None
+    if not error <= SAMPLE:
+        dense = artifact.schedule(DENSE)
+        dense = np.broadcast_to(dense, (golden.streams, *dense.shape))
+        step, cause = _where(artifact, golden, probe, dense, None, golden.path)
+        told = f"the executed actions of a dense call are up to {units:.2g} off the original's: {cause}"
     details = {"error_in_units": finite(units)}
-    if error <= SAMPLE:
-        return Rung(DENSE_CALL, PASSED, told, error, SAMPLE, "of the largest action", details=details)
-    step, cause = _where(artifact, golden, probe, dense_of(artifact, golden.streams), None, golden.path)
-    told = f"the executed actions of a dense call are up to {units:.2g} off the original's: {cause}"
-    remedy = "Convert the checkpoint again; if that does not help, please report it."
-    return Rung(DENSE_CALL, FAILED, told, finite(error), SAMPLE, "of the largest action", remedy, step, details=details)
+    return judged(DENSE_CALL, error, SAMPLE, ACTION, told, CONVERT, step=step, details=details)
 
 
 def check_precision(artifact: Artifact, golden: Golden) -> Rung | None:
@@ -66,10 +70,9 @@ def check_precision(artifact: Artifact, golden: Golden) -> Rung | None:
     runtime, obs = open_runtime(artifact), golden.network_observations(spec)
     runtime.reset()
     sample, _ = runtime.predict(obs, golden.noise, artifact.schedule(DENSE), plan_name=DENSE)
-    error = largest(sample, golden.sample)
     told = f"a dense call with {record.name} blocks against the original"
-    remedy = "Load with precision='fp32', or convert the checkpoint again." if error > tolerance else ""
-    return Rung(PRECISION, verdict(error <= tolerance), told, finite(error), tolerance, "of the largest value", remedy)
+    remedy = "Load with precision='fp32', or convert the checkpoint again."
+    return judged(PRECISION, largest(sample, golden.sample), tolerance, VALUE, told, remedy)
 
 
 def check_runtimes(artifact: Artifact, golden: Golden, runtime: Runtime) -> Rung:
@@ -87,15 +90,15 @@ def check_runtimes(artifact: Artifact, golden: Golden, runtime: Runtime) -> Rung
     error = largest(samples[0], samples[1])
     if error <= SAMPLE:
         told = "onnxruntime and the reference runtime give the same denoised sample"
-        return Rung(RUNTIMES, PASSED, told, error, SAMPLE, "of the largest value")
+        return judged(RUNTIMES, error, SAMPLE, VALUE, told, "")
     rows = np.unique(np.linspace(0, len(golden.steps) - 1, REFERENCE_STEPS).round().astype(np.int64))
     errors = block_errors(manifest, golden, _reference_blocks(reference.backend, obs), rows)
     kinds = tuple(block.kind for block in manifest.blocks)
-    wrong, step, where = describe_blocks(errors, golden, kinds, rows)
+    wrong, step, where = describe_blocks(errors, golden.steps[rows], kinds)
     found = f"in the reference runtime {where}" if wrong else "every block is the original's in both"
     told = f"onnxruntime and the reference runtime give other samples: {found}"
     remedy = "Their weights or graphs differ: convert the checkpoint again."
-    return Rung(RUNTIMES, FAILED, told, finite(error), SAMPLE, "of the largest value", remedy, step, wrong)
+    return judged(RUNTIMES, error, SAMPLE, VALUE, told, remedy, step=step, blocks=wrong)
 
 
 def _reference_blocks(reference: Any, obs: Mapping[str, npt.NDArray[Any]]) -> Any:
@@ -128,7 +131,7 @@ def check_plans(
         told = f"no record of {', '.join(plans)}: they were written by other means than 'ttscompile calibrate'"
         return Rung(PLANS, SKIPPED, told, remedy="Calibrate the artifact to have its plans verified."), {}
     failures: list[tuple[str, int | None, tuple[int, ...]]] = []
-    cells, worst = {}, 0.0
+    cells, worst = dict[str, npt.NDArray[np.bool_]](), 0.0
     for name, record in recorded.items():
         made, differ, few, error = _replay(artifact, golden, runtime, name, record)
         if not few:
@@ -147,15 +150,11 @@ def check_plans(
     if failures:
         told = "; ".join(told for told, _, _ in failures)
         remedy = "Plans or corrections were changed or exchanged after calibration: calibrate again."
-        steps = [step for _, step, _ in failures if step is not None]
-        details = {"plans": sorted({*cells}), "failures": [told for told, _, _ in failures]}
-        _, _, blocks = failures[0]
-        step = min(steps) if steps else None
-        return Rung(
-            PLANS, FAILED, told, finite(worst), SAMPLE, "of the largest value", remedy, step, blocks, details
-        ), cells
+        first = min((step for _, step, _ in failures if step is not None), default=None)
+        details = {"plans": sorted(cells), "failures": [told for told, _, _ in failures]}
+        return Rung(PLANS, FAILED, told, finite(worst), SAMPLE, VALUE, remedy, first, failures[0][2], details), cells
     told = f"{', '.join(recorded)}: plans, corrections and samples of two calls are what calibration stored"
-    return Rung(PLANS, PASSED, told, worst, SAMPLE, "of the largest value"), {}
+    return Rung(PLANS, PASSED, told, worst, SAMPLE, VALUE), {}
 
 
 def check_plans_precision(
@@ -177,21 +176,13 @@ def check_plans_precision(
         elif not errors[name] <= tolerance:
             wrong[name] = f"the samples of {name!r} by {errors[name]:.2g}"
     told = f"{', '.join(errors)}: two calls with {precision.name} blocks against what calibration stored of fp32"
-    remedy = ""
+    status, remedy = PASSED, ""
     if wrong:
         told = f"with {precision.name} blocks plans are not what calibration stored of fp32: "
         told += ", ".join(wrong.values())
-        remedy = "Load with precision='fp32', or convert the checkpoint again and calibrate."
+        status, remedy = FAILED, "Load with precision='fp32', or convert the checkpoint again and calibrate."
     details = {"errors": {name: finite(error) for name, error in errors.items()}}
-    worst = finite(float(np.max(list(errors.values()))))
-    return Rung(
-        PLANS_PRECISION, verdict(not wrong), told, worst, tolerance, "of the largest value", remedy, details=details
-    )
-
-
-def dense_of(artifact: Artifact, streams: int) -> PlanArray:
-    """The dense plan of some streams, int8 ``[B, K, blocks]``."""
-    return np.broadcast_to(artifact.schedule(DENSE), (streams, *artifact.schedule(DENSE).shape))
+    return Rung(PLANS_PRECISION, status, told, finite(max(errors.values())), tolerance, VALUE, remedy, details=details)
 
 
 def _replay(
@@ -203,33 +194,27 @@ def _replay(
         Executed plans ``[2, B, K, blocks]``; the cells ``[K, blocks]`` that are not those of the record; whether these
         may differ; and the error of the samples, with the stored plan where cells differ.
     """
+    obs, correction = golden.network_observations(artifact.manifest.spec), artifact.corrections.get(name)
+
+    def episode(plans: Sequence[Any], **named: Any) -> tuple[PlanArray, npt.NDArray[Any]]:
+        made, samples = [], []
+        runtime.reset()
+        for order, plan in zip((1, -1), plans, strict=True):
+            draws = None if golden.draws is None else np.ascontiguousarray(golden.draws[:, ::order])
+            noise = Noise(np.ascontiguousarray(golden.initial[::order]), draws)
+            turned = {key: np.ascontiguousarray(value[::order]) for key, value in obs.items()}
+            sample, report = runtime.predict(turned, noise, plan, correction=correction, **named)
+            made.append(report.plan)
+            samples.append(sample)
+        return np.stack(made), np.stack(samples)
+
     pruned = artifact.manifest.plans[name].pruned
-    schedule = None if pruned else artifact.schedule(name)
-    made, samples = _two_calls(artifact, golden, runtime, name, (schedule, schedule), True)
+    made, samples = episode([None if pruned else artifact.schedule(name)] * 2, plan_name=name, repair=True)
     differ = (made != record.plan).any((0, 1))
     if differ.any():  # a near tie, maybe: hold what the stored plan gives against the record
-        _, samples = _two_calls(artifact, golden, runtime, name, (record.plan[0], record.plan[1]), False)
+        _, samples = episode(record.plan)
     few = bool(np.count_nonzero(differ) <= (CELLS * differ.size if pruned else 0))
     return made, differ, few, largest(samples, record.sample)
-
-
-def _two_calls(
-    artifact: Artifact, golden: Golden, runtime: Runtime, name: str, plans: tuple[Any, Any], named: bool
-) -> tuple[PlanArray, npt.NDArray[Any]]:
-    """Executed plans and samples of an episode of two calls; ``named`` where the plans are those of the artifact."""
-    obs, made, samples = golden.network_observations(artifact.manifest.spec), [], []
-    runtime.reset()
-    for order, plan in zip((1, -1), plans, strict=True):
-        draws = None if golden.draws is None else np.ascontiguousarray(golden.draws[:, ::order])
-        noise = Noise(np.ascontiguousarray(golden.initial[::order]), draws)
-        turned = {key: np.ascontiguousarray(value[::order]) for key, value in obs.items()}
-        correction = artifact.corrections.get(name)
-        sample, report = runtime.predict(
-            turned, noise, plan, plan_name=name if named else None, repair=named, correction=correction
-        )
-        made.append(report.plan)
-        samples.append(sample)
-    return np.stack(made), np.stack(samples)
 
 
 def _where(

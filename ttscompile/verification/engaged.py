@@ -7,15 +7,14 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from time import perf_counter
 
-import numpy as np
-
 from ..artifact.golden import Golden
 from ..artifact.load import Artifact
 from ..artifact.manifest import DENSE
-from ..core.lattice import Source
+from ..core.lattice import sparsity
 from ..core.spec import Noise
 from ..measure.timer import Timer
 from ..runtimes.policy import CompiledPolicy
+from ..runtimes.report import CallReport
 from .rung import FAILED, PASSED, SKIPPED, Rung
 
 ENGAGED = "engaged"
@@ -69,14 +68,7 @@ class Engagement:
 def check_engaged(
     artifact: Artifact, golden: Golden, policy: CompiledPolicy, clock: Callable[[], float] = perf_counter
 ) -> Rung:
-    """Planned against executed cells, FLOPs and time of every plan; one that saves nothing fails.
-
-    Args:
-        artifact: opened.
-        golden: its record.
-        policy: loaded from it.
-        clock: in seconds.
-    """
+    """Planned against executed cells, FLOPs and time of every plan; one that saves nothing fails."""
     manifest = artifact.manifest
     if not manifest.plans:
         told = "the artifact is not calibrated: every call is dense, and nothing is saved"
@@ -87,17 +79,18 @@ def check_engaged(
     judged = {name: _fault(manifest.plans[name].kind, one, cells) for name, one in found.items()}
     faults = [f"plan {name!r} {fault}" for name, fault in judged.items() if fault]
     name = manifest.default_plan if manifest.default_plan in found else next(iter(found))
+    figure = (found[name].executed, None, "of the cells")
     if faults:
         remedy = "The plan is inert on this machine: calibrate again, and look at 'ttscompile inspect --plot'."
-        return Rung(
-            ENGAGED, FAILED, "; ".join(faults), found[name].executed, None, "of the cells", remedy, details=details
+        return Rung(ENGAGED, FAILED, "; ".join(faults), *figure, remedy, details=details)
+    shown = []
+    for n, one in found.items():
+        less = ", less than half of what its FLOPs promise" if one.time_saved < POOR * one.flops_saved else ""
+        shown.append(
+            f"{n!r} reuses {one.executed:.1%} of the cells, saves {one.flops_saved:.1%} of the FLOPs and"
+            f" {one.time_saved:.0%} of the time ({one.ms:.4g} ms for {one.dense_ms:.4g}{less})"
         )
-    shown = [
-        f"{n!r} reuses {one.executed:.1%} of the cells, saves {one.flops_saved:.1%} of the FLOPs and"
-        f" {one.time_saved:.0%} of the time ({one.ms:.4g} ms for {one.dense_ms:.4g}{_remark(one)})"
-        for n, one in found.items()
-    ]
-    return Rung(ENGAGED, PASSED, "; ".join(shown), found[name].executed, None, "of the cells", details=details)
+    return Rung(ENGAGED, PASSED, "; ".join(shown), *figure, details=details)
 
 
 def _measure(
@@ -107,9 +100,7 @@ def _measure(
     obs = {key: value[:1] for key, value in golden.raw_observations(manifest.spec).items()}
     noise = Noise(golden.initial[:1], None if golden.draws is None else golden.draws[:, :1].copy())
     names = (DENSE, *manifest.plans)
-    executed, legalised, flops = dict[str, float](), dict[str, int](), dict[str, float]()
-
-    timer = Timer(len(names), warm_up=1, clock=clock)
+    reports, timer = dict[str, CallReport](), Timer(len(names), warm_up=1, clock=clock)
 
     def call_all() -> None:
         """Time a call of each plan in the middle of an episode."""
@@ -120,10 +111,8 @@ def _measure(
             if name != DENSE:
                 call()  # what an episode's first call cannot read
             timer.time(i, call)
-            report = policy.last_report
-            assert report is not None
-            executed[name] = float(np.mean(report.plan != Source.COMPUTE))
-            legalised[name], flops[name] = report.legalised[0], report.flops[0]
+            assert policy.last_report is not None
+            reports[name] = policy.last_report
 
     begun = clock()
     call_all()  # warms up, and tells how long a round takes
@@ -134,9 +123,9 @@ def _measure(
     return {
         name: Engagement(
             planned=plan.sparsity,
-            executed=executed[name],
-            legalised=legalised[name],
-            flops_saved=1 - flops[name] / flops[DENSE],
+            executed=sparsity(reports[name].plan),
+            legalised=reports[name].legalised[0],
+            flops_saved=1 - reports[name].flops[0] / reports[DENSE].flops[0],
             ms=medians[name],
             dense_ms=medians[DENSE],
             time_saved=1 - medians[name] / medians[DENSE],
@@ -162,8 +151,3 @@ def _fault(kind: str, one: Engagement, cells: int) -> str:
             f" {one.time_saved:.1%} saved and has to be {LEAST_SAVED:.0%}"
         )
     return ""
-
-
-def _remark(one: Engagement) -> str:
-    """On a plan that saves much less time than FLOPs; empty for others."""
-    return ", less than half of what its FLOPs promise" if one.time_saved < POOR * one.flops_saved else ""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,9 +15,9 @@ from ..core.spec import Noise, PolicySpec
 from ..runtimes.policy import CompiledPolicy
 from ..runtimes.random_calls import random_noise
 from ..trajectories.episodes import Episode
-from .rung import FAILED, PASSED, SKIPPED, Rung, finite
+from .rung import SKIPPED, Rung, finite, judged
 
-SPARSITY = "sparsity error"
+SPARSITY, UNIT = "sparsity error", "action units"
 
 AS_CALIBRATED, FEW_AS_CALIBRATED = 2.0, 3.0
 """How often the mean error that calibration measured on held-out calls a plan's may be; and with ``FEW`` calls or less,
@@ -32,13 +31,9 @@ NEGLIGIBLE = 0.05
 Progress = Callable[[str], None]
 """Told what is being done."""
 
-
-@dataclass(frozen=True)
-class _Errors:
-    """Mean absolute differences of the executed actions from the dense call's, one a call, in their units."""
-
-    plans: Mapping[str, list[float]]
-    other_noise: list[float]
+Errors = dict[str | None, list[float]]
+"""By plan, for each call: mean absolute difference of the executed actions from the dense call's with the same noise,
+in their units. None: of a dense call with other noise."""
 
 
 def choose(episodes: Sequence[Episode], calls: int) -> list[Episode]:
@@ -63,65 +58,50 @@ def check_episodes(
     ``AS_CALIBRATED`` times the mean that calibration measured, where it did: a plan that is much worse than it was may
     still be within the noise of its policy. Without episodes the recorded observations are used, which are random: then
     nothing is judged.
-
-    Args:
-        artifact: opened.
-        golden: its record.
-        policy: loaded from it.
-        episodes: recorded; may be none.
-        told: of the episode under way.
     """
     manifest = artifact.manifest
     if not manifest.plans:
         return Rung(SPARSITY, SKIPPED, "the artifact is not calibrated: every call is dense")
     spec, draw = manifest.spec, np.random.default_rng(0)
-    total = _Errors({name: [] for name in manifest.plans}, [])
+    errors: Errors = {name: [] for name in (*manifest.plans, None)}
     for i, obs in enumerate([one.observations for one in episodes] or [golden.raw_observations(spec)]):
         rows = [{k: a[r : r + 1] for k, a in obs.items()} for r in range(len(next(iter(obs.values()))))]
         if episodes:
             told(f"episode {i + 1} of {len(episodes)}, {len(rows)} call{'s' * (len(rows) != 1)}")
-        _run(policy, spec, rows, draw, total)
+        _run(policy, spec, rows, draw, errors)
+    calls, other_noise = len(errors[None]), float(np.mean(errors.pop(None)))
     figures = {
         name: {"error": finite(float(np.mean(e))), "error_p90": finite(float(np.quantile(e, 0.9)))}
-        for name, e in total.plans.items()
+        for name, e in errors.items()
     }
-    yardstick = float(np.mean(total.other_noise))
-    calls = len(total.other_noise)
     name = manifest.default_plan if manifest.default_plan in manifest.plans else next(iter(manifest.plans))
-    error = float(np.mean(total.plans[name]))
-    details = {"plan": name, "calls": calls, "episodes": len(episodes), "plans": figures, "other_noise": yardstick}
-    others = ", ".join(f"{n!r} {np.mean(e):.3g}" for n, e in total.plans.items() if n != name)
-    found = (
-        f"executed actions of plan {name!r} are {error:.3g} from the dense policy's with the same noise, in their units"
-        + (f" ({others})" if others else "")
-        + f"; two dense calls with different noise are {yardstick:.3g} apart"
-    )
+    error = float(np.mean(errors[name]))
+    details = {"plan": name, "calls": calls, "episodes": len(episodes), "plans": figures, "other_noise": other_noise}
+    others = ", ".join(f"{n!r} {np.mean(e):.3g}" for n, e in errors.items() if n != name)
+    found = f"executed actions of plan {name!r} are {error:.3g} from the dense policy's with the same noise, in their"
+    found += f" units{f' ({others})' if others else ''}"
+    found += f"; two dense calls with different noise are {other_noise:.3g} apart"
     if not episodes:
-        where = f"{found}. No trajectories were given: these are {calls} calls on random observations, and not judged"
+        found += f". No trajectories were given: these are {calls} calls on random observations, and not judged"
         remedy = "Give recorded episodes with --trajectories to have this judged."
-        return Rung(SPARSITY, SKIPPED, where, finite(error), None, "action units", remedy, details=details)
+        return Rung(SPARSITY, SKIPPED, found, finite(error), None, UNIT, remedy, details=details)
     promised, promised_p90 = (_promised(manifest.calibration, name, key) for key in ("error", "error_p90"))
-    beyond = max(yardstick, promised_p90 or 0.0)
+    beyond = max(other_noise, promised_p90 or 0.0)
     factor = FEW_AS_CALIBRATED if calls <= FEW else AS_CALIBRATED
-    worse = float("inf") if promised is None else max(factor * promised, NEGLIGIBLE * yardstick)
+    worse = float("inf") if promised is None else max(factor * promised, NEGLIGIBLE * other_noise)
     reasons = list[str]()
     if not error <= beyond:
         reasons.append("more than other noise would change")
     if not error <= worse:
-        told_before = f"more than {factor:g} times the {promised:.3g} that calibration measured on held-out calls"
-        reasons.append(f"worse than calibrated, {told_before}")
-    tolerance = min(beyond, worse)
+        before = f"more than {factor:g} times the {promised:.3g} that calibration measured on held-out calls"
+        reasons.append(f"worse than calibrated, {before}")
     details |= {"promised": promised, "promised_p90": promised_p90, "reasons": reasons}
-    made = f"{calls} call{'s' * (calls != 1)} of {len(episodes)} episode{'s' * (len(episodes) != 1)}"
-    where = f"{made}: {found}"
-    if not reasons:
-        return Rung(SPARSITY, PASSED, where, error, tolerance, "action units", details=details)
-    where += f". This is {'; and '.join(reasons)}"
-    remedy = (
-        "These episodes are unlike those of the calibration, or the plan is too sparse: calibrate with such episodes,"
-        " or with a lower --target-sparsity."
-    )
-    return Rung(SPARSITY, FAILED, where, finite(error), tolerance, "action units", remedy, details=details)
+    made = f"{calls} call{'s' * (calls != 1)} of {len(episodes)} episode{'s' * (len(episodes) != 1)}: {found}"
+    if reasons:
+        made += f". This is {'; and '.join(reasons)}"
+    remedy = "These episodes are unlike those of the calibration, or the plan is too sparse: calibrate with such"
+    remedy += " episodes, or with a lower --target-sparsity."
+    return judged(SPARSITY, error, min(beyond, worse), UNIT, made, remedy, details=details)
 
 
 def _run(
@@ -129,7 +109,7 @@ def _run(
     spec: PolicySpec,
     rows: Sequence[Mapping[str, npt.NDArray[Any]]],
     draw: np.random.Generator,
-    total: _Errors,
+    errors: Errors,
 ) -> None:
     """One episode with every plan, and twice dense; each begins with a reset."""
     noises, others = ([random_noise(spec, draw) for _ in rows] for _ in range(2))
@@ -140,10 +120,9 @@ def _run(
         return [np.asarray(one, np.float64) for one in made]
 
     dense = actions(DENSE, noises)
-    pairs = [(total.plans[name], actions(name, noises)) for name in total.plans]
-    pairs.append((total.other_noise, actions(DENSE, others)))
-    for errors, made in pairs:
-        errors += [float(np.abs(one - other).mean()) for one, other in zip(made, dense, strict=True)]
+    for name, found in errors.items():
+        made = actions(DENSE, others) if name is None else actions(name, noises)
+        found += [float(np.abs(one - other).mean()) for one, other in zip(made, dense, strict=True)]
 
 
 def _promised(calibration: Mapping[str, Any] | None, name: str, key: str) -> float | None:

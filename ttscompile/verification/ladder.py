@@ -9,11 +9,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
+from ..artifact.archive import is_checkpoint
+from ..artifact.codec import encode
+from ..artifact.files import verify as verify_file
 from ..artifact.golden import load_golden, load_golden_plans
-from ..artifact.load import Artifact
+from ..artifact.load import Artifact, load_artifact, read_manifest
+from ..artifact.manifest import MANIFEST
 from ..core.spec import FP32
 from ..errors import ArtifactError, TtscompileError
 from ..runtimes.open import open_runtime
@@ -33,10 +34,11 @@ from .calls import (
 )
 from .engaged import ENGAGED, check_engaged
 from .episodes import SPARSITY, Progress, check_episodes, choose
-from .integrity import check_integrity
 from .network import BLOCK, EVALUATION, PREPROCESSING, check_blocks, check_evaluation, check_preprocessing
 from .probe import Probe
-from .rung import FAILED, ErrorMap, Rung, Verification
+from .rung import FAILED, PASSED, ErrorMap, Rung, Verification
+
+INTEGRITY = "integrity"
 
 
 def verify(
@@ -73,21 +75,63 @@ def verify(
         RuntimeUnavailableError: onnxruntime is missing.
     """
     begun = time.monotonic()
-    progress("integrity")
+    progress(INTEGRITY)
     rung, artifact = check_integrity(Path(path))
     if artifact is None:
         return Verification(str(path), None, None, (rung,), time.monotonic() - begun)
-    chunk = artifact.manifest.spec.chunk
-    episodes = []
+    manifest, episodes = artifact.manifest, []
     if trajectories:
-        recorded = load_trajectories(
-            trajectories, artifact.manifest.spec.observations, chunk.stop - chunk.start, sources
-        )
-        episodes = choose(recorded, calls)
+        chunk, observations = manifest.spec.chunk, manifest.spec.observations
+        episodes = choose(load_trajectories(trajectories, observations, chunk.stop - chunk.start, sources), calls)
     rungs, errors = _climb(artifact, episodes, threads, progress)
-    manifest = artifact.manifest
     seconds = time.monotonic() - begun
     return Verification(str(path), manifest.identity, manifest.model_identity, (rung, *rungs), seconds, errors)
+
+
+def check_integrity(path: Path) -> tuple[Rung, Artifact | None]:
+    """Hash every file, and open the artifact: None if that fails.
+
+    Raises:
+        ArtifactError: there is nothing at this path that could be an artifact.
+    """
+    if not path.exists() or (path.is_dir() and not (path / MANIFEST).is_file()) or is_checkpoint(path):
+        load_artifact(path)  # says what is wrong
+    wrong = _wrong_files(path) if path.is_dir() else []
+    artifact = None
+    if not wrong:
+        try:
+            artifact = load_artifact(path)
+        except ArtifactError as error:
+            wrong = [str(error)]
+    if artifact is None:
+        remedy = "Copy the artifact again, or convert the checkpoint again."
+        told = f"{len(wrong)} of its files are not as written: " * (len(wrong) > 1) + " ".join(wrong)
+        return Rung(INTEGRITY, FAILED, told, len(wrong), 0, "files", remedy, details={"wrong": wrong}), None
+    files = artifact.manifest.files
+    size = sum(record.bytes for record in files.values()) / 1e6
+    other = sorted({p.name for p in path.iterdir()} - {MANIFEST, *files}) if path.is_dir() else []
+    lie = f"{len(other)} other file{'s lie' if len(other) > 1 else ' lies'} beside them"
+    more = f"; {lie}, which nothing reads: {', '.join(other[:3])}" if other else ""
+    told = f"manifest and {len(files)} files, {size:.1f} MB, have the hashes that they were written with{more}"
+    return Rung(INTEGRITY, PASSED, told, 0, 0, "files", details={"unlisted": other}), artifact
+
+
+def _wrong_files(directory: Path) -> list[str]:
+    """What is wrong with the manifest or with each file that it lists."""
+    try:
+        manifest = read_manifest(directory)
+    except ArtifactError as error:
+        return [str(error)]
+    wrong = []
+    for name, record in manifest.files.items():
+        try:
+            verify_file(directory / name, record)
+        except ArtifactError as error:
+            wrong.append(str(error))
+    # Two spellings of one document have one checksum.
+    if not wrong and encode(manifest) != (directory / MANIFEST).read_bytes():
+        wrong = [f"{directory / MANIFEST}: is written otherwise than ttscompile writes it; the file was changed."]
+    return wrong
 
 
 def _climb(
@@ -107,7 +151,6 @@ def _climb(
     own = exact if plain is artifact else CompiledPolicy(artifact, own_runtime, seed=0)
     rungs: list[Rung] = []
     errors: ErrorMap | None = None
-    differing: Mapping[str, npt.NDArray[np.bool_]] = {}
 
     def climb(name: str, check: Callable[[], Rung | None]) -> None:
         progress(name)
@@ -124,8 +167,11 @@ def _climb(
         return rung
 
     def plans() -> Rung:
-        nonlocal differing
+        nonlocal errors
         rung, differing = check_plans(plain, golden, recorded, runtime, probe)
+        if errors is not None and differing:
+            name, cells = next(iter(differing.items()))
+            errors = replace(errors, plan=name, cells=cells)
         return rung
 
     climb(PREPROCESSING, lambda: check_preprocessing(plain, golden))
@@ -138,7 +184,4 @@ def _climb(
     climb(PLANS_PRECISION, lambda: check_plans_precision(artifact, golden, recorded, own_runtime))
     climb(SPARSITY, lambda: check_episodes(artifact, golden, own, episodes, progress))
     climb(ENGAGED, lambda: check_engaged(artifact, golden, own))
-    for name, cells in differing.items():
-        if errors is not None and errors.plan is None:
-            errors = replace(errors, plan=name, cells=cells)
     return rungs, errors

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from ..artifact.manifest import Manifest
 from ..core.spec import FloatArray
 from ..ir.pieces import block_name
 from .probe import Probe
-from .rung import ErrorMap, Rung, finite, verdict
+from .rung import ErrorMap, Rung, finite, judged
 
 PREPROCESSING, BLOCK, EVALUATION = "preprocessing", "block", "evaluation"
 
@@ -31,7 +31,7 @@ PREDICTION = 1e-3
 BlockFunction = Callable[[int, int, FloatArray], FloatArray]
 """Residual of block b at step k of a stream."""
 
-_CONVERT = "Convert the checkpoint again; if that does not help, please report it."
+CONVERT = "Convert the checkpoint again; if that does not help, please report it."
 
 
 def relative(found: npt.NDArray[Any], expected: npt.NDArray[Any]) -> float:
@@ -60,34 +60,19 @@ def check_preprocessing(artifact: Artifact, golden: Golden) -> Rung:
     executed = golden.actions[:, spec.chunk.start : spec.chunk.stop]
     errors["the executed part of the chunk"] = largest(executed, golden.executed)
     wrong = [name for name, error in errors.items() if not error <= EXACT]
-    worst = max(errors.values())
+    observed = f"{len(raw)} observation{'s' * (len(raw) != 1)}"
+    told = f"normalisers of {observed} and of the action, and the chunk, are the original's"
     if wrong:
-        told = (
-            f"{', '.join(wrong)}: not what the original network was given, or what was made of its output. The"
-            " normaliser or the chunk was changed or exchanged since the artifact was made."
-        )
-    else:
-        count = len(spec.observations)
-        observed = f"{count} observation{'s' * (count != 1)}"
-        told = f"normalisers of {observed} and of the action, and the chunk, are the original's"
-    remedy = _CONVERT if wrong else ""
+        told = f"{', '.join(wrong)}: not what the original network was given, or what was made of its output. The"
+        told += " normaliser or the chunk was changed or exchanged since the artifact was made."
     details = {"wrong": wrong, "errors": {name: finite(error) for name, error in errors.items()}}
-    return Rung(
-        PREPROCESSING, verdict(not wrong), told, finite(worst), EXACT, "of the largest", remedy, details=details
-    )
+    return judged(PREPROCESSING, max(errors.values()), EXACT, "of the largest", told, CONVERT, details=details)
 
 
 def block_errors(
     manifest: Manifest, golden: Golden, function: BlockFunction, rows: npt.NDArray[np.int64] | None = None
 ) -> npt.NDArray[np.float64]:
-    """Relative errors of each block taken alone, ``[A, blocks]``.
-
-    Args:
-        manifest: manifest of the artifact.
-        golden: its record.
-        function: gives the residuals.
-        rows: which of the recorded steps; None for all.
-    """
+    """Relative errors of each block taken alone, ``[A, blocks]``; of these rows of the recorded steps, None for all."""
     rows = np.arange(len(golden.steps)) if rows is None else rows
     norms = np.linalg.norm(golden.residuals.astype(np.float64), axis=(2, 3))
     errors = np.zeros((len(rows), len(manifest.blocks)))
@@ -108,30 +93,21 @@ def check_blocks(artifact: Artifact, golden: Golden, probe: Probe) -> tuple[Rung
     manifest = artifact.manifest
     errors = block_errors(manifest, golden, probe.block)
     kinds = tuple(block.kind for block in manifest.blocks)
-    wrong, step, told = describe_blocks(errors, golden, kinds)
+    wrong, step, told = describe_blocks(errors, golden.steps, kinds)
     if wrong:
         told += _shared_context(manifest, wrong)
     else:
         told = f"residuals of {len(kinds)} blocks at {len(golden.steps)} of {manifest.steps} steps are the original's"
-    rung = Rung(
-        BLOCK,
-        verdict(not wrong),
-        told,
-        finite(float(errors.max())),
-        RESIDUAL,
-        "of the residual",
-        f"The weights or graphs of these blocks are not the checkpoint's. {_CONVERT}" if wrong else "",
-        step=step,
-        blocks=wrong,
-    )
+    remedy = f"The weights or graphs of these blocks are not the checkpoint's. {CONVERT}"
+    worst = float(errors.max())
+    rung = judged(BLOCK, worst, RESIDUAL, "of the residual", told, remedy, step=step, blocks=wrong)
     return rung, ErrorMap(golden.steps, errors, RESIDUAL, kinds)
 
 
 def describe_blocks(
-    errors: npt.NDArray[np.float64], golden: Golden, kinds: tuple[str, ...], rows: npt.NDArray[np.int64] | None = None
+    errors: npt.NDArray[np.float64], steps: npt.NDArray[np.int64], kinds: tuple[str, ...]
 ) -> tuple[tuple[int, ...], int | None, str]:
     """Which blocks differ, from which step on, and that in words; empty, None and nothing if none does."""
-    steps = golden.steps if rows is None else golden.steps[rows]
     above = ~(errors <= RESIDUAL)
     wrong = tuple(np.flatnonzero(above.any(0)).tolist())
     if not wrong:
@@ -140,8 +116,7 @@ def describe_blocks(
     shown = [f"{b} ({kinds[b]}) by {errors[:, b].max():.2g} at {int(above[:, b].sum())} steps" for b in wrong[:6]]
     more = f" and {len(wrong) - 6} more" if len(wrong) > 6 else ""
     plural = "s" * (len(wrong) > 1)
-    told = f"block{plural} {', '.join(shown)}{more} of {len(steps)}, first at step {step}"
-    return wrong, step, told
+    return wrong, step, f"block{plural} {', '.join(shown)}{more} of {len(steps)}, first at step {step}"
 
 
 def _shared_context(manifest: Manifest, wrong: tuple[int, ...]) -> str:
@@ -156,31 +131,20 @@ def _shared_context(manifest: Manifest, wrong: tuple[int, ...]) -> str:
 
 def check_evaluation(artifact: Artifact, golden: Golden, probe: Probe, blocks: Rung) -> Rung:
     """Whole evaluations of the network at a few steps, from the sample to the prediction."""
-    errors = []
-    for k, given, expected in zip(golden.evaluated.tolist(), golden.inputs, golden.outputs, strict=True):
-        errors.append(relative(probe.evaluate(given, k), expected))
-    wrong = [int(k) for k, error in zip(golden.evaluated, errors, strict=True) if not error <= PREDICTION]
-    worst = float(np.max(errors))
-    steps = ", ".join(map(str, golden.evaluated.tolist()))
-    told, remedy = f"the network's output at steps {steps} is the original's", ""
-    if wrong:
-        cause = (
-            f"its block{'s' * (len(blocks.blocks) > 1)} {', '.join(map(str, blocks.blocks))}"
-            if blocks.blocks
-            else "what is not a block, since all blocks hold: stem, tail, or the encoder of the condition"
-        )
-        told = f"the network's output differs at steps {', '.join(map(str, wrong))}; the cause is {cause}"
-        remedy = f"The artifact does not hold the checkpoint's network. {_CONVERT}"
-    details: Mapping[str, Any] = {"steps": golden.evaluated.tolist(), "errors": [finite(error) for error in errors]}
-    return Rung(
-        EVALUATION,
-        verdict(not wrong),
-        told,
-        finite(worst),
-        PREDICTION,
-        "of the output",
-        remedy,
-        step=wrong[0] if wrong else None,
-        blocks=blocks.blocks if wrong else (),
-        details=details,
-    )
+    steps: list[int] = golden.evaluated.tolist()
+    errors = [
+        relative(probe.evaluate(given, k), expected)
+        for k, given, expected in zip(steps, golden.inputs, golden.outputs, strict=True)
+    ]
+    details = {"steps": steps, "errors": [finite(error) for error in errors]}
+    worst, allowed = float(np.max(errors)), (PREDICTION, "of the output")
+    wrong = [k for k, error in zip(steps, errors, strict=True) if not error <= PREDICTION]
+    if not wrong:
+        told = f"the network's output at steps {', '.join(map(str, steps))} is the original's"
+        return judged(EVALUATION, worst, *allowed, told, "", details=details)
+    cause = "what is not a block, since all blocks hold: stem, tail, or the encoder of the condition"
+    if blocks.blocks:
+        cause = f"its block{'s' * (len(blocks.blocks) > 1)} {', '.join(map(str, blocks.blocks))}"
+    told = f"the network's output differs at steps {', '.join(map(str, wrong))}; the cause is {cause}"
+    remedy = f"The artifact does not hold the checkpoint's network. {CONVERT}"
+    return judged(EVALUATION, worst, *allowed, told, remedy, step=wrong[0], blocks=blocks.blocks, details=details)

@@ -36,7 +36,7 @@ class Probe:
         self._manifest = artifact.manifest
         self._sessions = open_sessions(artifact, 1)
         self.streams = len(next(iter(obs.values())))
-        self._tables = {
+        tables = {
             name: repeat_streams(artifact.tables[name], None if axis is None else axis + 1, self.streams)
             for name, context in artifact.manifest.contexts.items()
             if context.binding is Binding.TABLE
@@ -46,8 +46,8 @@ class Probe:
         arguments = self._manifest.spec.arguments
         named = {**obs, **{arguments[key]: value for key, value in obs.items()}}
         feed = {name: np.ascontiguousarray(named[name]) for name in piece.inputs}
-        self._condition = run_named(self._sessions[CONDITION], piece.outputs, feed) if piece.outputs else {}
-        self._steps = [self._step(k) for k in range(self._manifest.steps)]
+        condition = run_named(self._sessions[CONDITION], piece.outputs, feed) if piece.outputs else {}
+        self._contexts = [self._step(k, tables, condition) for k in range(self._manifest.steps)]
         self._tail_blanks = {
             one.name: np.zeros([n if isinstance(n, int) else self.streams for n in one.shape], np.float32)
             for one in self._sessions[ADVANCE].get_inputs()
@@ -70,10 +70,9 @@ class Probe:
 
     def tail(self, stream: FloatArray, k: int) -> FloatArray:
         """The prediction at step k, ``[B, T, D]``; what else ``advance`` computes is left aside."""
-        feed = dict(self._tail_blanks)
-        feed[STREAM] = stream
+        feed = {**self._tail_blanks, STREAM: stream}
         own = {name: advance_context(TAIL, name) for name in self._manifest.pieces[ADVANCE].contexts}
-        feed |= {own[name]: self._value(name, k) for name in own if own[name] in feed}
+        feed |= {own[name]: self._contexts[k][name] for name in own if own[name] in feed}
         return run_named(self._sessions[ADVANCE], [PREDICTION], feed)[PREDICTION].transpose(1, 2, 0)
 
     def trace(self, noise: Noise, plan: PlanArray, correction: Correction | None) -> tuple[FloatArray, FloatArray]:
@@ -131,20 +130,15 @@ class Probe:
 
     def _run(self, piece: str, value: FloatArray, k: int) -> FloatArray:
         record = self._manifest.pieces[piece]
-        feed = {name: value if name == record.stream else self._value(name, k) for name in record.inputs}
+        feed = {name: value if name == record.stream else self._contexts[k][name] for name in record.inputs}
         result: FloatArray = run_named(self._sessions[piece], record.outputs, feed)[record.outputs[0]]
         return result
 
-    def _step(self, k: int) -> dict[str, Array]:
-        """Step values of step k."""
+    def _step(self, k: int, tables: Mapping[str, Array], condition: Mapping[str, Array]) -> dict[str, Array]:
+        """What pieces read at step k beside the stream: rows of tables, condition values and step values, by name."""
+        values = {**condition, **{name: table[k, ...] for name, table in tables.items()}}
         piece = self._manifest.pieces.get(STEP)
-        if piece is None:
-            return {}
-        feed = {n: self._tables[n][k, ...] if n in self._tables else self._condition[n] for n in piece.inputs}
-        return run_named(self._sessions[STEP], piece.outputs, feed)
-
-    def _value(self, name: str, k: int) -> Array:
-        if name in self._tables:
-            row: Array = self._tables[name][k, ...]
-            return row
-        return self._steps[k][name] if name in self._steps[k] else self._condition[name]
+        if piece is not None:
+            feed = {name: values[name] for name in piece.inputs}
+            values |= run_named(self._sessions[STEP], piece.outputs, feed)
+        return values

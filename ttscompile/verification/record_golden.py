@@ -17,13 +17,13 @@ from torch import nn
 
 from ..artifact.golden import DIGITS, Golden, GoldenPlan, load_golden, pattern, probe_stream, project
 from ..artifact.load import Artifact
-from ..core.spec import FloatArray, Noise, PolicySpec
+from ..core.spec import FloatArray, Noise
 from ..errors import CaptureError
 from ..frontends.eager import eager_policy
 from ..frontends.encoded import parts
 from ..ir.dataflow import reachable_from
 from ..ir.evaluate import Evaluator
-from ..ir.graph import Graph, TensorType, backward_slice
+from ..ir.graph import Graph, backward_slice
 from ..ir.program import Block, Program
 from ..ir.rows import Rows
 from ..runtimes.reference.model import ReferenceModel
@@ -40,6 +40,9 @@ EFFORT = 4e10
 
 ROOM = 1 << 20
 """Bytes of noise of one stream above which there is one stream."""
+
+PROBE = "probe."
+"""Before the number of a block: the input that takes the place of the stream before it."""
 
 
 def record_original(module: nn.Module, program: Program) -> Golden:
@@ -71,19 +74,24 @@ def _record_original(module: nn.Module, program: Program) -> Golden:
     observations, normalized = {}, {}
     for key, one in spec.observations.items():
         raw = np.concatenate([one.draw(draw) for _ in range(streams)])
-        raw = np.stack([np.resize(each, one.shape) for each in pattern(raw, one.shape)])
-        observations[key] = raw
-        normalized[key] = one.normalized(raw)
+        observations[key] = np.stack([np.resize(each, one.shape) for each in pattern(raw, one.shape)])
+        normalized[key] = one.normalized(observations[key])
     original, kept = spec.original, spec.sample[0]
     shape = (streams, *original.sample)
     initial = draw.standard_normal(shape, dtype=np.float32)
     draws = draw.standard_normal((steps, *shape), dtype=np.float32) if spec.sampler.stochastic else None
 
     copied = copy.deepcopy(module).cpu().float().eval()
-    watch = _Watch(copied, original)
+    evaluations: list[tuple[FloatArray, FloatArray]] = []
+
+    def watch(_: nn.Module, args: tuple[Any, ...], kwargs: dict[str, Any], output: torch.Tensor) -> None:
+        given = args[0] if args else kwargs[original.sample_argument]
+        evaluations.append((given.numpy().copy(), output.numpy().copy()))
+
+    parts(copied).denoiser.register_forward_hook(watch, with_kwargs=True)
     tensors = {key: torch.from_numpy(value) for key, value in normalized.items()}
     sample = eager_policy(copied, original)(tensors, Noise(initial, draws)).numpy()
-    given, predicted = np.stack(watch.given), np.stack(watch.predicted)
+    given, predicted = (np.stack(each) for each in zip(*evaluations, strict=True))
     # What the artifact predicts of it: the original has all steps, and says what those that are kept should be.
     initial, sample, given, predicted = (each[..., :kept, :] for each in (initial, sample, given, predicted))
     draws = None if draws is None else draws[..., :kept, :]
@@ -119,14 +127,12 @@ def _record_original(module: nn.Module, program: Program) -> Golden:
 def record_plans(artifact: Artifact) -> dict[str, GoldenPlan]:
     """What the reference runtime makes of the plans of an artifact, with their corrections: two calls each.
 
-    Args:
-        artifact: with its plans; without a golden record of the original network there is none of plans.
+    Nothing of an artifact without a golden record of the original network.
     """
     if artifact.manifest.stores.golden is None:
         return {}
-    golden, spec = load_golden(artifact), artifact.manifest.spec
-    model = ReferenceModel.from_artifact(artifact)
-    obs = golden.network_observations(spec)
+    golden, model = load_golden(artifact), ReferenceModel.from_artifact(artifact)
+    obs = golden.network_observations(artifact.manifest.spec)
     with torch.no_grad():
         return {name: _episode(artifact, model, name, golden, obs) for name in artifact.manifest.plans}
 
@@ -142,21 +148,12 @@ def _episode(
         wanted = pruner_plan(model.logits(contexts).numpy()) if pruned else artifact.schedule(name)
         plan, _ = repair_plan(wanted, model.groups, cache.written)
         draws = None if golden.draws is None else torch.from_numpy(golden.draws[:, ::order].copy())
-        result = model.denoise(
-            contexts,
-            torch.from_numpy(golden.initial[::order].copy()),
-            draws,
-            plan,
-            cache,
-            correction=artifact.corrections.get(name),
-        )
+        initial, correction = torch.from_numpy(golden.initial[::order].copy()), artifact.corrections.get(name)
+        result = model.denoise(contexts, initial, draws, plan, cache, correction=correction)
         cache = result.cache
         path = np.stack([project(sample.numpy(), 0) for sample in result.samples])
         calls.append((plan, path, result.sample.numpy()))
     return GoldenPlan(*(np.stack(each) for each in zip(*calls, strict=True)))
-
-
-_PROBE = "probe."
 
 
 def _spread(steps: int, count: int) -> npt.NDArray[np.int64]:
@@ -164,34 +161,8 @@ def _spread(steps: int, count: int) -> npt.NDArray[np.int64]:
     return np.unique(np.linspace(0, steps - 1, min(count, steps)).round().astype(np.int64))
 
 
-class _Watch:
-    """What goes in and comes out of each evaluation of a module: ``[B, T, D]`` each.
-
-    Args:
-        module: whose part that is evaluated at every step is hooked.
-        spec: names the sample's argument.
-    """
-
-    def __init__(self, module: nn.Module, spec: PolicySpec) -> None:
-        self._argument = spec.sample_argument
-        self.given: list[FloatArray] = []
-        self.predicted: list[FloatArray] = []
-        parts(module).denoiser.register_forward_hook(self._saw, with_kwargs=True)
-
-    def _saw(self, _: nn.Module, args: tuple[Any, ...], kwargs: dict[str, Any], output: torch.Tensor) -> None:
-        sample = args[0] if args else kwargs[self._argument]
-        self.given.append(sample.numpy().copy())
-        self.predicted.append(output.numpy().copy())
-
-
 class _Inside:
-    """The captured graph of one evaluation, cut open at its residual stream.
-
-    Args:
-        program: with the block table.
-        observations: normalised, by key.
-        streams: B.
-    """
+    """The captured graph of one evaluation on normalised observations ``[B, ...]``, cut open at its residual stream."""
 
     def __init__(self, program: Program, observations: Mapping[str, torch.Tensor], streams: int) -> None:
         self._spec, self._blocks, self._streams = program.spec, program.blocks, streams
@@ -211,21 +182,21 @@ class _Inside:
 
     def residuals(self, anchors: npt.NDArray[np.int64], scales: FloatArray) -> FloatArray:
         """Projections of each block's residual on its ``probe_stream``, ``[A, blocks, B, DIGITS]``."""
-        probes = {
-            _probe(block.index): torch.from_numpy(probe_stream(block.index, block.type, self._streams, float(scale)))
+        probes = [
+            torch.from_numpy(probe_stream(block.index, block.type, self._streams, float(scale)))
             for block, scale in zip(self._blocks, scales, strict=True)
-        }
+        ]
         run = Evaluator(self._loop, self._weights)
         with torch.inference_mode():
             values = Evaluator(self._condition, self._weights)(self._observations)
         fixed = dict(zip(self._condition.outputs, values, strict=True))
-        given = dict(zip(list(self._open.inputs)[-len(probes) :], probes.values(), strict=True))
+        given = dict(zip(list(self._open.inputs)[-len(probes) :], probes, strict=True))
         found = np.zeros((len(anchors), len(self._blocks), self._streams, DIGITS), np.float32)
         for i, k in enumerate(anchors.tolist()):
             with torch.inference_mode():
                 results = run({**fixed, **given, **self._at(k)})
             for b, (block, result) in enumerate(zip(self._blocks, results, strict=True)):
-                residual = result if block.residual is not None else result - probes[_probe(b)]
+                residual = result if block.residual is not None else result - probes[b]
                 found[i, b] = project(residual.numpy(), block.type.batch_axis)
         return found
 
@@ -235,20 +206,15 @@ class _Inside:
         return {self._spec.timestep_argument: timestep, **self._observations}
 
 
-def _probe(block: int) -> str:
-    """Name of the input that takes the place of the stream before a block."""
-    return f"{_PROBE}{block}"
-
-
 def _opened(graph: Graph, blocks: tuple[Block, ...]) -> Graph:
     """The graph with the stream before each block given as an input, and with the residuals as outputs.
 
     Nothing but block b reads the stream before it (``find_residual_blocks`` sees to that), so that what it reads can be
     replaced wherever it is read.
     """
-    places = {block.stream: _probe(block.index) for block in blocks}
+    places = {block.stream: f"{PROBE}{block.index}" for block in blocks}
     nodes = tuple(node.renamed(lambda name: places.get(name, name)) for node in graph.nodes)
-    probes: dict[str, TensorType] = {_probe(block.index): block.type for block in blocks}
+    probes = {places[block.stream]: block.type for block in blocks}
     outputs = tuple(block.result if block.residual is None else block.residual for block in blocks)
     types = graph.types()
     like, inner = blocks[0].type, types[blocks[0].stream]
@@ -268,7 +234,7 @@ def _opened(graph: Graph, blocks: tuple[Block, ...]) -> Graph:
 def _split(graph: Graph, varying: list[str]) -> tuple[Graph, Graph]:
     """What depends on observations alone, once, and what depends on these inputs or on a probe, for every step."""
     types = graph.types()
-    starts = [*varying, *(name for name in graph.inputs if name.startswith(_PROBE))]
+    starts = [*varying, *(name for name in graph.inputs if name.startswith(PROBE))]
     loop = reachable_from(graph, starts)
     before = {
         name: types[name]

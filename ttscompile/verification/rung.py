@@ -92,6 +92,11 @@ class Verification:
     map: ErrorMap | None = None
 
     @property
+    def failed(self) -> list[Rung]:
+        """The rungs that failed, from the lowest: those above it stand on it."""
+        return [rung for rung in self.rungs if rung.status == FAILED]
+
+    @property
     def passed(self) -> bool:
         """Whether no rung failed."""
         return not self.failed
@@ -99,12 +104,7 @@ class Verification:
     @property
     def first_failure(self) -> Rung | None:
         """The lowest rung that failed."""
-        return self.failed[0] if self.failed else None
-
-    @property
-    def failed(self) -> list[Rung]:
-        """The rungs that failed, from the lowest: those above it stand on it."""
-        return [rung for rung in self.rungs if rung.status == FAILED]
+        return next(iter(self.failed), None)
 
     @property
     def skipped(self) -> list[Rung]:
@@ -125,9 +125,7 @@ class Verification:
             "passed": self.passed,
             "first_failure": None if failure is None else failure.name,
             "seconds": round(self.seconds, 3),
-            "rungs": [
-                {**asdict(rung), "blocks": list(rung.blocks), "details": dict(rung.details)} for rung in self.rungs
-            ],
+            "rungs": [{**asdict(rung), "blocks": list(rung.blocks)} for rung in self.rungs],
             "map": None
             if self.map is None
             else {
@@ -143,6 +141,8 @@ def finite(number: float) -> float | None:
     return number if np.isfinite(number) else None
 
 
-def verdict(within: bool) -> str:
-    """``passed`` or ``failed``."""
-    return PASSED if within else FAILED
+def judged(name: str, error: float, tolerance: float, unit: str, told: str, remedy: str, **more: Any) -> Rung:
+    """A rung that passes where its error keeps within the tolerance; otherwise there is something to do."""
+    if error <= tolerance:
+        return Rung(name, PASSED, told, error, tolerance, unit, **more)
+    return Rung(name, FAILED, told, finite(error), tolerance, unit, remedy, **more)
