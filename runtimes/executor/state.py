@@ -11,12 +11,11 @@ from dataclasses import dataclass
 from ttscompile.core.spec import Affine, FloatArray
 from ttscompile.errors import DeadlineMissedError, ObservationError, StaleObservationError
 
-from .feasibility import LatencyWindow
+from .feasibility import LatencyWindow, Tiers
 from .guard import Guard
 from .schedule import Schedule
 from .settings import ExecutorSettings, Resolved
 from .statistics import Recorder
-from .tiers import Tiers
 from .window import Frame, ObservationWindow
 
 SAME_TIME = 1e-6
