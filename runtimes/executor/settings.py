@@ -190,21 +190,16 @@ def resolve(settings: ExecutorSettings, info: PolicyFacts, control_hz: float) ->
     longest = info.sample[0] - chunk.start
     horizon = settings.horizon or chunk.stop - chunk.start
     if horizon > longest:
-        raise ExecutorError(
-            f"horizon = {horizon}: the policy predicts {info.sample[0]} actions, {longest} of them from the observation"
-            f" on. Give at most {longest}."
-        )
+        predicted = f"{info.sample[0]} actions, {longest} of them from the observation on"
+        raise ExecutorError(f"horizon = {horizon}: the policy predicts {predicted}. Give at most {longest}.")
     reserve = longest - horizon if settings.reserve is None else settings.reserve
     if reserve > longest - horizon:
         raise ExecutorError(
             f"reserve = {reserve}: the policy predicts {longest} actions from the observation on, and horizon ="
             f" {horizon} are played anyway. Give at most {longest - horizon}, or None for all."
         )
-    unknown = [name for name in tiers if name not in info.plans]
-    if unknown:
-        raise ExecutorError(
-            f"the policy has no plan {unknown[0]!r}; it has {list(info.plans)}. Name tiers among these."
-        )
+    if unknown := [name for name in tiers if name not in info.plans]:
+        raise ExecutorError(f"the policy has no plan {unknown[0]!r}. Name tiers among these: {list(info.plans)}.")
     return Resolved(
         control_hz=control_hz,
         policy_hz=policy_hz,
