@@ -99,7 +99,7 @@ class ExecutorState:
         """A new episode: nothing from before is given out any more."""
         self.epoch += 1
         self.recorder.counts.resets += 1
-        self.recorder.pause()
+        self.recorder.last_tick = None
         self._begin_episode()
 
     # Observations

@@ -146,18 +146,14 @@ class Recorder:
         self.last_refusal: str | None = None
         self.latency_ms, self.observation_age_ms, self.action_age_ms = (Samples(window) for _ in range(3))
         self.slack_ms, self.queue_depth, self.tick_ms = (Samples(window) for _ in range(3))
-        self._last_tick: float | None = None
+        self.last_tick: float | None = None  # None where the loop stands still on purpose
 
     def tick(self, now: float) -> None:
         """An action was given out."""
         self.counts.ticks += 1
-        if self._last_tick is not None:
-            self.tick_ms.add(1e3 * (now - self._last_tick))
-        self._last_tick = now
-
-    def pause(self) -> None:
-        """The loop stands still on purpose: the time to the next tick is not measured."""
-        self._last_tick = None
+        if self.last_tick is not None:
+            self.tick_ms.add(1e3 * (now - self.last_tick))
+        self.last_tick = now
 
     def copy(self) -> dict[str, Any]:
         """What ``statistics`` needs, copied while the lock is held; the percentiles are made without it."""
