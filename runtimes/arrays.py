@@ -14,8 +14,6 @@ from ttscompile.errors import ObservationError, TtscompileError
 
 Array: TypeAlias = npt.NDArray[Any]
 
-_OVERSHOOT = 0.1
-
 
 def is_tensor(value: object) -> bool:
     """Whether this is a torch tensor; if torch was never imported, nothing is."""
@@ -48,16 +46,13 @@ def as_array(value: Any, what: str) -> Array:
         try:
             array: Array = value.detach().cpu().numpy()
         except TypeError as error:
-            raise ObservationError(
-                f"{what} is a tensor of dtype {value.dtype}, which numpy does not have. Convert it with .float()."
-            ) from error
+            problem = f"{what} is a tensor of dtype {value.dtype}, which numpy does not have"
+            raise ObservationError(f"{problem}. Convert it with .float().") from error
         return array
     if isinstance(value, np.ndarray):
         return value
-    raise ObservationError(
-        f"{what} is a {type(value).__name__}; expected a numpy array or a torch tensor."
-        " Use np.asarray(..., dtype=np.float32)."
-    )
+    expected = "expected a numpy array or a torch tensor. Use np.asarray(..., dtype=np.float32)."
+    raise ObservationError(f"{what} is a {type(value).__name__}; {expected}")
 
 
 def like(array: Array, example: Any) -> Any:
@@ -74,9 +69,8 @@ def check_observation(obs: Mapping[str, Any], specs: Mapping[str, ObservationSpe
         ObservationError: names the key, what was expected, what was found and the remedy.
     """
     if not isinstance(obs, Mapping):
-        raise ObservationError(
-            f"the observation is a {type(obs).__name__}; expected a dictionary with the keys {sorted(specs)}."
-        )
+        expected = f"a dictionary with the keys {sorted(specs)}"
+        raise ObservationError(f"the observation is a {type(obs).__name__}; expected {expected}.")
     missing, unexpected = sorted(set(specs) - set(obs)), sorted(map(str, set(obs) - set(specs)))
     if missing or unexpected:
         raise ObservationError(
@@ -86,9 +80,8 @@ def check_observation(obs: Mapping[str, Any], specs: Mapping[str, ObservationSpe
     arrays = {key: _one(key, as_array(obs[key], f"observation {key!r}"), spec) for key, spec in specs.items()}
     counts = {key: len(array) for key, array in arrays.items()}
     if len(set(counts.values())) > 1:
-        raise ObservationError(
-            f"observations hold different numbers of streams: {counts}. The first axis of all must be the same."
-        )
+        differ = f"observations hold different numbers of streams: {counts}"
+        raise ObservationError(f"{differ}. The first axis of all must be the same.")
     return arrays
 
 
@@ -96,34 +89,24 @@ def _one(key: str, array: Array, spec: ObservationSpec) -> Array:
     expected = f"{spec.dtype} [B, {', '.join(map(str, spec.shape))}]"
     found = f"{array.dtype} {list(array.shape)}"
     if array.shape[1:] != spec.shape or array.ndim != len(spec.shape) + 1 or len(array) < 1:
-        remedy = " A single stream needs a first axis of 1: use obs[None]." if array.shape == spec.shape else ""
-        remedy = remedy or _image_remedy(array, spec)
+        single = " A single stream needs a first axis of 1: use obs[None]."
+        remedy = single if array.shape == spec.shape else _image_remedy(array, spec)
         raise ObservationError(f"observation {key!r} has the wrong shape: expected {expected}; found {found}.{remedy}")
     if str(array.dtype) != spec.dtype:
-        remedy = _image_remedy(array, spec) or (
-            f" Convert it with .astype(np.{spec.dtype}), after making sure that its units are those of the training"
-            " data."
-        )
+        remedy = f" Convert it with .astype(np.{spec.dtype}), after making sure that its units are those of training."
+        remedy = _image_remedy(array, spec) or remedy
         raise ObservationError(f"observation {key!r} has the wrong dtype: expected {expected}; found {found}.{remedy}")
-    check_values(array, key, spec)
+    check_finite(array, f"observation {key!r}", "Look for the sensor, or the division, that made it.")
+    _check_bounds(key, array, spec)
     return array
 
 
-def check_values(array: Array, key: str, spec: ObservationSpec) -> None:
-    """Raise unless the numbers are finite, and of tokens and images within their bounds.
+def _check_bounds(key: str, array: Array, spec: ObservationSpec) -> None:
+    """Raise unless the numbers of tokens and images are within their bounds.
 
     Images may overshoot by a tenth of the range, as resizing with a cubic filter does at edges. One of 0..255 in place
     of 0..1 would give actions that look like actions.
-
-    Args:
-        array: of the specified dtype; with or without the axis of time.
-        key: of the observation, for messages.
-        spec: of the observation.
-
-    Raises:
-        ObservationError: says what was expected, what was found, and the remedy.
     """
-    check_finite(array, f"observation {key!r}", "Look for the sensor, or the division, that made it.")
     if spec.bounds is None or not (spec.image or array.dtype.kind in "iu"):
         return
     low, high = (np.asarray(each) for each in spec.bounds)
@@ -134,7 +117,7 @@ def check_values(array: Array, key: str, spec: ObservationSpec) -> None:
                 f" {array.max()}. Tokens must come from the tokenizer that the policy was trained with."
             )
         return
-    least, most, room = float(array.min()), float(array.max()), _OVERSHOOT * float(high[0] - low[0])
+    least, most, room = float(array.min()), float(array.max()), 0.1 * float(high[0] - low[0])
     if least < low[0] - room or most > high[0] + room:
         remedy = "Give what the camera measures, not normalised: the policy does that itself."
         if most > high[0] + room and least >= 0 and high[0] == 1:
@@ -147,12 +130,10 @@ def check_values(array: Array, key: str, spec: ObservationSpec) -> None:
 
 def _image_remedy(array: Array, spec: ObservationSpec) -> str:
     """What to do with an image of bytes, or with its channels last; nothing for other arrays."""
-    if not spec.image:
-        return ""
     remedy = ""
-    if array.dtype.kind in "iu":
+    if spec.image and array.dtype.kind in "iu":
         remedy += f" Divide by 255, channels first: image.astype(np.{spec.dtype}) / 255."
-    if array.shape[-3:] == (*spec.shape[-2:], spec.shape[-3]) != spec.shape[-3:]:
+    if spec.image and array.shape[-3:] == (*spec.shape[-2:], spec.shape[-3]) != spec.shape[-3:]:
         remedy += " Its channels are last: use np.moveaxis(image, -1, -3)."
     return remedy
 
@@ -166,10 +147,9 @@ def check_finite(array: Array, what: str, remedy: str) -> None:
     if array.dtype.kind != "f" or np.isfinite(array).all():
         return
     bad = np.argwhere(~np.isfinite(array))
-    first = tuple(int(i) for i in bad[0])
-    raise ObservationError(
-        f"{what} must be finite; found {array[first]} at index {first}, {len(bad)} such values in all. {remedy}"
-    )
+    first = tuple(bad[0].tolist())
+    found = f"{array[first]} at index {first}, {len(bad)} such values in all"
+    raise ObservationError(f"{what} must be finite; found {found}. {remedy}")
 
 
 def check_noise(noise: Noise, streams: int, spec: PolicySpec) -> Noise:
@@ -192,10 +172,8 @@ def check_noise(noise: Noise, streams: int, spec: PolicySpec) -> Noise:
         return Noise(initial)
     shape = (spec.sampler.steps, *one)
     if noise.steps is None:
-        raise ObservationError(
-            f"noise.steps is missing: the sampler of this policy draws noise in its steps. Give [K, B, T, D] = {shape},"
-            " or noise=None to have all of it drawn."
-        )
+        remedy = f"Give [K, B, T, D] = {shape}, or noise=None to have all of it drawn."
+        raise ObservationError(f"noise.steps is missing: the sampler draws noise in its steps. {remedy}")
     return Noise(initial, _noise(noise.steps, "noise.steps", "[K, B, T, D]", shape, spec.left_out))
 
 
@@ -204,9 +182,7 @@ def _noise(value: Any, what: str, axes: str, shape: tuple[int, ...], left_out: i
     if left_out and array.shape == (*shape[:-2], shape[-2] + left_out, shape[-1]):
         array = array[..., : shape[-2], :]
     if array.shape != shape or array.dtype != np.float32:
-        raise ObservationError(
-            f"{what} must be float32 {axes} = {list(shape)}; found {array.dtype} {list(array.shape)}."
-            " Draw it with rng.standard_normal(shape, dtype=np.float32)."
-        )
+        expected = f"float32 {axes} = {list(shape)}; found {array.dtype} {list(array.shape)}"
+        raise ObservationError(f"{what} must be {expected}. Use rng.standard_normal(shape, dtype=np.float32).")
     check_finite(array, what, "Draw it again.")
     return array

@@ -59,15 +59,14 @@ class MaskedUpdates:
     """
 
     def __init__(self, updates: FloatArray, chunk: ChunkSpec) -> None:
-        self.updates = updates.copy()
-        self._plain, self._start = updates, chunk.start
-        self._groups = slice(chunk.action_dim)  # with G = 1, the one
-        self._length = 0
+        self.updates, self._plain = updates.copy(), updates
+        self._chunk, self._length = chunk, 0
 
     def mask(self, length: int) -> None:
         """Set the length of the prefix."""
-        first, last = sorted((self._start + self._length, self._start + length))
-        changed = (slice(None), self._groups, slice(None), slice(first, last))
+        first, last = sorted((self._length, length))
+        positions, groups = slice(self._chunk.start + first, self._chunk.start + last), slice(self._chunk.action_dim)
+        changed = (slice(None), groups, slice(None), positions)  # with G = 1, the one
         self.updates[changed] = 0 if length > self._length else self._plain[changed]
         self._length = length
 
@@ -121,19 +120,15 @@ def check_prefix(prefix: Any, streams: int, spec: PolicySpec, refusal: str | Non
         ObservationError: of another kind, dtype or shape, too long or not finite; or the policy takes none.
     """
     array = as_array(prefix, "prefix")
-    chunk, (horizon, _) = spec.chunk, spec.sample
-    room = horizon - chunk.start
-    shape = (streams, array.shape[1] if array.ndim == 3 else 0, chunk.action_dim)
+    room = spec.sample[0] - spec.chunk.start
+    shape = (streams, array.shape[1] if array.ndim == 3 else 0, spec.chunk.action_dim)
     if array.shape != shape or array.dtype != np.float32:
-        raise ObservationError(
-            f"prefix must be float32 [B, N, Da] = [{streams}, N, {chunk.action_dim}]; found {array.dtype}"
-            f" {list(array.shape)}. Give the committed actions of every stream, from the chunk's first on."
-        )
+        expected = f"float32 [B, N, Da] = [{streams}, N, {shape[2]}]; found {array.dtype} {list(array.shape)}"
+        remedy = "Give the committed actions of every stream, from the chunk's first on."
+        raise ObservationError(f"prefix must be {expected}. {remedy}")
     if shape[1] > room:
-        raise ObservationError(
-            f"prefix holds {shape[1]} actions; the chunk has {room}, from its first executed one to the end of the"
-            f" prediction. Give at most {room}."
-        )
+        rest = f"{room}, from its first executed one to the end of the prediction"
+        raise ObservationError(f"prefix holds {shape[1]} actions; the chunk has {rest}. Give at most {room}.")
     if shape[1] and refusal is not None:
         raise ObservationError(f"the policy takes no prefix: {refusal} Call it without one.")
     check_finite(array, "prefix", "Only actions that can be executed can be committed.")
@@ -152,8 +147,8 @@ def known_samples(spec: PolicySpec, prefix: FloatArray, initial: FloatArray) -> 
         return None
     levels = noise_levels(spec.sampler)
     assert levels is not None
-    start, channels = spec.chunk.start, slice(spec.chunk.action_dim)
-    positions = slice(start, start + prefix.shape[1])
+    channels = slice(spec.chunk.action_dim)
+    positions = slice(spec.chunk.start, spec.chunk.start + prefix.shape[1])
     signal, deviation = (each.astype(np.float32)[:, None, None, None] for each in levels)
     noisy = signal * prefix + deviation * initial[:, positions, channels]
     return Known(positions, channels, np.concatenate([noisy, prefix[None]]))

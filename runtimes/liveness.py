@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ttscompile.artifact.manifest import Manifest
+from ttscompile.artifact.load import Artifact
 from ttscompile.core.lattice import BoolArray, Source
-
-if TYPE_CHECKING:
-    from ttscompile.artifact.load import Artifact
 
 HEAD = ("pruner.base", "pruner.mask", "pruner.step", "pruner.block")
 """Constants of a pruner whose logits are ``base + mask + (code * step) @ block`` with a code of -1..1."""
@@ -37,16 +33,10 @@ class RolloutNeeds:
 
 def rollout_needs(artifact: Artifact) -> RolloutNeeds:
     """What keeping the rollout cache of one stream takes."""
-    manifest = artifact.manifest
-    entry = residual_bytes(manifest)
+    entry = 4 * math.prod(artifact.manifest.blocks[0].type.at(1))  # residuals are float32
     readable = readable_rollout(artifact)
     read = int(np.count_nonzero(readable))
     return RolloutNeeds(read, read * entry, readable.size, readable.size * entry)
-
-
-def residual_bytes(manifest: Manifest) -> int:
-    """Bytes of one residual of one stream; residuals are float32."""
-    return 4 * math.prod(manifest.blocks[0].type.at(1))
 
 
 def readable_rollout(artifact: Artifact) -> BoolArray:
@@ -62,8 +52,7 @@ def readable_rollout(artifact: Artifact) -> BoolArray:
 
 def _pruner_can_read(artifact: Artifact) -> BoolArray:
     """Cells in which the ROLLOUT logit can be the largest; every cell of a pruner that is not the head we know."""
-    manifest = artifact.manifest
-    shape = (manifest.steps, len(manifest.blocks), len(Source))
+    shape = (artifact.manifest.steps, len(artifact.manifest.blocks), len(Source))
     head = artifact.pruner
     if not set(HEAD) <= set(head) or head["pruner.base"].shape != shape:
         return np.ones(shape[:2], dtype=np.bool_)

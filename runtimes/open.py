@@ -73,9 +73,8 @@ def open_runtime(artifact: Artifact, runtime: str = "onnxruntime", threads: int 
         ArtifactError: the parts of the artifact do not fit each other.
     """
     if not isinstance(threads, int) or isinstance(threads, bool) or not 1 <= threads <= MOST_THREADS:
-        raise RuntimeUnavailableError(
-            f"threads must be an integer of at least 1 and at most {MOST_THREADS}; found {threads!r}."
-        )
+        expected = f"an integer of at least 1 and at most {MOST_THREADS}"
+        raise RuntimeUnavailableError(f"threads must be {expected}; found {threads!r}.")
     kind = kind_of(runtime)
     try:
         with fitting(artifact):

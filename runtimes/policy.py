@@ -7,16 +7,15 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import DENSE
 from ttscompile.core.spec import FP32, ChunkSpec, FloatArray, Noise, ObservationSpec
 from ttscompile.errors import IllegalPlanError, RuntimeUnavailableError, TtscompileError
-from ttscompile.ir.graph import TensorType
 
 from .arrays import check_observation, check_seed, is_tensor, like
 from .inpainting import check_prefix, prefix_refusal
@@ -25,9 +24,6 @@ from .open import kind_of, open_runtime
 from .queues import Queues, is_window
 from .report import CallReport
 from .runtime import Runtime
-
-if TYPE_CHECKING:
-    from ttscompile.artifact.load import Artifact
 
 
 @dataclass(frozen=True)
@@ -133,6 +129,9 @@ class CompiledPolicy:
         seed: of the noise that is drawn when none is given.
         plan: see ``load``.
 
+    Attributes:
+        last_report: what the last call did; None before the first.
+
     Raises:
         IllegalPlanError: the artifact has no plan of this name.
     """
@@ -144,22 +143,20 @@ class CompiledPolicy:
         _require_plan(artifact, self._default)
         self._prefix_refusal = prefix_refusal(artifact.manifest.spec)
         self._rng = np.random.default_rng(check_seed(seed))
-        self._report: CallReport | None = None
+        self.last_report: CallReport | None = None
         self._queues = Queues(artifact.manifest.spec.observations)
         self._lock = threading.Lock()
 
     @property
-    def last_report(self) -> CallReport | None:
-        """What the last call did; None before the first."""
-        return self._report
-
-    @property
     def info(self) -> PolicyInfo:
         """What this policy is."""
-        manifest = self._manifest
+        manifest, blocks = self._manifest, []
+        for block in manifest.blocks:
+            shape = tuple(n for i, n in enumerate(block.type.at(1)) if i != block.type.batch_axis)
+            blocks.append(BlockInfo(block.kind, shape, block.flops))
         return PolicyInfo(
             K=manifest.steps,
-            blocks=tuple(BlockInfo(b.kind, _of_one_stream(b.type), b.flops) for b in manifest.blocks),
+            blocks=tuple(blocks),
             dense_flops=manifest.flops.dense,
             observation=manifest.spec.observations,
             action=manifest.spec.chunk,
@@ -269,11 +266,11 @@ class CompiledPolicy:
         with self._alone():
             specs = self._manifest.spec.observations
             if isinstance(batch, Mapping) and is_window(batch, specs):
-                observation = {key: value for key, value in batch.items() if key in specs}
-                return like(self._chunk(observation, noise, plan).copy(), self._example(batch))
-            frames = self._queues.after(batch)
-            chunk = self._chunk(self._queues.observation(frames), noise, plan)
-            self._queues.keep(frames)
+                chunk = self._chunk({key: value for key, value in batch.items() if key in specs}, noise, plan)
+            else:
+                frames = self._queues.after(batch)
+                chunk = self._chunk(self._queues.observation(frames), noise, plan)
+                self._queues.keep(frames)
             return like(chunk.copy(), self._example(batch))
 
     def _chunk(self, obs: Mapping[str, Any], noise: Noise | None, plan: str | npt.ArrayLike | None) -> FloatArray:
@@ -285,7 +282,7 @@ class CompiledPolicy:
         self, obs_dict: Mapping[str, Any], noise: Noise | None, plan: str | npt.ArrayLike | None, prefix: Any = None
     ) -> FloatArray:
         """One call; the actions ``[B, T, Da]``."""
-        self._report = None
+        self.last_report = None
         spec = self._manifest.spec
         obs = check_observation(obs_dict, spec.observations)
         streams = len(next(iter(obs.values())))
@@ -297,7 +294,7 @@ class CompiledPolicy:
         correction = None if name is None else self._artifact.corrections.get(name)
         noise = self._draw(streams) if noise is None else noise
         normalized = {key: spec.observations[key].normalized(array) for key, array in obs.items()}
-        sample, self._report = self._runtime.predict(
+        sample, self.last_report = self._runtime.predict(
             normalized, noise, matrix, plan_name=name, repair=repair, correction=correction, prefix=prefix
         )
         return spec.chunk.unnormalized(sample)
@@ -321,10 +318,8 @@ class CompiledPolicy:
             try:
                 return np.asarray(given.numpy(force=True) if is_tensor(given) else given), None, False
             except (TypeError, ValueError) as error:
-                raise IllegalPlanError(
-                    f"the plan is no matrix of integers ({error}); expected int8 [K, blocks] or [B, K, blocks] of"
-                    " ttscompile.Source."
-                ) from error
+                expected = "int8 [K, blocks] or [B, K, blocks] of ttscompile.Source"
+                raise IllegalPlanError(f"the plan is no matrix of integers ({error}); expected {expected}.") from error
         if plan == DENSE:
             return self._artifact.schedule(DENSE), DENSE, False
         _require_plan(self._artifact, plan)
@@ -338,10 +333,8 @@ class CompiledPolicy:
     @contextmanager
     def _alone(self) -> Iterator[None]:
         if not self._lock.acquire(blocking=False):
-            raise TtscompileError(
-                "the policy is in the middle of a call on another thread. It serves one caller at a time: load one"
-                " policy a thread, or send all streams in one batch."
-            )
+            remedy = "It serves one caller at a time: load one policy a thread, or send all streams in one batch."
+            raise TtscompileError(f"the policy is in the middle of a call on another thread. {remedy}")
         try:
             yield
         finally:
@@ -352,17 +345,8 @@ def _require_plan(artifact: Artifact, name: str) -> None:
     """Raise unless the artifact has a plan of this name."""
     known = [DENSE, *artifact.manifest.plans]
     if not isinstance(name, str):
-        raise IllegalPlanError(
-            f"expected the name of a plan, one of {known}; found a {type(name).__name__}. A matrix is for"
-            " predict_action(plan=...), call by call."
-        )
+        found = f"found a {type(name).__name__}. A matrix is for predict_action(plan=...), call by call."
+        raise IllegalPlanError(f"expected the name of a plan, one of {known}; {found}")
     if name not in known:
-        raise IllegalPlanError(
-            f"the artifact has no plan {name!r}; it has {known}. Use one of these, or give predict_action a matrix"
-            " [K, blocks] of ttscompile.Source."
-        )
-
-
-def _of_one_stream(type_: TensorType) -> tuple[int, ...]:
-    axis = type_.batch_axis
-    return tuple(n for i, n in enumerate(type_.at(1)) if i != axis)
+        remedy = "Use one of these, or give predict_action a matrix [K, blocks] of ttscompile.Source."
+        raise IllegalPlanError(f"the artifact has no plan {name!r}; it has {known}. {remedy}")

@@ -18,7 +18,6 @@ from ttscompile.errors import ObservationError
 
 from .arrays import Array, check_observation
 
-Frame = dict[str, Array]
 Frames = dict[str, deque[Array]]
 
 
@@ -54,18 +53,25 @@ class Queues:
         Raises:
             ObservationError: a key is missing or does not fit.
         """
+        known = {k: batch[k] for k in self._frame_specs if k in batch} if isinstance(batch, Mapping) else batch
+        frame = check_observation(known, self._frame_specs)
+        streams = len(next(iter(frame.values())))
+        before = len(next(iter(self._frames.values()))[-1]) if self._frames else streams
+        if streams != before:
+            found = f"the frame holds {streams} streams, and the frames before {before}"
+            raise ObservationError(f"{found}. The number of streams may change only after reset().")
         frames: Frames = {}
-        for key, value in self._checked(batch).items():
-            length = self._specs[key].frames or 1
-            frames[key] = deque(self._frames.get(key, [value] * length), maxlen=length)
-            frames[key].append(value)
+        for key, value in frame.items():
+            length, own = self._specs[key].frames or 1, value.copy()  # the caller may not change it any more
+            frames[key] = deque(self._frames.get(key, [own] * length), maxlen=length)
+            frames[key].append(own)
         return frames
 
     def keep(self, frames: Frames) -> None:
         """Keep what ``after`` gave."""
         self._frames = frames
 
-    def observation(self, frames: Frames) -> Frame:
+    def observation(self, frames: Frames) -> dict[str, Array]:
         """The window as ``predict_action`` takes it: by key ``[B, To, ...]``; of a key without frames the newest."""
         return {
             key: values[-1] if self._specs[key].frames is None else np.stack(values, axis=1)
@@ -84,19 +90,6 @@ class Queues:
     def pop(self) -> FloatArray:
         """The next actions ``[B, Da]``."""
         return self._actions.popleft()
-
-    def _checked(self, batch: Mapping[str, Any]) -> Frame:
-        """The frame as arrays of its own, which the caller may not change any more."""
-        known = {k: batch[k] for k in self._frame_specs if k in batch} if isinstance(batch, Mapping) else batch
-        frame = check_observation(known, self._frame_specs)
-        streams = len(next(iter(frame.values())))
-        before = len(next(iter(self._frames.values()))[-1]) if self._frames else streams
-        if streams != before:
-            raise ObservationError(
-                f"the frame holds {streams} streams, and the frames before {before}. The number of streams may change"
-                " only after reset()."
-            )
-        return {key: array.copy() for key, array in frame.items()}
 
 
 def is_window(batch: Mapping[str, Any], specs: Mapping[str, ObservationSpec]) -> bool:

@@ -13,6 +13,7 @@ import time
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -62,9 +63,6 @@ class Runtime:
     Args:
         artifact: loaded and checked.
         backend: opened on the same artifact.
-
-    Attributes:
-        backend: as given.
     """
 
     def __init__(self, artifact: Artifact, backend: Backend[Any]) -> None:
@@ -96,10 +94,8 @@ class Runtime:
             ObservationError: the episode under way has another number.
         """
         if self.streams not in (None, streams):
-            raise ObservationError(
-                f"the observation holds {streams} streams, and the episode under way {self.streams}: residuals are kept"
-                " for each stream. Call reset() before changing the number of streams."
-            )
+            found = f"the observation holds {streams} streams, and the episode under way {self.streams}"
+            raise ObservationError(f"{found}. Call reset() before changing the number of streams.")
 
     def predict(
         self,
@@ -140,10 +136,8 @@ class Runtime:
         written = np.zeros(cells, dtype=np.bool_) if self._written is None else self._written
         dropped = np.zeros(cells, dtype=np.bool_) if self._dropped is None else self._dropped
         if plan is None and self._helper is None:
-            raise IllegalPlanError(
-                "no plan was given and the artifact has no pruner to make one. Give plan='dense', the name of a plan of"
-                " the artifact, or a matrix; or calibrate the artifact with strategy='tts'."
-            )
+            remedy = "Give plan='dense', the name of a plan, or a matrix; or calibrate with strategy='tts'."
+            raise IllegalPlanError(f"no plan was given and the artifact has no pruner to make one. {remedy}")
         settled = None if plan is None else self._settle(plan, written, dropped, repair)
         if plan_name not in (DENSE, *self._manifest.plans):
             self._matrices = True
@@ -211,10 +205,7 @@ class Runtime:
                 " Begin the episode with a matrix (one of zeros computes all, as plan='dense' does): from a first"
                 " matrix on every call keeps what it computes."
             )
-
-        def check() -> None:
-            require_legal(plans, self._groups, written)
-
+        check = partial(require_legal, plans, self._groups, written)
         if (rollout & ~written).any():
             check()
         return _Settled(plans, tuple(self._lowering.lower(one, check) for one in plans), legalised)

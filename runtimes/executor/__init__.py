@@ -4,8 +4,7 @@ Everything that decides is a state machine without clock or thread, driven by ``
 
 - ``window``: frames in, observation windows out.
 - ``timeline``: actions by control tick, and how chunks join.
-- ``feasibility``: whether a policy keeps up, and when its next call must start.
-- ``tiers``: which plan runs under pressure.
+- ``feasibility``: whether a policy keeps up, when its next call must start, and which plan runs under pressure.
 - ``guard``: what a chunk must be before it is executed.
 - ``state``: all of these together.
 - ``statistics``, ``trace``: what happened.

@@ -15,6 +15,7 @@ Who owns what:
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Mapping
 from types import TracebackType
@@ -29,8 +30,7 @@ from ttscompile.runtimes.arrays import check_seed
 
 from .clock import Clock, MonotonicClock
 from .feasibility import Feasibility, LatencyWindow, fast_enough
-from .measure import measure_latencies, prefix_refusal
-from .pinning import pin
+from .measure import measure_latencies, require_prefix
 from .settings import ExecutorSettings, Policy, resolve
 from .state import ExecutorState, Job
 from .statistics import ExecutorStatistics, statistics
@@ -77,12 +77,8 @@ class AsyncExecutor:
         self._settings = settings = settings or ExecutorSettings()
         info = policy.info
         self._resolved = resolve(settings, info, control_hz)
-        refusal = prefix_refusal(policy) if settings.seam == "prefix" else None
-        if refusal is not None:
-            raise ExecutorError(
-                "seam='prefix' needs a policy whose predict_action takes prefix= and inpaints it;"
-                f" {refusal} Use seam='blend' or seam='replace'."
-            )
+        if settings.seam == "prefix":
+            require_prefix(policy)
         self._policy = policy
         self._normalizer = info.action.normalizer if info.action.ranged else None
         self._given_latencies = latencies
@@ -105,10 +101,8 @@ class AsyncExecutor:
         self._thread.start()
         if not self._ready.wait(open_timeout):
             self._closing = True
-            raise ExecutorError(
-                f"the policy was not measured within {open_timeout:g} s: a call of it hangs, or is very slow. Look at"
-                " 'ttscompile realtime DIR'."
-            )
+            what = f"the policy was not measured within {open_timeout:g} s: a call of it hangs, or is very slow."
+            raise ExecutorError(f"{what} Look at 'ttscompile realtime DIR'.")
         if self._failure is not None:
             self._thread.join()
             raise self._failure
@@ -215,9 +209,8 @@ class AsyncExecutor:
                 f"the policy is still in a call, {timeout:g} s after close(): it hangs, or is slower than that. Its"
                 " thread is left behind; do not use the policy again."
             )
-        if self._failure is not None and not self._failure_told:
-            self._failure_told = True
-            raise self._dead() from self._failure
+        if not self._failure_told:
+            self._raise_failure()
 
     def __enter__(self) -> Self:
         return self
@@ -282,19 +275,20 @@ class AsyncExecutor:
         return self._state
 
     def _checked(self) -> ExecutorState:
-        if self._failure is not None:
-            self._failure_told = True
-            raise self._dead() from self._failure
+        self._raise_failure()
         if self._closing:
             raise ExecutorClosedError("the executor was closed. Make another one.")
         return self._opened()
 
-    def _dead(self) -> WorkerDeadError:
+    def _raise_failure(self) -> None:
+        """Raise if the worker has ended by an error."""
         failure = self._failure
-        return WorkerDeadError(
-            f"the thread that owns the policy has ended, because a call raised {type(failure).__name__}: {failure}."
-            " Stop the robot safely; close this executor, and make another one when the cause is gone."
-        )
+        if failure is not None:
+            self._failure_told = True
+            raise WorkerDeadError(
+                f"the thread that owns the policy has ended, because a call raised {type(failure).__name__}: {failure}."
+                " Stop the robot safely; close this executor, and make another one when the cause is gone."
+            ) from failure
 
     # The worker's side
 
@@ -315,23 +309,19 @@ class AsyncExecutor:
         finally:
             self._ready.set()
 
-    def _measured(self) -> dict[str, list[float]]:
-        """Seconds of calls of each tier: as they were given, or measured now."""
-        given, tiers = self._given_latencies, self._resolved.tiers
-        if given is None:
-            self._policy.reset()
-            times = measure_latencies(self._policy, self._clock, self._settings, tiers)
-            return {name: [ms / 1e3 for ms in each.ms] for name, each in times.items()}
-        if missing := [name for name in tiers if name not in given]:
-            raise ExecutorError(f"latencies lacks the tier {missing[0]!r}; give one for each of {tiers}.")
-        return {name: [given[name]] for name in tiers}
-
     def _open(self) -> None:
         """Pin the thread, measure the tiers, refuse what is infeasible."""
-        settings, resolved = self._settings, self._resolved
+        settings, resolved, given = self._settings, self._resolved, self._given_latencies
         if settings.cores is not None:
-            pin(settings.cores)
-        measured = self._measured()
+            _pin(settings.cores)
+        if given is None:
+            self._policy.reset()
+            times = measure_latencies(self._policy, self._clock, settings, resolved.tiers)
+            measured = {name: [ms / 1e3 for ms in each.ms] for name, each in times.items()}
+        elif missing := [name for name in resolved.tiers if name not in given]:
+            raise ExecutorError(f"latencies lacks the tier {missing[0]!r}; give one for each of {resolved.tiers}.")
+        else:
+            measured = {name: [given[name]] for name in resolved.tiers}
         latencies = {name: LatencyWindow(settings.latency_window, values) for name, values in measured.items()}
         self._feasibility = {name: resolved.feasibility(max(values)) for name, values in measured.items()}
         tiers = fast_enough(self._feasibility, settings.refuse_infeasible)
@@ -377,3 +367,16 @@ class AsyncExecutor:
             args = {"plan": job.plan, "epoch": job.epoch, "chunk": outcome}
             report = getattr(self._policy, "last_report", None)
             self.trace.call(job.started, now, args, None if report is None else report.timings)
+
+
+def _pin(cores: tuple[int, ...]) -> None:
+    """Keep the calling thread on these processors."""
+    if not hasattr(os, "sched_setaffinity"):
+        raise ExecutorError("cores cannot be set on this system. Leave ExecutorSettings.cores at None.")
+    try:
+        os.sched_setaffinity(0, cores)
+    except OSError as error:
+        usable = sorted(os.sched_getaffinity(os.getpid()))
+        raise ExecutorError(
+            f"the policy's thread cannot be pinned to {cores}: {error}. This process may use {usable}."
+        ) from error

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from ttscompile.core.spec import Affine, FloatArray
 from ttscompile.errors import ExecutorError
@@ -55,12 +54,16 @@ class Guard:
     """
 
     def __init__(self, limits: GuardLimits, normalizer: Affine | None, channels: int) -> None:
-        low, high = _range(normalizer, limits.margin, channels)
+        unlimited = np.full(channels, np.inf, np.float32)
+        low, high = -unlimited, unlimited
+        if normalizer is not None:
+            ends = np.stack([normalizer.unnormalize(np.full(channels, end, np.float32)) for end in (-1.0, 1.0)])
+            low, high = ends.min(axis=0), ends.max(axis=0)
+            low, high = low - limits.margin * (high - low), high + limits.margin * (high - low)
         self._low = _vector(limits.low, channels, "low", low)
         self._high = _vector(limits.high, channels, "high", high)
         if not (self._low < self._high).all():
             raise ExecutorError(f"the guard's bounds leave no room: low {self._low} is not below high {self._high}.")
-        unlimited = np.full(channels, np.inf, np.float32)
         self._max_step = None if limits.max_step is None else _vector(limits.max_step, channels, "max_step", unlimited)
         self._max_jerk = None if limits.max_jerk is None else _vector(limits.max_jerk, channels, "max_jerk", unlimited)
 
@@ -71,10 +74,8 @@ class Guard:
         outside = (actions < self._low) | (actions > self._high)
         if outside.any():
             i, d = (int(n) for n in np.argwhere(outside)[0])
-            return (
-                f"action {i}, channel {d}, is {actions[i, d]:.6g}; the bounds are {self._low[d]:.6g} to"
-                f" {self._high[d]:.6g}"
-            )
+            bounds = f"{self._low[d]:.6g} to {self._high[d]:.6g}"
+            return f"action {i}, channel {d}, is {actions[i, d]:.6g}; the bounds are {bounds}"
         return None
 
     def refuse_motion(self, played: FloatArray, scheduled: FloatArray) -> str | None:
@@ -101,25 +102,12 @@ class Guard:
         return None
 
 
-def _range(normalizer: Affine | None, margin: float, channels: int) -> tuple[FloatArray, FloatArray]:
-    """What the normaliser maps to -1 and 1, ``margin`` further apart."""
-    if normalizer is None:
-        infinite = np.full(channels, np.inf, np.float32)
-        return -infinite, infinite
-    ends = np.stack([normalizer.unnormalize(np.full(channels, end, np.float32)) for end in (-1.0, 1.0)])
-    low, high = ends.min(axis=0), ends.max(axis=0)
-    return low - margin * (high - low), high + margin * (high - low)
-
-
-def _vector(
-    limit: float | Sequence[float] | None, channels: int, name: str, default: npt.NDArray[np.float32]
-) -> FloatArray:
+def _vector(limit: float | Sequence[float] | None, channels: int, name: str, default: FloatArray) -> FloatArray:
     """A limit as one number a channel."""
     if limit is None:
         return default
     array = np.asarray(limit, dtype=np.float32)
     if array.shape not in ((), (channels,)) or np.isnan(array).any():
-        raise ExecutorError(
-            f"the guard's {name} must be a number, or one for each of {channels} channels; found {limit}."
-        )
+        expected = f"a number, or one for each of {channels} channels"
+        raise ExecutorError(f"the guard's {name} must be {expected}; found {limit}.")
     return np.broadcast_to(array, (channels,))

@@ -1,31 +1,35 @@
-"""What has to be known of a policy before it drives a robot: how long its calls take, and what they accept."""
+"""What is measured before a policy drives a robot: what its calls take, and how punctual a loop is beside them."""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.core.spec import ChunkSpec, FloatArray, ObservationSpec
+from ttscompile.core.spec import ObservationSpec
+from ttscompile.errors import ExecutorError
 from ttscompile.measure.timer import Timer, Times
 
 from .clock import Clock
 from .settings import ExecutorSettings, Policy
 
 
-def prefix_refusal(policy: Policy) -> str | None:
-    """Why a policy cannot be given the actions that are committed; None if it can.
-
-    It can if ``predict_action`` has a parameter ``prefix``, by that name, and the policy itself has nothing against it.
-    """
-    if "prefix" not in inspect.signature(policy.predict_action).parameters:
-        return f"{type(policy).__name__} does not."
-    refusal: str | None = getattr(policy.info, "prefix_refusal", None)
-    return None if refusal is None else f"this one does not: {refusal}"
+def require_prefix(policy: Policy) -> None:
+    """Raise unless ``predict_action`` has a parameter of the name ``prefix``, and the policy has nothing against it."""
+    takes = "prefix" in inspect.signature(policy.predict_action).parameters
+    refusal = getattr(policy.info, "prefix_refusal", None)
+    if not takes or refusal is not None:
+        why = f"this one does not: {refusal}" if takes else f"{type(policy).__name__} does not."
+        raise ExecutorError(
+            "seam='prefix' needs a policy whose predict_action takes prefix= and inpaints it;"
+            f" {why} Use seam='blend' or seam='replace'."
+        )
 
 
 def neutral_observation(specs: dict[str, ObservationSpec]) -> dict[str, npt.NDArray[Any]]:
@@ -37,12 +41,6 @@ def neutral_observation(specs: dict[str, ObservationSpec]) -> dict[str, npt.NDAr
     return made
 
 
-def neutral_action(chunk: ChunkSpec) -> FloatArray:
-    """One action of one stream, ``[1, 1, Da]``, that the normaliser maps to 0."""
-    zeros = np.zeros((1, 1, chunk.action_dim), np.float32)
-    return zeros if chunk.normalizer is None else chunk.normalizer.unnormalize(zeros)
-
-
 def measure_latencies(
     policy: Policy, clock: Clock, settings: ExecutorSettings, plans: Sequence[str]
 ) -> dict[str, Times]:
@@ -50,10 +48,68 @@ def measure_latencies(
 
     The plans take turns. The caller resets the policy before and after.
     """
-    obs = neutral_observation(dict(policy.info.observation))
-    known = {"prefix": neutral_action(policy.info.action)} if settings.seam == "prefix" else {}
+    obs, known = neutral_observation(dict(policy.info.observation)), {}
+    if settings.seam == "prefix":  # one action that the normaliser maps to 0
+        chunk = policy.info.action
+        known["prefix"] = chunk.unnormalized(np.zeros((1, 1, chunk.action_dim), np.float32))
     timer = Timer(len(plans), settings.warm_up, clock.now)
     for _ in range(settings.warm_up + settings.measured_calls):
         for i in timer.round():
             timer.time(i, partial(policy.predict_action, obs, plan=plans[i], **known))
     return dict(zip(plans, timer.times, strict=True))
+
+
+@dataclass(frozen=True)
+class Jitter:
+    """How late the ticks of a loop were, in milliseconds, and what the loop's own work took.
+
+    Attributes:
+        hz: rate of the loop.
+        ticks: how many ticks were measured.
+        p50: median lateness.
+        p99: 99th percentile of the lateness.
+        max: the latest tick.
+        late: ticks that were later than half a period.
+        work_us: median of the work of a tick, microseconds.
+    """
+
+    hz: float
+    ticks: int
+    p50: float
+    p99: float
+    max: float
+    late: int
+    work_us: float
+
+    def to_json(self) -> dict[str, Any]:
+        """As plain JSON values."""
+        return asdict(self)
+
+
+def measure_jitter(hz: float, seconds: float, work: Callable[[], object] = lambda: None) -> Jitter:
+    """Run a loop in real time, sleeping between ticks, and measure how late it wakes.
+
+    Args:
+        hz: rate of the loop.
+        seconds: how long it runs.
+        work: called in every tick.
+    """
+    ticks = max(int(seconds * hz), 1)
+    late, took = np.empty(ticks), np.empty(ticks)
+    start = time.perf_counter()
+    for i in range(ticks):
+        due = start + (i + 1) / hz
+        time.sleep(max(due - time.perf_counter(), 0.0))
+        woke = time.perf_counter()
+        work()
+        late[i], took[i] = woke - due, time.perf_counter() - woke
+    p50, p99 = (float(p) for p in np.percentile(1e3 * late, [50, 99]))
+    return Jitter(
+        hz=hz,
+        ticks=ticks,
+        p50=p50,
+        p99=p99,
+        max=float(1e3 * late.max()),
+        late=int(np.count_nonzero(late > 0.5 / hz)),
+        work_us=float(1e6 * np.median(took)),
+    )

@@ -5,8 +5,7 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,15 +31,8 @@ MOST_SECONDS = 1e15
 """Times are less than this, either way."""
 
 
-@dataclass(frozen=True)
-class Request:
-    """A request that has been read.
-
-    Attributes:
-        id: what the client called it; sent back.
-        method: one of ``METHODS``.
-        params: checked as far as the method says.
-    """
+class Request(NamedTuple):
+    """A request: what the client called it, which is sent back; one of ``METHODS``; what it has, checked so far."""
 
     id: int | str | None
     method: str
@@ -76,13 +68,10 @@ def _checked(document: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     allowed = METHODS.get(method) if isinstance(method, str) else None
     if allowed is None:
         raise ProtocolError(f"the method is one of {', '.join(METHODS)}; found {str(method)[:40]!r}.")
-    unexpected = sorted(document.keys() - allowed)
-    if unexpected:
+    if unexpected := sorted(document.keys() - allowed):
         raise ProtocolError(f"{method} takes {sorted(allowed)}; found {unexpected[0][:40]!r}.")
     for key in ("t", "timeout"):
-        value = document.get(key)
-        if value is None:
-            continue
+        value = 0 if document.get(key) is None else document[key]
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MOST_SECONDS:
             raise ProtocolError(f"{key} is a number of seconds; found {str(value)[:40]}.")
     seed = document.get("seed")
@@ -130,10 +119,8 @@ def _packed(key: str, value: dict[str, Any]) -> Array:
         array: Array = np.frombuffer(content, dtype).reshape(shape)
         return array.astype(dtype.newbyteorder("="))
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise ProtocolError(
-            f"observation {key[:40]!r} must be lists of numbers, or an object with dtype, shape and base64:"
-            f" {str(error)[:200]}."
-        ) from error
+        expected = "lists of numbers, or an object with dtype, shape and base64"
+        raise ProtocolError(f"observation {key[:40]!r} must be {expected}: {str(error)[:200]}.") from error
 
 
 def answer(request_id: int | str | None, result: Mapping[str, Any]) -> str:

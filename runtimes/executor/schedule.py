@@ -53,10 +53,8 @@ class Schedule:
             ExecutorError: an action for a later time was given out before, or the time is of another clock.
         """
         if not abs(time - now) < FAR:
-            raise ExecutorError(
-                f"an action was asked for {time - now:.6g} s from now. Give times of time.monotonic(), or of the clock"
-                " that the executor was given."
-            )
+            remedy = "Give times of time.monotonic(), or of the clock that the executor was given."
+            raise ExecutorError(f"an action was asked for {time - now:.6g} s from now. {remedy}")
         tick = self.grid.tick(time)
         if self.last is not None and tick < self.last[0]:
             raise ExecutorError(

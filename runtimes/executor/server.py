@@ -112,10 +112,8 @@ class ExecutorServer:
                 logger=quiet,
             )
         except OSError as error:
-            raise ExecutorError(
-                f"cannot listen on {host}:{port}: {error.strerror}. Choose another port (0 takes any that is free), or"
-                " an address of this machine."
-            ) from error
+            remedy = "Choose another port (0 takes any that is free), or an address of this machine."
+            raise ExecutorError(f"cannot listen on {host}:{port}: {error.strerror}. {remedy}") from error
         try:
             on_start(next(iter(server.sockets)).getsockname()[1])
             await stop.wait()
@@ -187,24 +185,18 @@ class ExecutorServer:
             executor.observe(read_frame(params["obs"], executor.frames), params.get("t"))
             return {}
         if request.method == "action":
-            return {"action": (await self._action(params.get("t"), params.get("timeout"))).tolist()}
+            t, timeout = params.get("t"), params.get("timeout") or 0.0
+            if timeout > self._limits.action_timeout:
+                raise ProtocolError(f"timeout must be at most {self._limits.action_timeout:g} s; found {timeout:g}.")
+            if timeout <= 0:
+                return {"action": executor.action(t).tolist()}
+            waiting = asyncio.get_running_loop().run_in_executor(self._pool, executor.action, t, timeout)
+            return {"action": (await waiting).tolist()}
         if request.method == "reset":
             executor.reset(params.get("seed"))
             return {}
         if request.method == "statistics":
             return executor.statistics().to_json()
-        return self._info()
-
-    async def _action(self, t: float | None, timeout: float | None) -> Any:
-        if not timeout or timeout < 0:
-            return self._executor.action(t)
-        if timeout > self._limits.action_timeout:
-            raise ProtocolError(f"timeout must be at most {self._limits.action_timeout:g} s; found {timeout:g}.")
-        loop = asyncio.get_running_loop()
-        return await loop.run_in_executor(self._pool, self._executor.action, t, timeout)
-
-    def _info(self) -> dict[str, Any]:
-        executor = self._executor
         frames, (control_hz, policy_hz) = executor.frames, executor.rates
         return {
             "observation": {

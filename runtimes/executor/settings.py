@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
-from ttscompile.core.spec import ChunkSpec, ObservationSpec
 from ttscompile.errors import ExecutorError
 
 from .feasibility import Feasibility
@@ -15,40 +14,18 @@ from .window import FrameSpec
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from ttscompile.runtimes.policy import PolicyInfo
+
 INTERPOLATIONS = ("hold", "linear")
 SEAMS = ("replace", "blend", "prefix")
-
-
-class PolicyFacts(Protocol):
-    """What the executor has to know of a policy: the part of ``PolicyInfo`` that it reads."""
-
-    @property
-    def observation(self) -> Mapping[str, ObservationSpec]:
-        """Specification of each key."""
-
-    @property
-    def action(self) -> ChunkSpec:
-        """Chunking."""
-
-    @property
-    def sample(self) -> tuple[int, int]:
-        """``(T, D)``."""
-
-    @property
-    def plans(self) -> tuple[str, ...]:
-        """Names that ``predict_action(plan=...)`` takes."""
-
-    @property
-    def default_plan(self) -> str:
-        """The one that is taken when none is given."""
 
 
 class Policy(Protocol):
     """What the executor calls: a ``CompiledPolicy``, or what acts like one."""
 
     @property
-    def info(self) -> PolicyFacts:
-        """What it is."""
+    def info(self) -> Any:
+        """Of ``PolicyInfo`` what is read here: ``observation, action, sample, plans, default_plan``."""
 
     def reset(self, seed: int | None = None) -> None:
         """A new episode."""
@@ -171,7 +148,7 @@ class Resolved:
         return Feasibility(latency, self.control_hz, self.policy_hz, self.horizon, self.margin_ticks, self.reserve)
 
 
-def resolve(settings: ExecutorSettings, info: PolicyFacts, control_hz: float) -> Resolved:
+def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> Resolved:
     """Fit settings to a policy.
 
     Raises:
@@ -190,21 +167,17 @@ def resolve(settings: ExecutorSettings, info: PolicyFacts, control_hz: float) ->
     longest = info.sample[0] - chunk.start
     horizon = settings.horizon or chunk.stop - chunk.start
     if horizon > longest:
-        raise ExecutorError(
-            f"horizon = {horizon}: the policy predicts {info.sample[0]} actions, {longest} of them from the observation"
-            f" on. Give at most {longest}."
-        )
+        predicted = f"{info.sample[0]} actions, {longest} of them from the observation on"
+        raise ExecutorError(f"horizon = {horizon}: the policy predicts {predicted}. Give at most {longest}.")
     reserve = longest - horizon if settings.reserve is None else settings.reserve
     if reserve > longest - horizon:
         raise ExecutorError(
             f"reserve = {reserve}: the policy predicts {longest} actions from the observation on, and horizon ="
             f" {horizon} are played anyway. Give at most {longest - horizon}, or None for all."
         )
-    unknown = [name for name in tiers if name not in info.plans]
-    if unknown:
-        raise ExecutorError(
-            f"the policy has no plan {unknown[0]!r}; it has {list(info.plans)}. Name tiers among these."
-        )
+    if unknown := [name for name in tiers if name not in info.plans]:
+        known = list(info.plans)
+        raise ExecutorError(f"the policy has no plan {unknown[0]!r}; it has {known}. Name tiers among these.")
     return Resolved(
         control_hz=control_hz,
         policy_hz=policy_hz,

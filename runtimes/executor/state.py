@@ -11,12 +11,11 @@ from dataclasses import dataclass
 from ttscompile.core.spec import Affine, FloatArray
 from ttscompile.errors import DeadlineMissedError, ObservationError, StaleObservationError
 
-from .feasibility import LatencyWindow
+from .feasibility import LatencyWindow, Tiers
 from .guard import Guard
 from .schedule import Schedule
 from .settings import ExecutorSettings, Resolved
 from .statistics import Recorder
-from .tiers import Tiers
 from .window import Frame, ObservationWindow
 
 SAME_TIME = 1e-6
@@ -100,7 +99,7 @@ class ExecutorState:
         """A new episode: nothing from before is given out any more."""
         self.epoch += 1
         self.recorder.counts.resets += 1
-        self.recorder.pause()
+        self.recorder.last_tick = None
         self._begin_episode()
 
     # Observations
@@ -113,10 +112,9 @@ class ExecutorState:
         """
         ahead = time - now
         if not ahead <= 0.5 / self._resolved.control_hz:
-            raise ObservationError(
-                f"the observation's time is {ahead:.6g} s ahead of the executor's clock, {now:.6f}. Stamp frames with"
-                " time.monotonic(), or with the clock that the executor was given."
-            )
+            what = f"the observation's time is {ahead:.6g} s ahead of the executor's clock, {now:.6f}"
+            remedy = "Stamp frames with time.monotonic(), or with the clock that the executor was given."
+            raise ObservationError(f"{what}. {remedy}")
         counts = self.recorder.counts
         counts.frames += 1
         added = self._window.add(time, frame, now)
@@ -254,17 +252,17 @@ class ExecutorState:
             return "discarded"
         outcome = self._schedule.add(job.observed, actions, now)
         if outcome == "scheduled":
+            counts.chunks += 1
             self._update_due()
-        refused = outcome == "refused"
-        if refused:
+        elif outcome == "refused":
+            counts.chunks_refused += 1
             self.recorder.last_refusal = self._schedule.refusal
-        counts.chunks_refused += refused
-        counts.chunks += outcome == "scheduled"
-        counts.chunks_overdue += outcome == "overdue"
+        else:
+            counts.chunks_overdue += 1
         if job.deadline is not None:
             self.recorder.slack_ms.add(1e3 * (job.deadline - now))
         late = job.deadline is not None and now > job.deadline
-        if refused and not late:  # a faster plan is no remedy for what was refused in time, nor has it kept up
+        if outcome == "refused" and not late:  # a faster plan is no remedy for that, nor has it kept up
             return outcome
         switched = self._tiers.after_call(missed=late or self._schedule.runs_out(now) is None)
         counts.switches_down += switched == 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -85,8 +85,8 @@ class Counts:
     resets: int = 0
 
 
-@dataclass(frozen=True)
-class ExecutorStatistics:
+@dataclass(kw_only=True)
+class ExecutorStatistics(Counts):
     """What an executor did so far.
 
     Attributes:
@@ -121,22 +121,6 @@ class ExecutorStatistics:
 
     plan: str
     identity: str
-    ticks: int
-    reserve: int
-    holds: int
-    starved: int
-    frames: int
-    frames_late: int
-    frames_replaced: int
-    calls: int
-    chunks: int
-    chunks_refused: int
-    chunks_overdue: int
-    chunks_discarded: int
-    deadlines_missed: int
-    switches_down: int
-    switches_up: int
-    resets: int
     last_refusal: str | None
     latency_ms: Summary | None
     observation_age_ms: Summary | None
@@ -160,34 +144,25 @@ class Recorder:
     def __init__(self, window: int) -> None:
         self.counts = Counts()
         self.last_refusal: str | None = None
-        self.latency_ms = Samples(window)
-        self.observation_age_ms = Samples(window)
-        self.action_age_ms = Samples(window)
-        self.slack_ms = Samples(window)
-        self.queue_depth = Samples(window)
-        self.tick_ms = Samples(window)
-        self._last_tick: float | None = None
+        self.latency_ms, self.observation_age_ms, self.action_age_ms = (Samples(window) for _ in range(3))
+        self.slack_ms, self.queue_depth, self.tick_ms = (Samples(window) for _ in range(3))
+        self.last_tick: float | None = None  # None where the loop stands still on purpose
 
     def tick(self, now: float) -> None:
         """An action was given out."""
         self.counts.ticks += 1
-        if self._last_tick is not None:
-            self.tick_ms.add(1e3 * (now - self._last_tick))
-        self._last_tick = now
-
-    def pause(self) -> None:
-        """The loop stands still on purpose: the time to the next tick is not measured."""
-        self._last_tick = None
+        if self.last_tick is not None:
+            self.tick_ms.add(1e3 * (now - self.last_tick))
+        self.last_tick = now
 
     def copy(self) -> dict[str, Any]:
         """What ``statistics`` needs, copied while the lock is held; the percentiles are made without it."""
         samples = {name: value.copy() for name, value in vars(self).items() if isinstance(value, Samples)}
-        counts = {field.name: getattr(self.counts, field.name) for field in fields(Counts)}
-        return {"last_refusal": self.last_refusal, "counts": counts, "samples": samples}
+        return {"last_refusal": self.last_refusal, "counts": asdict(self.counts), "samples": samples}
 
 
 def statistics(plan: str, copied: dict[str, Any], identity: str = "") -> ExecutorStatistics:
     """Statistics from what ``Recorder.copy`` gave."""
     summaries: dict[str, Any] = {name: summary(*sample) for name, sample in copied["samples"].items()}
-    told = {"plan": plan, "identity": identity, "last_refusal": copied["last_refusal"]}
-    return ExecutorStatistics(**told, **copied["counts"], **summaries)
+    counts, last = copied["counts"], copied["last_refusal"]
+    return ExecutorStatistics(plan=plan, identity=identity, last_refusal=last, **counts, **summaries)

@@ -13,15 +13,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import floor
-from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from ttscompile.core.spec import FloatArray
-
-Times: TypeAlias = npt.NDArray[np.float64]
-
 
 FOLLOW = 0.05
 """Share of its distance from the middle of a tick by which each action moves the grid."""
@@ -75,7 +71,7 @@ class Timeline:
 
     start: int
     rows: FloatArray
-    observed: Times
+    observed: npt.NDArray[np.float64]
 
     @property
     def end(self) -> int:

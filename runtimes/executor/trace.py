@@ -88,11 +88,6 @@ class Trace:
 
 def _as_json(event: Event, zero: float) -> dict[str, Any]:
     phase, name, thread, start, duration, args = event
-    made: dict[str, Any] = {"ph": phase, "name": name, "pid": 1, "tid": thread, "ts": round(1e6 * (start - zero), 3)}
-    if phase == "X":
-        made["dur"] = round(1e6 * duration, 3)
-    if phase == "i":
-        made["s"] = "t"
-    if args:
-        made["args"] = dict(args)
-    return made
+    made = {"ph": phase, "name": name, "pid": 1, "tid": thread, "ts": round(1e6 * (start - zero), 3)}
+    lasting: dict[str, Any] = {"dur": round(1e6 * duration, 3)} if phase == "X" else {"s": "t"}
+    return made | lasting | ({"args": dict(args)} if args else {})

@@ -10,7 +10,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -64,21 +64,18 @@ class FrameSpec:
         """
         if not isinstance(obs, Mapping) or obs.keys() != self.shapes.keys():
             found = sorted(map(str, obs)) if isinstance(obs, Mapping) else type(obs).__name__
-            raise ObservationError(
-                f"expected one frame, a dictionary with the keys {sorted(self.shapes)}; found {found}."
-            )
-        return {key: self._one(key, as_array(obs[key], f"observation {key!r}")) for key in self.shapes}
+            keys = sorted(self.shapes)
+            raise ObservationError(f"expected one frame, a dictionary with the keys {keys}; found {found}.")
+        return {key: self._one(key, obs[key]) for key in self.shapes}
 
-    def _one(self, key: str, array: Array) -> Array:
-        shape, dtype = self.shapes[key], self.dtypes[key]
+    def _one(self, key: str, given: Any) -> Array:
+        array, shape, dtype = as_array(given, f"observation {key!r}"), self.shapes[key], self.dtypes[key]
         if array.shape != shape or array.dtype != dtype:
             remedy = "Convert it with .astype." if array.shape == shape else ""
             if array.shape[1:] == shape and key in self.history:
                 remedy = f"Give one frame at a time; the executor makes the window of {self.steps}."
-            raise ObservationError(
-                f"one frame of observation {key!r} must be {dtype} {list(shape)}; found {array.dtype}"
-                f" {list(array.shape)}. {remedy}".rstrip()
-            )
+            what = f"one frame of observation {key!r} must be {dtype} {list(shape)}"
+            raise ObservationError(f"{what}; found {array.dtype} {list(array.shape)}. {remedy}".rstrip())
         check_finite(array, f"observation {key!r}", "Look for the sensor, or the division, that made it.")
         return array.copy()
 
@@ -91,14 +88,8 @@ class FrameSpec:
         }
 
 
-@dataclass(frozen=True)
-class Window:
-    """A complete window.
-
-    Attributes:
-        time: when its newest frame was taken, in seconds.
-        frames: To of them, oldest first.
-    """
+class Window(NamedTuple):
+    """A complete window: when its newest frame was taken, in seconds; and its To frames, oldest first."""
 
     time: float
     frames: list[Frame]
@@ -120,7 +111,7 @@ class ObservationWindow:
 
     def __init__(self, steps: int, period: float, tolerance: float, max_age: float) -> None:
         self._steps, self._period, self._slack = steps, period, tolerance * period
-        self._keep = max_age + (steps - 1) * period + self._slack
+        self._keep = max_age + (steps - 1) * period + self._slack  # older ones are part of windows that are too old
         self._times: list[float] = []
         self._frames: list[Frame] = []
         self.complete: Window | None = None
@@ -150,13 +141,13 @@ class ObservationWindow:
             frames[place] = frame
             self.complete = self._find()
             return "replaced"
-        if time < self._oldest(now):
+        if time < now - self._keep:
             return "late"
         if place == len(times):
             self.delay = max(now - time, 0.0)
         times.insert(place, time)
         frames.insert(place, frame)
-        keep = max(bisect_left(times, self._oldest(times[-1])), len(times) - MOST_FRAMES)
+        keep = max(bisect_left(times, times[-1] - self._keep), len(times) - MOST_FRAMES)
         if keep:
             del times[:keep], frames[:keep]
         self.complete = self._find()
@@ -172,10 +163,6 @@ class ObservationWindow:
             f"the policy wants {self._steps} frames every {self._period:.4g} s, to within {self._slack:.2g} s; the"
             f" newest came {', '.join(f'{gap:.4g}' for gap in gaps)} s apart"
         )
-
-    def _oldest(self, newest: float) -> float:
-        """Frames before this can only be part of a window that is too old, if the newest one is of this time."""
-        return newest - self._keep
 
     def _find(self) -> Window | None:
         times, frames = self._times, self._frames

@@ -103,7 +103,7 @@ class OnnxBackend:
         work = Workspace(self._manifest, self.sessions, self._artifact.tables, streams)
         work.sums(max((one.slots for one in self._schedules), default=0))
         for correction in self._artifact.corrections.values():
-            work.prepare(correction)
+            work.advances_with(correction)
         for lowered in self._schedules:
             for k in np.flatnonzero(lowered.computed.all(axis=1)).tolist():
                 work.bind_dense(k)

@@ -1,8 +1,8 @@
-"""What the pieces read beside the stream, of one batch size: values of the condition, of each step, and of tables."""
+"""What the pieces read beside the stream, of one batch size, and the arrays that a block is bound to."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from ttscompile.errors import ArtifactError
 from ttscompile.ir.pieces import CONDITION, STEP
 from ttscompile.ir.program import Binding
 
-from .sessions import Array, repeat_streams, run_named
+from .sessions import Array, Bound, repeat_streams, run_named
 
 
 class ContextValues:
@@ -35,12 +35,13 @@ class ContextValues:
     ) -> None:
         self._manifest, self._sessions, self.streams = manifest, sessions, streams
         self._step_inputs: dict[str, Array] = {}
-        self.values: dict[str, Array] = {
-            name: repeat_streams(tables[name], _row_axis(context), streams)
-            if context.binding is Binding.TABLE
-            else np.zeros(_shape(context, manifest.steps, streams), context.type.dtype)
-            for name, context in manifest.contexts.items()
-        }
+        self.values: dict[str, Array] = {}
+        for name, context in manifest.contexts.items():
+            axis, steps = context.type.batch_axis, () if context.binding is Binding.CONDITION else (manifest.steps,)
+            if context.binding is Binding.TABLE:  # its first axis is the step
+                self.values[name] = repeat_streams(tables[name], None if axis is None else axis + 1, streams)
+            else:
+                self.values[name] = np.zeros((*steps, *context.type.at(streams)), context.type.dtype)
 
     @property
     def nbytes(self) -> int:
@@ -68,9 +69,9 @@ class ContextValues:
         row: Array = value[k, ...]  # an array still where it is one number
         return row
 
-    def of_piece(self, piece: PieceRecord) -> dict[str, tuple[ContextRecord, Array]]:
-        """Contexts that a piece of the loop reads, and their values: ``[K, ...]`` unless they are of the condition."""
-        return {name: (self._manifest.contexts[name], self.values[name]) for name in piece.contexts}
+    def of(self, name: str) -> tuple[ContextRecord, Array]:
+        """A context and its values: ``[K, ...]`` unless they are of the condition."""
+        return self._manifest.contexts[name], self.values[name]
 
     def _run_step(self, piece: PieceRecord) -> None:
         """The step values of all steps in one batch of K * B, step-major."""
@@ -84,31 +85,79 @@ class ContextValues:
                 continue
             if name not in self._step_inputs:
                 if axis is None:
-                    raise ArtifactError(
-                        f"table {name!r} : {context.type} of the step piece has no axis for the streams, so that the"
-                        " steps cannot run as one batch. Convert the checkpoint again."
-                    )
+                    problem = f"table {name!r} : {context.type} of the step piece has no axis for the streams"
+                    raise ArtifactError(f"{problem}. Convert the checkpoint again.")
                 self._step_inputs[name] = np.concatenate(list(self.values[name]), axis=axis)
             feed[name] = self._step_inputs[name]
         for name, value in run_named(self._sessions[STEP], piece.outputs, feed).items():
-            np.copyto(self.values[name], self._by_step(name, value))
-
-    def _by_step(self, name: str, value: Array) -> Array:
-        """``[..., K * B, ...]`` as ``[K, ..., B, ...]``."""
-        axis = self._manifest.contexts[name].type.batch_axis
-        if axis is None:
-            raise ArtifactError(f"step value {name!r} has no axis for the streams. Convert the checkpoint again.")
-        front = np.moveaxis(value, axis, 0)
-        split = front.reshape(self._manifest.steps, self.streams, *front.shape[1:])
-        return np.moveaxis(split, 1, axis + 1)
+            axis = self._manifest.contexts[name].type.batch_axis
+            if axis is None:
+                raise ArtifactError(f"step value {name!r} has no axis for the streams. Convert the checkpoint again.")
+            front = np.moveaxis(value, axis, 0)  # from [..., K * B, ...] to [K, ..., B, ...]
+            split = front.reshape(steps, self.streams, *front.shape[1:])
+            np.copyto(self.values[name], np.moveaxis(split, 1, axis + 1))
 
 
-def _row_axis(context: ContextRecord) -> int | None:
-    """Batch axis of a whole table, whose first axis is the step."""
-    axis = context.type.batch_axis
-    return None if axis is None else axis + 1
+class BoundBlock:
+    """A block bound to arrays for all streams, or for n of them.
 
+    Args:
+        session: of the block.
+        piece: of the block.
+        contexts: values for all streams.
+        axis: of the streams in the residual stream.
+        stream: what it reads.
+        residual: what it writes.
+        count: n.
+    """
 
-def _shape(context: ContextRecord, steps: int, streams: int) -> tuple[int, ...]:
-    one = context.type.at(streams)
-    return one if context.binding is Binding.CONDITION else (steps, *one)
+    def __init__(
+        self,
+        session: Any,
+        piece: PieceRecord,
+        contexts: ContextValues,
+        axis: int,
+        stream: Array,
+        residual: Array,
+        count: int,
+    ) -> None:
+        self._stream, self._axis = stream, axis
+        self.rows = np.moveaxis(residual, axis, 0)
+        whole = count == contexts.streams
+        self._by_step: list[tuple[Array, Array]] = []  # where it is read from, and one value a step
+        self._gathered: list[tuple[Array, Array, int, bool]] = []  # where, value, axis of the streams, one a step
+        arrays: dict[str, Array] = {}
+        for name in piece.contexts:
+            context, value = contexts.of(name)
+            batch, stepwise = context.type.batch_axis, context.binding is not Binding.CONDITION
+            if not stepwise and (whole or batch is None):
+                arrays[name] = value
+                continue
+            arrays[name] = np.zeros(context.type.at(count), context.type.dtype)
+            if whole or batch is None:
+                self._by_step.append((arrays[name], value))
+            elif context.binding is Binding.TABLE:  # the same for every stream
+                self._by_step.append((arrays[name], value.take(np.arange(count), axis=batch + 1)))
+            else:
+                self._gathered.append((arrays[name], value, batch, stepwise))
+        self._own = (*arrays.values(), stream, residual) if not whole else tuple(to for to, _ in self._by_step)
+        inputs = {name: stream if name == piece.stream else arrays[name] for name in piece.inputs}
+        self._bound = Bound(session, inputs, {piece.outputs[0]: residual})
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the arrays that are its own."""
+        return sum(array.nbytes for array in self._own)
+
+    def run(self, k: int) -> None:
+        """Run at step k on the stream as it is."""
+        for to, values in self._by_step:
+            np.copyto(to, values[k])
+        self._bound.run()
+
+    def gather(self, k: int, streams: Sequence[int], stream: Array) -> None:
+        """Run at step k on these streams of the batch's ``stream``."""
+        np.take(stream, streams, axis=self._axis, out=self._stream, mode="clip")
+        for to, value, axis, stepwise in self._gathered:
+            np.take(value[k] if stepwise else value, streams, axis=axis, out=to, mode="clip")
+        self.run(k)

@@ -50,22 +50,6 @@ saturate. It takes processors with VNNI for such that saturate, and costs them t
 is needed."""
 
 
-def import_onnxruntime() -> Any:
-    """The module ``onnxruntime``.
-
-    Raises:
-        RuntimeUnavailableError: it is not installed, or does not load.
-    """
-    try:
-        import onnxruntime
-    except ImportError as error:
-        raise RuntimeUnavailableError(
-            f"runtime 'onnxruntime' needs the package onnxruntime, which cannot be imported ({error})."
-            " Run: pip install onnxruntime."
-        ) from error
-    return onnxruntime
-
-
 def open_sessions(artifact: Artifact, threads: int, blocks: bool = True) -> dict[str, Any]:
     """What runs each ONNX piece of the artifact, by name: an ``InferenceSession``, or a ``JointBlock``.
 
@@ -97,22 +81,32 @@ def open_blocks(artifact: Artifact, threads: int) -> dict[str, Any]:
 
 
 def _open_blocks(artifact: Artifact, threads: int) -> dict[str, Any]:
-    if threads > 1:
-        return dict(_joint_blocks(artifact, _open(artifact, {JOINT}, threads)[JOINT]))
-    return _open(artifact, {block_name(b) for b in range(len(artifact.manifest.blocks))}, threads)
+    manifest = artifact.manifest
+    names = [block_name(b) for b in range(len(manifest.blocks))]
+    if threads == 1:
+        return _open(artifact, names, threads)
+    session, blanks = _open(artifact, [JOINT], threads)[JOINT], dict[int, dict[str, Array]]()
+    pieces = [manifest.pieces[name] for name in names]
+    joint = join([tuple(manifest.contexts[name].type for name in piece.contexts) for piece in pieces])
+    return {
+        name: JointBlock(session, joint, b, piece, manifest.blocks[b].type, blanks)
+        for b, (name, piece) in enumerate(zip(names, pieces, strict=True))
+    }
 
 
 def _open(artifact: Artifact, pieces: Iterable[str], threads: int) -> dict[str, Any]:
-    ort = import_onnxruntime()
+    try:
+        import onnxruntime as ort
+    except ImportError as error:
+        problem = f"runtime 'onnxruntime' needs the package onnxruntime, which cannot be imported ({error})."
+        raise RuntimeUnavailableError(f"{problem} Run: pip install onnxruntime.") from error
     sessions: dict[str, Any] = {}
     careful = needs_care(artifact.manifest.precision_name)
     for piece in sorted(pieces):
         path = artifact.onnx_path(piece)
         options = _options(ort, 1 if piece in SINGLE_THREADED else threads, piece in OF_ALL_BLOCKS, careful)
         try:
-            sessions[piece] = ort.InferenceSession(
-                str(path), options, providers=["CPUExecutionProvider"], enable_fallback=0
-            )
+            sessions[piece] = ort.InferenceSession(str(path), options, ["CPUExecutionProvider"], enable_fallback=0)
         except Exception as error:  # onnxruntime's own classes are derived from Exception
             if "global thread pool" in str(error):
                 raise RuntimeUnavailableError(
@@ -142,15 +136,8 @@ def _options(ort: Any, threads: int, spin: bool, careful: bool) -> Any:
 
 
 def needs_care(precision: str) -> bool:
-    """Whether sessions need ``EXACT_INTEGERS`` for blocks of this precision to be right; warns that they are slow then.
-
-    Args:
-        precision: of the artifact's blocks.
-    """
-    if precision == FP32:
-        return False
-    found = has_integer_dot_product()
-    if found:
+    """Whether sessions need ``EXACT_INTEGERS`` for blocks of this precision to be right; warns that they are slow."""
+    if precision == FP32 or (found := has_integer_dot_product()):
         return False
     what = "nothing that says what this one has" if found is None else "one without them"
     warnings.warn(
@@ -203,17 +190,6 @@ class JointBlock:
         }
 
 
-def _joint_blocks(artifact: Artifact, session: Any) -> dict[str, JointBlock]:
-    manifest = artifact.manifest
-    pieces = [manifest.pieces[block_name(b)] for b in range(len(manifest.blocks))]
-    joint = join([tuple(manifest.contexts[name].type for name in piece.contexts) for piece in pieces])
-    blanks: dict[int, dict[str, Array]] = {}
-    return {
-        block_name(b): JointBlock(session, joint, b, piece, manifest.blocks[b].type, blanks)
-        for b, piece in enumerate(pieces)
-    }
-
-
 class Bound:
     """A session tied to arrays that stay where they are: running it reads some and writes the others.
 
@@ -249,7 +225,7 @@ class Bound:
         try:
             self._session.run_with_iobinding(self._binding)
         except Exception as error:  # onnxruntime's own classes, and what it raises itself
-            raise failed(error) from error
+            raise _failed(error) from error
 
 
 def run_named(session: Any, outputs: Sequence[str], inputs: Mapping[str, Array]) -> dict[str, Array]:
@@ -261,10 +237,10 @@ def run_named(session: Any, outputs: Sequence[str], inputs: Mapping[str, Array])
     try:
         return dict(zip(outputs, session.run(list(outputs), dict(inputs)), strict=True))
     except Exception as error:
-        raise failed(error) from error
+        raise _failed(error) from error
 
 
-def failed(error: Exception) -> ArtifactError:
+def _failed(error: Exception) -> ArtifactError:
     """The error of a graph that onnxruntime loads and cannot run."""
     return ArtifactError(
         f"onnxruntime cannot run a graph of the artifact: {str(error).strip()[:500]} The graph does not fit the"

@@ -9,8 +9,7 @@ same context buffers, to which the values of the step are copied.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,10 +23,8 @@ from ttscompile.ir.graph import TensorType
 from ttscompile.ir.pieces import ADVANCE, CONTEXT, DENSE_STEP, IDLE, PRUNER, STEM, STREAM, block_name
 from ttscompile.runtimes.inpainting import Known, MaskedUpdates
 
-from .bound_block import BoundBlock
-from .contexts import ContextValues
+from .contexts import BoundBlock, ContextValues
 from .idle_steps import IdleSteps
-from .rollout_store import RolloutStore
 from .sessions import Array, Bound, run_named
 
 
@@ -58,10 +55,9 @@ class Workspace:
     def __init__(
         self, manifest: Manifest, sessions: Mapping[str, Any], tables: Mapping[str, Array], streams: int
     ) -> None:
-        kind = stream_type(manifest, streams)
+        kind = _stream_type(manifest, streams)
         shape = kind.at(streams)
-        self.streams = streams
-        self.axis = kind.batch_axis or 0
+        self.streams, self.axis = streams, kind.batch_axis or 0
         self._manifest, self._sessions = manifest, sessions
         self._steps, count = manifest.steps, len(manifest.blocks)
         horizon, dimensions = manifest.spec.sample
@@ -91,7 +87,7 @@ class Workspace:
         self._no_correction = no_correction(self._steps, manifest.spec.sample)
         # By the correction's identity, which the entry keeps from reuse, and whether there is a prefix.
         self._advances: dict[tuple[int, bool], _Advances] = {}
-        self._advance = self._advances_with(self._no_correction)
+        self._advance = self.advances_with(self._no_correction)
         self._dense: dict[int, Bound] = {}
         self._blocks: list[BoundBlock] = []
         self._some: dict[tuple[int, int], BoundBlock] = {}
@@ -106,7 +102,7 @@ class Workspace:
         if known is not None:
             self._initial[:, known.positions, known.channels] = known.values[0]
         np.copyto(self.sample[0], self._initial.transpose(2, 0, 1))
-        self._advance = self._advances_with(correction or self._no_correction, known)
+        self._advance = self.advances_with(correction or self._no_correction, known)
         self._history.fill(0)
         if self._memory:
             self._memory[0].fill(0)
@@ -160,10 +156,6 @@ class Workspace:
         """The sample after the last step, a copy ``[B, T, D]``."""
         return self.sample[self._steps % 2].transpose(1, 2, 0).copy()
 
-    def prepare(self, correction: Correction) -> None:
-        """Make what the first call with a correction would have to make."""
-        self._advances_with(correction)
-
     def bind_blocks(self) -> None:
         """Make what running a single block would have to make; ``sessions`` has those of single blocks."""
         self._blocks = [self._bound_block(b, self.stream, row, self.streams) for b, row in enumerate(self.current)]
@@ -209,7 +201,6 @@ class Workspace:
         key = b, len(streams)
         some = self._some.get(key)
         if some is None:
-            assert self._manifest.blocks[b].type.batch_axis is not None
             shape = self._manifest.blocks[b].type.at(len(streams))
             stream, residual = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
             some = self._some[key] = self._bound_block(b, stream, residual, len(streams))
@@ -237,13 +228,13 @@ class Workspace:
         idle = 0 if self.idle is None else self.idle.nbytes
         return sum(array.nbytes for array in arrays) + self._contexts.nbytes + self.rollout.nbytes + bound + idle
 
-    def _advances_with(self, correction: Correction, known: Known | None = None) -> _Advances:
+    def advances_with(self, correction: Correction, known: Known | None = None) -> _Advances:
         """Bindings of all steps to the rows of a correction; made once for each, and once for its prefixes."""
         made = self._advances.get((id(correction), known is not None))
         if made is None:
             masked = None
             if known is not None:
-                masked = MaskedUpdates(self._advances_with(correction).updates, self._manifest.spec.chunk)
+                masked = MaskedUpdates(self.advances_with(correction).updates, self._manifest.spec.chunk)
             updates = matrices(self._sampler, correction) if masked is None else masked.updates
             steps = [self._bind_advance(k, updates[k]) for k in range(self._steps)]
             made = _Advances(correction, correction.anchors.tolist(), updates, steps, masked)
@@ -256,7 +247,7 @@ class Workspace:
         piece = self._manifest.pieces[ADVANCE]
         following = min(k + 1, self._steps - 1)  # after the last step there is no stream to make; it is not read
         inputs = {
-            pieces.STREAM: self.stream,
+            STREAM: self.stream,
             pieces.SAMPLE: self.sample[k % 2],
             pieces.OFFSET: self._offset[k],
             pieces.HISTORY: self._history,
@@ -279,39 +270,59 @@ class Workspace:
         return Bound(self._sessions[ADVANCE], {name: inputs[name] for name in piece.inputs}, outputs)
 
 
-@dataclass(frozen=True)
-class _Advances:
-    """What ``advance`` runs with one correction.
+class RolloutStore:
+    """Entries of the rollout cache: copies of computed residuals that a later call of the episode can read.
+
+    Memory is taken when an entry is kept for the first time, and stays for the next episodes.
+
+    Args:
+        shape: of a residual of all streams.
+        axis: of the streams in it.
 
     Attributes:
-        correction: it.
-        anchors: of each step, whether it enters the history.
-        updates: float32 ``[K, G, R, T]``.
-        steps: the bindings.
-        masked: what ``updates`` are of, with a prefix.
+        entries: by flat index ``k * blocks + b``.
     """
+
+    def __init__(self, shape: tuple[int, ...], axis: int) -> None:
+        self._shape, self._axis = shape, axis
+        self.entries: dict[int, Array] = {}
+
+    def entry(self, cell: int) -> Array:
+        """The entry of a cell; a new one holds zeros."""
+        found = self.entries.get(cell)
+        if found is None:
+            found = self.entries[cell] = np.empty(self._shape, np.float32)
+            found.fill(0.0)  # commits its pages now
+        return found
+
+    def of_stream(self, cell: int, s: int) -> Array:
+        """One stream's part of an entry, as a view."""
+        view: Array = np.moveaxis(self.entry(cell), self._axis, 0)[s]
+        return view
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the entries."""
+        return sum(entry.nbytes for entry in self.entries.values())
+
+
+class _Advances(NamedTuple):
+    """What ``advance`` runs with one correction."""
 
     correction: Correction
-    anchors: list[bool]
-    updates: Array
+    anchors: list[bool]  # of each step, whether it enters the history
+    updates: Array  # float32 [K, G, R, T]
     steps: list[Bound]
-    masked: MaskedUpdates | None
+    masked: MaskedUpdates | None  # what the updates are of, with a prefix
 
 
-def stream_type(manifest: Manifest, streams: int) -> TensorType:
-    """The type of the residual stream.
-
-    Raises:
-        ArtifactError: it is not one for all blocks, or not float32.
-        ObservationError: it has no axis for as many streams.
-    """
+def _stream_type(manifest: Manifest, streams: int) -> TensorType:
+    """The type of the residual stream, which is float32, the same for all blocks, and has an axis for the streams."""
     kind = manifest.blocks[0].type
     if any(block.type != kind for block in manifest.blocks) or kind.dtype != "float32":
         types = sorted({str(block.type) for block in manifest.blocks})
         raise ArtifactError(f"the residual stream changes its type, or is not float32: {types}. It cannot be executed.")
     if kind.batch_axis is None and streams > 1:
-        raise ObservationError(
-            f"this policy's residual stream has type {kind}, without an axis for the streams; found {streams}"
-            " streams. Call it with one stream at a time."
-        )
+        problem = f"this policy's residual stream has type {kind}, without an axis for the streams"
+        raise ObservationError(f"{problem}; found {streams} streams. Call it with one stream at a time.")
     return kind

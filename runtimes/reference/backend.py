@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -19,7 +18,7 @@ from .reuse import RolloutCache
 
 
 class ReferenceBackend:
-    """A ``Backend`` on ``ReferenceModel``.
+    """A ``Backend`` on ``ReferenceModel``, without gradients; what fails is an error of the artifact.
 
     Args:
         artifact: loaded and checked.
@@ -45,12 +44,12 @@ class ReferenceBackend:
     def start(self, call: Call) -> None:
         """See ``Backend.start``."""
         self._call = call
-        with self._computing():
+        with fitting(self._artifact), torch.no_grad():
             self._contexts = self.model.prologue({key: torch.from_numpy(np.array(a)) for key, a in call.obs.items()})
 
     def logits(self) -> FloatArray:
         """See ``Backend.logits``."""
-        with self._computing():
+        with fitting(self._artifact), torch.no_grad():
             return np.asarray(self.model.logits(self._contexts).numpy(), dtype=np.float32)
 
     def first_step(self) -> None:
@@ -61,15 +60,9 @@ class ReferenceBackend:
         call = self._call
         cache = RolloutCache(self._residuals if call.written.any() else {}, call.written)
         noise = noise_tensors(call.noise, self._artifact.manifest.spec.sampler.stochastic)
-        with self._computing():
+        with fitting(self._artifact), torch.no_grad():
             made = self.model.denoise(
                 self._contexts, *noise, np.stack(plans), cache, correction=call.correction, known=call.known
             )
         self._residuals = made.cache.residuals
         return np.asarray(made.sample.numpy(), dtype=np.float32)
-
-    @contextmanager
-    def _computing(self) -> Iterator[None]:
-        """Without gradients, which belong to a thread; what fails is an error of the artifact."""
-        with fitting(self._artifact), torch.no_grad():
-            yield

@@ -26,7 +26,7 @@ from ttscompile.ir.program import Binding, Pieces, Program
 from ttscompile.runtimes.inpainting import Known
 
 from .reuse import Caches, Cell, RolloutCache, reuse, stream_axis
-from .sampler import Carried, advance, begin, hold
+from .sampler import Carried, TorchSampler, hold
 
 
 @dataclass(frozen=True)
@@ -83,6 +83,7 @@ class ReferenceModel:
         steps: K.
         blocks: number of residual blocks.
         groups: FORWARD group of each block.
+        sampler: what moves the sample on.
         pruner_weights: the pruner's tensors by name.
     """
 
@@ -94,11 +95,11 @@ class ReferenceModel:
         groups: Sequence[int],
         weights: Mapping[str, npt.NDArray[np.generic]],
     ) -> None:
-        self._pieces, self._types, self._sampler = pieces, tuple(types), spec.sampler
+        self._pieces, self._types, self.sampler = pieces, tuple(types), TorchSampler(spec.sampler)
         self._weights = {name: _tensor(value) for name, value in weights.items()}
         self._tables = {name: _tensor(value) for name, value in self._pieces.tables.items()}
-        self._condition = Evaluator(self._pieces.condition, self._weights)
-        self._step = Evaluator(self._pieces.step, self._weights) if self._pieces.step is not None else None
+        self._condition = Evaluator(pieces.condition, self._weights)
+        self._step = Evaluator(pieces.step, self._weights) if pieces.step is not None else None
         self._stem = Evaluator(pieces.stem.graph, self._weights)
         self._blocks = tuple(Evaluator(piece.graph, self._weights) for piece in pieces.blocks)
         self._tail = Evaluator(pieces.tail.graph, self._weights)
@@ -186,16 +187,6 @@ class ReferenceModel:
         """The network's output ``[B, T, D]`` at step k, from the sample ``[B, T, D]``."""
         return self.tail(blocks(k, self.stem(sample, k, contexts)), k, contexts)
 
-    def begin(self, initial: Tensor) -> Carried:
-        """What the sampler carries to step 0, from the sample ``[B, T, D]``."""
-        return begin(self._sampler, initial)
-
-    def advance(
-        self, carried: Carried, prediction: Tensor, noise: Tensor | None, k: int, correction: Correction | None = None
-    ) -> Carried:
-        """The sampler: what is carried to step k + 1 (see ``sampler``)."""
-        return advance(self._sampler, carried, prediction, noise, k, correction)
-
     def empty_cache(self, streams: int) -> RolloutCache:
         """The rollout cache at the start of an episode."""
         return RolloutCache({}, np.zeros((streams, self.steps, self.blocks), dtype=np.bool_))
@@ -219,10 +210,10 @@ class ReferenceModel:
             correction: of the sampler's steps; None for none.
             known: what a prefix makes known of the samples; None for nothing.
         """
-        carried = hold(self.begin(initial), known, 0)
+        carried = hold(self.sampler.begin(initial), known, 0)
         for k in range(self.steps):
             prediction = self.predict(carried.sample, k, contexts, blocks)
-            carried = self.advance(carried, prediction, None if noise is None else noise[k], k, correction)
+            carried = self.sampler.advance(carried, prediction, None if noise is None else noise[k], k, correction)
             carried = hold(carried, known, k + 1)
             yield carried
 
@@ -282,8 +273,7 @@ class ReferenceModel:
             return self.block(cell.b, cell.k, stream, contexts)
         if not takers and not cell.trains:
             return None
-        axis = stream_axis(cell.type)
-        whole = torch.zeros_like(stream)
+        axis, whole = stream_axis(cell.type), torch.zeros_like(stream)
         if cell.trains:
             with torch.no_grad():
                 part = self.block(cell.b, cell.k, stream, contexts, others)
@@ -299,24 +289,16 @@ class ReferenceModel:
             plan = check_plan(gates, self.steps, self.blocks, streams)
             return torch.nn.functional.one_hot(torch.from_numpy(plan.astype(np.int64)), 4).float(), plan
         if tuple(gates.shape) != (streams, self.steps, self.blocks, 4):
-            raise IllegalPlanError(
-                f"gates have shape {tuple(gates.shape)}; expected [B, K, blocks, 4] ="
-                f" ({streams}, {self.steps}, {self.blocks}, 4)."
-            )
+            expected = f"[B, K, blocks, 4] = ({streams}, {self.steps}, {self.blocks}, 4)"
+            raise IllegalPlanError(f"gates have shape {tuple(gates.shape)}; expected {expected}.")
         values = gates.detach()
         if not bool((((values == 0) | (values == 1)).all(-1) & (values.sum(-1) == 1)).all()):
-            raise IllegalPlanError(
-                "gates must be one-hot over their last axis: use straight-through gates, hard in the forward pass."
-            )
+            remedy = "use straight-through gates, hard in the forward pass"
+            raise IllegalPlanError(f"gates must be one-hot over their last axis: {remedy}.")
         return gates, values.argmax(-1).numpy().astype(np.int8)
 
     def _bind(
-        self,
-        piece: LoopPiece,
-        value: Tensor,
-        k: int,
-        contexts: Contexts,
-        streams: Sequence[int] | None = None,
+        self, piece: LoopPiece, value: Tensor, k: int, contexts: Contexts, streams: Sequence[int] | None = None
     ) -> dict[str, Tensor]:
         """The inputs of a loop piece at step k; of some streams only, if they are given."""
         stream = {piece.stream: _select(value, piece.type, streams)}
@@ -330,10 +312,11 @@ class ReferenceModel:
         for name, kind in types.items():
             binding = self._pieces.bindings[name]
             if binding is Binding.TABLE:
-                bound[name] = _select(_expanded(self._tables[name][k], kind, contexts.streams), kind, streams)
+                row, axis = self._tables[name][k], kind.batch_axis
+                value = row.expand([contexts.streams if i == axis else n for i, n in enumerate(row.shape)])
             else:
-                source = contexts.steps[k] if binding is Binding.STEP else contexts.condition
-                bound[name] = _select(source[name], kind, streams)
+                value = (contexts.steps[k] if binding is Binding.STEP else contexts.condition)[name]
+            bound[name] = _select(value, kind, streams)
         return bound
 
 
@@ -346,14 +329,6 @@ def noise_tensors(noise: Noise, stochastic: bool) -> tuple[Tensor, Tensor | None
 def _tensor(array: npt.NDArray[np.generic]) -> Tensor:
     """A copy as a tensor: arrays of an artifact are read-only, and torch has no such tensors."""
     return torch.from_numpy(np.array(array))
-
-
-def _expanded(row: Tensor, kind: TensorType, streams: int) -> Tensor:
-    """A table's row for all streams: repeated along its batch axis, if it has one."""
-    axis = kind.batch_axis
-    if axis is None:
-        return row
-    return row.expand(*(streams if i == axis else n for i, n in enumerate(row.shape)))
 
 
 def _select(value: Tensor, kind: TensorType, streams: Sequence[int] | None) -> Tensor:

@@ -30,17 +30,11 @@ class RolloutCache:
 
 @dataclass
 class Caches:
-    """The three caches during a call, for all streams at once.
+    """The three caches during a call, for all streams at once; when it starts there is what earlier calls left."""
 
-    Attributes:
-        forward: by group; empty when the call starts.
-        timestep: by block; empty when the call starts.
-        rollout: by step and block; what earlier calls of the episode left.
-    """
-
-    forward: dict[int, Tensor] = field(default_factory=dict)
-    timestep: dict[int, Tensor] = field(default_factory=dict)
-    rollout: dict[tuple[int, int], Tensor] = field(default_factory=dict)
+    rollout: dict[tuple[int, int], Tensor]  # by step and block
+    forward: dict[int, Tensor] = field(default_factory=dict)  # by group
+    timestep: dict[int, Tensor] = field(default_factory=dict)  # by block
 
 
 @dataclass(frozen=True)
@@ -100,18 +94,13 @@ def reuse(cell: Cell, computed: Tensor | None, caches: Caches, write_gradients: 
     """
     forward, timestep = caches.forward.get(cell.group), caches.timestep.get(cell.b)
     rollout = caches.rollout.get((cell.k, cell.b))
-    candidates = {
-        Source.COMPUTE: computed,
-        Source.FORWARD: forward,
-        Source.TIMESTEP: timestep,
-        Source.ROLLOUT: rollout,
-    }
     if computed is not None and (cell.takes(Source.COMPUTE) or (cell.trains and write_gradients)):
         caches.forward[cell.group] = cell.written(computed, forward, write_gradients)
         caches.timestep[cell.b] = cell.written(computed, timestep, write_gradients)
     if computed is not None and cell.takes(Source.COMPUTE):
         caches.rollout[cell.k, cell.b] = cell.written(computed.detach(), rollout, False)
-    added = [cell.gate(s) * c for s, c in candidates.items() if c is not None and (cell.trains or cell.takes(s))]
+    candidates = zip(Source, (computed, forward, timestep, rollout), strict=True)
+    added = [cell.gate(s) * c for s, c in candidates if c is not None and (cell.trains or cell.takes(s))]
     return torch.stack(added).sum(0) if len(added) > 1 else added[0]
 
 
@@ -121,9 +110,7 @@ def stream_axis(kind: TensorType) -> int:
     Raises:
         IllegalPlanError: there is none.
     """
-    axis = kind.batch_axis
-    if axis is None:
-        raise IllegalPlanError(
-            f"the residual stream has type {kind}, without an axis for the streams: plans cannot differ by stream."
-        )
-    return axis
+    if kind.batch_axis is None:
+        problem = f"the residual stream has type {kind}, without an axis for the streams"
+        raise IllegalPlanError(f"{problem}: plans cannot differ by stream.")
+    return kind.batch_axis

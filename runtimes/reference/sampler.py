@@ -26,49 +26,52 @@ class Carried(NamedTuple):
     history: Tensor
 
 
-def begin(table: SamplerTable, initial: Tensor) -> Carried:
-    """What is carried to step 0: the sample ``[B, T, D]``, and zeros."""
-    streams, horizon, channels = initial.shape
-    memory = initial.new_zeros(streams, table.memories, horizon, channels)
-    return Carried(initial, memory, initial.new_zeros(streams, HISTORY * horizon, channels))
-
-
-def advance(
-    table: SamplerTable,
-    carried: Carried,
-    prediction: Tensor,
-    noise: Tensor | None,
-    k: int,
-    correction: Correction | None = None,
-) -> Carried:
-    """What is carried to step k + 1 (``core.spec.SamplerTable`` has the formula).
+class TorchSampler:
+    """The sampler of a policy by its table.
 
     Args:
         table: of the sampler.
-        carried: to step k.
-        prediction: the network's output at step k, ``[B, T, D]``.
-        noise: the draw used at step k, ``[B, T, D]``; None if the sampler is deterministic.
-        k: step.
-        correction: of the sampler's steps; None for none.
     """
-    sample, memory, history = carried
-    row = {name: float(getattr(table, name)[k]) for name in table.COLUMNS}
-    clean = row["sample_to_x0"] * sample + row["out_to_x0"] * prediction
-    if table.clip is not None:
-        clean = clean.clamp(-table.clip, table.clip)
-    following = row["x0_to_next"] * clean + row["sample_to_next"] * sample + row["out_to_next"] * prediction
-    for s in range(table.memories):
-        following = following + float(table.memory_to_next[k, s]) * memory[:, s]
-    if noise is not None:
-        following = following + row["noise_to_next"] * noise
-    if table.memories:
-        terms = torch.cat([torch.stack([clean, sample, prediction], 1), memory], 1)
-        memory = torch.einsum("sr,brtd->bstd", torch.from_numpy(table.to_memory[k].copy()), terms)
-    if correction is None:
-        return Carried(following, memory, history)
-    weights, bias = torch.tensor(correction.weights[k]), torch.tensor(correction.bias[k])
-    uncorrected = Carried(following, memory, history)
-    return correct(carried, prediction, uncorrected, weights, bias, bool(correction.anchors[k]))
+
+    def __init__(self, table: SamplerTable) -> None:
+        self._table = table
+
+    def begin(self, initial: Tensor) -> Carried:
+        """What is carried to step 0: the sample ``[B, T, D]``, and zeros."""
+        streams, horizon, channels = initial.shape
+        memory = initial.new_zeros(streams, self._table.memories, horizon, channels)
+        return Carried(initial, memory, initial.new_zeros(streams, HISTORY * horizon, channels))
+
+    def advance(
+        self, carried: Carried, prediction: Tensor, noise: Tensor | None, k: int, correction: Correction | None = None
+    ) -> Carried:
+        """What is carried to step k + 1 (``core.spec.SamplerTable`` has the formula).
+
+        Args:
+            carried: to step k.
+            prediction: the network's output at step k, ``[B, T, D]``.
+            noise: the draw used at step k, ``[B, T, D]``; None if the sampler is deterministic.
+            k: step.
+            correction: of the sampler's steps; None for none.
+        """
+        table, (sample, memory, history) = self._table, carried
+        row = {name: float(getattr(table, name)[k]) for name in table.COLUMNS}
+        clean = row["sample_to_x0"] * sample + row["out_to_x0"] * prediction
+        if table.clip is not None:
+            clean = clean.clamp(-table.clip, table.clip)
+        following = row["x0_to_next"] * clean + row["sample_to_next"] * sample + row["out_to_next"] * prediction
+        for s in range(table.memories):
+            following = following + float(table.memory_to_next[k, s]) * memory[:, s]
+        if noise is not None:
+            following = following + row["noise_to_next"] * noise
+        if table.memories:
+            terms = torch.cat([torch.stack([clean, sample, prediction], 1), memory], 1)
+            memory = torch.einsum("sr,brtd->bstd", torch.from_numpy(table.to_memory[k].copy()), terms)
+        uncorrected = Carried(following, memory, history)
+        if correction is None:
+            return uncorrected
+        weights, bias = torch.tensor(correction.weights[k]), torch.tensor(correction.bias[k])
+        return correct(carried, prediction, uncorrected, weights, bias, bool(correction.anchors[k]))
 
 
 def features(carried: Carried, prediction: Tensor) -> Tensor:

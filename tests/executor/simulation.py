@@ -110,7 +110,7 @@ def workers() -> list[threading.Thread]:
 
 @dataclass(frozen=True)
 class Facts:
-    """``PolicyFacts`` of a policy that observes ``[episode, seconds]``."""
+    """What an executor reads of the ``PolicyInfo`` of a policy that observes ``[episode, seconds]``."""
 
     observation: Mapping[str, ObservationSpec]
     action: ChunkSpec

@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 
 from ttscompile import Affine
 from ttscompile.errors import ExecutorError
-from ttscompile.runtimes.executor.feasibility import Feasibility, LatencyWindow
+from ttscompile.runtimes.executor.feasibility import MOST_PATIENCE, Feasibility, LatencyWindow, Tiers
 from ttscompile.runtimes.executor.guard import Guard, GuardLimits
-from ttscompile.runtimes.executor.tiers import MOST_PATIENCE, Tiers
 
 
 def test_the_arithmetic_of_push_t() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
-from ttscompile.runtimes.executor.jitter import measure_jitter
+from ttscompile.runtimes.executor.measure import measure_jitter
 
 from .simulation import FakeClock, ScriptedPolicy
 

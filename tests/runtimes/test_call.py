@@ -180,7 +180,7 @@ def test_a_first_call_with_a_schedule_binds_nothing(
     make_artifact: MakeArtifact, monkeypatch: pytest.MonkeyPatch, whole_steps: bool
 ) -> None:
     """What a session is bound to is settled at load; a call that binds costs many times a warm one."""
-    from ttscompile.runtimes.onnxruntime import bound_block, workspace
+    from ttscompile.runtimes.onnxruntime import contexts, workspace
 
     schedule = uniform_plan(5, 5, 2)
     if not whole_steps:
@@ -196,7 +196,7 @@ def test_a_first_call_with_a_schedule_binds_nothing(
     def bind(*_: object) -> None:
         raise AssertionError("a session was bound during a call")
 
-    for module, name in ((workspace, "Bound"), (workspace, "BoundBlock"), (bound_block, "BoundBlock")):
+    for module, name in ((workspace, "Bound"), (workspace, "BoundBlock"), (contexts, "BoundBlock")):
         monkeypatch.setattr(module, name, bind)
     for _ in range(2):
         runtime.predict(obs, noise, schedule, plan_name="mine")

@@ -15,7 +15,7 @@ from ttscompile.core.lattice import PlanArray, dense_plan, uniform_plan
 from ttscompile.errors import IllegalPlanError
 from ttscompile.runtimes.onnxruntime.decode import decode_first, decode_rest
 from ttscompile.runtimes.onnxruntime.instructions import Instructions, instructions_of
-from ttscompile.runtimes.onnxruntime.rollout_store import RolloutStore
+from ttscompile.runtimes.onnxruntime.workspace import RolloutStore
 from ttscompile.runtimes.settle import LoweringCache
 
 from .literal import Episode, Toy

@@ -96,7 +96,7 @@ def everything_recorded(
 ) -> torch.Tensor:
     """The call as one differentiable formula: all candidates of all cells, recorded, mixed by the gates."""
     assert noise.steps is not None
-    carried, steps = MODEL.begin(torch.from_numpy(noise.initial)), torch.from_numpy(noise.steps)
+    carried, steps = MODEL.sampler.begin(torch.from_numpy(noise.initial)), torch.from_numpy(noise.steps)
     forward: dict[int, torch.Tensor] = {}
     timestep: dict[int, torch.Tensor] = {}
     zero = torch.zeros(())
@@ -111,7 +111,7 @@ def everything_recorded(
             write = g[0] if write_gradients else g[0].detach()
             forward[group] = write * computed + (1 - write) * old_forward
             timestep[b] = write * computed + (1 - write) * old_timestep
-        carried = MODEL.advance(carried, MODEL.tail(h, k, contexts), steps[k], k)
+        carried = MODEL.sampler.advance(carried, MODEL.tail(h, k, contexts), steps[k], k)
     return carried.sample
 
 

@@ -69,7 +69,7 @@ class _Lane:
         assert calls.path is not None
         self._executor, self._plan, self._calls, self._path = executor, plan, calls, calls.path
         self._state = State()
-        self._carried = self._following = executor.model.begin(calls.initial)
+        self._carried = self._following = executor.model.sampler.begin(calls.initial)
         self._prediction = calls.initial
 
     def predict(self, k: int) -> tuple[Tensor, Tensor]:
@@ -81,7 +81,7 @@ class _Lane:
 
         self._prediction = model.predict(self._carried.sample, k, calls.contexts, blocks)
         noise = None if calls.noise is None else calls.noise[k]
-        self._following = model.advance(self._carried, self._prediction, noise, k)
+        self._following = model.sampler.advance(self._carried, self._prediction, noise, k)
         missing = (self._path[:, k] - self._following.sample).permute(2, 0, 1)
         return features(self._carried, self._prediction), missing
 

@@ -27,8 +27,7 @@ from ttscompile.errors import DeadlineMissedError
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.timer import Times
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings, Feasibility, GuardLimits, MonotonicClock
-from ttscompile.runtimes.executor.jitter import Jitter, measure_jitter
-from ttscompile.runtimes.executor.measure import measure_latencies, neutral_observation
+from ttscompile.runtimes.executor.measure import Jitter, measure_jitter, measure_latencies, neutral_observation
 from ttscompile.runtimes.executor.settings import resolve
 from ttscompile.runtimes.policy import CompiledPolicy
 
