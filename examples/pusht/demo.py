@@ -32,7 +32,7 @@ from variants import Variant, first_seed_option, open_variant, results_console, 
 import ttscompile
 from ttscompile.calibration.result import CalibrationResult
 from ttscompile.measure.machine import fingerprint, one_line
-from ttscompile.plots.plan import plot_plan
+from ttscompile.plots.maps import plot_plan
 
 if TYPE_CHECKING:
     from ttscompile.calibration import CalibrationResult

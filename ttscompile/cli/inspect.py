@@ -16,7 +16,7 @@ from ttscompile.cli.output import print_json, progress, results, say
 from ttscompile.cli.summary import print_summary
 from ttscompile.core.lattice import PlanArray
 from ttscompile.errors import ArtifactError, ObservationError
-from ttscompile.plots.plan import plot_plan
+from ttscompile.plots.maps import plot_plan
 from ttscompile.report.summary import document
 from ttscompile.trajectories import read_npz
 

@@ -13,7 +13,7 @@ from ttscompile.cli.options import PATH, artifact_argument, count_option, json_o
 from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results, say, table
 from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
 from ttscompile.measure.machine import fingerprint, one_line
-from ttscompile.plots.errors import plot_errors
+from ttscompile.plots.maps import plot_errors
 from ttscompile.report.verified import figure
 
 

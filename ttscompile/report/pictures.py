@@ -18,7 +18,7 @@ from ..measure.points import Point
 from ..measure.units import ms
 from ..plots.figure import STEPS_AXIS, beside, new_figure, plain_powers
 from ..plots.frontier import plot_frontier
-from ..plots.plan import COLOURS, plot_plan
+from ..plots.maps import COLOURS, plot_plan
 from .measure import Course, Latency
 from .page import Picture
 
@@ -51,7 +51,7 @@ def drawn(draw: Callable[[Path], None]) -> bytes:
 
 
 def plan_picture(plan: PlanArray, kinds: Sequence[str], title: str, caption: str) -> Picture:
-    """One plan, ``[K, blocks]``, and its counts, for who cannot see it; see ``ttscompile.plots.plan.plot_plan``."""
+    """One plan, ``[K, blocks]``, and its counts, for who cannot see it; see ``ttscompile.plots.maps.plot_plan``."""
     png = drawn(lambda path: plot_plan(plan, [plain(kind) for kind in kinds], path, plain(title)))
     counts = ", ".join(f"{source.name.lower()} {int(np.count_nonzero(plan == source))}" for source in Source)
     return Picture(png, f"{caption} {sparsity(plan):.1%} of {plan.size} cells are reused: {counts}.")

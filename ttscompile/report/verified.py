@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..plots.errors import plot_errors
+from ..plots.maps import plot_errors
 from ..verification import Rung, Verification
 from .page import Picture, Section, Table
 from .pictures import drawn, plain
