@@ -14,7 +14,7 @@ from ttscompile.core.lattice import Source
 from ttscompile.errors import IllegalPlanError
 from ttscompile.measure.points import Point
 from ttscompile.plots import frontier
-from ttscompile.plots.plan import COLOURS, plot_plan
+from ttscompile.plots.maps import COLOURS, plot_plan
 
 
 def pixels_of(source: Source, picture: Path) -> int:

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 from ttscompile.core.lattice import Source
-from ttscompile.plots.plan import COLOURS
+from ttscompile.plots.maps import COLOURS
 
 STEPS, KINDS = 6, ("SA", "FF", "SA", "FF", "SA", "FF")
 TOLD = {

@@ -31,7 +31,7 @@ from variants import Variant, first_seed_option, open_variant, results_console, 
 import ttscompile
 from ttscompile.calibration.result import CalibrationResult
 from ttscompile.measure.machine import fingerprint, one_line
-from ttscompile.plots.plan import plot_plan
+from ttscompile.plots.maps import plot_plan
 
 BUILD = Path(__file__).resolve().parents[2] / "build" / "pusht"
 SAMPLER, STEPS, HORIZON = "dpmsolver++", 16, 12

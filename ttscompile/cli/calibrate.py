@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
 import ttscompile
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.strategies import DEFAULT, NAMES, STRATEGIES
-from ttscompile.cli.output import (
-    artifact_argument,
-    json_option,
-    manifest_of,
-    only_results_on_stdout,
-    print_json,
-    results,
-)
+from ttscompile.cli.options import ABOVE_0, artifact_argument, count_option, json_option
+from ttscompile.cli.output import manifest_of, only_results_on_stdout, print_json, results
 from ttscompile.cli.recordings import FilesCommand, Sources, require_recordings, trajectories_options
 from ttscompile.cli.summary import print_summary
 from ttscompile.report.summary import document
@@ -46,7 +41,7 @@ from ttscompile.report.summary import document
     help="In its place: the sparsest plan whose mean action error on held-out episodes, in the units of the actions, is"
     " not above this.",
 )
-@click.option("--threads", type=click.IntRange(min=1), default=1, show_default=True, help="Of calls for --latency-ms.")
+@count_option("--threads", "Of calls for --latency-ms.")
 @click.option(
     "--strategy",
     type=click.Choice(NAMES),
@@ -54,12 +49,10 @@ from ttscompile.report.summary import document
     show_default=True,
     help=f"How the plan is found. {'; '.join(f'{one.name}: {one.source}' for one in STRATEGIES)}.",
 )
-@click.option(
-    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the split, the noise and the training."
-)
+@count_option("--seed", "Of the split, the noise and the training.", default=0, least=0)
 @click.option(
     "--max-minutes",
-    type=click.FloatRange(min=0, min_open=True),
+    type=ABOVE_0,
     default=15.0,
     show_default=True,
     help="All in all, about: the best plan found by then is taken. Also decides how many calls are used.",
@@ -70,16 +63,8 @@ def calibrate(
     directory: Path,
     trajectories: tuple[Path, ...],
     sources: Sources,
-    target_sparsity: float | None,
-    target_flops: float | None,
-    latency_ms: float | None,
-    max_action_error: float | None,
-    threads: int,
-    strategy: str,
-    seed: int,
-    max_minutes: float,
-    resume: bool,
     as_json: bool,
+    **budget_and_search: Any,  # ttscompile.calibrate takes them by the same names
 ) -> None:
     """Learn for the artifact DIRECTORY which residuals can be reused, from recorded episodes.
 
@@ -90,20 +75,7 @@ def calibrate(
     manifest_of(directory)
     require_recordings(trajectories)
     with only_results_on_stdout():
-        ttscompile.calibrate(
-            directory,
-            trajectories=list(trajectories),
-            observation=sources,
-            target_sparsity=target_sparsity,
-            strategy=strategy,
-            seed=seed,
-            resume=resume,
-            target_flops=target_flops,
-            latency_ms=latency_ms,
-            max_action_error=max_action_error,
-            threads=threads,
-            max_minutes=max_minutes,
-        )
+        ttscompile.calibrate(directory, trajectories=list(trajectories), observation=sources, **budget_and_search)
     artifact = load_artifact(directory)
     if as_json:
         print_json(document(artifact))

@@ -3,29 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from ttscompile.artifact.manifest import abbreviated
 from ttscompile.calibration.strategies import NAMES
-from ttscompile.cli.output import (
-    artifact_argument,
-    identity_of,
-    json_option,
-    manifest_of,
-    ms,
-    only_results_on_stdout,
-    print_json,
-    progress,
-    results,
-    share,
-    table,
-)
+from ttscompile.cli.options import PATH, artifact_argument, count_option, json_option, names_option
+from ttscompile.cli.output import manifest_of, only_results_on_stdout, print_json, progress, results, say, table
 from ttscompile.cli.recordings import FilesCommand, Sources, require_recordings, trajectories_options
 from ttscompile.errors import RuntimeUnavailableError
 from ttscompile.measure.machine import fingerprint, one_line
+from ttscompile.measure.units import ms, share
 from ttscompile.plots.frontier import plot_frontier
 
 if TYPE_CHECKING:
@@ -34,22 +23,12 @@ if TYPE_CHECKING:
     from ttscompile.measure.points import Frontier
 
 
-def _strategies(_: click.Context, __: click.Parameter, value: str) -> tuple[str, ...]:
-    names = tuple(dict.fromkeys(name.strip() for name in value.split(",") if name.strip()))
-    unknown = [name for name in names if name not in NAMES]
-    if unknown:
-        raise click.BadParameter(f"{unknown[0]!r} is not one of {', '.join(NAMES)}.")
-    return names
-
-
-SPARSITIES = 0.9, 0.95, 0.98
-LEFT = 5, 3, 2
-"""Steps to compute in their place, where a call has so few that one of them is more than the last leaves."""
-
-
 def default_sparsities(steps: int) -> tuple[float, ...]:
-    """Shares of the cells that a policy of ``steps`` steps can reuse, from safe to daring."""
-    return SPARSITIES if steps >= 50 else tuple(1 - left / steps for left in LEFT if left < steps)
+    """Shares of the cells that a policy of ``steps`` steps can reuse, from safe to daring.
+
+    Of less than 50 steps, what leaves five, three and two to compute: a single one is more than 0.98 leaves.
+    """
+    return (0.9, 0.95, 0.98) if steps >= 50 else tuple(1 - left / steps for left in (5, 3, 2) if left < steps)
 
 
 def _sparsities(_: click.Context, __: click.Parameter, value: str | None) -> tuple[float, ...] | None:
@@ -59,8 +38,7 @@ def _sparsities(_: click.Context, __: click.Parameter, value: str | None) -> tup
         found = tuple(dict.fromkeys(float(part) for part in value.split(",") if part.strip()))
     except ValueError as error:
         raise click.BadParameter(f"{error}; expected numbers, such as 0.9,0.95.") from error
-    wrong = [one for one in found if not 0 < one < 1]
-    if wrong:
+    if wrong := [one for one in found if not 0 < one < 1]:
         raise click.BadParameter(f"{wrong[0]:g} is not above 0 and below 1.")
     return found
 
@@ -68,11 +46,10 @@ def _sparsities(_: click.Context, __: click.Parameter, value: str | None) -> tup
 @click.command(cls=FilesCommand)
 @artifact_argument
 @trajectories_options()
-@click.option(
+@names_option(
     "--strategies",
+    NAMES,
     default="tts,bac,interval",
-    show_default=True,
-    callback=_strategies,
     help="Each finds a plan for each sparsity; an empty list compares plans of artifacts alone.",
 )
 @click.option(
@@ -84,15 +61,13 @@ def _sparsities(_: click.Context, __: click.Parameter, value: str | None) -> tup
     "--with",
     "others",
     multiple=True,
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="DIR...",
     help="Other artifacts of the same checkpoint, for instance with other samplers; every word up to the next option.",
 )
-@click.option("--calls", type=click.IntRange(min=1), default=32, show_default=True, help="Held-out calls, at most.")
-@click.option(
-    "--learned-calls", type=click.IntRange(min=2), default=256, show_default=True, help="To learn from, at most."
-)
-@click.option("--threads", type=click.IntRange(min=1), default=1, show_default=True, help="Of onnxruntime.")
+@count_option("--calls", "Held-out calls, at most.", default=32)
+@count_option("--learned-calls", "To learn from, at most.", default=256, least=2)
+@count_option("--threads", "Of onnxruntime.")
 @click.option(
     "--max-minutes",
     type=click.FloatRange(min=0),
@@ -100,11 +75,9 @@ def _sparsities(_: click.Context, __: click.Parameter, value: str | None) -> tup
     show_default=True,
     help="Limit of each search, about; there is one for each strategy and sparsity.",
 )
-@click.option("--intervals", type=click.IntRange(min=1), help="Of each search, at most; for a quick look.")
-@click.option(
-    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the split, the noise and the searches."
-)
-@click.option("--plot", "picture", type=click.Path(path_type=Path), help="Draw into this file (.png, .svg, .pdf).")
+@count_option("--intervals", "Of each search, at most; for a quick look.", default=None)
+@count_option("--seed", "Of the split, the noise and the searches.", default=0, least=0)
+@click.option("--plot", "picture", type=PATH, help="Draw into this file (.png, .svg, .pdf).")
 @json_option
 def compare(
     directory: Path,
@@ -113,21 +86,17 @@ def compare(
     strategies: tuple[str, ...],
     sparsities: tuple[float, ...] | None,
     others: tuple[Path, ...],
-    calls: int,
     learned_calls: int,
-    threads: int,
-    max_minutes: float,
-    intervals: int | None,
-    seed: int,
     picture: Path | None,
     as_json: bool,
+    **search: Any,  # the comparison of ttscompile.calibration takes them by the same names
 ) -> None:
     """Hold plans of the artifact DIRECTORY against each other: held-out action error and measured latency.
 
     Strategies find plans now, from the episodes that are not held out; nothing is written to the artifact. Every plan
     runs on the same calls, in turn, and its actions are held against those of the dense policy with the same noise.
     """
-    identities = {path: identity_of(path) for path in (directory, *others)}  # of what is measured now
+    manifests = {path: manifest_of(path) for path in (directory, *others)}  # of what is measured now
     require_recordings(trajectories)
     try:
         from ttscompile.calibration.compare import compare as measure
@@ -136,7 +105,7 @@ def compare(
             f"compare needs {error.name}, which is not installed. Run: pip install 'ttscompile[compile]'."
         ) from error
     if sparsities is None:
-        sparsities = default_sparsities(manifest_of(directory).steps)
+        sparsities = default_sparsities(manifests[directory].steps)
     columns = (TextColumn("{task.description:<28}"), BarColumn(bar_width=24), MofNCompleteColumn(), TimeElapsedColumn())
     told = progress()
     with only_results_on_stdout(), Progress(*columns, console=told, disable=not told.is_terminal) as bar:
@@ -144,7 +113,7 @@ def compare(
 
         def tell(what: str, done: int, total: int) -> None:
             if not told.is_terminal and what != bar.tasks[task].description:  # a log has no bar
-                told.print(what, soft_wrap=True)
+                say(told, what)
             bar.update(task, description=what, completed=done, total=total)
 
         found = measure(
@@ -154,66 +123,59 @@ def compare(
             sparsities if strategies else (),
             others,
             observation=sources,
-            calls=calls,
             learned=learned_calls,
-            threads=threads,
-            seed=seed,
-            intervals=intervals,
-            max_minutes=max_minutes,
             progress=tell,
+            **search,
         )
-    for warning in found.warnings:
-        told.print(f"warning: {warning}", soft_wrap=True)
-    machine = one_line(fingerprint())
+    say(told, *(f"warning: {warning}" for warning in found.warnings))
+    machine, threads = fingerprint(), f"{found.threads} thread{'s' * (found.threads > 1)}"
     if as_json:
-        compared = [{"path": str(path), "identity": identities[path]} for path in others]
-        print_json({"identity": identities[directory], "with": compared, "machine": fingerprint(), **found.to_json()})
+        compared = [{"path": str(path), "identity": manifests[path].identity} for path in others]
+        identity = manifests[directory].identity
+        print_json({"identity": identity, "with": compared, "machine": machine, **found.to_json()})
     else:
-        _print(found, results(), machine)
-        for path, identity in identities.items():
-            results().print(f"{path}: identity {abbreviated(identity)}", soft_wrap=True)
+        output = results()
+        _print(found, output, threads)
+        say(output, one_line(machine))
+        say(output, *(f"{path}: identity {manifest.short_identity}" for path, manifest in manifests.items()))
     if picture is not None:
-        name = directory.resolve().name
-        title = f"{name}: {found.calls} held-out calls, {threads} thread{'s' * (threads > 1)}\n{machine}"
+        title = f"{directory.resolve().name}: {found.calls} held-out calls, {threads}\n{one_line(machine)}"
         plot_frontier(found.points, found.efficient(), found.yardsticks, picture, title)
-        told.print(f"wrote {picture}", soft_wrap=True)
+        say(told, f"wrote {picture}")
 
 
-def _print(found: Frontier, output: Console, machine: str) -> None:
+def _print(found: Frontier, output: Console, threads: str) -> None:
     """The comparison as a table, and what is compared."""
     efficient = found.efficient()
     made = table("", "plan", "error", "90th pct.", "ms a call", "quartiles", "GFLOP", "reused", "frontier")
     for p in found.points:
-        low, high = p.quartiles_ms
         made.add_row(
             p.series,
             p.name + " *" * (p.noise != "all"),
             f"{p.error:.4g}",
             f"{p.error_p90:.4g}",
             ms(p.latency_ms, 4),
-            f"{ms(low, 4)}..{ms(high, 4)}",
+            "..".join(ms(quartile, 4) for quartile in p.quartiles_ms),
             f"{p.flops / 1e9:.3f}",
             share(p.sparsity),
             "yes" if p in efficient else "",
         )
     output.print(made)
-    output.print(
+    say(
+        output,
         f"Error: mean absolute difference of the executed actions, in their units, from those of the dense policy in"
         f" fp32 with the same observation and noise; {found.calls} calls of episodes that no strategy here learned"
-        f" from. Latency: medians of the same calls, one stream, {found.threads} thread{'s' * (found.threads > 1)}."
+        f" from. Latency: medians of the same calls, one stream, {threads}."
         " Frontier: no other plan is faster and more accurate.",
-        soft_wrap=True,
     )
     told = {"steps": "the same initial sample and other draws", "all": "other noise altogether"}
     apart = "; ".join(f"by {error:.4g} with {told[name]}" for name, error in found.yardsticks.items())
     if any(p.noise != "all" for p in found.points):
-        output.print(
+        say(
+            output,
             "* Another sampler: it shares the initial sample with the dense policy and nothing else (and a stochastic"
             " sampler soon forgets that), so its error holds what other noise would change too. Compare it with the"
             " yardstick, and judge it by the task's score.",
-            soft_wrap=True,
         )
-    output.print(f"Yardstick: two dense calls are apart {apart}.", soft_wrap=True)
-    for name, reason in found.skipped.items():
-        output.print(f"{name}: left out: {reason}", soft_wrap=True)
-    output.print(machine, soft_wrap=True)
+    say(output, f"Yardstick: two dense calls are apart {apart}.")
+    say(output, *(f"{name}: left out: {reason}" for name, reason in found.skipped.items()))

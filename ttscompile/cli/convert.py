@@ -11,7 +11,8 @@ import ttscompile
 from ttscompile.artifact.ceiling import few_steps, many_steps
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import require_replaceable
-from ttscompile.cli.output import json_option, only_results_on_stdout, print_json, progress, results
+from ttscompile.cli.options import PATH, count_option, json_option
+from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results, say
 from ttscompile.cli.summary import print_summary
 from ttscompile.core.spec import FP32, PRECISIONS
 from ttscompile.errors import CheckpointError
@@ -20,8 +21,8 @@ from ttscompile.report.summary import document
 
 
 @click.command()
-@click.argument("checkpoint", type=click.Path(path_type=Path))
-@click.option("-o", "--output", "directory", required=True, type=click.Path(path_type=Path), help="The artifact.")
+@click.argument("checkpoint", type=PATH)
+@click.option("-o", "--output", "directory", required=True, type=PATH, help="The artifact.")
 @click.option(
     "--format",
     type=click.Choice(FORMATS),
@@ -35,11 +36,11 @@ from ttscompile.report.summary import document
     help="In place of the checkpoint's own: ddpm, ddim or dpmsolver++ of a diffusion policy, euler or rk4 of one"
     " trained with flow matching.",
 )
-@click.option(
+@count_option(
     "--steps",
-    type=click.IntRange(min=1),
-    help="Denoising or integration steps, in place of the checkpoint's own. rk4 evaluates the network four times a"
+    "Denoising or integration steps, in place of the checkpoint's own. rk4 evaluates the network four times a"
     " step: K is four times this.",
+    default=None,
 )
 @click.option(
     "--spacing",
@@ -54,11 +55,11 @@ from ttscompile.report.summary import document
     type=click.Path(path_type=Path, file_okay=False),
     help="LeRobot: folder with the CLIP encoders' config.json, if not in or beside CHECKPOINT. Nothing is downloaded.",
 )
-@click.option(
+@count_option(
     "--prediction-horizon",
-    type=click.IntRange(min=1),
-    help="Predict only the first so many steps of the policy's horizon, at least those that it executes: less to"
+    "Predict only the first so many steps of the policy's horizon, at least those that it executes: less to"
     " compute, the same actions. Refused where attention is not causal.",
+    default=None,
 )
 @click.option(
     "--precision",
@@ -101,7 +102,7 @@ def convert(
             status.update(f"compiling: after {name}")
             if explain:
                 for i, note in enumerate(notes or ("nothing to do",)):
-                    console.print(f"{name if i == 0 else '':<22}{note}", soft_wrap=True)
+                    say(console, f"{name if i == 0 else '':<22}{note}")
 
         ttscompile.convert(
             checkpoint,
@@ -114,17 +115,16 @@ def convert(
         )
     artifact = load_artifact(directory)
     if (warning := few_steps(artifact.manifest)) is not None:
-        console.print(f"warning: {warning}", soft_wrap=True)
+        say(console, f"warning: {warning}")
     for stage in stages:
         if stage["stage"] == "narrow" and prediction_horizon is None:
-            console.print("hint:", *stage["notes"], soft_wrap=True)
+            say(console, " ".join(["hint:", *stage["notes"]]))
     if of_checkpoint["sampler"] is None and (hint := many_steps(artifact.manifest)) is not None:
-        console.print(f"hint: {hint}", soft_wrap=True)
+        say(console, f"hint: {hint}")
     if as_json:
         print_json(document(artifact) | {"stages": stages})
     else:
         console = results()
         print_summary(artifact, console)
         if single_file is not None:
-            megabytes = single_file.stat().st_size / 1e6
-            console.print(f"single file: {single_file}, {megabytes:.1f} MB", soft_wrap=True, highlight=False)
+            say(console, f"single file: {single_file}, {single_file.stat().st_size / 1e6:.1f} MB")

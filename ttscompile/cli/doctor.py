@@ -6,7 +6,8 @@ from pathlib import Path
 
 import click
 
-from ttscompile.cli.output import identity_of, json_option, print_json
+from ttscompile.cli.options import json_option
+from ttscompile.cli.output import identity_of, print_json
 from ttscompile.doctor import diagnosis as examination
 
 

@@ -11,11 +11,12 @@ import numpy.typing as npt
 import ttscompile
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import DENSE
-from ttscompile.cli.output import artifact_argument, json_option, print_json, progress, results
+from ttscompile.cli.options import PATH, artifact_argument, json_option
+from ttscompile.cli.output import print_json, progress, results, say
 from ttscompile.cli.summary import print_summary
 from ttscompile.core.lattice import PlanArray
 from ttscompile.errors import ArtifactError, ObservationError
-from ttscompile.plots.plan import plot_plan
+from ttscompile.plots.maps import plot_plan
 from ttscompile.report.summary import document
 from ttscompile.trajectories import read_npz
 
@@ -25,9 +26,7 @@ SCHEDULE = "schedule"
 
 @click.command()
 @artifact_argument
-@click.option(
-    "--plot", "picture", type=click.Path(path_type=Path), help="Draw a plan into this file (.png, .svg or .pdf)."
-)
+@click.option("--plot", "picture", type=PATH, help="Draw a plan into this file (.png, .svg or .pdf).")
 @click.option("--plan", "name", help="The plan to draw. Without this option it is the artifact's default plan.")
 @click.option(
     "--observation",
@@ -43,9 +42,9 @@ def inspect(directory: Path, picture: Path | None, name: str | None, observation
     artifact = load_artifact(directory)
     if picture is not None:
         name = name or _drawn_by_default(artifact, observation)
-        plan = _plan(artifact, name, observation)
-        plot_plan(plan, [block.kind for block in artifact.manifest.blocks], picture, f"plan {name!r}")
-        progress().print(f"wrote {picture}", soft_wrap=True)
+        kinds = [block.kind for block in artifact.manifest.blocks]
+        plot_plan(_plan(artifact, name, observation), kinds, picture, f"plan {name!r}")
+        say(progress(), f"wrote {picture}")
     if as_json:
         print_json(document(artifact))
     else:
@@ -58,21 +57,16 @@ def _drawn_by_default(artifact: Artifact, observation: Path | None) -> str:
     record = artifact.manifest.plans.get(default)
     if record is None or record.kind == "schedule" or observation is not None or SCHEDULE not in artifact.schedules:
         return default
-    progress().print(
+    say(
+        progress(),
         f"plan {default!r} is made for each observation, and none was given: drawing {SCHEDULE!r}, the schedule that"
         " it departs from",
-        soft_wrap=True,
     )
     return SCHEDULE
 
 
 def _plan(artifact: Artifact, name: str, observation: Path | None) -> PlanArray:
-    """The plan to draw, int8 ``[K, blocks]``.
-
-    Raises:
-        ArtifactError: there is no plan of this name, or it depends on an observation and none was given.
-        ObservationError: the observation does not fit the policy.
-    """
+    """The plan to draw, int8 ``[K, blocks]``."""
     plans = artifact.manifest.plans
     if name != DENSE and name not in plans:
         raise ArtifactError(f"{artifact.path}: has no plan {name!r}; it has {[DENSE, *plans]}. Use one of these.")
@@ -94,22 +88,13 @@ def _plan(artifact: Artifact, name: str, observation: Path | None) -> PlanArray:
 
 
 def _calls(path: Path, artifact: Artifact) -> list[dict[str, npt.NDArray[np.generic]]]:
-    """The observations of consecutive calls, ``[1, ...]`` an array; the policy checks all but their number.
-
-    Raises:
-        TrajectoryError: not an npz.
-        ObservationError: a key is missing, or the arrays do not hold the same number of calls.
-    """
+    """The observations of consecutive calls, ``[1, ...]`` an array; the policy checks all but their number."""
     specs = artifact.manifest.spec.observations
     stored = read_npz(path)
-    missing = [key for key in specs if key not in stored]
-    if missing:
+    if missing := [key for key in specs if key not in stored]:
         raise ObservationError(f"{path}: has no array {missing[0]!r}; expected {list(specs)}, found {list(stored)}.")
-    arrays = {key: stored[key] for key in specs}
-    rows = {k: a if a.ndim > len(specs[k].shape) else a[None] for k, a in arrays.items()}
+    rows = {k: stored[k] if stored[k].ndim > len(spec.shape) else stored[k][None] for k, spec in specs.items()}
     counts = {k: len(a) for k, a in rows.items()}
     if len(set(counts.values())) != 1 or 0 in counts.values():
-        raise ObservationError(
-            f"{path}: expected the same number of calls, at least one, for every key; found {counts}."
-        )
+        raise ObservationError(f"{path}: expected as many calls for every key, at least one; found {counts}.")
     return [{k: a[i : i + 1] for k, a in rows.items()} for i in range(min(counts.values()))]

@@ -1,14 +1,14 @@
-"""What the commands share: where results and progress go, and how figures are written."""
+"""Where results and progress of the commands go, and how tables are written."""
 
 from __future__ import annotations
 
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import click
 from rich import box
@@ -18,29 +18,9 @@ from rich.table import Table
 from ttscompile.artifact.load import load_artifact, read_manifest
 from ttscompile.artifact.manifest import Manifest, abbreviated
 from ttscompile.errors import TtscompileError
-from ttscompile.measure.units import flops as flops
-from ttscompile.measure.units import ms as ms
-from ttscompile.measure.units import share as share
-from ttscompile.report.page import Table as Made
-
-Command = TypeVar("Command", bound=Callable[..., Any])
-
-artifact_argument = click.argument("directory", type=click.Path(path_type=Path))
-json_option = click.option(
-    "--json", "as_json", is_flag=True, help="Print one JSON document on standard output, and nothing else."
-)
-
-
-def count_option(name: str, help: str, *, default: int | None = 1, least: int = 1) -> Callable[[Command], Command]:
-    """An option that takes a whole number of at least ``least``."""
-    kind = click.IntRange(min=least)
-    return click.option(name, type=kind, default=default, show_default=default is not None, help=help)
-
 
 _WIDTH = 110
 """Columns of a table that goes to a file or a pipe; a terminal's own width is used where there is one."""
-
-_SCRIPTS_WIDTH = 150
 
 
 def results(width: int = _WIDTH) -> Console:
@@ -51,7 +31,7 @@ def results(width: int = _WIDTH) -> Console:
 
 def results_console() -> Console:
     """The same for scripts of ``examples``, whose tables are wider."""
-    return results(_SCRIPTS_WIDTH)
+    return results(150)
 
 
 def run(command: click.Command) -> None:
@@ -88,21 +68,20 @@ def _without_nan(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def table(*columns: str) -> Table:
+def say(console: Console, *lines: str) -> None:
+    """Write lines without breaking them where the console ends."""
+    for line in lines:
+        console.print(line, soft_wrap=True)
+
+
+def table(*columns: str, rows: Iterable[Iterable[str]] = ()) -> Table:
     """A table whose first column is text and whose others are figures."""
     made = Table(box=box.SIMPLE_HEAD)
     for i, column in enumerate(columns):
         made.add_column(column, justify="right" if i else "left", no_wrap=i == 0, overflow="fold")
+    for row in rows:
+        made.add_row(*row)
     return made
-
-
-def print_table(made: Made, console: Console) -> None:
-    """A table of a report, if it has any rows."""
-    if made.rows:
-        shown = table(*made.head)
-        for row in made.rows:
-            shown.add_row(*row)
-        console.print(shown)
 
 
 def manifest_of(path: Path) -> Manifest:
@@ -125,4 +104,4 @@ def identity_of(path: Path) -> str:
 
 def print_identity(identity: str, console: Console) -> None:
     """The line that says what the figures above are of."""
-    console.print(f"identity {abbreviated(identity)}", soft_wrap=True)
+    say(console, f"identity {abbreviated(identity)}")

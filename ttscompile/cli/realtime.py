@@ -11,21 +11,12 @@ import numpy as np
 
 import ttscompile
 from ttscompile.artifact.manifest import UNIFORM, marked
-from ttscompile.cli.loop_options import loop_options
-from ttscompile.cli.output import (
-    artifact_argument,
-    count_option,
-    json_option,
-    ms,
-    print_identity,
-    print_json,
-    progress,
-    results,
-    table,
-)
+from ttscompile.cli.options import ABOVE_0, artifact_argument, count_option, json_option, loop_options
+from ttscompile.cli.output import print_identity, print_json, progress, results, say, table
 from ttscompile.errors import DeadlineMissedError
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.timer import Times
+from ttscompile.measure.units import ms
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings, Feasibility, GuardLimits, MonotonicClock
 from ttscompile.runtimes.executor.measure import Jitter, measure_jitter, measure_latencies, neutral_observation
 from ttscompile.runtimes.executor.settings import resolve
@@ -47,7 +38,7 @@ JITTER_HZ = 200
 @click.option(
     "--jitter",
     "jitter_seconds",
-    type=click.FloatRange(min=0, min_open=True),
+    type=ABOVE_0,
     help=f"Also run a loop of {JITTER_HZ} Hz for this many seconds, first alone and then beside the default plan, and"
     " say how late it wakes.",
 )
@@ -79,33 +70,24 @@ def realtime(
     judged = {name: resolved.feasibility(max(times.ms) / 1e3) for name, times in measured.items()}
     jitter = None
     if jitter_seconds is not None:
-        beside = _run_on_a_robot(judged, policy.info.default_plan)
+        default = policy.info.default_plan  # which a robot runs; the fastest, where that was not measured
+        beside = default if default in judged else min(judged, key=lambda name: judged[name].latency)
         with console.status("measuring jitter"):
             jitter = _jitter(policy, beside, resolved.policy_hz, judged[beside].latency, jitter_seconds)
     if as_json:
-        print_json(
-            {
-                "identity": policy.info.identity,
-                "machine": fingerprint(),
-                "threads": threads,
-                "runs": runs,
-                "plans": {name: {"median_ms": measured[name].median} | each.to_json() for name, each in judged.items()},
-                "jitter": None if jitter is None else {name: each.to_json() for name, each in jitter.items()},
-            }
-        )
+        of = {"identity": policy.info.identity, "machine": fingerprint(), "threads": threads, "runs": runs}
+        plans = {name: {"median_ms": measured[name].median} | each.to_json() for name, each in judged.items()}
+        loops = None if jitter is None else {name: each.to_json() for name, each in jitter.items()}
+        print_json(of | {"plans": plans, "jitter": loops})
     else:
-        _print(measured, judged, jitter, runs, threads)
+        _print(measured, judged, jitter, f"Of {runs} calls with {threads} thread{'s' * (threads > 1)}")
         print_identity(policy.info.identity, results())
     if not any(each.feasible for each in judged.values()):
         context.exit(1)
 
 
 def _print(
-    measured: dict[str, Times],
-    judged: dict[str, Feasibility],
-    jitter: dict[str, Jitter] | None,
-    runs: int,
-    threads: int,
+    measured: dict[str, Times], judged: dict[str, Feasibility], jitter: dict[str, Jitter] | None, counted: str
 ) -> None:
     output = results()
     made = table("plan", "median ms", "longest ms", "may take ms", "up to Hz", "verdict")
@@ -119,35 +101,17 @@ def _print(
             "feasible" if each.feasible else "too slow",
         )
     output.print(made)
-    for name, each in judged.items():
-        output.print(f"{marked(name)}: {each.explain()}", soft_wrap=True)
+    say(output, *(f"{marked(name)}: {each.explain()}" for name, each in judged.items()))
     if UNIFORM in judged:
-        output.print(
-            f"{UNIFORM} is for comparisons: evenly spaced steps, not calibrated. Not for a robot.", soft_wrap=True
-        )
-    output.print(
-        f"Of {runs} calls with {threads} thread{'s' * (threads > 1)}; the longest has to fit. Hz: of the policy, with"
-        " as many control ticks an action as here.",
-        soft_wrap=True,
-    )
+        say(output, f"{UNIFORM} is for comparisons: evenly spaced steps, not calibrated. Not for a robot.")
+    say(output, f"{counted}; the longest has to fit. Hz: of the policy, with as many control ticks an action as here.")
     if jitter is not None:
         made = table(f"{JITTER_HZ} Hz loop", "late, median ms", "p99 ms", "max ms", "ticks late by half", "work us")
         for name, one in jitter.items():
-            made.add_row(
-                name,
-                f"{one.p50:.3f}",
-                f"{one.p99:.3f}",
-                f"{one.max:.3f}",
-                f"{one.late} of {one.ticks}",
-                f"{one.work_us:.1f}",
-            )
+            late = (f"{milliseconds:.3f}" for milliseconds in (one.p50, one.p99, one.max))
+            made.add_row(name, *late, f"{one.late} of {one.ticks}", f"{one.work_us:.1f}")
         output.print(made)
-    output.print(one_line(fingerprint()), soft_wrap=True)
-
-
-def _run_on_a_robot(judged: dict[str, Feasibility], default: str) -> str:
-    """The plan to run beside the loop: the default; the fastest where that was not measured."""
-    return default if default in judged else min(judged, key=lambda name: judged[name].latency)
+    say(output, one_line(fingerprint()))
 
 
 def _jitter(policy: CompiledPolicy, name: str, policy_hz: float, latency: float, seconds: float) -> dict[str, Jitter]:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import click
 
+from ttscompile.cli.options import PATH, Decorator, together
 from ttscompile.errors import TrajectoryError
 
 Sources = dict[str, tuple[str, ...]]
@@ -22,11 +22,12 @@ class FilesCommand(click.Command):
         expanded: list[str] = []
         taking = ""
         for arg in args:
-            if taking and not arg.startswith("-"):
+            if arg in ("--trajectories", "--with"):
+                taking = arg
+            elif taking and not arg.startswith("-"):
                 expanded += [taking, arg]
-                continue
-            taking = arg if arg in ("--trajectories", "--with") else ""
-            if not taking:
+            else:
+                taking = ""
                 expanded.append(arg)
         return super().parse_args(ctx, expanded)
 
@@ -55,20 +56,19 @@ def require_recordings(paths: Iterable[Path]) -> None:
             raise TrajectoryError(f"{path}: does not exist. Give the file or the directory of a recording.")
 
 
-def trajectories_options(required: bool = True) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def trajectories_options(required: bool = True) -> Decorator:
     """``--trajectories`` as ``trajectories: tuple[Path, ...]`` and ``--observation`` as ``sources: Sources``."""
-
-    def with_options(command: Callable[..., Any]) -> Callable[..., Any]:
-        files = click.option(
+    return together(
+        click.option(
             "--trajectories",
             required=required,
             multiple=True,
-            type=click.Path(path_type=Path),
+            type=PATH,
             metavar="FILE...",
             help="Recordings of episodes: .npz files, zarr replay buffers of Diffusion Policy, HDF5 files of robomimic,"
             " or LeRobot data sets. Every word up to the next option is one.",
-        )
-        observation = click.option(
+        ),
+        click.option(
             "--observation",
             "sources",
             multiple=True,
@@ -76,7 +76,5 @@ def trajectories_options(required: bool = True) -> Callable[[Callable[..., Any]]
             metavar="KEY=NAME,NAME:N",
             help="The arrays that a key of the observation is made of, where a recording of frames names them"
             " otherwise. They are joined in this order; NAME:N takes the first N numbers of an array.",
-        )
-        return files(observation(command))
-
-    return with_options
+        ),
+    )

@@ -2,43 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import click
 
 import ttscompile
 from ttscompile.artifact.files import replace_file
 from ttscompile.artifact.load import load_artifact
-from ttscompile.cli.output import artifact_argument, count_option, only_results_on_stdout, progress, results
+from ttscompile.cli.options import PATH, artifact_argument, count_option
+from ttscompile.cli.output import only_results_on_stdout, progress, results, say
 from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
-from ttscompile.core.untrusted_json import parse_json
-from ttscompile.errors import ArtifactError, OutputError, ReportError
-from ttscompile.report import Given, Section, build, refused, render, verified
-from ttscompile.report.comparison import from_comparison
+from ttscompile.errors import ArtifactError, OutputError
+from ttscompile.report import Given, Section, build, render, verified
+from ttscompile.report.comparison import read_comparison
 from ttscompile.report.page import require_packages
 from ttscompile.report.verified import NOT_RUN
-from ttscompile.trajectories import Episode, load_trajectories
-
-MAX_COMPARISON = 16 * 2**20
-"""Bytes of what ``compare --json`` printed."""
+from ttscompile.trajectories import load_trajectories
 
 
 @click.command(cls=FilesCommand)
 @artifact_argument
-@click.option(
-    "-o", "--output", type=click.Path(path_type=Path), required=True, help="The page to write; its name ends in .html."
-)
+@click.option("-o", "--output", type=PATH, required=True, help="The page to write; its name ends in .html.")
 @trajectories_options(required=False)
-@click.option(
-    "--episode",
-    "number",
-    type=click.IntRange(min=0),
-    default=0,
-    show_default=True,
-    help="Number of the recorded episode that is run, from 0.",
-)
+@count_option("--episode", "Number of the recorded episode that is run, from 0.", default=0, least=0)
 @click.option(
     "--comparison",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
@@ -56,7 +42,7 @@ def report(
     output: Path,
     trajectories: tuple[Path, ...],
     sources: Sources,
-    number: int,
+    episode: int,
     comparison: Path | None,
     verifies: bool,
     threads: int,
@@ -76,71 +62,36 @@ def report(
     console = progress()
     artifact = load_artifact(directory)
     manifest = artifact.manifest
-    episode = None
+    chosen = None
     if trajectories:
         chunk = manifest.spec.chunk
         recorded = load_trajectories(trajectories, manifest.spec.observations, chunk.stop - chunk.start, sources)
-        episode = _chosen(recorded, number)
-    compared = None if comparison is None else from_comparison(_document(comparison))
+        if episode >= len(recorded):
+            raise click.BadParameter(f"there are {len(recorded)} episodes, numbered from 0.", param_hint="--episode")
+        chosen = recorded[episode]
+    compared = None if comparison is None else read_comparison(comparison)
     with only_results_on_stdout(), console.status("loading") as status:
         passed, section = True, NOT_RUN
         if verifies:
-            passed, section = _verified(directory, trajectories, sources, threads, status.update)
-        given = Given(episode, compared, section, threads, runs)
+            try:
+                found = ttscompile.verify(
+                    directory,
+                    trajectories,
+                    sources=sources,
+                    threads=threads,
+                    progress=lambda what: status.update(f"verifying: {what}"),
+                )
+                passed, section = found.passed, verified(found)
+            except ArtifactError as error:  # it has nothing to check against, and so fails nothing
+                section = Section("Verification", (f"Could not be run: {error}",))
+        given = Given(chosen, compared, section, threads, runs)
         policy = ttscompile.load(directory, threads=threads, seed=0)
         page = render(build(artifact, policy, given, status.update))
     try:
         replace_file(output, page.encode())
     except OSError as error:
         raise OutputError(f"{output}: the report cannot be written: {error}. Give a folder that exists.") from error
-    results().print(
-        f"wrote {output}, {len(page) / 1e6:.2f} MB, on artifact {manifest.short_identity}",
-        soft_wrap=True,
-    )
+    say(results(), f"wrote {output}, {len(page) / 1e6:.2f} MB, on artifact {manifest.short_identity}")
     if not passed:
-        console.print("failed: the artifact does not hold what it promises; the page says where.", soft_wrap=True)
+        say(console, "failed: the artifact does not hold what it promises; the page says where.")
         context.exit(1)
-
-
-def _verified(
-    directory: Path,
-    trajectories: tuple[Path, ...],
-    sources: Sources,
-    threads: int,
-    progress: Callable[[str], None],
-) -> tuple[bool, Section]:
-    """Whether no check failed, and what the page says; an artifact that has nothing to check against fails none."""
-    try:
-        found = ttscompile.verify(
-            directory,
-            trajectories,
-            sources=sources,
-            threads=threads,
-            progress=lambda what: progress(f"verifying: {what}"),
-        )
-    except ArtifactError as error:
-        return True, refused(str(error))
-    return found.passed, verified(found)
-
-
-def _chosen(episodes: list[Episode], number: int) -> Episode:
-    if number >= len(episodes):
-        raise click.BadParameter(f"there are {len(episodes)} episodes, numbered from 0.", param_hint="--episode")
-    return episodes[number]
-
-
-def _document(path: Path) -> dict[str, Any]:
-    """A JSON document of moderate size.
-
-    Raises:
-        ReportError: it is none.
-    """
-    try:
-        document = parse_json(path.read_bytes(), MAX_COMPARISON)
-    except (OSError, ValueError) as error:
-        raise ReportError(
-            f"{path}: no JSON document: {error}. Give what 'ttscompile compare ... --json' printed."
-        ) from error
-    if not isinstance(document, dict):
-        raise ReportError(f"{path}: expected a JSON object; found another value. Give what compare --json printed.")
-    return document

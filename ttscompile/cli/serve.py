@@ -11,10 +11,11 @@ from typing import Any
 import click
 
 import ttscompile
-from ttscompile.cli.loop_options import loop_options
-from ttscompile.cli.output import artifact_argument, count_option, progress
+from ttscompile.cli.options import artifact_argument, count_option, loop_options
+from ttscompile.cli.output import progress, say
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
 from ttscompile.runtimes.executor.server import ExecutorServer, ServerLimits
+from ttscompile.runtimes.executor.settings import INTERPOLATIONS, SEAMS
 
 
 @click.command()
@@ -39,14 +40,14 @@ from ttscompile.runtimes.executor.server import ExecutorServer, ServerLimits
 )
 @click.option(
     "--seam",
-    type=click.Choice(["replace", "blend", "prefix"]),
+    type=click.Choice(SEAMS),
     default="replace",
     show_default=True,
     help="How a chunk of actions joins the one before it.",
 )
 @click.option(
     "--interpolation",
-    type=click.Choice(["hold", "linear"]),
+    type=click.Choice(INTERPOLATIONS),
     default="hold",
     show_default=True,
     help="What is between two actions where the control loop is faster than the policy.",
@@ -82,10 +83,7 @@ def serve(
         executor = AsyncExecutor(policy, control_hz, ExecutorSettings(tiers=tiers or None, **settings))
     limits = ServerLimits(clients=max_clients, message_bytes=max_message_bytes)
     if host not in ("127.0.0.1", "::1", "localhost"):
-        console.print(
-            f"warning: {host} may be reached from other machines, and whoever reaches it can drive the robot.",
-            soft_wrap=True,
-        )
+        say(console, f"warning: {host} may be reached from other machines, and whoever reaches it can drive the robot.")
     with executor:
         asyncio.run(_run(ExecutorServer(executor, limits), host, port, policy.info.identity))
     click.echo(json.dumps({"statistics": executor.statistics().to_json()}, allow_nan=False))

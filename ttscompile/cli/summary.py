@@ -7,9 +7,9 @@ from typing import Any
 from rich.console import Console
 
 from ttscompile.artifact.load import Artifact
-from ttscompile.artifact.manifest import abbreviated
-from ttscompile.cli.output import flops, print_table, share, table
-from ttscompile.report import facts
+from ttscompile.cli.output import table
+from ttscompile.measure.units import flops, share
+from ttscompile.report import Table, facts
 from ttscompile.report.summary import document
 
 
@@ -19,49 +19,50 @@ def print_summary(artifact: Artifact, console: Console) -> None:
     captured = summary["flops"]["captured"]
     sampler, chunk = summary["sampler"], summary["chunk"]
     horizon, channels = summary["sample"]
-    about = table("artifact", summary["path"])
-    about.columns[1].justify = "left"
-    about.add_row("identity", abbreviated(summary["identity"]))
-    about.add_row("from", ", ".join(f"{k} {v}" for k, v in summary["source"].items()) or "a module")
-    about.add_row(
-        "sampler", f"{sampler['name']}, K = {sampler['steps']} steps" + ", draws noise" * sampler["stochastic"]
-    )
-    for key, observation in summary["observations"].items():
-        about.add_row(f"observation {key!r}", f"{observation['dtype']}{observation['shape']} a stream")
-    about.add_row(
-        "action",
-        f"{horizon} steps of {chunk['action_dim']}, of which {chunk['start']}..{chunk['stop'] - 1} are executed"
-        + (f"; {summary['left_out']} more are left out" if summary["left_out"] else "")
-        + (f"; the sample has {channels} channels" if channels != chunk["action_dim"] else ""),
-    )
+    action = f"{horizon} steps of {chunk['action_dim']}, of which {chunk['start']}..{chunk['stop'] - 1} are executed"
+    if summary["left_out"]:
+        action += f"; {summary['left_out']} more are left out"
+    if channels != chunk["action_dim"]:
+        action += f"; the sample has {channels} channels"
     cache = summary["rollout_cache"]
-    about.add_row(
-        "rollout cache",
+    kept = (
         f"{cache['read']} of {cache['cells']} residuals a stream, {cache['bytes_read'] / 1e6:.1f} MB, for its plans;"
-        f" {cache['bytes_most'] / 1e6:.1f} MB for plans that you give",
+        f" {cache['bytes_most'] / 1e6:.1f} MB for plans that you give"
     )
-    about.add_row("precision", _told_precision(summary["precision"], len(summary["blocks"])))
+    rows = (
+        ("identity", manifest.short_identity),
+        ("from", ", ".join(f"{k} {v}" for k, v in summary["source"].items()) or "a module"),
+        ("sampler", f"{sampler['name']}, K = {sampler['steps']} steps" + ", draws noise" * sampler["stochastic"]),
+        *((f"observation {k!r}", f"{o['dtype']}{o['shape']} a stream") for k, o in summary["observations"].items()),
+        ("action", action),
+        ("rollout cache", kept),
+        ("precision", _told_precision(summary["precision"], len(summary["blocks"]))),
+    )
+    about = table("artifact", summary["path"], rows=rows)
+    about.columns[1].justify = "left"
     console.print(about)
-    print_table(facts.block_table(manifest), console)
-    costs = table("FLOPs a call, one stream", "", "of the captured policy")
-    for name, count in summary["flops"].items():
-        costs.add_row(name.replace("_", " "), flops(count), share(count / captured))
-    console.print(costs)
-    print_table(facts.plan_table(artifact), console)
+    _print_facts(console, facts.block_table(manifest))
+    costs = [(name.replace("_", " "), flops(n), share(n / captured)) for name, n in summary["flops"].items()]
+    console.print(table("FLOPs a call, one stream", "", "of the captured policy", rows=costs))
+    _print_facts(console, facts.plan_table(artifact))
     record = manifest.calibration
     if record is None:
         console.print("Not calibrated: every call is dense. Run 'ttscompile calibrate' to give it a plan.")
         return
-    print_table(facts.score_table(record), console)
+    _print_facts(console, facts.score_table(record))
     for line in facts.left_out(record):
         console.print(f"  {line}")  # as a row it would squeeze the figures
-    print_table(facts.record_table(record, most=90), console)
+    _print_facts(console, facts.record_table(record, most=90))
+
+
+def _print_facts(console: Console, made: Table) -> None:
+    if made.rows:
+        console.print(table(*made.head, rows=made.rows))
 
 
 def _told_precision(precision: dict[str, Any], blocks: int) -> str:
-    """The same as one line."""
     if not precision["blocks"]:
-        return f"{precision['name']}"
+        return str(precision["name"])
     told = f"{precision['name']} weights in {precision['blocks']} of {blocks} blocks, {precision['bytes'] / 1e6:.1f} MB"
     error = precision["error"]
     if error is None:

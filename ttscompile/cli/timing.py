@@ -107,12 +107,17 @@ def contestants(
         SpecError: the checkpoint is of another policy.
     """
     manifest = load_artifact(directory).manifest
-    name = plan or manifest.default_plan
     own = manifest.precision_name
-    made = [_compiled("compiled" + f", {own}" * (own != FP32), directory, threads, name, manifest.spec, own)]
+
+    def compiled(label: str, plan: str, precision: str) -> Contestant:
+        policy = ttscompile.load(directory, threads=threads, precision=precision)
+        policy.reset()
+        return plan_contestant(label, policy, plan, manifest.spec)
+
+    made = [compiled("compiled" + f", {own}" * (own != FP32), plan or manifest.default_plan, own)]
     for rival in against:
         if rival == "onnxruntime-dense":
-            made.append(_compiled("dense onnxruntime", directory, threads, "dense", manifest.spec, FP32))
+            made.append(compiled("dense onnxruntime", "dense", FP32))
         elif checkpoint is not None:
             made.append(_eager(checkpoint, threads, manifest, rival == "original"))
     return made
@@ -151,29 +156,13 @@ def measure(
     return [_summary(*one) for one in zip(entered, timer.times, reports, strict=True)]
 
 
-def _compiled(label: str, directory: Path, threads: int, plan: str, spec: PolicySpec, precision: str) -> Contestant:
-    policy = ttscompile.load(directory, threads=threads, precision=precision)
-    policy.reset()
-    return plan_contestant(label, policy, plan, spec)
-
-
 def plan_contestant(label: str, policy: CompiledPolicy, plan: str, spec: PolicySpec) -> Contestant:
-    """A plan of a compiled policy.
+    """A plan of a loaded policy, which contestants may share if their plans read nothing of earlier calls."""
 
-    Args:
-        label: name of the contestant, for people.
-        policy: loaded; contestants may share one if their plans read nothing of earlier calls.
-        plan: its name.
-        spec: specification of the policy.
-    """
-    return Contestant(
-        label=label,
-        plan=plan,
-        call=lambda obs, noise: policy.predict_action(obs, noise=noise, plan=plan),
-        report=lambda: policy.last_report,
-        spec=spec,
-        dense_flops=0.0,
-    )
+    def call(obs: Observation, noise: Noise) -> object:
+        return policy.predict_action(obs, noise=noise, plan=plan)
+
+    return Contestant(label, plan, call, lambda: policy.last_report, spec, 0.0)
 
 
 def _eager(checkpoint: Path, threads: int, manifest: Manifest, as_saved: bool) -> Contestant:
@@ -190,10 +179,10 @@ def _eager(checkpoint: Path, threads: int, manifest: Manifest, as_saved: bool) -
         ) from error
     module, original = original_policy(checkpoint, manifest.spec)
     torch.set_num_threads(threads)
+    dense, sampler = manifest.flops.dense, original.sampler
     if not as_saved:
         whole = manifest.spec.original
-        return network_contestant("eager PyTorch", eager_policy(module, whole), whole, manifest.flops.dense)
-    sampler, dense = original.sampler, manifest.flops.dense
+        return network_contestant("eager PyTorch", eager_policy(module, whole), whole, dense)
     # An encoder runs once a call, whatever the sampler: what it takes is not known apart.
     flops = dense / manifest.steps * sampler.steps if parts(module).encoder is None else None
     label = f"original, {sampler.name} {sampler.steps}"
@@ -213,28 +202,18 @@ def original_policy(checkpoint: Path, spec: PolicySpec) -> tuple[nn.Module, Poli
     from ttscompile.frontends import load_checkpoint_policy
 
     module, original = load_checkpoint_policy(checkpoint)
-    if _interface(original) != _interface(spec):
-        raise SpecError(
-            f"{checkpoint}: expected the policy that the artifact was made from, {_interface(spec)}; found"
-            f" {_interface(original)}. Give that policy's checkpoint."
-        )
-    if different := _different_statistics(original, spec):
-        raise SpecError(
-            f"{checkpoint}: expected the policy that the artifact was made from; found another one of the same shapes:"
-            f" the normaliser of {', '.join(different)} differs. Give that policy's checkpoint."
-        )
+    wrong = f"{checkpoint}: expected the policy that the artifact was made from"
+    found, expected = _interface(original), _interface(spec)
+    if found != expected:
+        raise SpecError(f"{wrong}, {expected}; found {found}. Give that policy's checkpoint.")
+    if different := ", ".join(_different_statistics(original, spec)):
+        told = f"found another one of the same shapes: the normaliser of {different} differs"
+        raise SpecError(f"{wrong}; {told}. Give that policy's checkpoint.")
     return module, original
 
 
 def network_contestant(label: str, run: EagerPolicy, spec: PolicySpec, dense_flops: float | None) -> Contestant:
-    """The whole network in PyTorch, once a step.
-
-    Args:
-        label: name of the contestant, for people.
-        run: of ``ttscompile.frontends.eager``.
-        spec: specification of the policy.
-        dense_flops: of a call; None where they are not known.
-    """
+    """The whole network in PyTorch, once a step; ``dense_flops`` as in ``Contestant``."""
     import torch
 
     def call(obs: Observation, noise: Noise) -> object:

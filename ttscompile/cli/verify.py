@@ -9,19 +9,12 @@ from rich.console import Console
 
 import ttscompile
 from ttscompile.artifact.manifest import abbreviated
-from ttscompile.cli.output import (
-    artifact_argument,
-    count_option,
-    json_option,
-    only_results_on_stdout,
-    print_json,
-    progress,
-    results,
-)
-from ttscompile.cli.output import table as make_table
+from ttscompile.cli.options import PATH, artifact_argument, count_option, json_option
+from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results, say, table
 from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
 from ttscompile.measure.machine import fingerprint, one_line
-from ttscompile.plots.errors import plot_errors
+from ttscompile.plots.maps import plot_errors
+from ttscompile.report.verified import figure
 
 
 @click.command(cls=FilesCommand)
@@ -32,7 +25,7 @@ from ttscompile.plots.errors import plot_errors
 @click.option(
     "--plot",
     "picture",
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="Draw the error of every block at every step into this file (.png, .svg or .pdf).",
 )
 @json_option
@@ -63,13 +56,13 @@ def verify(
             progress=lambda what: status.update(f"verifying: {what}"),
         )
     for rung in found.skipped:
-        console.print(f"warning: {rung.name} was skipped: {rung.told.rstrip('.')}. {rung.remedy}", soft_wrap=True)
+        say(console, f"warning: {rung.name} was skipped: {rung.told.rstrip('.')}. {rung.remedy}")
     if as_json:
         print_json({"machine": fingerprint(), "threads": threads, **found.to_json()})
     else:
         _print(found, results())
     if picture is not None:
-        console.print(_draw(found, picture), soft_wrap=True)
+        say(console, _draw(found, picture))
     if not found.passed:
         context.exit(1)
 
@@ -88,15 +81,13 @@ def _draw(found: ttscompile.Verification, picture: Path) -> str:
 
 def _print(found: ttscompile.Verification, output: Console) -> None:
     """The ladder as a table, and what to do."""
-    made = make_table("rung", "", "error", "allowed", "of what")
+    rows = [(r.name, r.status, figure(r.figure), figure(r.tolerance), r.unit) for r in found.rungs]
+    made = table("rung", "", "error", "allowed", "of what", rows=rows)
     made.columns[1].justify = made.columns[4].justify = "left"
-    for rung in found.rungs:
-        made.add_row(rung.name, rung.status, _number(rung.figure), _number(rung.tolerance), rung.unit)
     identity = "unknown" if found.identity is None else abbreviated(found.identity)
-    output.print(f"{found.path}: identity {identity}", soft_wrap=True)
+    say(output, f"{found.path}: identity {identity}")
     output.print(made)
-    for rung in found.rungs:
-        output.print(f"{rung.name}: {rung.told.rstrip('.')}.", soft_wrap=True)
+    say(output, *(f"{rung.name}: {rung.told.rstrip('.')}." for rung in found.rungs))
     failure = found.first_failure
     if failure is None:
         told = f"All rungs hold{f', {len(found.skipped)} skipped' if found.skipped else ''}; {found.seconds:.1f} s."
@@ -104,9 +95,4 @@ def _print(found: ttscompile.Verification, output: Console) -> None:
         told = f"FAILED at {failure.name}{f' ({failure.place})' if failure.place else ''}. {failure.remedy}"
         if above := [rung.name for rung in found.failed[1:]]:
             told += f" What fails above it may only follow from it: {', '.join(above)}."
-    output.print(told, soft_wrap=True)
-    output.print(one_line(fingerprint()), soft_wrap=True)
-
-
-def _number(figure: float | None) -> str:
-    return "" if figure is None else f"{figure:.2g}"
+    say(output, told, one_line(fingerprint()))

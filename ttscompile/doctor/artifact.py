@@ -44,17 +44,10 @@ def _needs(artifact: Artifact) -> list[Finding]:
     from ..measure.machine import has_integer_dot_product
     from ..runtimes.liveness import rollout_needs
 
-    manifest = artifact.manifest
-    needs = manifest.requires
-    found = [
-        Finding(PART, "identity", manifest.short_identity),
-        Finding(
-            PART,
-            "format",
-            f"schema {manifest.schema_version} of ttscompile {manifest.ttscompile_version}; opset {needs.opset},"
-            f" onnxruntime {needs.onnxruntime} or later",
-        ),
-    ]
+    manifest, needs = artifact.manifest, artifact.manifest.requires
+    written = f"schema {manifest.schema_version} of ttscompile {manifest.ttscompile_version}"
+    told = f"{written}; opset {needs.opset}, onnxruntime {needs.onnxruntime} or later"
+    found = [Finding(PART, "identity", manifest.short_identity), Finding(PART, "format", told)]
     precision = manifest.precision_name
     slow = precision == "int8" and has_integer_dot_product() is False
     remedy = "Its fast kernels saturate on this processor. Load it with precision='fp32', which it holds too."
@@ -73,8 +66,8 @@ def _needs(artifact: Artifact) -> list[Finding]:
         remedy = "It computes everything, in many times the time. Run: ttscompile calibrate DIR --trajectories FILE."
         found.append(Finding(PART, "plan", "dense: not calibrated", Level.WARNING, remedy))
     else:
-        others = ", ".join(manifest.plans)
-        found.append(Finding(PART, "plan", f"default {manifest.default_plan!r}; it has {others}"))
+        told = f"default {manifest.default_plan!r}; it has {', '.join(manifest.plans)}"
+        found.append(Finding(PART, "plan", told))
     return found
 
 
@@ -105,11 +98,6 @@ def _call(directory: Path, artifact: Artifact) -> list[Finding]:
         return [Finding(PART, "call", "the actions are not finite numbers", Level.PROBLEM, remedy)]
     chunk = artifact.manifest.spec.chunk
     median = statistics.median(times[1:])
-    return [
-        Finding(
-            PART,
-            "call",
-            f"{median:.1f} ms with one thread (the first {times[0]:.1f}), for {chunk.stop - chunk.start} actions:"
-            f" {1000 / median:.1f} calls a second",
-        )
-    ]
+    took = f"{median:.1f} ms with one thread (the first {times[0]:.1f})"
+    told = f"{took}, for {chunk.stop - chunk.start} actions: {1000 / median:.1f} calls a second"
+    return [Finding(PART, "call", told)]

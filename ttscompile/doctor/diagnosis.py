@@ -9,6 +9,8 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +31,8 @@ def examine(directory: Path | None = None) -> list[Finding]:
     Returns:
         Findings; none raises. What stops an artifact from running has the level ``PROBLEM``.
     """
-    found = [*package_findings(), *machine_findings()]
-    if directory is not None:
-        found += artifact_findings(directory)
-    return found
+    of_artifact = [] if directory is None else artifact_findings(directory)
+    return [*package_findings(), *machine_findings(), *of_artifact]
 
 
 def problems(found: Sequence[Finding]) -> int:
@@ -46,7 +46,7 @@ def document(found: Sequence[Finding]) -> dict[str, Any]:
         "ok": problems(found) == 0,
         "problems": problems(found),
         "warnings": sum(finding.level is Level.WARNING for finding in found),
-        "findings": [finding.to_json() for finding in found],
+        "findings": [{**asdict(finding), "level": finding.level.value} for finding in found],
     }
 
 
@@ -54,14 +54,12 @@ def text(found: Sequence[Finding]) -> str:
     """The findings for people: a line each, its remedy below it, and the verdict at the end."""
     width = max(len(finding.what) for finding in found)
     lines: list[str] = []
-    part = ""
-    for finding in found:
-        if finding.part != part:
-            part = finding.part
-            lines += ["", part]
-        lines.append(f"  {MARKS[finding.level]:<8}{finding.what:<{width}}  {finding.found}")
-        if finding.remedy:
-            lines.append(f"  {'':<8}{'':<{width}}  -> {finding.remedy}")
+    for part, findings in groupby(found, lambda finding: finding.part):
+        lines += ["", part]
+        for each in findings:
+            lines.append(f"  {MARKS[each.level]:<8}{each.what:<{width}}  {each.found}")
+            if each.remedy:
+                lines.append(f"  {'':<8}{'':<{width}}  -> {each.remedy}")
     count, warnings = problems(found), document(found)["warnings"]
     verdict = "No problem" if count == 0 else f"{count} problem{'s' * (count > 1)}"
     lines += ["", f"{verdict}, {warnings} warning{'s' * (warnings != 1)}."]
@@ -70,14 +68,13 @@ def text(found: Sequence[Finding]) -> str:
 
 def main(arguments: Sequence[str]) -> int:
     """``python -m ttscompile.doctor [DIR] [--json]``; returns the exit status, see ``ttscompile doctor``."""
-    paths = [argument for argument in arguments if not argument.startswith("-")]
-    options = [argument for argument in arguments if argument.startswith("-")]
-    if len(paths) > 1 or set(options) - {"--json"}:
+    paths = [Path(argument) for argument in arguments if argument != "--json"]
+    if len(paths) > 1 or any(argument.startswith("-") for argument in arguments if argument != "--json"):
         sys.stderr.write("usage: python -m ttscompile.doctor [DIR] [--json]\n")
         return 2
-    if paths and not Path(paths[0]).exists():
+    if paths and not paths[0].exists():
         sys.stderr.write(f"error: {paths[0]}: does not exist. Give the directory that 'ttscompile convert' wrote.\n")
         return 2
-    found = examine(Path(paths[0]) if paths else None)
-    sys.stdout.write((json.dumps(document(found), indent=2) if "--json" in options else text(found)) + "\n")
+    found = examine(*paths)
+    sys.stdout.write((json.dumps(document(found), indent=2) if "--json" in arguments else text(found)) + "\n")
     return 1 if problems(found) else 0

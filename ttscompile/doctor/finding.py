@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 
 class Level(enum.Enum):
@@ -42,7 +42,3 @@ class Finding:
     ) -> Finding:
         """Of this level and with this remedy if it is wrong, else ``OK`` and without."""
         return cls(part, what, found, level, remedy) if wrong else cls(part, what, found)
-
-    def to_json(self) -> dict[str, str]:
-        """As plain JSON values."""
-        return {**asdict(self), "level": self.level.value}

@@ -53,28 +53,24 @@ def usable_cores(root: Path = Path("/")) -> float:
 
 def cgroup_cores(root: Path) -> float | None:
     """Cores' worth of time that the control group allows; None for no limit."""
-    found = _text(root / "sys/fs/cgroup/cpu.max").split()
-    if len(found) == 2 and found[0].isdigit() and found[1].isdigit() and int(found[1]) > 0:
-        return int(found[0]) / int(found[1])
-    quota = _number(root / "sys/fs/cgroup/cpu/cpu.cfs_quota_us")
-    period = _number(root / "sys/fs/cgroup/cpu/cpu.cfs_period_us")
-    return quota / period if quota is not None and quota > 0 and period else None
+    told = _text(root / "sys/fs/cgroup/cpu.max").split()  # of version 2; of version 1 there are two files
+    if len(told) != 2:
+        told = [_text(root / f"sys/fs/cgroup/cpu/cpu.cfs_{name}_us").strip() for name in ("quota", "period")]
+    quota, period = (int(number) if number.isdigit() else 0 for number in told)  # "max" and -1 are no limit
+    return quota / period if quota and period else None
 
 
 def available_bytes(root: Path = Path("/")) -> int | None:
     """Memory that can be had without swapping, in the control group's limit; None where nothing says so."""
-    found = []
-    for line in _text(root / "proc/meminfo").splitlines():
-        name, _, value = line.partition(":")
-        if name == "MemAvailable":
-            found.append(1024 * int(value.split()[0]))
+    kibibytes = cpuinfo(root / "proc/meminfo").get("MemAvailable")  # a file of the same form
+    found = [] if kibibytes is None else [1024 * int(kibibytes.split()[0])]
     for limit, used in (
         ("sys/fs/cgroup/memory.max", "sys/fs/cgroup/memory.current"),
         ("sys/fs/cgroup/memory/memory.limit_in_bytes", "sys/fs/cgroup/memory/memory.usage_in_bytes"),
     ):
-        most, now = _number(root / limit), _number(root / used)
-        if most is not None:
-            found.append(most - (now or 0))
+        most, now = (_text(root / name).strip() for name in (limit, used))
+        if most.isdigit():
+            found.append(int(most) - (int(now) if now.isdigit() else 0))
     return max(min(found), 0) if found else None
 
 
@@ -108,8 +104,7 @@ def _cores(root: Path) -> list[Finding]:
         else f"threads=1 first; up to {most}, if a call is too slow: it leaves a core to the control loop"
     )
     found.append(Finding(part, "threads", advice))
-    governor = _text(root / "sys/devices/system/cpu/cpu0/cpufreq/scaling_governor").strip()
-    if governor:
+    if governor := _text(root / "sys/devices/system/cpu/cpu0/cpufreq/scaling_governor").strip():
         remedy = "The first calls after a pause are slow. Run: sudo cpupower frequency-set -g performance."
         found.append(Finding.judged(part, "frequency governor", governor, governor != "performance", remedy))
     load = os.getloadavg()[0]
@@ -126,30 +121,21 @@ def _memory(root: Path) -> list[Finding]:
 
 def _clock(root: Path) -> list[Finding]:
     part, info = "clock", time.get_clock_info("monotonic")
-    found = [Finding(part, "resolution", f"{1e9 * info.resolution:g} ns, {1e9 * _tick():.0f} ns between two readings")]
-    source = _text(root / "sys/devices/system/clocksource/clocksource0/current_clocksource").strip()
-    if source:
+    readings = [time.monotonic() for _ in range(201)]
+    apart = statistics.median(b - a for a, b in pairwise(readings))
+    found = [Finding(part, "resolution", f"{1e9 * info.resolution:g} ns, {1e9 * apart:.0f} ns between two readings")]
+    if source := _text(root / "sys/devices/system/clocksource/clocksource0/current_clocksource").strip():
         remedy = "Reading the time costs a system call of microseconds; see the kernel's parameter clocksource=tsc."
         found.append(Finding.judged(part, "source", source, source not in _FAST_CLOCKS, remedy))
-    late = _lateness_ms()
-    told = f"{late:.2f} ms late in the median, of 20 sleeps of 1 ms"
-    remedy = "A control loop will jitter: look with ttscompile realtime DIR --control-hz HZ --jitter 10."
-    return [*found, Finding.judged(part, "sleep", told, late > _LATE_MS, remedy)]
-
-
-def _tick() -> float:
-    """Seconds between two readings of the clock, median."""
-    times = [time.monotonic() for _ in range(201)]
-    return statistics.median(b - a for a, b in pairwise(times))
-
-
-def _lateness_ms() -> float:
-    late = []
+    latenesses = []
     for _ in range(20):
         started = time.monotonic()
         time.sleep(0.001)
-        late.append(1e3 * (time.monotonic() - started) - 1)
-    return statistics.median(late)
+        latenesses.append(1e3 * (time.monotonic() - started) - 1)
+    late = statistics.median(latenesses)
+    told = f"{late:.2f} ms late in the median, of 20 sleeps of 1 ms"
+    remedy = "A control loop will jitter: look with ttscompile realtime DIR --control-hz HZ --jitter 10."
+    return [*found, Finding.judged(part, "sleep", told, late > _LATE_MS, remedy)]
 
 
 def _affinity() -> set[int]:
@@ -175,8 +161,3 @@ def _text(path: Path) -> str:
         return path.read_text(errors="replace")
     except OSError:
         return ""
-
-
-def _number(path: Path) -> int | None:
-    text = _text(path).strip()
-    return int(text) if text.lstrip("-").isdigit() else None

@@ -58,34 +58,32 @@ def requirements() -> list[Requirement]:
 def _python() -> list[Finding]:
     part, bits = "python", 8 * struct.calcsize("P")
     told = f"{platform.python_implementation()} {platform.python_version()}, {bits} bits"
-    if sys.version_info[:2] < PYTHON:
-        wanted = ".".join(map(str, PYTHON))
-        found = [Finding(part, "version", told, Level.PROBLEM, f"Install Python {wanted} or later.")]
-    elif bits < 64:
-        found = [Finding(part, "version", told, Level.PROBLEM, "Install a 64-bit Python: onnxruntime has no other.")]
-    else:
-        found = [Finding(part, "version", told)]
+    old = sys.version_info[:2] < PYTHON
+    remedy = "Install a 64-bit Python: onnxruntime has no other."
+    if old:
+        remedy = f"Install Python {'.'.join(map(str, PYTHON))} or later."
+    own = Finding.judged(part, "version", told, old or bits < 64, remedy, Level.PROBLEM)
     system = f"{platform.system()} {platform.release()} {platform.machine()}"
     remedy = "ttscompile is tested on Linux only; use that."
-    return [*found, Finding.judged(part, "system", system, platform.system() != "Linux", remedy)]
+    return [own, Finding.judged(part, "system", system, platform.system() != "Linux", remedy)]
 
 
 def _packages(wanted: list[Requirement]) -> list[Finding]:
     part = "packages"
     try:
-        own = Finding(part, PROJECT, version(PROJECT))
+        found = [Finding(part, PROJECT, version(PROJECT))]
     except PackageNotFoundError:
         remedy = "Install it: pip install ttscompile. Until then nothing is known of the packages it needs."
         return [Finding(part, PROJECT, "not installed: imported from a folder", Level.WARNING, remedy)]
-    found = [own]
     for each in (r for r in wanted if not r.extra):
         installed, fits = _installed(each)
         if fits:
             found.append(Finding(part, each.name, installed))
             continue
-        level = Level.WARNING if each.name in _COMMAND_LINE else Level.PROBLEM
-        needed = "the command line needs it" if each.name in _COMMAND_LINE else "no artifact runs without"
-        remedy = f"Run: pip install '{each.name}>={each.least}'" + f" ({needed})."
+        level, needed = Level.PROBLEM, "no artifact runs without"
+        if each.name in _COMMAND_LINE:
+            level, needed = Level.WARNING, "the command line needs it"
+        remedy = f"Run: pip install '{each.name}>={each.least}' ({needed})."
         found.append(Finding(part, each.name, f"{installed}; {each.least} or later is needed", level, remedy))
     for extra in dict.fromkeys(r.extra for r in wanted if r.extra in ENABLES):
         found.append(_extra(extra, [r for r in wanted if r.extra == extra]))
@@ -103,16 +101,14 @@ def _installed(wanted: Requirement) -> tuple[str, bool]:
 
 def _extra(name: str, wanted: list[Requirement]) -> Finding:
     """One extra: complete, or what it lacks; its absence is no problem on a robot."""
-    found = [_installed(each) for each in wanted]
-    what = f"extra {name!r}"
-    lacking = [
-        f"{each.name} {'' if told == 'not installed' else told + ' '}(needs {each.least})"
-        for each, (told, fits) in zip(wanted, found, strict=True)
-        if not fits
-    ]
+    what, lacking, there = f"extra {name!r}", [], []
+    for each in wanted:
+        told, fits = _installed(each)
+        there.append(f"{each.name} {told}")
+        if not fits:
+            lacking.append(f"{each.name} {'' if told == 'not installed' else told + ' '}(needs {each.least})")
     if not lacking:
-        versions = ", ".join(f"{each.name} {told}" for each, (told, _) in zip(wanted, found, strict=True))
-        return Finding("packages", what, f"for {ENABLES[name]}: {versions}")
+        return Finding("packages", what, f"for {ENABLES[name]}: {', '.join(there)}")
     remedy = f"Where you want {ENABLES[name]}: pip install 'ttscompile[{name}]'."
     return Finding("packages", what, f"lacks {', '.join(lacking)}", Level.NOTE, remedy)
 
@@ -125,8 +121,8 @@ def _providers() -> list[Finding]:
         offered = list(module.get_available_providers())
     except ModuleNotFoundError as error:
         lacking = error.name or "onnxruntime"
-        remedy = f"Run: pip install {lacking}."
-        return [Finding(part, "import", f"fails: {lacking} is not installed", Level.PROBLEM, remedy)]
+        told, remedy = f"fails: {lacking} is not installed", f"Run: pip install {lacking}."
+        return [Finding(part, "import", told, Level.PROBLEM, remedy)]
     except Exception as error:  # a broken installation: its shared library, or numpy's
         remedy = "Install it again: pip install --force-reinstall onnxruntime numpy."
         return [Finding(part, "import", f"fails: {type(error).__name__}: {error}", Level.PROBLEM, remedy)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,17 +18,14 @@ STEPS_AXIS = "denoising step k, in order of execution (0 is the noisiest)"
 _CHARACTER = 0.012
 """Share of the axes' width, about, that a character of a point's name takes."""
 
-_ABBREVIATIONS = {"self_attention": "SA", "cross_attention": "CA", "feed_forward": "FF"}
 
-
-def new_figure(width: float, height: float, picture: str = "a picture", told: str = "the figures") -> Figure:
+def new_figure(width: float, height: float, told: str = "the figures") -> Figure:
     """An empty figure, without pyplot, which keeps every figure in a global list and would choose a window system.
 
     Args:
         width: in inches.
         height: in inches.
-        picture: what it will be, for the error.
-        told: what ``--json`` has in its place.
+        told: what it will show, and ``--json`` says too; for the error.
 
     Raises:
         RuntimeUnavailableError: matplotlib is not installed.
@@ -39,17 +35,12 @@ def new_figure(width: float, height: float, picture: str = "a picture", told: st
         from matplotlib.figure import Figure
     except ModuleNotFoundError as error:
         raise RuntimeUnavailableError(
-            f"{picture} needs matplotlib, and {error.name!r} is not installed. Install 'ttscompile[compile]', or read"
-            f" {told} with --json."
+            f"a picture of {told} needs matplotlib, and {error.name!r} is not installed. Install"
+            f" 'ttscompile[compile]', or read {told} with --json."
         ) from error
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
-
-
-def block_names(kinds: Sequence[str]) -> list[str]:
-    """Short names of blocks: ``SA 0``."""
-    return [f"{_ABBREVIATIONS.get(kind, kind[:12])} {b}" for b, kind in enumerate(kinds)]
 
 
 def plain_powers(axis: Axis) -> None:

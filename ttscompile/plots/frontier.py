@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from math import log
 from pathlib import Path
 from textwrap import wrap
+from typing import Any
 
 from ..measure.points import Point
 from .figure import beside, new_figure, plain_powers, write_picture
@@ -18,10 +19,7 @@ MARKERS = "osD^vP*"
 _TITLE_WIDTH = 105
 """Characters."""
 
-_TOLD = {
-    "steps": "dense, same initial sample, other draws",
-    "all": "dense, other noise",
-}
+_TOLD = {"steps": "dense, same initial sample, other draws", "all": "dense, other noise"}
 
 
 def plot_frontier(
@@ -61,16 +59,8 @@ def plot_frontier(
         axes.annotate(p.name, (p.latency_ms, p.error), fontsize=8, **beside(place, p.name, above))
     best = [point for point in efficient if point.error > 0]
     if len(best) > 1:  # of one point there is no line
-        axes.step(
-            [p.latency_ms for p in best],
-            [p.error for p in best],
-            where="post",
-            color="#999999",
-            linewidth=4,
-            alpha=0.35,
-            zorder=0,
-            label="frontier",
-        )
+        line: dict[str, Any] = {"color": "#999999", "linewidth": 4, "alpha": 0.35, "zorder": 0}
+        axes.step([p.latency_ms for p in best], [p.error for p in best], where="post", label="frontier", **line)
     for (name, height), style in zip(yardsticks.items(), ("--", ":"), strict=False):
         if height > 0:
             axes.axhline(height, color="#555555", linestyle=style, linewidth=1, label=_TOLD[name])

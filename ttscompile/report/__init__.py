@@ -2,6 +2,6 @@
 
 from .build import Given, build
 from .page import Page, Picture, Section, Table, render
-from .verified import refused, verified
+from .verified import verified
 
-__all__ = ["Given", "Page", "Picture", "Section", "Table", "build", "refused", "render", "verified"]
+__all__ = ["Given", "Page", "Picture", "Section", "Table", "build", "render", "verified"]

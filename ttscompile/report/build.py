@@ -6,20 +6,20 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from ..artifact.load import Artifact
 from ..artifact.manifest import DENSE
 from ..measure.machine import fingerprint, one_line
-from ..measure.points import efficient
+from ..measure.points import Point, efficient
 from ..measure.units import flops, ms, share
 from ..report import facts, pictures
 from ..runtimes.policy import CompiledPolicy
 from ..trajectories.episodes import Episode
-from .comparison import Compared, from_record
+from .comparison import Compared
 from .measure import Course, Latency, measure_parts, run_episode
 from .page import Page, Picture, Section, Table, require_packages
 from .verified import NOT_RUN
-
-_CACHES = "the last block of its kind (FORWARD), an earlier step (TIMESTEP) or the last call (ROLLOUT)."
 
 MOST_PICTURES = 6
 """Schedules that are drawn; an artifact may hold many."""
@@ -67,7 +67,6 @@ def build(
         progress("running an episode")
         course = run_episode(policy, given.episode)
     progress("drawing")
-    record = manifest.calibration
     sections = (
         facts.provenance(artifact),
         facts.policy(manifest),
@@ -77,7 +76,7 @@ def build(
         *(() if course is None else (_episode(course),)),
         _latency(latencies, given, manifest.default_plan),
         _frontier(artifact, latencies, given.comparison),
-        _calibration(record),
+        _calibration(manifest.calibration),
         given.verification,
         facts.limits(artifact),
     )
@@ -103,8 +102,7 @@ def _figures(artifact: Artifact, latencies: Sequence[Latency]) -> tuple[tuple[st
         ("denoising steps", str(manifest.steps)),
         ("residual blocks", str(len(manifest.blocks))),
     ]
-    score = facts.scores(manifest.calibration).get(manifest.default_plan)
-    if score is not None:
+    if (score := facts.scores(manifest.calibration).get(manifest.default_plan)) is not None:
         made.append(("held-out action error", f"{score['error']:.3g}"))
     return tuple(made)
 
@@ -115,33 +113,19 @@ def _plans(artifact: Artifact, course: Course | None) -> Section:
     drawn: list[Picture] = []
     ordered = sorted(artifact.schedules, key=lambda name: name != manifest.default_plan)
     for name in ordered[:MOST_PICTURES]:
-        plan = artifact.schedule(name)
-        drawn.append(
-            Picture(
-                pictures.plan_picture(plan, kinds, f"plan {name!r}"),
-                caption=f"Plan {name!r} of one call: steps across, blocks down. {pictures.caption_of(plan)}",
-            )
-        )
+        caption = f"Plan {name!r} of one call: steps across, blocks down."
+        drawn.append(pictures.plan_picture(artifact.schedule(name), kinds, f"plan {name!r}", caption))
     if course is not None:
         last, calls = course.plans[-1], len(course.plans)
         if not any((last == schedule).all() for schedule in artifact.schedules.values()):
-            drawn.append(
-                Picture(
-                    pictures.plan_picture(last, kinds, f"executed in call {calls - 1}"),
-                    caption=f"What the last of {calls} calls of the episode executed. {pictures.caption_of(last)}",
-                )
-            )
-        drawn.append(
-            Picture(
-                pictures.shares_picture(course),
-                alt="A heat map a source: the share of calls in which a cell had this source.",
-                caption=f"Mean over {calls} calls of the episode {course.name}, a map for each source.",
-            )
-        )
-    text = [
-        "A plan says for every denoising step and every block whether it is computed, or its residual taken from "
-        + _CACHES
-    ]
+            caption = f"What the last of {calls} calls of the episode executed."
+            drawn.append(pictures.plan_picture(last, kinds, f"executed in call {calls - 1}", caption))
+        caption = f"Mean over {calls} calls of the episode {course.name}, a map for each source."
+        alt = "A heat map a source: the share of calls in which a cell had this source."
+        drawn.append(Picture(pictures.shares_picture(course), caption, alt))
+    elsewhere = "the last block of its kind (FORWARD), an earlier step (TIMESTEP) or the last call (ROLLOUT)"
+    computed = "A plan says for every denoising step and every block whether it is computed"
+    text = [f"{computed}, or its residual taken from {elsewhere}."]
     if len(ordered) > MOST_PICTURES:
         text.append(f"{MOST_PICTURES} of {len(ordered)} schedules are drawn.")
     if not ordered:
@@ -150,23 +134,17 @@ def _plans(artifact: Artifact, course: Course | None) -> Section:
 
 
 def _episode(course: Course) -> Section:
-    low, high = float(course.sparsity.min()), float(course.sparsity.max())
-    replaced = sum(course.legalised)
-    mean = share(float(course.sparsity.mean()))
-    reused = f"{mean} of the cells were reused in each."
-    if high > low:
-        reused = f"between {share(low)} and {share(high)} of the cells were reused, {mean} on average."
-    text = f"{len(course.plans)} consecutive calls of {course.name} with the default plan: {reused}" + (
-        f" {replaced} cells were replaced because what they read was not computed yet."
-        if replaced
-        else " Every read found what it was to read."
-    )
-    drawn = Picture(
-        pictures.sparsity_picture(course),
-        alt="A line: the share of reused cells, call by call.",
-        caption="Share of the cells that were reused, as executed. Step 0 of every call is dense.",
-    )
-    return Section("Episode", (text,), pictures=(drawn,))
+    low, mean, high = (share(float(of(course.sparsity))) for of in (np.min, np.mean, np.max))
+    reused = f"between {low} and {high} of the cells were reused, {mean} on average."
+    if low == high:
+        reused = f"{mean} of the cells were reused in each."
+    found = "Every read found what it was to read."
+    if replaced := sum(course.legalised):
+        found = f"{replaced} cells were replaced because what they read was not computed yet."
+    text = f"{len(course.plans)} consecutive calls of {course.name} with the default plan: {reused} {found}"
+    caption = "Share of the cells that were reused, as executed. Step 0 of every call is dense."
+    alt = "A line: the share of reused cells, call by call."
+    return Section("Episode", (text,), pictures=(Picture(pictures.sparsity_picture(course), caption, alt),))
 
 
 def _latency(latencies: Sequence[Latency], given: Given, default: str) -> Section:
@@ -174,9 +152,9 @@ def _latency(latencies: Sequence[Latency], given: Given, default: str) -> Sectio
         (
             one.plan + (" (default)" if one.plan == default else ""),
             ms(one.total),
-            f"{ms(one.quartiles[0])}..{ms(one.quartiles[1])}",
+            "..".join(map(ms, one.quartiles)),
             f"{one.parts['prologue']:.2f}",
-            f"{one.pruner:.2f}",
+            f"{one.parts['pruner']:.2f}",
             f"{one.parts['wait_pruner']:.2f}",
             ms(one.parts["decode"]),
             flops(one.flops),
@@ -189,11 +167,8 @@ def _latency(latencies: Sequence[Latency], given: Given, default: str) -> Sectio
         f" {given.threads} thread{'s' * (given.threads != 1)}, onnxruntime. The pruner runs beside step 0: only the"
         " wait for it lengthens a call."
     )
-    drawn = Picture(
-        pictures.latency_picture(latencies),
-        alt="Bars: what the calls of each plan spend their time on. The table has the figures.",
-        caption="What the calls of each plan spend their time on.",
-    )
+    alt = "Bars: what the calls of each plan spend their time on. The table has the figures."
+    drawn = Picture(pictures.latency_picture(latencies), "What the calls of each plan spend their time on.", alt)
     return Section("Latency", (text, one_line(fingerprint())), (Table(head, rows),), (drawn,))
 
 
@@ -203,16 +178,17 @@ def _frontier(artifact: Artifact, latencies: Sequence[Latency], compared: Compar
         points, yardsticks = compared
         text = "As ttscompile compare measured it, on the machine and the calls that its document names."
     else:
-        points, yardsticks = from_record(manifest.calibration, latencies), {}
+        judged = facts.scores(manifest.calibration)
+        known = [one for one in latencies if one.plan in judged]
+        points = tuple(Point("this artifact", p.plan, float(judged[p.plan]["error"]), p.total) for p in known)
+        yardsticks = {}
         text = "Errors from the calibration record, latencies measured now. ttscompile compare measures more of it."
     if not any(point.error > 0 for point in points):
         return Section("Frontier", ("There is no error to hold against a latency: calibrate the artifact first.",))
     best = efficient(points)
-    drawn = Picture(
-        pictures.frontier_picture(points, best, yardsticks, f"artifact {manifest.short_identity}"),
-        alt="Points: action error against latency of each plan. The table has the figures.",
-        caption="Action error against latency: down and left is better.",
-    )
+    png = pictures.frontier_picture(points, best, yardsticks, f"artifact {manifest.short_identity}")
+    alt = "Points: action error against latency of each plan. The table has the figures."
+    drawn = Picture(png, "Action error against latency: down and left is better.", alt)
     rows = tuple((p.series, p.name, f"{p.error:.4g}", ms(p.latency_ms), "yes" if p in best else "") for p in points)
     head = ("", "plan", "action error", "ms a call", "on the frontier")
     return Section("Frontier", (text,), (Table(head, rows),), (drawn,))
@@ -224,13 +200,9 @@ def _calibration(record: Mapping[str, Any] | None) -> Section:
     scores = facts.scores(record)
     drawn: tuple[Picture, ...] = ()
     if scores and all(score["error"] > 0 for score in scores.values()):
-        drawn = (
-            Picture(
-                pictures.plans_picture(scores),
-                alt="Points: held-out action error of each plan against the share of cells it computes.",
-                caption="Held-out action error against computed cells: mean (point) and 90th percentile (bar).",
-            ),
-        )
+        caption = "Held-out action error against computed cells: mean (point) and 90th percentile (bar)."
+        alt = "Points: held-out action error of each plan against the share of cells it computes."
+        drawn = (Picture(pictures.plans_picture(scores), caption, alt),)
     tables = (facts.score_table(record), facts.record_table(record)) if scores else (facts.record_table(record),)
     text = "Errors on episodes that nothing was learned from, against the dense policy with the same noise."
     return Section("Calibration", (*((text,) if scores else ()), *facts.left_out(record)), tables, drawn)

@@ -1,52 +1,48 @@
-"""Points of action error against latency, from the calibration record or from ``ttscompile compare --json``."""
+"""Points of action error against latency, from what ``ttscompile compare --json`` printed."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+from ..core.untrusted_json import parse_json
 from ..errors import ReportError
 from ..measure.points import Point
-from .facts import scores
-from .measure import Latency
 
-_NUMBERS = ("error", "latency_ms")
-
+MAX_BYTES = 16 * 2**20
+_REMEDY = "Give what 'ttscompile compare ... --json' printed."
 
 Compared = tuple[tuple[Point, ...], dict[str, float]]
 """Points and yardsticks of a comparison."""
 
 
-def from_record(record: Mapping[str, Any] | None, latencies: Sequence[Latency]) -> tuple[Point, ...]:
-    """The plans of an artifact that calibration judged and that were timed."""
-    judged = scores(record)
-    return tuple(
-        Point("this artifact", one.plan, float(judged[one.plan]["error"]), one.total)
-        for one in latencies
-        if one.plan in judged
-    )
-
-
-def from_comparison(document: Mapping[str, Any]) -> Compared:
+def read_comparison(path: Path) -> Compared:
     """Points and yardsticks of a comparison.
 
     Raises:
-        ReportError: it is not what ``ttscompile compare --json`` prints.
+        ReportError: the file is not what ``ttscompile compare --json`` prints.
     """
-    found, yardsticks = document.get("points"), document.get("yardsticks", {})
-    good = isinstance(found, list) and isinstance(yardsticks, dict)
-    good = good and all(isinstance(p, dict) and all(_is_number(p.get(name)) for name in _NUMBERS) for p in found or ())
-    if not good or not all(_is_number(value) for value in yardsticks.values()):
+    try:
+        document: Any = parse_json(path.read_bytes(), MAX_BYTES)
+    except (OSError, ValueError) as error:
+        raise ReportError(f"{path}: no JSON document: {error}. {_REMEDY}") from error
+    document = document if isinstance(document, dict) else {}
+    points: Any = document.get("points")
+    yardsticks = document.get("yardsticks", {})
+    good = isinstance(points, list) and isinstance(yardsticks, dict)
+    good = good and all(isinstance(p, dict) and _is_number(p.get("error")) for p in points)
+    good = good and all(map(_is_number, [*(p.get("latency_ms") for p in points), *yardsticks.values()]))
+    if not good:
         raise ReportError(
-            "the comparison is not what 'ttscompile compare ... --json' prints: expected 'points' with error and"
-            f" latency_ms, and 'yardsticks'; found {sorted(map(str, document))[:8]}. Give that command's output."
+            f"{path}: expected an object with 'points', which have error and latency_ms, and with 'yardsticks'; found"
+            f" {sorted(map(str, document))[:8]}. {_REMEDY}"
         )
-    points = tuple(
+    found = (
         Point(str(p.get("series", "")), str(p.get("name", "")), float(p["error"]), float(p["latency_ms"]))
-        for p in found or ()
+        for p in points
     )
-    return points, {name: float(value) for name, value in yardsticks.items() if name in ("steps", "all")}
+    return tuple(found), {name: float(value) for name, value in yardsticks.items() if name in ("steps", "all")}
 
 
 def _is_number(value: object) -> bool:

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from itertools import groupby
 from typing import Any
 
 from ..artifact.ceiling import few_steps
 from ..artifact.load import Artifact
-from ..artifact.manifest import DENSE, BlockRecord, Manifest, marked
+from ..artifact.manifest import DENSE, BlockRecord, Manifest, PlanRecord, marked
 from ..ir.flops import graph_flops
-from ..ir.graph import TensorType
 from ..ir.program import Binding
 from ..measure.units import flops, plain, share
 from ..runtimes.liveness import rollout_needs
 from .page import Section, Table
 
 _NOT_TOLD = ("plans", "precision", "sparsity", "flops_sparsity", "skipped")
-_SCORE = ("error", "error_p90", "sparsity", "flops_saved")
+_ERRORS = ("error", "error_p90")
 
 
 def provenance(artifact: Artifact) -> Section:
@@ -65,9 +65,7 @@ def hoisting(artifact: Artifact) -> Section:
     """What is computed when, and what that saves before anything is reused."""
     manifest = artifact.manifest
     record, steps = manifest.flops, manifest.steps
-    bound: dict[Binding, list[TensorType]] = {binding: [] for binding in Binding}
-    for context in manifest.contexts.values():
-        bound[context.binding].append(context.type)
+    bound = Counter(context.binding for context in manifest.contexts.values())
     table_bytes = sum(table.nbytes for table in artifact.tables.values())
     condition = graph_flops(artifact.pieces.condition)
     loop = steps * (record.stem + record.tail + sum(record.blocks))
@@ -76,20 +74,12 @@ def hoisting(artifact: Artifact) -> Section:
     def row(name: str, when: str, values: str, cost: float) -> tuple[str, ...]:
         return name, when, values, flops(cost), share(cost / record.dense)
 
+    tables = f"{len(artifact.tables)} tables of {steps} rows, {table_bytes / 1e6:.1f} MB"
+    batched = max(record.prologue - condition, 0)
     rows = (
-        row(
-            "table",
-            "when it was compiled",
-            f"{len(artifact.tables)} tables of {steps} rows, {table_bytes / 1e6:.1f} MB",
-            0,
-        ),
-        row("condition", "once a call", f"{len(bound[Binding.CONDITION])} values", condition),
-        row(
-            "step",
-            f"once a call, {steps} steps in one batch",
-            f"{len(bound[Binding.STEP])} values",
-            max(record.prologue - condition, 0),
-        ),
+        row("table", "when it was compiled", tables, 0),
+        row("condition", "once a call", f"{bound[Binding.CONDITION]} values", condition),
+        row("step", f"once a call, {steps} steps in one batch", f"{bound[Binding.STEP]} values", batched),
         row("loop", f"{steps} times a call", f"stem, {len(record.blocks)} blocks, tail", loop),
         row("all, every cell computed", "", "", dense),
         row("the denoiser as it was captured", f"{steps} times a call", "", record.dense),
@@ -106,10 +96,9 @@ def hoisting(artifact: Artifact) -> Section:
 
 def blocks(manifest: Manifest) -> Section:
     """The block table, and what a group is."""
-    text = (
-        f"{len(manifest.blocks)} residual blocks, numbered in order of execution. Reuse from the last block of a kind"
-    )
-    return Section("Blocks", (f"{text} (FORWARD) stays within a group.",), (block_table(manifest),))
+    text = f"{len(manifest.blocks)} residual blocks, numbered in order of execution."
+    forward = "Reuse from the last block of a kind (FORWARD) stays within a group."
+    return Section("Blocks", (f"{text} {forward}",), (block_table(manifest),))
 
 
 def block_table(manifest: Manifest) -> Table:
@@ -128,34 +117,31 @@ def block_table(manifest: Manifest) -> Table:
     return Table(("block", "kind", "residual", "group", "FLOPs, one evaluation"), tuple(rows))
 
 
+def plans_of(manifest: Manifest) -> dict[str, PlanRecord]:
+    """All plans, the dense one first."""
+    return {DENSE: PlanRecord("schedule", 0.0, 0.0), **manifest.plans}
+
+
 def plan_flops(artifact: Artifact, name: str) -> float | None:
     """FLOPs of a call with a plan; a pruner's blocks cost what was measured on average, None if they were not."""
     manifest = artifact.manifest
-    own = manifest.plans.get(name)
-    dense = manifest.flops.call(artifact.schedule(DENSE), pruned=own is not None and own.pruned)
-    if own is None:
-        return dense
-    share_saved = own.flops_sparsity
-    return None if share_saved is None else dense - share_saved * manifest.steps * sum(manifest.flops.blocks)
+    own = plans_of(manifest)[name]
+    if own.flops_sparsity is None:
+        return None
+    dense = manifest.flops.call(artifact.schedule(DENSE), pruned=own.pruned)
+    return dense - own.flops_sparsity * manifest.steps * sum(manifest.flops.blocks)
 
 
 def plan_table(artifact: Artifact) -> Table:
     """Every plan: its kind, its sparsity, its cost."""
     manifest = artifact.manifest
     rows = []
-    for name in (DENSE, *manifest.plans):
-        own, cost = manifest.plans.get(name), plan_flops(artifact, name)
-        cells, weighed = (0.0, 0.0) if own is None else (own.sparsity, own.flops_sparsity)
-        rows.append(
-            (
-                f"{name} (default)" if name == manifest.default_plan else marked(name),
-                "schedule" if own is None else own.kind,
-                share(cells),
-                share(weighed),
-                "" if cost is None else flops(cost),
-                "" if cost is None else share(cost / manifest.flops.dense),
-            )
-        )
+    for name, own in plans_of(manifest).items():
+        told = f"{name} (default)" if name == manifest.default_plan else marked(name)
+        saved = (own.kind, share(own.sparsity), share(own.flops_sparsity))
+        cost = plan_flops(artifact, name)
+        costs = ("", "") if cost is None else (flops(cost), share(cost / manifest.flops.dense))
+        rows.append((told, *saved, *costs))
     head = ("plan", "kind", "cells reused", "FLOPs reused", "FLOPs a call", "of the captured policy")
     return Table(head, tuple(rows))
 
@@ -163,17 +149,13 @@ def plan_table(artifact: Artifact) -> Table:
 def score_table(record: Mapping[str, Any]) -> Table:
     """What calibration measured on episodes that it did not learn from."""
 
-    def errors(score: Mapping[str, Any]) -> tuple[str, str]:
-        return f"{score['error']:.4g}", f"{score['error_p90']:.4g}"
+    def row(name: str, score: Mapping[str, Any], *saved: str) -> tuple[str, ...]:
+        return name, f"{score['error']:.4g}", f"{score['error_p90']:.4g}", *(saved or ("", ""))
 
     precision = _mapping(record.get("precision"))
     rows = [
-        (marked(name), *errors(score), share(score["sparsity"]), share(score["flops_saved"]))
-        for name, score in _scores(record, *_SCORE).items()
-    ]
-    rows += [
-        (f"{name}: {precision.get('name')} against fp32", *errors(score), "", "")
-        for name, score in _scores(precision, *_SCORE[:2]).items()
+        *(row(marked(name), s, share(s["sparsity"]), share(s["flops_saved"])) for name, s in scores(record).items()),
+        *(row(f"{name}: {precision.get('name')} against fp32", s) for name, s in scores(precision, _ERRORS).items()),
     ]
     head = ("held-out episodes", "mean action error", "90th percentile", "cells reused", "FLOPs saved")
     return Table(head, tuple(rows))
@@ -197,15 +179,13 @@ def record_table(record: Mapping[str, Any], most: int = 200) -> Table:
     return Table(("calibration", ""), tuple(rows), prose=True)
 
 
-def scores(record: Mapping[str, Any] | None) -> Mapping[str, Mapping[str, Any]]:
+def scores(
+    record: Mapping[str, Any] | None, wanted: tuple[str, ...] = (*_ERRORS, "sparsity", "flops_saved")
+) -> Mapping[str, Mapping[str, Any]]:
     """Of each plan that calibration judged, if its figures are there: a record is free JSON of whoever made it."""
-    return _scores(record or {}, *_SCORE)
-
-
-def _scores(record: Mapping[str, Any], *wanted: str) -> dict[str, Mapping[str, Any]]:
     return {
         str(name): score
-        for name, score in _mapping(record.get("plans")).items()
+        for name, score in _mapping((record or {}).get("plans")).items()
         if isinstance(score, Mapping) and all(isinstance(score.get(key), int | float) for key in wanted)
     }
 
@@ -217,7 +197,7 @@ def _mapping(value: object) -> Mapping[str, Any]:
 def limits(artifact: Artifact) -> Section:
     """What a reader should not expect, from the artifact's own facts."""
     manifest = artifact.manifest
-    spec, plans = manifest.spec, manifest.plans
+    sampler = manifest.spec.sampler
     points = []
     if manifest.calibration is None or manifest.default_plan == DENSE:
         points.append("Not calibrated: its default plan computes everything. It is as slow as a dense call.")
@@ -226,19 +206,18 @@ def limits(artifact: Artifact) -> Section:
             "Errors are of the actions, on recorded episodes, against the dense policy with the same noise. They are no"
             " success rates: evaluate the plan on your own task before a robot moves."
         )
-    few = few_steps(manifest)
-    if few is not None:
+    if (few := few_steps(manifest)) is not None:
         points.append(few)
-    if spec.sampler.stochastic:
+    if sampler.stochastic:
         points.append(
-            f"The sampler ({spec.sampler.name}) draws noise in every step: two calls on one observation differ, dense"
+            f"The sampler ({sampler.name}) draws noise in every step: two calls on one observation differ, dense"
             " or not. Give reset a seed, or predict_action the noise, to repeat a call."
         )
     if manifest.precision_name == "fp32":
         points.append("Weights are in fp32. On processors with integer dot products, --precision int8 may be faster.")
     else:
         points.append(f"Blocks compute with {manifest.precision_name} weights: dense calls differ from fp32 as well.")
-    if any(plan.pruned for plan in plans.values()):
+    if any(plan.pruned for plan in manifest.plans.values()):
         points.append("A plan that is made for each observation costs a different time each call.")
     needs = rollout_needs(artifact)
     if needs.read:
@@ -246,8 +225,7 @@ def limits(artifact: Artifact) -> Section:
             f"Its plans read residuals of the call before: {needs.bytes_read / 1e6:.1f} MB a stream are kept, and the"
             " first call after reset() falls back, which its report counts."
         )
-    coarse = [str(i) for i, block in enumerate(manifest.blocks) if block.reason]
-    if coarse:
+    if coarse := [str(i) for i, block in enumerate(manifest.blocks) if block.reason]:
         points.append(f"Blocks {', '.join(coarse)} are coarse: several operations are reused or computed together.")
     points.append(
         "Times are of warm calls of one stream on one machine, taken while this page was made. There is no GPU runtime."

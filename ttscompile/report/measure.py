@@ -32,8 +32,7 @@ class Latency:
         plan: its name.
         total: from the normalised observation to the denoised sample.
         quartiles: first and third of the total.
-        parts: of ``PARTS`` by name.
-        pruner: the pruner's own time, most of it beside step 0.
+        parts: of ``PARTS`` by name; and ``pruner``, the pruner's own time, most of it beside step 0.
         flops: FLOPs of a call.
     """
 
@@ -41,7 +40,6 @@ class Latency:
     total: float
     quartiles: tuple[float, float]
     parts: Mapping[str, float]
-    pruner: float
     flops: float
 
 
@@ -87,22 +85,13 @@ def measure_parts(policy: CompiledPolicy, plans: Sequence[str], runs: int) -> li
             if timer.counted:
                 reports[i].append(report)
     policy.reset()
-    return [_latency(plan, made) for plan, made in zip(plans, reports, strict=True)]
-
-
-def _latency(plan: str, made: Sequence[CallReport]) -> Latency:
-    def middle(part: str) -> float:
-        return float(np.median([getattr(report.timings, part) for report in made]))
-
-    total = Times(tuple(report.timings.total for report in made))
-    return Latency(
-        plan=plan,
-        total=total.median,
-        quartiles=total.quartiles,
-        parts={part: middle(part) for part in PARTS},
-        pruner=middle("pruner"),
-        flops=float(np.median([report.flops[0] for report in made])),
-    )
+    found = []
+    for plan, made in zip(plans, reports, strict=True):
+        total = Times(tuple(report.timings.total for report in made))
+        parts = {p: float(np.median([getattr(report.timings, p) for report in made])) for p in (*PARTS, "pruner")}
+        count = float(np.median([report.flops[0] for report in made]))
+        found.append(Latency(plan, total.median, total.quartiles, parts, count))
+    return found
 
 
 def run_episode(policy: CompiledPolicy, episode: Episode) -> Course:
@@ -113,17 +102,13 @@ def run_episode(policy: CompiledPolicy, episode: Episode) -> Course:
         episode: its first ``EPISODE_CALLS`` calls are run.
     """
     policy.reset()
-    count = min(episode.calls, EPISODE_CALLS)
     made = []
-    for row in range(count):
+    for row in range(min(episode.calls, EPISODE_CALLS)):
         obs = {key: array[row : row + 1] for key, array in episode.observations.items()}
         made.append(_call(policy, obs, None))
     policy.reset()
-    return Course(
-        name=episode.name,
-        plans=np.stack([report.plan[0] for report in made]),
-        legalised=tuple(report.legalised[0] for report in made),
-    )
+    plans = np.stack([report.plan[0] for report in made])
+    return Course(episode.name, plans, tuple(report.legalised[0] for report in made))
 
 
 def _call(policy: CompiledPolicy, obs: Mapping[str, Any], plan: str | None) -> CallReport:

@@ -18,17 +18,22 @@ from ..measure.points import Point
 from ..measure.units import ms
 from ..plots.figure import STEPS_AXIS, beside, new_figure, plain_powers
 from ..plots.frontier import plot_frontier
-from ..plots.plan import COLOURS, plot_plan
-from .measure import PARTS, Course, Latency
+from ..plots.maps import COLOURS, plot_plan
+from .measure import Course, Latency
+from .page import Picture
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_PART_COLOURS = {"prologue": "#0072b2", "wait_pruner": "#cc79a7", "decode": "#d55e00"}
+_PARTS = {
+    "prologue": ("#0072b2", "prologue"),
+    "wait_pruner": ("#cc79a7", "wait for the pruner"),
+    "decode": ("#d55e00", "denoising loop"),
+}
+"""Colour and name of each of ``PARTS``."""
+
 _DWARFS = 4.0
 """A bar is cut off where it is so many times as long as the next."""
-
-_PART_NAMES = {"prologue": "prologue", "wait_pruner": "wait for the pruner", "decode": "denoising loop"}
 
 
 def plain(text: str, most: int = 60) -> str:
@@ -45,9 +50,11 @@ def drawn(draw: Callable[[Path], None]) -> bytes:
         return path.read_bytes()
 
 
-def plan_picture(plan: PlanArray, kinds: Sequence[str], title: str) -> bytes:
-    """One plan, ``[K, blocks]``; see ``ttscompile.plots.plot_plan``."""
-    return drawn(lambda path: plot_plan(plan, [plain(kind) for kind in kinds], path, plain(title)))
+def plan_picture(plan: PlanArray, kinds: Sequence[str], title: str, caption: str) -> Picture:
+    """One plan, ``[K, blocks]``, and its counts, for who cannot see it; see ``ttscompile.plots.maps.plot_plan``."""
+    png = drawn(lambda path: plot_plan(plan, [plain(kind) for kind in kinds], path, plain(title)))
+    counts = ", ".join(f"{source.name.lower()} {int(np.count_nonzero(plan == source))}" for source in Source)
+    return Picture(png, f"{caption} {sparsity(plan):.1%} of {plan.size} cells are reused: {counts}.")
 
 
 def frontier_picture(
@@ -66,8 +73,7 @@ def shares_picture(course: Course) -> bytes:
     panels = figure.subplots(len(used), 1, sharex=True, squeeze=False)[:, 0]
     for axes, source in zip(panels, used, strict=True):
         drawn = axes.imshow(shares[source].T, cmap="cividis", vmin=0, vmax=1, aspect="auto", interpolation="none")
-        mean = float(shares[source].mean())
-        axes.set_title(f"{source.name}: {mean:.1%} of the cells", fontsize=10, loc="left")
+        axes.set_title(f"{source.name}: {shares[source].mean():.1%} of the cells", fontsize=10, loc="left")
         axes.set_ylabel("block")
     panels[-1].set_xlabel(STEPS_AXIS)
     figure.colorbar(drawn, ax=list(panels), label="share of the calls", pad=0.01)
@@ -85,11 +91,9 @@ def sparsity_picture(course: Course) -> bytes:
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlabel("call of the episode")
     axes.set_ylabel("cells reused, %")
-    low = 100 * float(course.sparsity.min())
-    axes.set_ylim(max(min(low - 2, 90.0), -2.0), 100.5)
+    axes.set_ylim(max(min(100 * float(course.sparsity.min()) - 2, 90.0), -2.0), 100.5)
     axes.grid(color="#dddddd", linewidth=0.5)
-    replaced = np.flatnonzero(course.legalised)
-    if len(replaced):
+    if len(replaced := np.flatnonzero(course.legalised)):
         axes.scatter(replaced, 100 * course.sparsity[replaced], marker="x", color="#0072b2", zorder=3)
         axes.set_title("crosses: cells that read what was never computed were replaced", fontsize=9, loc="left")
     return _png(figure)
@@ -101,9 +105,9 @@ def latency_picture(latencies: Sequence[Latency]) -> bytes:
     axes = figure.add_subplot()
     rows = np.arange(len(latencies))[::-1]
     left = np.zeros(len(latencies))
-    for part in PARTS:
+    for part, (colour, name) in _PARTS.items():
         widths = np.array([latency.parts[part] for latency in latencies])
-        axes.barh(rows, widths, left=left, height=0.6, color=_PART_COLOURS[part], label=_PART_NAMES[part])
+        axes.barh(rows, widths, left=left, height=0.6, color=colour, label=name)
         left += widths
     ends = sorted(left)
     cut = len(ends) > 1 and ends[-1] > _DWARFS * ends[-2]
@@ -112,18 +116,12 @@ def latency_picture(latencies: Sequence[Latency]) -> bytes:
     axes.set_yticks(rows, [plain(latency.plan, 24) for latency in latencies])
     for row, end, latency in zip(rows, left, latencies, strict=True):
         inside = bool(end > limit)
-        axes.annotate(
-            f"{ms(latency.total)} ms" + ", cut off" * inside,
-            (limit if inside else end, row),
-            xytext=(-6 if inside else 4, 0),
-            textcoords="offset points",
-            va="center",
-            ha="right" if inside else "left",
-            color="white" if inside else "black",
-        )
+        told = f"{ms(latency.total)} ms" + ", cut off" * inside
+        place, shift, side, colour = (limit, -6, "right", "white") if inside else (end, 4, "left", "black")
+        moved: dict[str, Any] = {"xytext": (shift, 0), "textcoords": "offset points", "va": "center", "ha": side}
+        axes.annotate(told, (place, row), color=colour, **moved)
     axes.set_xlabel("ms of a call, median")
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    axes.spines[["top", "right"]].set_visible(False)
     figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=9)
     return _png(figure)
 
@@ -149,12 +147,6 @@ def plans_picture(scores: Mapping[str, Mapping[str, Any]]) -> bytes:
     axes.grid(which="both", color="#dddddd", linewidth=0.5)
     axes.set_axisbelow(True)
     return _png(figure)
-
-
-def caption_of(plan: PlanArray) -> str:
-    """Counts of a plan, for who cannot see it."""
-    counts = ", ".join(f"{source.name.lower()} {int(np.count_nonzero(plan == source))}" for source in Source)
-    return f"{sparsity(plan):.1%} of {plan.size} cells are reused: {counts}."
 
 
 def _png(figure: Figure) -> bytes:

@@ -6,16 +6,15 @@ from dataclasses import asdict
 from typing import Any
 
 from ..artifact.load import Artifact
-from ..artifact.manifest import DENSE, Manifest
+from ..artifact.manifest import Manifest
 from ..runtimes.liveness import rollout_needs
-from .facts import plan_flops
+from .facts import plan_flops, plans_of
 
 
 def document(artifact: Artifact) -> dict[str, Any]:
     """Everything that an artifact says of itself, as plain JSON values."""
     manifest = artifact.manifest
     spec = manifest.spec
-    sampler = spec.sampler
     return {
         "path": str(artifact.path),
         "identity": manifest.identity,
@@ -23,41 +22,20 @@ def document(artifact: Artifact) -> dict[str, Any]:
         "schema_version": manifest.schema_version,
         "ttscompile_version": manifest.ttscompile_version,
         "source": dict(spec.source),
-        "sampler": {
-            "name": sampler.name,
-            "steps": sampler.steps,
-            "stochastic": sampler.stochastic,
-            "clip": sampler.clip,
-        },
+        "sampler": {name: getattr(spec.sampler, name) for name in ("name", "steps", "stochastic", "clip")},
         "sample": list(spec.sample),
         "left_out": spec.left_out,
         "observations": {k: {"shape": list(o.shape), "dtype": o.dtype} for k, o in spec.observations.items()},
         "chunk": {"action_dim": spec.chunk.action_dim, "start": spec.chunk.start, "stop": spec.chunk.stop},
         "blocks": [
-            {
-                "index": i,
-                "kind": block.kind,
-                "type": str(block.type),
-                "group": block.group,
-                "flops": block.flops,
-                "reason": block.reason,
-            }
-            for i, block in enumerate(manifest.blocks)
+            {"index": i, "kind": b.kind, "type": str(b.type), "group": b.group, "flops": b.flops, "reason": b.reason}
+            for i, b in enumerate(manifest.blocks)
         ],
         "precision": _precision(manifest),
         "flops": _flops(manifest),
-        "ceiling": {
-            "sparsity": 1 - 1 / manifest.steps,
-            "flops": manifest.flops.ceiling(manifest.steps),
-        },
+        "ceiling": {"sparsity": 1 - 1 / manifest.steps, "flops": manifest.flops.ceiling(manifest.steps)},
         "plans": {
-            name: {
-                "kind": "schedule" if plan is None else plan.kind,
-                "sparsity": 0.0 if plan is None else plan.sparsity,
-                "flops_sparsity": 0.0 if plan is None else plan.flops_sparsity,
-                "flops": plan_flops(artifact, name),
-            }
-            for name, plan in {DENSE: None, **manifest.plans}.items()
+            name: asdict(plan) | {"flops": plan_flops(artifact, name)} for name, plan in plans_of(manifest).items()
         },
         "rollout_cache": asdict(rollout_needs(artifact)),
         "default_plan": manifest.default_plan,

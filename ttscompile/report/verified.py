@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..plots.errors import plot_errors
+from ..plots.maps import plot_errors
 from ..verification import Rung, Verification
 from .page import Picture, Section, Table
 from .pictures import drawn, plain
@@ -10,48 +10,28 @@ from .pictures import drawn, plain
 NOT_RUN = Section("Verification", ("Not run for this report: --verify adds it, ttscompile verify DIR runs it alone.",))
 
 
-def refused(reason: str) -> Section:
-    """The section of an artifact that cannot be verified."""
-    return Section("Verification", (f"Could not be run: {reason}",))
-
-
 def verified(found: Verification) -> Section:
     """A row a rung, what to do about the first that failed, and where residuals differ."""
-    rows = tuple(
-        (rung.name, rung.status, _number(rung.figure), _number(rung.tolerance), rung.unit, _told(rung))
-        for rung in found.rungs
-    )
-    failure = found.first_failure
-    text = (
-        f"All rungs hold; {found.seconds:.1f} s. Neither the checkpoint nor torch was needed."
-        if failure is None
-        else f"FAILED at {failure.name}. {failure.remedy} What fails above it may only follow from it."
-    )
-    return Section(
-        "Verification",
-        (text,),
-        (Table(("rung", "verdict", "error", "allowed", "of what", "found"), rows),),
-        _map(found),
-    )
-
-
-def _map(found: Verification) -> tuple[Picture, ...]:
-    errors = found.map
-    if errors is None:
-        return ()
-    kinds = [plain(kind) for kind in errors.kinds]
-    png = drawn(
-        lambda path: plot_errors(
-            errors.errors, errors.steps.tolist(), kinds, errors.tolerance, path, "residuals", errors.cells, None
+    rows = tuple((r.name, r.status, figure(r.figure), figure(r.tolerance), r.unit, _told(r)) for r in found.rungs)
+    head = ("rung", "verdict", "error", "allowed", "of what", "found")
+    text = f"All rungs hold; {found.seconds:.1f} s. Neither the checkpoint nor torch was needed."
+    if (failure := found.first_failure) is not None:
+        text = f"FAILED at {failure.name}. {failure.remedy} What fails above it may only follow from it."
+    shown: tuple[Picture, ...] = ()
+    if (errors := found.map) is not None:
+        of = errors.errors, errors.steps.tolist(), [plain(kind) for kind in errors.kinds], errors.tolerance
+        png = drawn(lambda path: plot_errors(*of, path, "residuals", errors.cells))
+        caption = (
+            "Relative error of every block's residual at the steps that were looked at: steps across, blocks down."
         )
-    )
-    caption = "Relative error of every block's residual at the steps that were looked at: steps across, blocks down."
-    return (Picture(png, caption),)
+        shown = (Picture(png, caption),)
+    return Section("Verification", (text,), (Table(head, rows),), shown)
 
 
 def _told(rung: Rung) -> str:
     return f"{rung.told}." + (f" First at {rung.place}." if rung.place else "")
 
 
-def _number(figure: float | None) -> str:
-    return "" if figure is None else f"{figure:.2g}"
+def figure(number: float | None) -> str:
+    """An error or a tolerance for people; empty if there is none."""
+    return "" if number is None else f"{number:.2g}"
