@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ..errors import CheckpointError
-from .json_files import read_json
-from .settings import Settings
+from .settings import Settings, read_json
 
 _MOST = {"num_hidden_layers": 512, "image_size": 4096, "patch_size": 4096}
 _MOST_OTHERWISE = 2**20

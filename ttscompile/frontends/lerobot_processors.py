@@ -14,10 +14,9 @@ from typing import Any
 import torch
 
 from ..errors import CheckpointError
-from .json_files import read_json
 from .lerobot_statistics import STATISTICS, Features, Statistics
 from .saved_weights import read_tensors
-from .settings import Settings
+from .settings import Settings, read_json
 
 ACTION = "action"
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
