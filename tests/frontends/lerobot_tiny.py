@@ -10,8 +10,8 @@ import torch
 from safetensors.torch import save_file
 
 from ttscompile.frontends.clip_config import TextConfig, VisionConfig
+from ttscompile.frontends.lerobot import Network
 from ttscompile.frontends.lerobot_config import read_lerobot_config
-from ttscompile.frontends.lerobot_weights import Network
 
 TO, DS, DA, SIDE = 2, 5, 3, 24
 

@@ -27,11 +27,9 @@ from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.image_geometry import ResizeCrop
-from ttscompile.frontends.lerobot import with_inputs
+from ttscompile.frontends.lerobot import Network, with_inputs
 from ttscompile.frontends.lerobot_config import read_lerobot_config
-from ttscompile.frontends.lerobot_processors import read_processors
-from ttscompile.frontends.lerobot_statistics import Normalizer, Statistics
-from ttscompile.frontends.lerobot_weights import Network
+from ttscompile.frontends.lerobot_processors import Normalizer, Statistics, read_processors
 from ttscompile.runtimes import open_runtime
 
 from ..runtimes.agreement import call_terms, largest_difference

@@ -39,19 +39,9 @@ class _Node(_Inert):
     """Stand-in for omegaconf's value nodes; the data is in ``state["_val"]``."""
 
 
-class _Metadata(_Inert):
-    """Stand-in for what omegaconf notes beside the data; never read."""
-
-
-class _Defaults(dict[Any, Any]):
+def _defaults(factory: object = None) -> dict[Any, Any]:
     """Stand-in for ``collections.defaultdict`` inside the metadata; its factory is dropped."""
-
-    def __init__(self, factory: object = None) -> None:
-        super().__init__()
-
-
-class _AnyType:
-    """Stand-in for ``typing.Any``."""
+    return {}
 
 
 _BUILTIN_TYPES: Mapping[str, type] = {
@@ -76,9 +66,9 @@ def _load_type(name: str) -> type:
 _STAND_INS: list[Callable[..., Any] | tuple[Callable[..., Any], str]] = [
     *((_Container, f"omegaconf.{kind.lower()}.{kind}") for kind in ("DictConfig", "ListConfig")),
     *((_Node, f"omegaconf.nodes.{kind}Node") for kind in ("Any", "Boolean", "Float", "Integer", "String")),
-    *((_Metadata, f"omegaconf.base.{kind}") for kind in ("Metadata", "ContainerMetadata")),
-    (_Defaults, "collections.defaultdict"),
-    (_AnyType, "typing.Any"),
+    # What omegaconf notes beside the data is never read.
+    *((_Inert, name) for name in ("omegaconf.base.Metadata", "omegaconf.base.ContainerMetadata", "typing.Any")),
+    (_defaults, "collections.defaultdict"),
     (_load_type, "dill._dill._load_type"),
 ]
 
@@ -105,39 +95,31 @@ def read_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
             f"{path}: not a torch checkpoint, or a truncated one: expected a zip archive as torch.save writes it, found"
             f" {path.stat().st_size} bytes without a zip directory. Copy the file again, or save it with torch >= 1.6."
         )
-    _require_stored(path)
-    with safe_globals(_STAND_INS):
-        try:
+    try:
+        _require_stored(path)
+        with safe_globals(_STAND_INS):
             unknown = sorted(get_unsafe_globals_in_checkpoint(path))
-        except Exception as error:
-            raise _unreadable(path, error) from error
-        if unknown:
-            raise CheckpointError(
-                f"{path}: refused, because its pickle names {', '.join(unknown)}, which could run code while loading."
-                " Nothing of the file was executed. Expected tensors, plain containers and omegaconf's configuration"
-                " only: save the checkpoint again without these objects."
-            )
-        try:
+            if unknown:
+                raise CheckpointError(
+                    f"{path}: refused, because its pickle names {', '.join(unknown)}, which could run code while"
+                    " loading. Nothing of the file was executed. Save the checkpoint again without these objects."
+                )
             payload = torch.load(path, map_location="cpu", weights_only=True)
-        except CheckpointError:
-            raise
-        except Exception as error:
-            raise _unreadable(path, error) from error
+    except CheckpointError:
+        raise
+    except Exception as error:  # a damaged directory or pickle; of whatever kind
+        raise _unreadable(path, error) from error
     if not isinstance(payload, dict):
-        raise CheckpointError(
-            f"{path}: holds a {type(payload).__name__}; expected a dictionary with cfg and state_dicts."
-        )
+        found = type(payload).__name__
+        raise CheckpointError(f"{path}: holds a {found}; expected a dictionary with cfg and state_dicts.")
     _require_own_data(path, payload)
     return payload
 
 
 def _require_stored(path: Path) -> None:
     """Raise if reading the archive could take more memory than the file has bytes: ``torch.save`` never compresses."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            entries = archive.infolist()
-    except Exception as error:  # a damaged directory; of whatever kind
-        raise _unreadable(path, error) from error
+    with zipfile.ZipFile(path) as archive:
+        entries = archive.infolist()
     compressed = [entry.filename for entry in entries if entry.compress_type != zipfile.ZIP_STORED]
     total, size = sum(entry.file_size for entry in entries), path.stat().st_size
     if compressed or total > size:
@@ -161,10 +143,10 @@ def _require_own_data(path: Path, payload: object) -> None:
         if isinstance(value, torch.Tensor):
             plain = value.layout == torch.strided and value.device.type == "cpu" and not value.is_quantized
             if not plain or value.numel() * value.element_size() > value.untyped_storage().nbytes():
+                what = f"{value.dtype}, {value.layout}, {list(value.shape)} on {value.device.type}"
                 raise CheckpointError(
-                    f"{path}: expected dense tensors with data of their own; found one of {value.dtype},"
-                    f" {value.layout}, {list(value.shape)} on {value.device.type}. Save the checkpoint again with"
-                    " tensors that are contiguous."
+                    f"{path}: expected dense tensors with data of their own; found one of {what}. Save the checkpoint"
+                    " again with tensors that are contiguous."
                 )
         elif isinstance(value, dict):
             pending += [*value.keys(), *value.values()]
@@ -185,12 +167,14 @@ def _unreadable(path: Path, error: Exception) -> CheckpointError:
     )
 
 
-def plain_config(value: Any, where: str = "cfg") -> Any:
+def plain_config(value: Any, where: str = "cfg", depth: int = 0, values: Iterator[int] | None = None) -> Any:
     """Turn inert configuration objects into dictionaries, lists and scalars.
 
     Args:
         value: what ``read_checkpoint`` found, or a part of it; plain dictionaries and lists pass as they are.
         where: dotted name of ``value``, for messages.
+        depth: of ``value`` in the whole.
+        values: counts those of the whole.
 
     Returns:
         dict, list, str, int, float, bool or None, nested.
@@ -199,10 +183,7 @@ def plain_config(value: Any, where: str = "cfg") -> Any:
         CheckpointError: an object of another type, a malformed one, nesting without end, or more values than any
             configuration has.
     """
-    return _plain(value, where, 0, itertools.count())
-
-
-def _plain(value: Any, where: str, depth: int, values: Iterator[int]) -> Any:
+    values = itertools.count() if values is None else values
     if depth > _DEEPEST:
         raise CheckpointError(f"{where}: the configuration is nested deeper than {_DEEPEST} levels; it is malformed.")
     if next(values) > _MOST_VALUES:
@@ -212,14 +193,13 @@ def _plain(value: Any, where: str, depth: int, values: Iterator[int]) -> Any:
         state = getattr(value, "state", None)
         if not isinstance(state, dict) or key not in state:
             raise CheckpointError(f"{where}: a configuration object without {key}; the checkpoint is malformed.")
-        return _plain(state[key], where, depth + 1, values)
+        return plain_config(state[key], where, depth + 1, values)
     if isinstance(value, dict):
         items = {str(name): item for name, item in value.items() if name not in _HYDRA}
-        return {name: _plain(item, f"{where}.{name}", depth + 1, values) for name, item in items.items()}
+        return {name: plain_config(item, f"{where}.{name}", depth + 1, values) for name, item in items.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(item, f"{where}[{i}]", depth + 1, values) for i, item in enumerate(value)]
+        return [plain_config(item, f"{where}[{i}]", depth + 1, values) for i, item in enumerate(value)]
     if value is None or isinstance(value, (str, int, float, bool)):
         return value
-    raise CheckpointError(
-        f"{where}: found a {type(value).__name__}; expected dictionaries, lists, strings, numbers or None."
-    )
+    found = type(value).__name__
+    raise CheckpointError(f"{where}: found a {found}; expected dictionaries, lists, strings, numbers or None.")

@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ..errors import CheckpointError
-from .json_files import read_json
-from .settings import Settings
+from .settings import Settings, read_json
 
 _MOST = {"num_hidden_layers": 512, "image_size": 4096, "patch_size": 4096}
 _MOST_OTHERWISE = 2**20
 _MOST_LETTERS = 200
+
+NAME_FOLDER = "Name the folder that has it: encoders= in Python, --encoders on the command line."
 
 
 @dataclass(frozen=True)
@@ -43,10 +44,7 @@ class TowerConfig:
                 settings.number(field.name, most=_MOST.get(field.name, _MOST_OTHERWISE))
         settings.choice("hidden_act", "quick_gelu", "gelu")
         if self.hidden_size % self.num_attention_heads:
-            raise CheckpointError(
-                f"CLIP's hidden_size = {self.hidden_size} is no multiple of num_attention_heads ="
-                f" {self.num_attention_heads}."
-            )
+            raise settings.refusal("hidden_size", f"a multiple of num_attention_heads = {self.num_attention_heads}")
         if not isinstance(self.layer_norm_eps, float) or not 0 < self.layer_norm_eps < 1:
             raise settings.refusal("layer_norm_eps", "a small positive number")
 
@@ -69,10 +67,9 @@ class VisionConfig(TowerConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.num_channels != 3 or self.patch_size > self.image_size:
-            raise CheckpointError(
-                f"CLIP's num_channels is {self.num_channels}, its patch_size {self.patch_size} and its image_size"
-                f" {self.image_size}; expected 3 channels, and patches that are no larger than the image."
-            )
+            found = f"{self.num_channels}, its patch_size {self.patch_size} and its image_size {self.image_size}"
+            expected = "3 channels, and patches that are no larger than the image"
+            raise CheckpointError(f"CLIP's num_channels is {found}; expected {expected}.")
 
     @property
     def patches(self) -> int:
@@ -117,9 +114,7 @@ Tower = TypeVar("Tower", bound=TowerConfig)
 def find_encoder(name: str, folders: Sequence[Path]) -> Path | None:
     """The local directory of an encoder: ``name``, or its last part, in one of ``folders``, or one of them itself.
 
-    Args:
-        name: as the policy's configuration says it, ``openai/clip-vit-base-patch16`` or a path of another machine.
-        folders: in the order in which they are searched.
+    The name is as the policy's configuration says it, ``openai/clip-vit-base-patch16`` or a path of another machine.
     """
     relative = Path(name)
     if max(map(len, relative.parts), default=0) > _MOST_LETTERS:
@@ -129,19 +124,15 @@ def find_encoder(name: str, folders: Sequence[Path]) -> Path | None:
         names.insert(0, name)
     for folder in folders:
         for candidate in (*(folder / each for each in names if each), folder):
-            if (candidate / "config.json").is_file() and _is_clip(candidate / "config.json"):
+            path = candidate / "config.json"
+            # The policy's own directory has one, too.
+            if path.is_file() and str(read_json(path).get("model_type")).startswith("clip"):
                 return candidate
     return None
 
 
 def encoder_config(name: str, part: str, cls: type[Tower], folders: Sequence[Path]) -> Tower:
-    """The configuration of one encoder.
-
-    Args:
-        name: see ``find_encoder``.
-        part: ``vision_config`` or ``text_config``.
-        cls: of the result.
-        folders: see ``find_encoder``.
+    """The configuration of one encoder: its ``part``, ``vision_config`` or ``text_config``, as a ``cls``.
 
     Raises:
         CheckpointError: there is none on this machine, or it is not CLIP's.
@@ -155,14 +146,11 @@ def encoder_config(name: str, part: str, cls: type[Tower], folders: Sequence[Pat
         looked = ", ".join(dict.fromkeys(str(folder) for folder in folders))
         raise CheckpointError(
             f"the observation encoder {name!r} is not on this machine, and nothing is ever downloaded. Looked for a"
-            f" directory {name!r} or {Path(name).name!r} with a config.json in {looked}. Copy its config.json there"
-            " (and its tokenizer's files, to compile for one task), or name the folder that has it: encoders="
-            " in Python, --encoders on the command line."
+            f" directory {name!r} or {Path(name).name!r} with a config.json in {looked}. Copy it there (and the files"
+            f" of its tokenizer, to compile for one task). {NAME_FOLDER}"
         )
-    if settings.get("model_type") == f"clip_{part.split('_')[0]}_model":
-        inner: Any = settings
-    else:
-        inner = settings.get(part)
+    alone = settings.get("model_type") == f"clip_{part.split('_')[0]}_model"
+    inner: Any = settings if alone else settings.get(part)
     if not isinstance(inner, dict):
         raise CheckpointError(f"{where}: has no {part}; expected the configuration of a CLIP model.")
     names = {field.name for field in fields(cls)}
@@ -170,9 +158,3 @@ def encoder_config(name: str, part: str, cls: type[Tower], folders: Sequence[Pat
         return cls(**{key: value for key, value in inner.items() if key in names})
     except CheckpointError as error:
         raise CheckpointError(f"{where}: {error}") from error
-
-
-def _is_clip(path: Path) -> bool:
-    """Whether a ``config.json`` is CLIP's: the policy's own directory has one, too."""
-    kind = read_json(path).get("model_type")
-    return isinstance(kind, str) and kind.startswith("clip")

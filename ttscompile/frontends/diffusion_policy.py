@@ -25,11 +25,7 @@ from .interpolation import Config
 from .refusals import refuse_file, refuse_payload, refuse_policy
 from .scheduler import configured_sampler
 from .settings import Settings
-from .transformer_for_diffusion import (
-    ConditionedDenoiser,
-    InpaintingDenoiser,
-    TransformerConfig,
-)
+from .transformer_for_diffusion import ConditionedDenoiser, InpaintingDenoiser, TransformerConfig
 
 _POLICY = "DiffusionTransformerLowdimPolicy"
 _NETWORK = "TransformerForDiffusion"
@@ -81,9 +77,8 @@ def build(payload: Mapping[str, Any], options: LoadOptions) -> tuple[nn.Module, 
     load_network(network, rest)
 
     obs_dim, action_dim, n_obs_steps = policy["obs_dim"], policy["action_dim"], policy["n_obs_steps"]
-    if policy["obs_as_cond"]:
-        module: nn.Module = ConditionedDenoiser(network)
-    else:
+    module: nn.Module = ConditionedDenoiser(network)
+    if not policy["obs_as_cond"]:
         module = InpaintingDenoiser(network, horizon, action_dim, n_obs_steps)
     if encoder is None:
         observations = {"obs": ObservationSpec((n_obs_steps, obs_dim), affine(weights, "obs", obs_dim))}

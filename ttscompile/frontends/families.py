@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Literal
 from ..core.spec import PolicySpec
 from ..errors import CheckpointError
 from ..samplers.flow import METHODS
-from .json_files import read_json
 from .refusals import refuse_directory
+from .settings import read_json
 
 if TYPE_CHECKING:
     from torch import nn

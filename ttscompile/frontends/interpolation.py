@@ -24,20 +24,16 @@ _LARGEST = 1e15  # magnitude of any number in it, so that no expression can take
 _MOST_VALUES = 100_000  # that one key may resolve to: references to lists of references grow without bound
 _LONGEST_TEXT = 100_000  # characters of a resolved text, for the same reason
 
-_ARITHMETIC: Mapping[type[ast.AST], Callable[[Any, Any], Any]] = {
+_OPERATORS: Mapping[type[ast.AST], Callable[..., Any]] = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
     ast.Mult: operator.mul,
     ast.Div: operator.truediv,
     ast.FloorDiv: operator.floordiv,
     ast.Mod: operator.mod,
-}
-_UNARY: Mapping[type[ast.AST], Callable[[Any], Any]] = {
     ast.UAdd: operator.pos,
     ast.USub: operator.neg,
     ast.Not: operator.not_,
-}
-_COMPARISON: Mapping[type[ast.AST], Callable[[Any, Any], Any]] = {
     ast.Eq: operator.eq,
     ast.NotEq: operator.ne,
     ast.Lt: operator.lt,
@@ -65,16 +61,16 @@ def _evaluate(node: ast.AST) -> Any:
     match node:
         case ast.Constant(value=bool() | int() | float() | str() | None):
             return node.value
-        case ast.UnaryOp() if type(node.op) in _UNARY:
+        case ast.UnaryOp() if type(node.op) in _OPERATORS:
             operand = _evaluate(node.operand)
-            return _UNARY[type(node.op)](operand if isinstance(node.op, ast.Not) else _number(operand))
-        case ast.BinOp() if type(node.op) in _ARITHMETIC:
+            return _OPERATORS[type(node.op)](operand if isinstance(node.op, ast.Not) else _number(operand))
+        case ast.BinOp() if type(node.op) in _OPERATORS:
             left, right = _number(_evaluate(node.left)), _number(_evaluate(node.right))
-            return _number(_ARITHMETIC[type(node.op)](left, right))
-        case ast.Compare() if all(type(op) in _COMPARISON for op in node.ops):
+            return _number(_OPERATORS[type(node.op)](left, right))
+        case ast.Compare() if all(type(op) in _OPERATORS for op in node.ops):
             values = [_evaluate(side) for side in (node.left, *node.comparators)]
             pairs = zip(node.ops, values, values[1:], strict=False)
-            return all(_COMPARISON[type(op)](left, right) for op, left, right in pairs)
+            return all(_OPERATORS[type(op)](left, right) for op, left, right in pairs)
         case ast.BoolOp():
             wanted = isinstance(node.op, ast.Or)
             value: Any = None
@@ -135,9 +131,7 @@ class Config:
             CheckpointError: it is absent, or cannot be resolved; names the key.
         """
         if not self._find(key)[0]:
-            raise CheckpointError(
-                f"cfg.{key} is missing from the checkpoint's configuration; it is needed to rebuild it."
-            )
+            raise CheckpointError(f"cfg.{key} is missing from the checkpoint's configuration; it is needed.")
         return self.get(key)
 
     def _find(self, key: str) -> tuple[bool, Any]:
@@ -153,17 +147,13 @@ class Config:
 
     def _resolve(self, value: Any, key: str, seen: tuple[str, ...], values: Iterator[int]) -> Any:
         if next(values) > _MOST_VALUES:
-            raise CheckpointError(
-                f"cfg.{key} refers to more than {_MOST_VALUES} values; the configuration is malformed."
-            )
+            raise CheckpointError(f"cfg.{key} refers to more than {_MOST_VALUES} values; it is malformed.")
         if isinstance(value, Mapping):
             return {name: self._resolve(item, f"{key}.{name}", seen, values) for name, item in value.items()}
         if isinstance(value, list):
             return [self._resolve(item, f"{key}[{i}]", seen, values) for i, item in enumerate(value)]
         if value == "???":
-            raise CheckpointError(
-                f"cfg.{key} is '???', a value that was never given; set it and save the checkpoint again."
-            )
+            raise CheckpointError(f"cfg.{key} is '???', which was never given; set it and save the checkpoint again.")
         if isinstance(value, str) and "${" in value:
             return self._interpolate(value, key, seen, values)
         return value
@@ -186,9 +176,7 @@ class Config:
             return look_up(lone)
         replaced = _REFERENCE.sub(lambda reference: str(look_up(reference)), text)
         if len(replaced) > _LONGEST_TEXT:
-            raise CheckpointError(
-                f"cfg.{key} is longer than {_LONGEST_TEXT} characters; the configuration is malformed."
-            )
+            raise CheckpointError(f"cfg.{key} is longer than {_LONGEST_TEXT} characters; it is malformed.")
         expression = _EVAL.fullmatch(replaced)
         if expression:
             try:

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from .json_files import read_json
 from .multi_task_dit import DiTConfig
 from .refusals import LEROBOT, refuse_policy
-from .settings import Settings, is_shape
+from .settings import Settings, is_shape, read_json
 
 POLICY = "multi_task_dit"
 CONFIG, WEIGHTS = "config.json", "model.safetensors"

@@ -1,6 +1,6 @@
 """LeRobot's processors: what is done to observations before the policy, and to actions after it.
 
-Source: ``lerobot.processor`` of huggingface/lerobot 0.6; the arithmetic is in ``lerobot_statistics``.
+Source: ``lerobot.processor`` of huggingface/lerobot 0.6.
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from torch import nn
 
+from ..core.spec import Affine
 from ..errors import CheckpointError
-from .json_files import read_json
-from .lerobot_statistics import STATISTICS, Features, Statistics
 from .saved_weights import read_tensors
-from .settings import Settings
+from .settings import Settings, read_json
 
-ACTION = "action"
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
 
 _RENAME, _TOKENIZE, _NORMALIZE = "rename_observations_processor", "tokenizer_processor", "normalizer_processor"
@@ -31,43 +31,122 @@ _KNOWN_STEPS: Mapping[str, frozenset[str]] = {
 _ONCE = frozenset({_RENAME, _TOKENIZE, _NORMALIZE, _UNNORMALIZE})
 
 
+Features = Mapping[str, tuple[str, tuple[int, ...]]]
+"""Type (``STATE``, ``VISUAL``, ``ACTION``) and shape by the policy's name, as its configuration has them."""
+
+STATISTICS = {
+    "MEAN_STD": ("mean", "std"),
+    "MIN_MAX": ("min", "max"),
+    "QUANTILES": ("q01", "q99"),
+    "QUANTILE10": ("q10", "q90"),
+}
+"""The two statistics of each mode."""
+
+_LEAST_STD = 1e-30
+"""Stands for a standard deviation of zero, which gives the mean whatever the network says."""
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """How one feature is normalised: its mode, and the two statistics that the mode names, float32.
+
+    Attributes:
+        mode: ``MEAN_STD``, ``MIN_MAX``, ``QUANTILES`` or ``QUANTILE10``.
+        first: mean, or the lower end of the range.
+        second: standard deviation, or the upper end.
+        eps: of the processor's configuration.
+    """
+
+    mode: str
+    first: torch.Tensor
+    second: torch.Tensor
+    eps: float
+
+    @property
+    def width(self) -> torch.Tensor:
+        """What is divided by: ``std + eps``; or the range, and ``eps`` where that is zero."""
+        if self.mode == "MEAN_STD":
+            return self.second + self.eps
+        width = self.second - self.first
+        return torch.where(width == 0, torch.tensor(self.eps, dtype=width.dtype), width)
+
+    @property
+    def usual_range(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Of a vector: where its values usually are, by these statistics; of MEAN_STD two deviations to each side."""
+        low, high = self.first, self.second
+        if self.mode == "MEAN_STD":
+            low, high = self.first - 2 * self.second, self.first + 2 * self.second
+        low, high = torch.minimum(low, high), torch.maximum(low, high)
+        return tuple(low.tolist()), tuple(high.tolist())
+
+    def inverse(self) -> Affine:
+        """The inverse as an ``Affine``, for vectors. MEAN_STD inverts with the bare standard deviation."""
+        first = self.first.double().numpy()
+        if self.mode == "MEAN_STD":
+            scale = 1 / np.maximum(self.second.double().numpy(), _LEAST_STD)
+            return Affine(scale=scale.astype(np.float32), offset=(-first * scale).astype(np.float32))
+        scale = 2 / self.width.double().numpy()
+        return Affine(scale=scale.astype(np.float32), offset=(-first * scale - 1).astype(np.float32))
+
+
+class Normalizer(nn.Module):
+    """``(x - mean) / (std + eps)``, or ``2 (x - low) / range - 1``, as LeRobot writes it.
+
+    It is part of the compiled network rather than an ``Affine`` of the observation: images are normalised by channel,
+    and a channel that never changed in training is divided by 1e-8, which only this order of operations survives.
+
+    Args:
+        statistics: of a feature, broadcast against its values; None leaves them as they are.
+    """
+
+    first: torch.Tensor
+    width: torch.Tensor
+
+    def __init__(self, statistics: Statistics | None) -> None:
+        super().__init__()
+        self.mode = None if statistics is None else statistics.mode
+        if statistics is not None:
+            self.register_buffer("first", statistics.first, persistent=False)
+            self.register_buffer("width", statistics.width, persistent=False)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """``[B, To, ...]`` -> the same."""
+        if self.mode is None:
+            return x
+        if self.mode == "MEAN_STD":
+            return (x - self.first) / self.width
+        return 2 * (x - self.first) / self.width - 1
+
+
 @dataclass(frozen=True)
 class Processors:
     """What the two pipelines of a policy do.
 
     Attributes:
-        normalizers: statistics by the policy's name of each feature; those that pass as they are, are absent.
+        normalizers: statistics by the policy's name of each feature; of those that pass as they are there are none.
         action: of the action; None where it passes as it is.
         renamed: the policy's name of an observation -> the name that the robot gives it, where they differ.
-        tokenizer: settings of the tokenizer; None without one.
+        tokenizer: settings of the tokenizer; none without one.
     """
 
     normalizers: Mapping[str, Statistics]
     action: Statistics | None
     renamed: Mapping[str, str]
-    tokenizer: Mapping[str, Any] | None
+    tokenizer: Mapping[str, Any]
 
 
 def read_processors(directory: Path, features: Features) -> Processors:
-    """The pipelines of a directory that LeRobot saved.
-
-    Args:
-        directory: of the policy.
-        features: of the policy.
+    """The pipelines of a policy that LeRobot saved, with these features.
 
     Raises:
         CheckpointError: a file is missing or damaged; a step is not known, there twice, or out of order.
     """
     before, after = (_steps(directory, name) for name in (PREPROCESSOR, POSTPROCESSOR))
-    renamed = _renamed(directory, before, features)
-    statistics = _statistics(directory, before, _NORMALIZE, features)
-    inverse = _statistics(directory, after, _UNNORMALIZE, features)
-    tokenizers = [dict(step["config"]) for step in before if step["registry_name"] == _TOKENIZE]
     return Processors(
-        normalizers={key: value for key, value in statistics.items() if features[key][0] != "ACTION"},
-        action=inverse.get(ACTION),
-        renamed=renamed,
-        tokenizer=tokenizers[0] if tokenizers else None,
+        renamed=_renamed(directory, before, features),
+        normalizers=_statistics(directory, before, _NORMALIZE, features),
+        action=_statistics(directory, after, _UNNORMALIZE, features).get("action"),
+        tokenizer=next((dict(step["config"]) for step in before if step["registry_name"] == _TOKENIZE), {}),
     )
 
 
@@ -76,9 +155,8 @@ def _steps(directory: Path, name: str) -> list[dict[str, Any]]:
     path = directory / name
     if not path.is_file():
         raise CheckpointError(
-            f"{path}: no such file. Policies saved by lerobot before 0.4 keep their statistics inside the weights;"
-            " migrate it with lerobot's own script (lerobot.processor.migrate_policy_normalization), and convert what"
-            " that writes."
+            f"{path}: no such file. Policies saved by lerobot before 0.4 keep their statistics inside the weights:"
+            " migrate it with lerobot's own script (lerobot.processor.migrate_policy_normalization), and convert that."
         )
     steps = read_json(path).get("steps")
     if not isinstance(steps, list) or not all(isinstance(step, dict) for step in steps):
@@ -87,28 +165,23 @@ def _steps(directory: Path, name: str) -> list[dict[str, Any]]:
         registered = step.get("registry_name")  # a step of somebody's own has a class instead
         if not isinstance(registered, str) or registered not in _KNOWN_STEPS[name]:
             raise CheckpointError(
-                f"{path}: the step {step.get('registry_name', step.get('class'))!r:.80} is not known here, and without"
-                f" it actions would be wrong. Expected {', '.join(sorted(_KNOWN_STEPS[name]))}. Do its work outside of"
-                " the policy, and leave it out of the file."
+                f"{path}: the step {step.get('registry_name', step.get('class'))!r:.80} is not known here; expected"
+                f" {', '.join(sorted(_KNOWN_STEPS[name]))}. Do its work outside of the policy, and leave it out."
             )
         if not isinstance(step.setdefault("config", {}), dict):
             raise CheckpointError(f"{path}: the configuration of {registered} is no object.")
         if registered == _DEVICE and step["config"].get("float_dtype") not in (None, "float32"):
-            raise CheckpointError(
-                f"{path}: {registered}.float_dtype is {step['config']['float_dtype']!r:.80}; expected null or float32:"
-                " the compiled policy computes in float32. Set it to null if the policy was trained so."
-            )
+            found = f"{registered}.float_dtype is {step['config']['float_dtype']!r:.80}"
+            raise CheckpointError(f"{path}: {found}; expected null or float32, in which the compiled policy computes.")
     order = [step["registry_name"] for step in steps]
     twice = sorted(kind for kind in _ONCE if order.count(kind) > 1)
     if twice:
-        raise CheckpointError(
-            f"{path}: expected at most one step of a kind; found {order.count(twice[0])} of {twice[0]}. Combine them"
-            " into one, and save the pipeline again."
-        )
+        found = f"found {order.count(twice[0])} of {twice[0]}"
+        raise CheckpointError(f"{path}: expected at most one step of a kind; {found}. Combine them into one.")
     if _RENAME in order and any(kind in order[: order.index(_RENAME)] for kind in (_NORMALIZE, _TOKENIZE)):
         raise CheckpointError(
-            f"{path}: expected {_RENAME} before the other steps, as lerobot saves them; found {', '.join(order)}. Steps"
-            " before it would see other names. Save the pipeline again in that order."
+            f"{path}: expected {_RENAME} before the other steps, as lerobot saves them; found {', '.join(order)}."
+            " Save the pipeline again in that order."
         )
     return steps
 
@@ -131,15 +204,17 @@ def _statistics(
     directory: Path, steps: list[dict[str, Any]], registered: str, features: Features
 ) -> dict[str, Statistics]:
     """Statistics of each feature that a normalising step changes."""
-    found = [step for step in steps if step["registry_name"] == registered]
-    if len(found) != 1:
-        raise CheckpointError(f"{directory}: expected one step {registered}; found {len(found)}.")
-    (step,) = found
+    step = next((step for step in steps if step["registry_name"] == registered), None)
+    if step is None:
+        raise CheckpointError(f"{directory}: expected one step {registered}; found none.")
     settings = Settings(step["config"], f"{directory}: {registered}.")
     modes, eps = settings.names("norm_map"), settings.values.get("eps", 1e-8)
     if not isinstance(eps, float) or not eps > 0:
         raise settings.refusal("eps", "a positive number")
-    tensors = _state(directory, step)
+    file = step.get("state_file")
+    if file is not None and (not isinstance(file, str) or Path(file).name != file or len(file) > 200):
+        raise CheckpointError(f"{directory}: state_file {file!r:.80} is not the name of a file in this directory.")
+    tensors = {} if file is None else read_tensors(directory / file)
     only, own = settings.values.get("normalize_observation_keys"), settings.values.get("features", {})
     if not isinstance(own, dict):
         raise settings.refusal("features", "type and shape by name")
@@ -156,11 +231,8 @@ def _statistics(
             raise settings.refusal("norm_map", f"one of IDENTITY, {', '.join(STATISTICS)} for {kind}")
         names = [f"{key}.{name}" for name in STATISTICS[mode]]
         if not any(name.rpartition(".")[0] == key for name in tensors):
-            warnings.warn(
-                f"{directory}: {registered} has no statistics of {key}, so it is not normalised ({mode} is configured);"
-                " lerobot does the same.",
-                stacklevel=6,
-            )
+            told = f"has no statistics of {key}, so it is not normalised ({mode} is configured); lerobot does the same."
+            warnings.warn(f"{directory}: {registered} {told}", stacklevel=6)
             continue
         missing = [name for name in names if name not in tensors]
         if missing:
@@ -168,15 +240,6 @@ def _statistics(
         first, second = (_broadcast(directory, name, tensors[name], kind, shape) for name in names)
         result[key] = Statistics(mode, first, second, eps)
     return result
-
-
-def _state(directory: Path, step: Mapping[str, Any]) -> dict[str, torch.Tensor]:
-    name = step.get("state_file")
-    if name is None:
-        return {}
-    if not isinstance(name, str) or Path(name).name != name or len(name) > 200:
-        raise CheckpointError(f"{directory}: state_file {name!r:.80} is not the name of a file in this directory.")
-    return read_tensors(directory / name)
 
 
 def _broadcast(directory: Path, name: str, value: torch.Tensor, kind: str, shape: tuple[int, ...]) -> torch.Tensor:

@@ -19,7 +19,7 @@ from torch.nn import functional
 from .clip import ClipText, ClipVision
 from .clip_config import TextConfig, VisionConfig
 from .image_geometry import ResizeCrop
-from .lerobot_statistics import Normalizer
+from .lerobot_processors import Normalizer
 from .transformer_for_diffusion import SinusoidalEmbedding
 
 

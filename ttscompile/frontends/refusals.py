@@ -15,15 +15,21 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from ..errors import CheckpointError
-from .json_files import read_json
+from .settings import read_json
 
 _BUILD = "Build the network with the code that trained it and use ttscompile.compile_denoiser(module, spec)"
 _HEAD = f"{_BUILD}: the action head is the module, and what the vision-language model gives it are its observations."
+_DITA = f"{_HEAD} For Dita the prefix of its Llama, as a KV cache."
 _U_NET = (
     "Its denoiser is not a transformer and has no residual stream whose blocks could be reused. Train a transformer"
     " policy: Diffusion Policy's configurations named train_diffusion_transformer_*, or LeRobot's multi_task_dit."
 )
+_INNER = "Give its folder pretrained_model."
+_JAX = "Convert it to PyTorch with the tool of its project (openpi: convert_jax_model_to_pytorch.py)."
+_OCTO = "Octo denoises with a small MLP on one readout token, not with a transformer: no residuals worth reusing."
+_HYBRID_VLA = "It denoises inside its language model, in one sequence with the text: it has no action head to compile."
 _MOST_FILES = 10_000  # looked at in a directory; somebody may give the root of a disk
+_ARTIFACT, _LOAD = "an artifact that is compiled already", "Load it with ttscompile.load, or calibrate it."
 _NO_LOOP = "There is no denoising loop to compile."
 _MERGE = "Merge it into its base model (PeftModel.merge_and_unload), save that policy, and convert the result."
 _WEIGHTS = (
@@ -62,25 +68,15 @@ POLICIES = (
 """By the class name of a configuration's ``policy``, in lower case."""
 
 DIRECTORIES = (
-    Refusal(
-        r"^manifest\.json$", "an artifact that is compiled already", "Load it with ttscompile.load, or calibrate it."
-    ),
+    Refusal(r"^manifest\.json$", _ARTIFACT, _LOAD),
     Refusal(r"^adapter_config\.json$", "a PEFT adapter without the weights that it adapts", _MERGE),
-    Refusal(
-        r"^(example_batch|octo[^/]*)\.msgpack$",
-        "an Octo model",
-        "Octo denoises with a small MLP on one readout token, not with a transformer: no residuals worth reusing.",
-    ),
+    Refusal(r"^(example_batch|octo[^/]*)\.msgpack$", "an Octo model", _OCTO),
     Refusal(
         r"(^|/)(_METADATA|_CHECKPOINT_METADATA|manifest\.ocdbt)$|\.msgpack$",
         "a JAX checkpoint (Orbax or msgpack)",
-        f"Convert it to PyTorch with the tool of its project (openpi: convert_jax_model_to_pytorch.py). {_BUILD}.",
+        f"{_JAX} {_BUILD}.",
     ),
-    Refusal(
-        r"(^|/)pretrained_model/config\.json$",
-        "a directory around what lerobot saved",
-        "Give its folder pretrained_model.",
-    ),
+    Refusal(r"(^|/)pretrained_model/config\.json$", "a directory around what lerobot saved", _INNER),
     Refusal(r"^config\.json: (lang|img|state)_adaptor\b", "RDT", f"{_HEAD} Its sampler is dpmsolver++."),
     Refusal(r"^config\.json: model_type=gr00t", "a GR00T model", _HEAD),
     Refusal(r"\.ckpt$", "a directory of checkpoints", "Give one of the files in it, checkpoints/latest.ckpt say."),
@@ -88,9 +84,7 @@ DIRECTORIES = (
 )
 """By the path of a file in a directory, three levels deep, or an entry of its ``config.json``."""
 
-ENTRIES = (
-    Refusal(r"^parameter$", "a checkpoint of Dita", f"{_HEAD} For Dita the prefix of its Llama, as a KV cache."),
-)
+ENTRIES = (Refusal(r"^parameter$", "a checkpoint of Dita", _DITA),)
 """By an entry of a torch checkpoint."""
 
 LEROBOT = (
@@ -105,11 +99,7 @@ LEROBOT = (
 """By the type of a LeRobot policy, in lower case."""
 
 STATES = (
-    Refusal(
-        r"^(x_embedder|llm_backbone\.x_embedder)\b",
-        "a checkpoint of HybridVLA",
-        "It denoises inside its language model, in one sequence with the text: it has no action head to compile.",
-    ),
+    Refusal(r"^(x_embedder|llm_backbone\.x_embedder)\b", "a checkpoint of HybridVLA", _HYBRID_VLA),
     Refusal(r"^action_model\b", "a checkpoint of CogACT", f"{_HEAD} Guidance doubles the batch inside the module."),
     Refusal(r"(^|\.)(state|lang|img)_adaptor\.", "weights of RDT", f"{_HEAD} Its sampler is dpmsolver++."),
     Refusal(r"(^|\.)noise_net\.|(^|\.)time_net\.", "a checkpoint of DiT-Policy", _HEAD),
@@ -156,8 +146,7 @@ def refuse_payload(payload: Mapping[str, Any]) -> None:
     """
     if "cfg" in payload and "state_dicts" in payload:
         return
-    entries = sorted(map(str, payload))
-    missing = "cfg" if "cfg" not in payload else "state_dicts"
+    entries, missing = sorted(map(str, payload)), "cfg" if "cfg" not in payload else "state_dicts"
     if "cfg" in payload or "state_dicts" in payload:
         raise CheckpointError(
             f"no entry {missing!r}; found {entries[:8]}. Expected all that Diffusion Policy's workspace saves: {{cfg,"
@@ -199,14 +188,11 @@ def refuse_file(path: Path) -> None:
     except (zipfile.BadZipFile, NotImplementedError, OSError, ValueError):
         return  # a damaged archive, which the reader of checkpoints describes
     if "manifest.json" in names:
-        raise _refused(path, "an artifact that is compiled already", "manifest.json", DIRECTORIES[0].remedy)
+        raise _refused(path, _ARTIFACT, "manifest.json", _LOAD)
     if not any(name.endswith("data.pkl") for name in names):
-        raise _refused(
-            path,
-            "a zip archive that torch.save did not write",
-            f"{', '.join(names[:4]) or 'no entries'}, and no data.pkl",
-            "Unpack it, and convert the checkpoint inside.",
-        )
+        how = f"{', '.join(names[:4]) or 'no entries'}, and no data.pkl"
+        remedy = "Unpack it, and convert the checkpoint inside."
+        raise _refused(path, "a zip archive that torch.save did not write", how, remedy)
 
 
 def refuse_directory(path: Path) -> NoReturn:
@@ -218,9 +204,9 @@ def refuse_directory(path: Path) -> NoReturn:
     every = chain.from_iterable(path.glob(level) for level in ("*", "*/*", "*/*/*"))
     names = sorted(each.relative_to(path).as_posix() for each in islice(every, _MOST_FILES))
     names += _entries(path / "config.json")
-    found = next((each for each in DIRECTORIES if _match(each, names)), None)
-    if found is not None:
-        raise _refused(path, found.what, str(_match(found, names)), found.remedy)
+    for row in DIRECTORIES:
+        if how := _match(row, names):
+            raise _refused(path, row.what, how, row.remedy)
     raise CheckpointError(
         f"{path} is a directory without a policy that is read: found {', '.join(names[:6]) or 'nothing'}; expected the"
         " config.json and model.safetensors of LeRobot's multi_task_dit, or give a .ckpt file of Diffusion Policy."
@@ -246,14 +232,8 @@ def _weight_names(payload: Mapping[str, Any]) -> set[str]:
     """Names of the weights, without the entries that hold them; CogACT's and HybridVLA's modules keep theirs."""
     names: set[str] = set()
     for key, value in payload.items():
-        if not isinstance(value, Mapping):
-            names.add(str(key))
-            continue
-        for inner, item in value.items():
-            if isinstance(item, Mapping):
-                names |= {f"{inner}.{name}" for name in item}
-            else:
-                names.add(str(inner))
+        for inner, item in value.items() if isinstance(value, Mapping) else [(key, value)]:
+            names |= {f"{inner}.{name}" for name in item} if isinstance(item, Mapping) else {str(inner)}
     return names
 
 

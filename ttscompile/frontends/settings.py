@@ -1,12 +1,35 @@
-"""Entries of a configuration that another program wrote, each checked as it is taken."""
+"""JSON that another program wrote, a checkpoint's configuration, each entry checked as it is taken."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeGuard
 
+from ..core.untrusted_json import parse_json
 from ..errors import CheckpointError
+
+MAX_BYTES = 4 * 2**20
+"""Of a configuration; in use are some 10 KB."""
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The object that a file holds.
+
+    Raises:
+        CheckpointError: missing, unreadable, too large or deep, not strictly JSON, or something else than an object.
+    """
+    if not path.is_file():
+        raise CheckpointError(f"{path}: no such file.")
+    try:
+        with path.open("rb") as file:
+            data = parse_json(file.read(MAX_BYTES + 1), MAX_BYTES)
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{path}: cannot be read as JSON: {error!s:.300}. Copy the file again.") from error
+    if not isinstance(data, dict):
+        raise CheckpointError(f"{path}: holds a {type(data).__name__}; expected an object.")
+    return data
 
 
 @dataclass(frozen=True)
@@ -62,12 +85,10 @@ class Settings:
     def size(self, name: str, default: list[int] | None, most: int | None = None) -> tuple[int, int] | None:
         """Height and width of an image, ``most`` pixels each at most; None for null."""
         value = self.values.get(name, default)
-        if value is None:
-            return None
-        if not is_shape(value, most) or len(value) != 2:
+        if value is not None and (not is_shape(value, most) or len(value) != 2):
             limit = "" if most is None else f" of {most} pixels at most"
             raise self.refusal(name, f"[height, width]{limit} or null")
-        return value[0], value[1]
+        return None if value is None else (value[0], value[1])
 
     def refusal(self, name: str, expected: str, default: Any = None) -> CheckpointError:
         """The error for one entry."""

@@ -58,10 +58,8 @@ class TransformerConfig:
             if wanted is int and value < smallest:
                 raise CheckpointError(f"cfg.policy.model.{field.name} is {value}; expected at least {smallest}.")
         if self.n_emb % self.n_head or self.n_emb % 2 or self.n_emb < 4:
-            raise CheckpointError(
-                f"cfg.policy.model: n_emb = {self.n_emb} with n_head = {self.n_head}; expected an even width of at"
-                " least 4 that the heads divide."
-            )
+            found = f"n_emb = {self.n_emb} with n_head = {self.n_head}"
+            raise CheckpointError(f"cfg.policy.model: {found}; expected an even width from 4 on that the heads divide.")
         if self.cond_dim and not self.time_as_cond:
             raise CheckpointError("cfg.policy.model: cond_dim > 0 needs time_as_cond; the original refuses this, too.")
 
@@ -116,11 +114,6 @@ class Layers(nn.Module):
         return x
 
 
-def _additive(allowed: torch.Tensor) -> torch.Tensor:
-    """0 where attention is allowed, -inf elsewhere."""
-    return torch.zeros(allowed.shape).masked_fill(~allowed, -math.inf)
-
-
 class TransformerForDiffusion(nn.Module):
     """The denoiser: noisy sample, timestep and observation tokens to a prediction.
 
@@ -154,11 +147,11 @@ class TransformerForDiffusion(nn.Module):
         self.register_buffer("mask", None)
         self.register_buffer("memory_mask", None)
         if config.causal_attn:
-            trunk = torch.arange(config.trunk_tokens)[:, None]
-            self.mask = _additive(trunk >= trunk.T)
+            forbidden = torch.full((config.trunk_tokens, max(config.trunk_tokens, config.memory_tokens)), -math.inf)
+            self.mask = forbidden[:, : config.trunk_tokens].triu(1)
             if config.cond_dim:
                 # Memory token 0 is the timestep, token s is the observation of time s - 1.
-                self.memory_mask = _additive(trunk >= torch.arange(config.memory_tokens)[None, :] - 1)
+                self.memory_mask = forbidden[:, : config.memory_tokens].triu(2)
 
         self.ln_f = nn.LayerNorm(width)
         self.head = nn.Linear(width, config.output_dim)
@@ -181,18 +174,14 @@ class TransformerForDiffusion(nn.Module):
         count = tokens.shape[1]  # fewer than the horizon's, where only the first steps are predicted
         mask = None if self.mask is None else self.mask[:count, :count]
         if self.decoder is None:
-            x = self.encoder(tokens + self.pos_emb[:, :count], src_mask=mask)
-            x = x[:, 1:]
+            x = self.encoder(tokens + self.pos_emb[:, :count], src_mask=mask)[:, 1:]
         else:
-            memory = time
-            if self.cond_obs_emb is not None:
-                memory = torch.cat((time, self.cond_obs_emb(cond)), dim=1)
+            memory = time if self.cond_obs_emb is None else torch.cat((time, self.cond_obs_emb(cond)), dim=1)
             memory = self.encoder(memory + self.cond_pos_emb[:, : memory.shape[1]])
             memory_mask = None if self.memory_mask is None else self.memory_mask[:count]
             tokens = tokens + self.pos_emb[:, :count]
             x = self.decoder(tokens, memory, tgt_mask=mask, memory_mask=memory_mask)
-        prediction: torch.Tensor = self.head(self.ln_f(x))
-        return prediction
+        return self.head(self.ln_f(x))  # type: ignore[no-any-return]
 
 
 class ConditionedDenoiser(nn.Module):
@@ -204,8 +193,7 @@ class ConditionedDenoiser(nn.Module):
 
     def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
         """``[B, T, Da]``, ``[B]``, normalised ``[B, To, Do]`` -> ``[B, T, Da]``."""
-        prediction: torch.Tensor = self.model(sample, timestep, obs)
-        return prediction
+        return self.model(sample, timestep, obs)  # type: ignore[no-any-return]
 
 
 class InpaintingDenoiser(nn.Module):
@@ -237,5 +225,4 @@ class InpaintingDenoiser(nn.Module):
         """``[B, T, Da + Do]``, ``[B]``, normalised ``[B, To, Do]`` -> ``[B, T, Da + Do]``."""
         steps = sample.shape[1]
         placed = nn.functional.pad(obs, (self.action_dim, 0, 0, steps - self.n_obs_steps))
-        prediction: torch.Tensor = self.model(torch.where(self.observed[:steps], placed, sample), timestep)
-        return prediction
+        return self.model(torch.where(self.observed[:steps], placed, sample), timestep)  # type: ignore[no-any-return]
