@@ -98,11 +98,10 @@ def _layouts(graph: Graph, types: Mapping[str, TensorType]) -> dict[str, _Layout
         layout = _made(node, axis, [types[name] for name in read], [known[name] for name in read])
         if layout is not None:
             known[node.name] = layout
-    return {**known, **{name: _Layout(_multiple(types[name]), 1) for name in alike}}
+    return {**known, **{name: _Layout(_batches(types[name]), 1) for name in alike}}
 
 
-def _multiple(type_: TensorType) -> int:
-    """Rows a stream."""
+def _batches(type_: TensorType) -> int:
     return next(size.multiple for size in type_.shape if isinstance(size, Batch))
 
 
@@ -143,14 +142,13 @@ def _numbers(sizes: tuple[Size, ...]) -> int:
 
 def crossing_inputs(graph: Graph, rows: Mapping[str, Rows]) -> Graph:
     """The graph with the inputs that are in ``rows`` as they cross."""
-    found = [rows[name] for name in graph.inputs if name in rows]
-    inputs = {}
-    for name, type_ in graph.inputs.items():
-        if name in rows:
-            inputs[rows[name].crossing] = rows[name].unfolded
-        else:
-            inputs[name] = type_
-    return replace(graph, inputs=inputs, nodes=(*(one.enter() for one in found), *graph.nodes)) if found else graph
+    found = {name: rows[name] for name in graph.inputs if name in rows}
+    inputs = dict(
+        (found[name].crossing, found[name].unfolded) if name in found else (name, type_)
+        for name, type_ in graph.inputs.items()
+    )
+    nodes = (*(one.enter() for one in found.values()), *graph.nodes)
+    return replace(graph, inputs=inputs, nodes=nodes) if found else graph
 
 
 def crossing_outputs(graph: Graph, rows: Mapping[str, Rows]) -> Graph:
