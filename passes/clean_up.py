@@ -101,9 +101,9 @@ def fold_constants(graph: Graph, weights: Weights) -> Graph:
     """Evaluate what depends on nothing but constants, unless its shape depends on the batch."""
     types = graph.types()
     known = set(graph.constants)
-    folded: list[Node] = []
+    folded = []
     for node in graph.nodes:
-        if all(name in known for name in node.refs()) and not node.mentions_batch():
+        if known.issuperset(node.refs()) and not node.mentions_batch():
             folded.append(node)
             known.add(node.name)
     if not folded:
@@ -111,31 +111,20 @@ def fold_constants(graph: Graph, weights: Weights) -> Graph:
     rest = [n for n in graph.nodes if n.name not in known]
     read = {name for n in rest for name in n.refs()} | set(graph.outputs)
     wanted = tuple(n.name for n in folded if n.name in read and len(n.types) == 1)
-    # An output stays a node: pieces are wired by the names of outputs.
-    outputs = [n for n in folded if n.name in graph.outputs]
-    fragment = Graph({}, graph.constants, tuple(folded), wanted)
-    used = reaching(fragment, wanted)
-    tensors = {n: torch.from_numpy(weights[n]) for n in graph.constants if n in used}
-    fragment = replace(
-        fragment,
-        constants={n: t for n, t in graph.constants.items() if n in used},
-        nodes=tuple(n for n in folded if n.name in used),
-    )
+    fragment = drop_dead(Graph({}, graph.constants, tuple(folded), wanted))
     with torch.no_grad():
-        values = Evaluator(fragment, tensors)({})
+        values = Evaluator(fragment, {n: torch.from_numpy(weights[n]) for n in fragment.constants})({})
     constants = dict(graph.constants)
     for name, value in zip(wanted, values, strict=True):
         constants[name] = types[name]
         weights[name] = value.contiguous().numpy().copy()
-    if outputs:
-        renamed = {n.name: f"{n.name}.constant" for n in outputs}
-        for old, new in renamed.items():
-            constants[new] = constants.pop(old)
-            weights[new] = weights[old]  # which another graph may read as a constant
-            rest.append(Node(old, "aten.clone.default", (Ref(new),), (), (types[old],), "constant output"))
-        first = [n for n in rest if n.name in renamed]
-        rest = first + [n for n in rest if n.name not in renamed]
-    return replace(graph, constants=constants, nodes=tuple(rest))
+    outputs = []
+    for old in (n.name for n in folded if n.name in graph.outputs):  # it stays a node: pieces are wired by its name
+        new = f"{old}.constant"
+        constants[new] = constants.pop(old)
+        weights[new] = weights[old]  # which another graph may read as a constant
+        outputs.append(Node(old, "aten.clone.default", (Ref(new),), (), (types[old],), "constant output"))
+    return replace(graph, constants=constants, nodes=(*outputs, *rest))
 
 
 def merge_repeated(graph: Graph) -> Graph:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from ttscompile.errors import NoResidualBlocksError
 from ttscompile.ir.dataflow import between, dominators, reachable_from, reaching
@@ -86,8 +86,7 @@ def find_residual_blocks(graph: Graph, sample: str) -> BlockTable:
             + "\nNothing can be reused then. If the output is the sample plus more, use EDMDenoiser and edm_table."
         )
     links = _main_stream(graph, links, declined)
-    blocks = _chain(graph, points, links, declined)
-    return BlockTable(tuple(_number(graph, blocks)), tuple(declined))
+    return BlockTable(tuple(_chain(graph, points, links, declined)), tuple(declined))
 
 
 def _links(graph: Graph, points: Sequence[str], loop: set[str]) -> tuple[list[_Link], list[str]]:
@@ -136,19 +135,26 @@ def _main_stream(graph: Graph, links: list[_Link], declined: list[str]) -> list[
 
 
 def _chain(graph: Graph, points: Sequence[str], links: list[_Link], declined: list[str]) -> list[Block]:
-    """Blocks from links, with coarse blocks over what lies between and around them."""
+    """Blocks from links, with coarse blocks over what lies between and around them.
+
+    Blocks of one kind are one FORWARD group. The residual of a coarse block also holds what happens to the stream
+    before the addition, so it is of another kind.
+    """
     types = graph.types()
     stream_type = types[links[0].result]
+    of_type = [name for name in points if types[name] == stream_type]
     blocks: list[Block] = []
+    groups: dict[tuple[str, bool], int] = {}
 
     def add(stream: str, result: str, residual: str | None, reason: str = "", hides: bool = False) -> None:
         nodes = between(graph, stream, residual if residual is not None else result)
         kind = _kind(graph, nodes, stream, hides)
-        blocks.append(Block(len(blocks), kind, stream, result, residual, stream_type, group=0, reason=reason))
+        group = groups.setdefault((kind, residual is None), len(groups))
+        blocks.append(Block(len(blocks), kind, stream, result, residual, stream_type, group, reason))
 
     cursor = links[0].stream
-    early = _first_of_type(points, types, stream_type, before=cursor)
-    if early is not None and _hides_residuals(graph, early, cursor, stream_type):
+    early, late = of_type[0], of_type[-1]
+    if early != cursor and _hides_residuals(graph, early, cursor, stream_type):
         add(early, cursor, None, "the chain starts late: a skip connection goes around the additions before it", True)
     for link in links:
         if link.stream == cursor:
@@ -159,23 +165,9 @@ def _chain(graph: Graph, points: Sequence[str], links: list[_Link], declined: li
             add(cursor, link.result, None, f"the stream is changed by {_describe(gap)} before the addition", hides)
             declined.append(f"%{link.result}: merged with what comes before it; {blocks[-1].reason}")
         cursor = link.result
-    late = _last_of_type(points, types, stream_type)
     if late != cursor and _hides_residuals(graph, cursor, late, stream_type):
         add(cursor, late, None, "the chain ends early: a skip connection goes around the additions after it", True)
     return blocks
-
-
-def _first_of_type(points: Sequence[str], types: dict[str, TensorType], wanted: TensorType, before: str) -> str | None:
-    for name in points:
-        if name == before:
-            return None
-        if types[name] == wanted:
-            return name
-    return None
-
-
-def _last_of_type(points: Sequence[str], types: dict[str, TensorType], wanted: TensorType) -> str:
-    return [name for name in points if types[name] == wanted][-1]
 
 
 def _hides_residuals(graph: Graph, start: str, stop: str, stream_type: TensorType) -> bool:
@@ -199,11 +191,7 @@ def _describe(nodes: Sequence[Node]) -> str:
 def _kind(graph: Graph, nodes: Sequence[Node], stream: str, hides: bool) -> str:
     """``self_attention``, ``cross_attention``, ``feed_forward``, or a signature of the structure.
 
-    Args:
-        graph: the denoiser.
-        nodes: of the block.
-        stream: what flows into it.
-        hides: whether it is a coarse block of several residuals.
+    ``nodes`` are the block's, into which ``stream`` flows; it may be a coarse one that ``hides`` several residuals.
     """
     types, producers = graph.types(), graph.producers()
     inside = {n.name for n in nodes} | {stream}
@@ -255,16 +243,3 @@ def _key_operands(producers: dict[str, Node], softmax: Node) -> list[str]:
             return list(node.refs())[-1:]
         pending.extend(node.refs())
     return []
-
-
-def _number(graph: Graph, blocks: Sequence[Block]) -> list[Block]:
-    """Give every block its FORWARD group: the blocks of its kind and shape.
-
-    The residual of a coarse block also holds what happens to the stream before the addition, so it is of another kind.
-    """
-    groups: dict[tuple[str, TensorType, bool], int] = {}
-    numbered = []
-    for block in blocks:
-        group = groups.setdefault((block.kind, block.type, block.residual is None), len(groups))
-        numbered.append(replace(block, group=group))
-    return numbered

@@ -80,7 +80,7 @@ def _sink(piece: Graph, prologue: Graph, known: Mapping[str, Binding]) -> Graph:
     Hoisted they would be a copy for each of the K steps, computed or not, and their rows would fill the cache.
     """
     producers, types = prologue.producers(), prologue.types()
-    moved: list[Node] = []
+    moved = []
     inputs: dict[str, TensorType] = {}
     for name, type_ in piece.inputs.items():
         node = producers.get(name)
@@ -97,9 +97,8 @@ def _sink(piece: Graph, prologue: Graph, known: Mapping[str, Binding]) -> Graph:
 def _name_inputs(prologue: Graph) -> tuple[Graph, dict[str, str]]:
     """Read every input through a node of its own, so that whatever the loop needs is the result of some node."""
     renamed = {name: f"{name}.value" for name in prologue.inputs}
-    copies = [
-        Node(renamed[name], "aten.clone.default", (Ref(name),), (), (type_,)) for name, type_ in prologue.inputs.items()
-    ]
+    inputs = prologue.inputs.items()
+    copies = [Node(renamed[name], "aten.clone.default", (Ref(name),), (), (type_,)) for name, type_ in inputs]
     nodes = [node.renamed(lambda name: renamed.get(name, name)) for node in prologue.nodes]
     outputs = tuple(renamed.get(name, name) for name in prologue.outputs)
     return replace(prologue, nodes=(*copies, *nodes), outputs=outputs), renamed

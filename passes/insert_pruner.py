@@ -16,6 +16,8 @@ from ttscompile.ir.program import Binding, Program
 
 from .base import Pass, PassResult
 
+Parameters = dict[str, npt.NDArray[np.float32]]
+
 SOURCES = 4
 MASKED = -1e9
 """Logit of a source that is illegal in a cell whatever the caches hold."""
@@ -86,7 +88,7 @@ class InsertPruner(Pass[Program, Program]):
             head = InsertPruner(rank=head.rank // 2, width=max(head.width // 2, 4))
         return head
 
-    def _parameters(self, inputs: int, steps: int, blocks: int) -> dict[str, npt.NDArray[np.float32]]:
+    def _parameters(self, inputs: int, steps: int, blocks: int) -> Parameters:
         draw = np.random.default_rng(0)
 
         def normal(*shape: int, scale: float) -> npt.NDArray[np.float32]:
@@ -107,13 +109,7 @@ class InsertPruner(Pass[Program, Program]):
             "pruner.mask": mask,
         }
 
-    def _head(
-        self,
-        features: dict[str, TensorType],
-        parameters: dict[str, npt.NDArray[np.float32]],
-        steps: int,
-        blocks: int,
-    ) -> Graph:
+    def _head(self, features: dict[str, TensorType], parameters: Parameters, steps: int, blocks: int) -> Graph:
         nodes: list[Node] = []
 
         def emit(name: str, op: str, shape: Sequence[int], *args: Argument) -> Ref:
@@ -179,17 +175,14 @@ def _features(program: Program) -> tuple[Graph, tuple[str, ...]]:
     pieces = program.pieces
     graph = pieces.condition
     types, producers = graph.types(), graph.producers()
-    chosen: str | None = None
     arithmetic = {n.name for n in graph.nodes if node_flops(n, types)}
-    for name in dominators(graph, graph.inputs, graph.outputs):
+    for name in reversed(dominators(graph, graph.inputs, graph.outputs)):
         node = producers.get(name)
         worked = not arithmetic.isdisjoint(reaching(graph, [name]))
         readable = types[name].batch_axis is not None and types[name].dtype == "float32"
         if worked and node is not None and len(node.types) == 1 and readable:
-            chosen = name
-    if chosen is not None:
-        outputs = graph.outputs if chosen in graph.outputs else (*graph.outputs, chosen)
-        return replace(graph, outputs=outputs), (chosen,)
+            outputs = graph.outputs if name in graph.outputs else (*graph.outputs, name)
+            return replace(graph, outputs=outputs), (name,)
     nodes = list(graph.nodes)
     features: list[str] = []
     for key, type_ in graph.inputs.items():

@@ -60,18 +60,14 @@ class Partition(Pass[Captured, Cut]):
         loop = Loop(
             stem=outline(spec.sample_argument, blocks[0].stream),
             blocks=tuple(
-                outline(block.stream, block.residual)
-                if block.residual is not None
-                else _difference(outline(block.stream, block.result))
-                for block in blocks
+                _difference(outline(b.stream, b.result)) if b.residual is None else outline(b.stream, b.residual)
+                for b in blocks
             ),
             tail=outline(blocks[-1].result, graph.outputs[0]),
         )
         inside = sum(len(piece.graph.nodes) for piece in loop.blocks)
-        note = (
-            f"nodes: prologue {len(prologue.nodes)}, stem {len(loop.stem.graph.nodes)}, {len(blocks)} blocks {inside},"
-            f" tail {len(loop.tail.graph.nodes)}"
-        )
+        early, stem, tail = (len(graph.nodes) for graph in (prologue, loop.stem.graph, loop.tail.graph))
+        note = f"nodes: prologue {early}, stem {stem}, {len(blocks)} blocks {inside}, tail {tail}"
         cut = Cut(spec, graph, program.weights, blocks, prologue, loop, dense_flops=program.dense_flops)
         return PassResult(cut, (note,))
 

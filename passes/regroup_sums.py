@@ -44,9 +44,7 @@ class RegroupSums(Pass[Captured, Captured]):
             terms = _terms(graph, node, producers, users, points)
             streams = [t for t in terms if t in points and types[t] == node.type]
             branches = [t for t in terms if t not in streams]
-            if len(streams) != 1 or len(branches) < 2 or any(t not in loop for t in branches):
-                continue
-            if any(types[t] != node.type for t in branches):
+            if len(streams) != 1 or len(branches) < 2 or any(t not in loop or types[t] != node.type for t in branches):
                 continue
             new[node.name] = _regrouped(node, streams[0], branches)
             notes.append(f"%{node.name} ({node.source or 'source unknown'}): {len(branches)} branches in parallel")

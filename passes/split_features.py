@@ -73,34 +73,23 @@ def _sum(node: Node, parts: list[str], types: Mapping[str, TensorType]) -> list[
     assert isinstance(weight, Ref)
     rows = types[weight.name].shape[0]
     nodes: list[Node] = []
+
+    def emit(name: str, op: str, args: tuple[Argument, ...], type_: TensorType) -> None:
+        nodes.append(Node(name, op, args, (), (type_,), node.source))
+
     start, total = 0, ""
     for index, part in enumerate(parts):
         size = types[part].shape[-1]
         assert isinstance(size, int)
-        columns = Node(
-            f"{node.name}.columns{index}",
-            "aten.slice.Tensor",
-            (weight, 1, start, start + size),
-            (),
-            (TensorType((rows, size), types[weight.name].dtype),),
-            node.source,
-        )
+        columns, linear = f"{node.name}.columns{index}", f"{node.name}.part{index}"
+        cut = TensorType((rows, size), types[weight.name].dtype)
+        emit(columns, "aten.slice.Tensor", (weight, 1, start, start + size), cut)
         bias: tuple[Argument, ...] = node.args[2:] if index == 0 else ()
-        shape = (*types[part].shape[:-1], rows)
-        linear = Node(
-            f"{node.name}.part{index}",
-            _LINEAR,
-            (Ref(part), Ref(columns.name), *bias),
-            (),
-            (TensorType(shape, node.type.dtype),),
-            node.source,
-        )
-        nodes += [columns, linear]
+        made = TensorType((*types[part].shape[:-1], rows), node.type.dtype)
+        emit(linear, _LINEAR, (Ref(part), Ref(columns), *bias), made)
         name = node.name if index == len(parts) - 1 else f"{node.name}.sum{index}"
         if index:
-            nodes.append(Node(name, "aten.add.Tensor", (Ref(total), Ref(linear.name)), (), (node.type,), node.source))
-            total = name
-        else:
-            total = linear.name
+            emit(name, "aten.add.Tensor", (Ref(total), Ref(linear)), node.type)
+        total = name if index else linear
         start += size
     return nodes

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
+from itertools import groupby
 
 from ttscompile.ir.binding import bindings, input_bindings, join
 from ttscompile.ir.graph import GETITEM, Argument, Batch, Graph, Node, Ref, Size, TensorType
@@ -97,10 +98,8 @@ class _Splitter:
         if parts is None or name in self.whole:
             return
         self.whole.add(name)
-        refs: tuple[Argument, ...] = tuple(Ref(p) for p in parts.names)
-        self.nodes.append(
-            Node(name, "aten.cat.default", (refs, parts.axis), (), (self.types[name],), "sunk by SplitTokens")
-        )
+        args = (tuple(Ref(part) for part in parts.names), parts.axis)
+        self.nodes.append(Node(name, "aten.cat.default", args, (), (self.types[name],), "sunk by SplitTokens"))
 
     def emit(self, node: Node, index: int, args: tuple[Argument, ...], types: tuple[TensorType, ...]) -> str:
         """Add the ``index``-th part of ``node`` and return its name."""
@@ -119,7 +118,9 @@ class _Splitter:
         names = [o.name for o in operands if isinstance(o, Ref)]
         if any(self.types[name].dtype != node.type.dtype for name in names):
             return False  # apart, what is another dtype in the whole would be computed with in its own
-        axis = _positive(node.args[1] if len(node.args) > 1 else 0, node.type)
+        axis = node.args[1] if len(node.args) > 1 else 0
+        assert isinstance(axis, int)
+        axis %= len(node.type.shape)
         pieces: list[tuple[str, int]] = []
         for name in names:
             inner = self.parts.get(name)
@@ -129,23 +130,17 @@ class _Splitter:
                 pieces.append((name, size))
             else:
                 return False
-        groups: list[list[tuple[str, int]]] = []
-        for piece in pieces:
-            if groups and self.bindings[groups[-1][0][0]] is self.bindings[piece[0]]:
-                groups[-1].append(piece)
-            else:
-                groups.append([piece])
+        groups = [list(group) for _, group in groupby(pieces, key=lambda piece: self.bindings[piece[0]])]
         if len(groups) < 2:
             return False
-        grouped: list[str] = []
-        for i, group in enumerate(groups):
-            if len(group) == 1:
-                grouped.append(group[0][0])
-                continue
-            size = sum(s for _, s in group)
-            refs: tuple[Argument, ...] = tuple(Ref(n) for n, _ in group)
-            grouped.append(self.emit(node, i, (refs, axis), (_resized(node.type, axis, size),)))
-        self.parts[node.name] = _Parts(axis, tuple(grouped), tuple(sum(s for _, s in g) for g in groups))
+        grouped, sizes = [], [sum(size for _, size in group) for group in groups]
+        for i, (group, size) in enumerate(zip(groups, sizes, strict=True)):
+            name = group[0][0]
+            if len(group) > 1:
+                args = (tuple(Ref(part) for part, _ in group), axis)
+                name = self.emit(node, i, args, (_resized(node.type, axis, size),))
+            grouped.append(name)
+        self.parts[node.name] = _Parts(axis, tuple(grouped), tuple(sizes))
         self.split_at.append(node.name)
         return True
 
@@ -153,16 +148,10 @@ class _Splitter:
         """Rows ``start .. start + size`` of an operand that is not split."""
         type_ = _resized(self.types[name], axis, size)
         part = f"{node.name}.slice{index}"
-        self.nodes.append(
-            Node(part, "aten.slice.Tensor", (Ref(name), axis, start, start + size), (), (type_,), node.source)
-        )
+        args = (Ref(name), axis, start, start + size)
+        self.nodes.append(Node(part, "aten.slice.Tensor", args, (), (type_,), node.source))
         self.types[part], self.bindings[part] = type_, self.bindings[name]
         return part
-
-
-def _positive(axis: Argument, type_: TensorType) -> int:
-    assert isinstance(axis, int)
-    return axis % len(type_.shape)
 
 
 def _resized(type_: TensorType, axis: int, size: int) -> TensorType:
@@ -185,7 +174,7 @@ def _parts(splitter: _Splitter, node: Node) -> _Parts | None:
         return _per_part(splitter, node, source, permutation(node, rank).index(axis))
     if row.name == "expand":
         axis += len(new) - rank
-        return _per_part(splitter, node, source, axis, lambda size: (_resized(node.type, axis, size).shape,))
+        return _per_part(splitter, node, source, axis, shaped=True)
     if row.along is not None and len(along := axes_along(node, rank)) == 1:
         (across,) = along
         # A selection leaves its axis out.
@@ -196,18 +185,13 @@ def _parts(splitter: _Splitter, node: Node) -> _Parts | None:
     return _per_part(splitter, node, source, axis) if node.op == GETITEM else None
 
 
-def _per_part(
-    splitter: _Splitter,
-    node: Node,
-    source: _Parts,
-    axis: int,
-    rest: Callable[[int], tuple[Argument, ...]] | None = None,
-) -> _Parts:
-    """Emit ``node`` once a part; ``rest`` gives its arguments after the first, for the size of a part."""
+def _per_part(splitter: _Splitter, node: Node, source: _Parts, axis: int, shaped: bool = False) -> _Parts:
+    """Emit ``node`` once a part; if it is ``shaped``, with the shape of the part as its second argument."""
     names = []
     for i, (name, size) in enumerate(zip(source.names, source.sizes, strict=True)):
-        args = (Ref(name), *(node.args[1:] if rest is None else rest(size)))
-        names.append(splitter.emit(node, i, args, tuple(_resized(t, axis, size) for t in node.types)))
+        types = tuple(_resized(type_, axis, size) for type_ in node.types)
+        args = (Ref(name), types[0].shape) if shaped else (Ref(name), *node.args[1:])
+        names.append(splitter.emit(node, i, args, types))
     return _Parts(axis, tuple(names), source.sizes)
 
 
@@ -218,7 +202,7 @@ def _reshaped(splitter: _Splitter, node: Node, source: _Parts, type_: TensorType
     if not kept:
         return None
     node = replace(node, op="aten.reshape.default", kwargs=())
-    return _per_part(splitter, node, source, kept[0], lambda size: (_resized(node.type, kept[0], size).shape,))
+    return _per_part(splitter, node, source, kept[0], shaped=True)
 
 
 def _factors(shape: Sequence[Size]) -> tuple[int, int]:

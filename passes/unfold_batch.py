@@ -39,16 +39,9 @@ class UnfoldBatch(Pass[Cut, Cut]):
                 for name in (piece.stream, *(() if piece is loop.tail else piece.graph.outputs)):
                     rows[name] = Rows(name, like.type, f"{name}.rows", like.unfolded)
             blocks = tuple(replace(b, type=like.unfolded) for b in blocks)
-        new = replace(
-            program,
-            blocks=blocks,
-            prologue=crossing_outputs(program.prologue, rows),
-            loop=Loop(
-                stem=_crossing(loop.stem, rows),
-                blocks=tuple(_crossing(piece, rows) for piece in loop.blocks),
-                tail=_crossing(loop.tail, rows),
-            ),
-        )
+        stem, *inner, tail = (_crossing(piece, rows) for piece in loop.loop.values())
+        prologue = crossing_outputs(program.prologue, rows)
+        new = replace(program, blocks=blocks, prologue=prologue, loop=Loop(stem, tuple(inner), tail))
         return PassResult(new, (f"{len(rows)} values have several rows a stream and cross with an axis of streams",))
 
 

@@ -159,8 +159,11 @@ def compile_denoiser(
     models = lower_program(program)
     explain("lower", (f"{len(models)} ONNX models",))
     blocks = None if precision == FP32 else _lower_blocks(program, models, precision, explain)
-    # Made before anything is written: a program that has no single file leaves no artifact without one.
-    whole = None if single_file is None else _lower_whole(program, models, blocks)
+    whole: bytes | None = None
+    if single_file is not None:  # made before anything is written: without one there is no artifact either
+        lowered, weights = ({}, {}) if blocks is None else (blocks.models, blocks.weights)
+        model = lower_single_file(program, {**models, **lowered}, {**program.weights, **weights})
+        whole = model.SerializeToString(deterministic=True)
     if directory is not None:
         golden = record_original(module, program)
         explain("record_original", (f"{len(golden.steps)} of {spec.sampler.steps} steps, {golden.streams} streams",))
@@ -170,16 +173,6 @@ def compile_denoiser(
         _write(Path(single_file), whole)
         explain("write_single_file", (f"{len(whole) / 1e6:.1f} MB",))
     return program
-
-
-def _lower_whole(program: Program, models: Mapping[str, ModelProto], blocks: LoweredBlocks | None) -> bytes:
-    """The single file of the whole call."""
-    if blocks is None:
-        model = lower_single_file(program, models, program.weights)
-    else:
-        model = lower_single_file(program, {**models, **blocks.models}, {**program.weights, **blocks.weights})
-    content: bytes = model.SerializeToString(deterministic=True)
-    return content
 
 
 def _write(path: Path, content: bytes) -> None:

@@ -105,8 +105,13 @@ class Evaluator:
         self._slots: dict[str, int] = {}
         for name in (*graph.inputs, *graph.constants):
             self._slots[name] = len(self._slots)
-        self._constants = [_checked_constant(n, t, weights) for n, t in graph.constants.items()]
-        self._steps: list[tuple[Callable[[Frame, int], Any], tuple[int, ...]]] = []
+        self._constants = [weights.get(name) for name in graph.constants]
+        for (name, type_), value in zip(graph.constants.items(), self._constants, strict=True):
+            if value is None:
+                raise CaptureError(f"constant %{name} : {type_} of the graph has no value among the weights.")
+            if value.dtype != getattr(torch, type_.dtype, None) or tuple(value.shape) != type_.shape:
+                raise CaptureError(f"constant %{name} has type {_describe(value)}; the graph expects {type_}.")
+        self._steps: list[tuple[Getter, tuple[int, ...]]] = []
         dead = _dead_after(graph)
         for node in graph.nodes:
             call = self._compile(node)
@@ -114,8 +119,7 @@ class Evaluator:
                 raise CaptureError(f"two values are called %{node.name}; the second is {_where(node)}.")
             self._slots[node.name] = len(self._slots)
             self._steps.append((call, tuple(self._slots[name] for name in dead[node.name])))
-        missing = [name for name in graph.outputs if name not in self._slots]
-        if missing:
+        if missing := [name for name in graph.outputs if name not in self._slots]:
             raise CaptureError(f"outputs {missing} of the graph are values that nothing computes.")
         self._outputs = tuple(self._slots[name] for name in graph.outputs)
 
@@ -149,36 +153,18 @@ class Evaluator:
             raise CaptureError(f"{_where(node)} failed for {streams} streams: {error}") from error
         return tuple(frame[slot] for slot in self._outputs)
 
-    def _compile(self, node: Node) -> Callable[[Frame, int], Any]:
+    def _compile(self, node: Node) -> Getter:
         """A closure that computes one node from the frame."""
-        function = resolve_op(node)
-        args, changing = self._layout(node, node.args)
-        names = tuple(name for name, _ in node.kwargs)
-        kwargs, changing_kwargs = self._layout(node, tuple(value for _, value in node.kwargs))
+        function, positional, names = resolve_op(node), len(node.args), [name for name, _ in node.kwargs]
+        fixed, getter = self._argument(node, (*node.args, *(value for _, value in node.kwargs)))
 
         def call(frame: Frame, streams: int) -> Any:
-            values = args.copy()
-            for i, getter in changing:
-                values[i] = getter(frame, streams)
+            values = fixed if getter is None else getter(frame, streams)
             if not names:
                 return function(*values)
-            named = kwargs.copy()
-            for i, getter in changing_kwargs:
-                named[i] = getter(frame, streams)
-            return function(*values, **dict(zip(names, named, strict=True)))
+            return function(*values[:positional], **dict(zip(names, values[positional:], strict=True)))
 
         return call
-
-    def _layout(self, node: Node, arguments: tuple[Argument, ...]) -> tuple[list[Any], list[tuple[int, Getter]]]:
-        """Arguments that never change, and getters of those that do, by position."""
-        fixed: list[Any] = []
-        changing: list[tuple[int, Getter]] = []
-        for i, argument in enumerate(arguments):
-            value, getter = self._argument(node, argument)
-            fixed.append(value)
-            if getter is not None:
-                changing.append((i, getter))
-        return fixed, changing
 
     def _argument(self, node: Node, argument: Argument) -> tuple[Any, Getter | None]:
         """Either a value, or a getter of a value that depends on the frame or on B."""
@@ -195,7 +181,8 @@ class Evaluator:
         if isinstance(argument, Enum):
             return self._enum(node, argument), None
         if isinstance(argument, tuple):
-            fixed, changing = self._layout(node, argument)
+            both = [self._argument(node, item) for item in argument]
+            fixed, changing = [value for value, _ in both], [(i, g) for i, (_, g) in enumerate(both) if g is not None]
             if not changing:
                 return fixed, None
 
@@ -236,9 +223,8 @@ def bind_batch(types: Mapping[str, TensorType], values: Mapping[str, torch.Tenso
         for axis, (found, expected) in enumerate(zip(shape, type_.shape, strict=True)):
             if isinstance(expected, int):
                 if found != expected:
-                    raise ObservationError(
-                        f"input {name!r} has type {_describe(value)}; expected {type_}: axis {axis} differs."
-                    )
+                    wrong = f"input {name!r} has type {_describe(value)}; expected {type_}: axis {axis} differs."
+                    raise ObservationError(wrong)
                 continue
             count, rest = divmod(found, expected.multiple)
             if rest or count < 1 or streams not in (None, count):
@@ -251,21 +237,9 @@ def bind_batch(types: Mapping[str, TensorType], values: Mapping[str, torch.Tenso
     return 1 if streams is None else streams
 
 
-def _checked_constant(name: str, type_: TensorType, weights: Mapping[str, torch.Tensor]) -> torch.Tensor:
-    value = weights.get(name)
-    if value is None:
-        raise CaptureError(f"constant %{name} : {type_} of the graph has no value among the weights.")
-    if value.dtype != getattr(torch, type_.dtype, None) or tuple(value.shape) != type_.shape:
-        raise CaptureError(f"constant %{name} has type {_describe(value)}; the graph expects {type_}.")
-    return value
-
-
 def _dead_after(graph: Graph) -> dict[str, list[str]]:
     """By node: the inputs and results that nothing reads after it. Constants stay."""
-    last = {node.name: node.name for node in graph.nodes}
-    for node in graph.nodes:
-        for name in node.refs():
-            last[name] = node.name
+    last = {name: node.name for node in graph.nodes for name in (node.name, *node.refs())}
     dead: dict[str, list[str]] = {node.name: [] for node in graph.nodes}
     for name, reader in last.items():
         if name not in graph.outputs and name not in graph.constants:

@@ -96,13 +96,15 @@ class Node:
 
     def refs(self) -> Iterator[str]:
         """Names of the values that it reads, with repetitions, in order."""
-        yield from _refs(self.args)
-        for _, value in self.kwargs:
-            yield from _refs(value)
+        return (leaf.name for leaf in self.leaves() if isinstance(leaf, Ref))
+
+    def leaves(self) -> Iterator[Argument]:
+        """Its arguments and, in place of lists, what is in them; positional ones first."""
+        return _leaves((*self.args, *(value for _, value in self.kwargs)))
 
     def mentions_batch(self) -> bool:
         """Whether the batch size is among its arguments."""
-        return any(map(_mentions_batch, self.args)) or any(_mentions_batch(a) for _, a in self.kwargs)
+        return any(isinstance(leaf, Batch) for leaf in self.leaves())
 
     def renamed(self, rename: Callable[[str], str]) -> Node:
         """The same operation on other values; its own name is kept."""
@@ -163,16 +165,10 @@ def backward_slice(graph: Graph, outputs: tuple[str, ...], stops: Mapping[str, T
 
     Inputs of the result are the stops that it reads, in the order of ``stops``, and then inputs of ``graph``.
     """
-    producers = graph.producers()
-    needed: set[str] = set()
-    pending = list(outputs)
-    while pending:
-        name = pending.pop()
-        if name in needed:
-            continue
-        needed.add(name)
-        if name in producers and name not in stops:
-            pending.extend(producers[name].refs())
+    needed = set(outputs)
+    for node in reversed(graph.nodes):
+        if node.name in needed and node.name not in stops:
+            needed.update(node.refs())
     candidates = {**stops, **graph.inputs}
     return Graph(
         inputs={n: t for n, t in candidates.items() if n in needed},
@@ -182,16 +178,12 @@ def backward_slice(graph: Graph, outputs: tuple[str, ...], stops: Mapping[str, T
     )
 
 
-def _refs(argument: Argument) -> Iterator[str]:
-    if isinstance(argument, Ref):
-        yield argument.name
-    elif isinstance(argument, tuple):
+def _leaves(argument: Argument) -> Iterator[Argument]:
+    if isinstance(argument, tuple):
         for item in argument:
-            yield from _refs(item)
-
-
-def _mentions_batch(argument: Argument) -> bool:
-    return any(map(_mentions_batch, argument)) if isinstance(argument, tuple) else isinstance(argument, Batch)
+            yield from _leaves(item)
+    else:
+        yield argument
 
 
 def _rename(argument: Argument, rename: Callable[[str], str]) -> Argument:

@@ -85,25 +85,21 @@ def _rows(name: str, type_: TensorType, layout: _Layout | None) -> Rows:
 def _layouts(graph: Graph, types: Mapping[str, TensorType]) -> dict[str, _Layout]:
     """The layout of every value with an axis of streams of which it is known."""
     known = {name: _Layout(1, 1) for name, type_ in types.items() if type_.batch_axis is not None}
-    alike: set[str] = set()  # all rows of one number, so that every layout fits
+    alike: dict[str, _Layout] = {}  # all rows of one number, so that every layout fits
     for node in graph.nodes:
         axis = _axis(node.type)
         read = [name for name in node.refs() if _axis(types[name]) is not None and name not in alike]
         if axis is None or node.name in known or not all(name in known for name in read):
             continue
         if not read:
-            if operation(node.op).filled is not None or node.op == _EXPAND:
-                alike.add(node.name)
+            size = node.type.shape[axis]
+            if isinstance(size, Batch) and (operation(node.op).filled is not None or node.op == _EXPAND):
+                alike[node.name] = _Layout(size.multiple, 1)
             continue
         layout = _made(node, axis, [types[name] for name in read], [known[name] for name in read])
         if layout is not None:
             known[node.name] = layout
-    return {**known, **{name: _Layout(_multiple(types[name]), 1) for name in alike}}
-
-
-def _multiple(type_: TensorType) -> int:
-    """Rows a stream."""
-    return next(size.multiple for size in type_.shape if isinstance(size, Batch))
+    return {**known, **alike}
 
 
 def _made(node: Node, axis: int, read: Sequence[TensorType], layouts: Sequence[_Layout]) -> _Layout | None:
@@ -143,14 +139,13 @@ def _numbers(sizes: tuple[Size, ...]) -> int:
 
 def crossing_inputs(graph: Graph, rows: Mapping[str, Rows]) -> Graph:
     """The graph with the inputs that are in ``rows`` as they cross."""
-    found = [rows[name] for name in graph.inputs if name in rows]
-    inputs = {}
-    for name, type_ in graph.inputs.items():
-        if name in rows:
-            inputs[rows[name].crossing] = rows[name].unfolded
-        else:
-            inputs[name] = type_
-    return replace(graph, inputs=inputs, nodes=(*(one.enter() for one in found), *graph.nodes)) if found else graph
+    found = {name: rows[name] for name in graph.inputs if name in rows}
+    inputs = dict(
+        (found[name].crossing, found[name].unfolded) if name in found else (name, type_)
+        for name, type_ in graph.inputs.items()
+    )
+    nodes = (*(one.enter() for one in found.values()), *graph.nodes)
+    return replace(graph, inputs=inputs, nodes=nodes) if found else graph
 
 
 def crossing_outputs(graph: Graph, rows: Mapping[str, Rows]) -> Graph:

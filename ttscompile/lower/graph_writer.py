@@ -101,15 +101,17 @@ class GraphWriter:
         if tensor.raw_data or 0 in tensor.dims:
             made = numpy_helper.to_array(tensor)
             return self.constant(made, made.dtype)
-        value = weights.get(tensor.name)
-        if value is None or value.shape != tuple(tensor.dims):
-            raise LoweringError(
-                f"the model's initializer {tensor.name!r} {list(tensor.dims)} has no value among the program's weights."
-                " This is an error in ttscompile; please report it."
-            )
+        value, shape = weights.get(tensor.name), tuple(tensor.dims)
+        if value is None or value.shape != shape:
+            what = f"the model's initializer {tensor.name!r} {list(shape)} has no value among the program's weights"
+            raise LoweringError(f"{what}. This is an error in ttscompile; please report it.")
         name = self.fresh(tensor.name)
         self._initializers.append(numpy_helper.from_array(np.ascontiguousarray(value), name))
         return name
+
+    def body(self, name: str, *results: str) -> GraphProto:
+        """What was written, as a branch of an If whose outputs are float32."""
+        return self.graph(name, [tensor(result, np.float32) for result in results])
 
     def graph(self, name: str, outputs: Sequence[ValueInfoProto], inputs: Sequence[ValueInfoProto] = ()) -> GraphProto:
         """What was written, as a graph."""

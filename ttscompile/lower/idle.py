@@ -31,7 +31,7 @@ from ..ir.operations import Linear, operation
 from ..ir.pieces import BASE, IDLE, PRODUCT, SHIFT, TOTAL
 from ..ir.program import Pieces
 from .graph_writer import GraphWriter, tensor
-from .onnx_model import IR_VERSION
+from .onnx_model import own_model
 
 Wide = npt.NDArray[np.float64]
 Weights = Mapping[str, npt.NDArray[np.generic]]
@@ -110,19 +110,11 @@ def _write(kind: TensorType, turned: bool, stem: _Affine, head: _Affine, eps: fl
     product = np.concatenate([triangle / root, np.zeros((1, dimensions)), (centred @ head.matrix).T])
     w.rename(w.constant(product, np.float32), PRODUCT)
     w.rename(w.constant(head.constant.T[:, None], np.float32), SHIFT)
-    tokens, size = len(stem.constant), len(product)
-    outputs = [
-        tensor(BASE, np.float32, [size, "B", tokens]),
-        tensor(PRODUCT, np.float32, product.shape),
-        tensor(SHIFT, np.float32, [dimensions, 1, tokens]),
-    ]
+    tokens = len(stem.constant)
+    shapes = {BASE: [len(product), "B", tokens], PRODUCT: product.shape, SHIFT: [dimensions, 1, tokens]}
+    outputs = [tensor(name, np.float32, shape) for name, shape in shapes.items()]
     given = tensor(TOTAL, np.float32, [n if isinstance(n, int) else str(n) for n in kind.shape])
-    return ModelProto(
-        ir_version=IR_VERSION,
-        producer_name="ttscompile",
-        opset_import=[helper.make_opsetid("", opset)],
-        graph=w.graph(IDLE, outputs, [given]),
-    )
+    return own_model(w.graph(IDLE, outputs, [given]), [helper.make_opsetid("", opset)])
 
 
 def _affine(graph: Graph, weights: Weights, turned_in: bool = False, turned_out: bool = False) -> _Affine:
@@ -212,11 +204,9 @@ def _norm_arguments(norm: Node, weights: Weights, width: int) -> tuple[Wide, Wid
 def _wide(graph: Graph) -> Graph:
     """The graph in float64."""
 
-    def wide(types: Mapping[str, TensorType]) -> dict[str, TensorType]:
-        return {name: replace(t, dtype="float64") if t.dtype == "float32" else t for name, t in types.items()}
+    def wide(type_: TensorType) -> TensorType:
+        return replace(type_, dtype="float64") if type_.dtype == "float32" else type_
 
-    nodes = tuple(
-        replace(n, types=tuple(replace(t, dtype="float64") if t.dtype == "float32" else t for t in n.types))
-        for n in graph.nodes
-    )
-    return replace(graph, inputs=wide(graph.inputs), constants=wide(graph.constants), nodes=nodes)
+    inputs, constants = ({n: wide(t) for n, t in types.items()} for types in (graph.inputs, graph.constants))
+    nodes = tuple(replace(node, types=tuple(map(wide, node.types))) for node in graph.nodes)
+    return replace(graph, inputs=inputs, constants=constants, nodes=nodes)

@@ -18,7 +18,7 @@ from ..ir.pieces import (
     block_name,
     dense_step_outputs,
 )
-from .onnx_model import opsets, value_info
+from .onnx_model import opsets, own_model, value_info
 
 
 def lower_all_blocks(blocks: Sequence[LoopPiece], models: Mapping[str, ModelProto]) -> dict[str, ModelProto]:
@@ -36,8 +36,6 @@ def _join_blocks(blocks: Sequence[LoopPiece], own: Sequence[ModelProto]) -> Mode
     joint = join([tuple(piece.contexts.values()) for piece in blocks])
     # Runtimes refuse a stream that changes its type; the sizes that are declared here then are those of every block.
     stream = blocks[0].type
-
-    result = value_info(RESIDUAL, stream)
 
     def branch(first: int, stop: int, depth: int) -> GraphProto:
         name = f"{RESIDUAL}.{first}.{stop}" if depth else RESIDUAL
@@ -59,8 +57,8 @@ def _join_blocks(blocks: Sequence[LoopPiece], own: Sequence[ModelProto]) -> Mode
     root = branch(0, len(own), 0)
     inputs = [value_info(name, TensorType((), "bool")) for name in joint.switches]
     inputs += [value_info(name, type_) for name, type_ in ((STREAM, stream), *joint.slots)]
-    graph = GraphProto(name=JOINT, node=root.node, input=inputs, output=[result], initializer=root.initializer)
-    return _model(own, graph)
+    graph = GraphProto(name=JOINT, node=root.node, input=inputs, output=root.output, initializer=root.initializer)
+    return own_model(graph, opsets(own))
 
 
 def _chain_blocks(blocks: Sequence[LoopPiece], own: Sequence[ModelProto]) -> ModelProto:
@@ -86,16 +84,7 @@ def _chain_blocks(blocks: Sequence[LoopPiece], own: Sequence[ModelProto]) -> Mod
     given = [value_info(STREAM, stream), *(value_info(CONTEXT + name, type_) for name, type_ in contexts.items())]
     made = [value_info(name, stream) for name in (last, *residuals)]
     graph = GraphProto(name=DENSE_STEP, node=nodes, input=given, output=made, initializer=weights.values())
-    return _model(own, graph)
-
-
-def _model(own: Sequence[ModelProto], graph: GraphProto) -> ModelProto:
-    return ModelProto(
-        ir_version=max(model.ir_version for model in own),
-        producer_name="ttscompile",
-        opset_import=opsets(own),
-        graph=graph,
-    )
+    return own_model(graph, opsets(own))
 
 
 def _leaf(model: ModelProto, inputs: Mapping[str, str], output: ValueInfoProto, prefix: str) -> GraphProto:
@@ -109,8 +98,7 @@ def _leaf(model: ModelProto, inputs: Mapping[str, str], output: ValueInfoProto, 
         copy = NodeProto()
         copy.CopyFrom(node)
         copy.name = f"{prefix}.{node.name}"
-        del copy.input[:], copy.output[:]
-        copy.input.extend(names.get(value, f"{prefix}.{value}") for value in node.input)
-        copy.output.extend(names.get(value, f"{prefix}.{value}") for value in node.output)
+        copy.input[:] = [names.get(value, f"{prefix}.{value}") for value in node.input]
+        copy.output[:] = [names.get(value, f"{prefix}.{value}") for value in node.output]
         nodes.append(copy)
     return GraphProto(name=model.graph.name, node=nodes, initializer=graph.initializer, output=[output])

@@ -48,27 +48,16 @@ GROUP = 6
 
 @dataclass(frozen=True)
 class LoopInputs:
-    """Names of values that the loop reads.
+    """Names of values that the loop reads."""
 
-    Attributes:
-        initial: sample at step 0, ``[B, T, D]``.
-        offset: of the sampler's updates, ``[K, D, B, T]``.
-        update: matrices of the sampler's updates, ``[K, G, R, (1 + S) T]``.
-        anchors: bool ``[K]``; after these steps sample and prediction enter the history.
-        history: before step 0, ``[D, B, 4 T]``.
-        memory: of the sampler, before step 0: ``[D, B, S T]``; None if it has none.
-        rows: rollout cache ``[R, E]``, with a residual as a row of E numbers.
-        index: int64 ``[K, N]``; which row is the residual of a cell.
-    """
-
-    initial: str
-    offset: str
-    update: str
-    anchors: str
-    history: str
-    memory: str | None
-    rows: str
-    index: str
+    initial: str  # sample at step 0, [B, T, D]
+    offset: str  # of the sampler's updates, [K, D, B, T]
+    update: str  # matrices of the sampler's updates, [K, G, R, (1 + S) T]
+    anchors: str  # bool [K]; after these steps sample and prediction enter the history
+    history: str  # before step 0, [D, B, 4 T]
+    memory: str | None  # of the sampler, before step 0: [D, B, S T]; None if it has none
+    rows: str  # rollout cache [R, E], with a residual as a row of E numbers
+    index: str  # int64 [K, N]; which row is the residual of a cell
 
 
 @dataclass(frozen=True)
@@ -161,13 +150,11 @@ class DenoisingLoop:
         )
         value, made = state.stream, list[str]()
         starts = range(0, len(self._groups), GROUP)
-        for start, flag in zip(
-            starts, _flags(w, w.op("Gather", plan.any_of_group, k), range(len(starts))), strict=True
-        ):
+        flags = _flags(w, w.op("Gather", plan.any_of_group, k), range(len(starts)))
+        for start, flag in zip(starts, flags, strict=True):
             members = range(start, min(start + GROUP, len(self._groups)))
-            value, residuals = w.choose(
-                flag, self._group(step, value, made, members), self._reused(w, value, f"group_{start}")
-            )
+            group, reused = self._group(step, value, made, members), self._reused(w, value, f"group_{start}")
+            value, residuals = w.choose(flag, group, reused)
             made.append(residuals)
         last = w.op("Gather", step.sums, w.constant(-1))
         value = w.op("Add", value, w.op("Reshape", last, self._shape))
@@ -196,11 +183,7 @@ class DenoisingLoop:
         again, anew = w.inner(), w.inner()
         same = again.op("Identity", last)
         made = anew.op("Reshape", self._sums(anew, k, table), anew.constant([-1]))
-        (total,) = w.choose(
-            w.op("Gather", plan.same, k),
-            again.graph("again", [tensor(same, np.float32)]),
-            anew.graph("anew", [tensor(made, np.float32)]),
-        )
+        (total,) = w.choose(w.op("Gather", plan.same, k), again.body("again", same), anew.body("anew", made))
         value = w.op("Add", state.stream, w.op("Reshape", total, self._shape))
         state = self._advance(w, replace(state, stream=value), k)
         out = [w.op("Identity", on), *state.values, total]
@@ -221,22 +204,18 @@ class DenoisingLoop:
         share = mixed.op("Compress", mixed.op("Slice", plan.from_rollout, *bounds), reads, axis=1)
         older = mixed.op("MatMul", share, mixed.op("Gather", self._inputs.rows, cells))
         both = mixed.op("Add", mixed.op("MatMul", coefficients, table), older)
-        return w.choose(
-            w.op("Gather", plan.any_rollout, k),
-            mixed.graph("mixed", [tensor(both, np.float32)]),
-            plain.graph("plain", [tensor(total, np.float32)]),
-        )[0]
+        any_rollout = w.op("Gather", plan.any_rollout, k)
+        return w.choose(any_rollout, mixed.body("mixed", both), plain.body("plain", total))[0]
 
     def _group(self, step: _Step, stream: str, before: Sequence[str], members: range) -> GraphProto:
         """Neighbouring blocks of which some are computed; gives the stream and the computed residuals."""
         w = self._main.inner()
         value, made = stream, list[str]()
         for b, flag in zip(members, _flags(w, step.computed, members), strict=True):
-            value, residual = w.choose(
-                flag, self._block(step, value, [*before, *made], b), self._reused(w, value, block_name(b))
-            )
+            block, reused = self._block(step, value, [*before, *made], b), self._reused(w, value, block_name(b))
+            value, residual = w.choose(flag, block, reused)
             made.append(residual)
-        return w.graph(f"group_{members.start}", [tensor(n, np.float32) for n in (value, _joined(w, made))])
+        return w.body(f"group_{members.start}", value, _joined(w, made))
 
     def _block(self, step: _Step, stream: str, before: Sequence[str], b: int) -> GraphProto:
         """The gap before a computed block, and the block; gives the stream and the residual as a row."""
@@ -247,24 +226,18 @@ class DenoisingLoop:
         name, piece = block_name(b), self._pieces.blocks[b]
         (residual,) = w.inline(self._models[name], self._feeds(w, piece, value, step.k), self._weights)
         value = w.op("Add", value, residual)
-        row = w.op("Reshape", residual, w.constant([1, -1]))
-        return w.graph(name, [tensor(n, np.float32) for n in (value, row)])
+        return w.body(name, value, w.op("Reshape", residual, w.constant([1, -1])))
 
     def _reused(self, w: GraphWriter, stream: str, name: str) -> GraphProto:
         """The other branch: the stream as it is, and no residuals. What is reused is in the sums of the gaps."""
         inner = w.inner()
-        results = [inner.op("Identity", value) for value in (stream, self._none)]
-        return inner.graph(f"{name}_reused", [tensor(n, np.float32) for n in results])
+        return inner.body(f"{name}_reused", inner.op("Identity", stream), inner.op("Identity", self._none))
 
     def _add_in_step(self, w: GraphWriter, step: _Step, stream: str, before: Sequence[str], b: int) -> str:
-        """Add FORWARD reads, in the gap before block b, of residuals that the step itself has computed.
+        """Add to the stream, in the gap before block b, FORWARD reads of residuals that the step itself has computed.
 
-        Args:
-            w: where.
-            step: of the gap.
-            stream: to add to.
-            before: residuals of the blocks before b, rows of those that were computed.
-            b: number of the block, or of blocks for the step's last gap.
+        The residuals of the blocks ``before`` b are rows of those that were computed; b is the number of blocks for the
+        step's last gap.
         """
         if not any(group in self._groups[:c] for c, group in enumerate(self._groups[:b])):
             return stream  # no block before b has one of its group before it
@@ -276,11 +249,8 @@ class DenoisingLoop:
         share = reads.op("Compress", row, reads.op("Slice", step.computed, *bounds))
         total = reads.op("MatMul", reads.op("Unsqueeze", share, reads.constant([0])), _joined(reads, before))
         added = reads.op("Add", stream, reads.op("Reshape", total, self._shape))
-        return w.choose(
-            w.op("Gather", step.in_step, w.constant(b)),
-            reads.graph("in_step", [tensor(added, np.float32)]),
-            plain.graph("plain", [tensor(same, np.float32)]),
-        )[0]
+        in_step = w.op("Gather", step.in_step, w.constant(b))
+        return w.choose(in_step, reads.body("in_step", added), plain.body("plain", same))[0]
 
     def _fresh_state(self, w: GraphWriter) -> _State:
         """Names for what a body carries."""
@@ -309,11 +279,7 @@ class DenoisingLoop:
         kept = anchor.op("Slice", history, anchor.constant([0]), length, anchor.constant([2]))
         longer = anchor.op("Concat", sample, prediction, kept, axis=2)
         same = other.op("Identity", history)
-        return w.choose(
-            is_anchor,
-            anchor.graph("anchor", [tensor(longer, np.float32)]),
-            other.graph("other", [tensor(same, np.float32)]),
-        )[0]
+        return w.choose(is_anchor, anchor.body("anchor", longer), other.body("other", same))[0]
 
     def _following(self, w: GraphWriter, k: str) -> str:
         """The next step; of the last one itself, whose stream nobody reads."""

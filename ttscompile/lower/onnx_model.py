@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import count
 
 import onnx
 from onnx import AttributeProto, GraphProto, ModelProto, NodeProto, TensorProto, ValueInfoProto, helper
@@ -69,20 +70,21 @@ def name_model(exported: ModelProto, name: str, inputs: Values, constants: Value
         nodes.append(_renamed(node, f"n{index}", names, name))
     types = dict(constants)
     read = {value for node in nodes for value in node.input} | {own for own, _ in outputs}
-    empty = [TensorProto(name=c, dims=_dims(t), data_type=_dtype(t)) for c, t in types.items() if c in read]
+    empty = [TensorProto(name=c, dims=t.at(1), data_type=_dtype(t)) for c, t in types.items() if c in read]
     domains = {node.domain for node in nodes} | {""}
-    return ModelProto(
-        ir_version=IR_VERSION,
-        producer_name="ttscompile",
-        opset_import=[o for o in exported.opset_import if o.domain in domains],
-        graph=GraphProto(
-            name=name,
-            input=[value_info(own, type_) for own, type_ in inputs],
-            output=[value_info(own, type_) for own, type_ in outputs],
-            initializer=[*empty, *kept.values()],
-            node=nodes,
-        ),
+    own_graph = GraphProto(
+        name=name,
+        input=[value_info(own, type_) for own, type_ in inputs],
+        output=[value_info(own, type_) for own, type_ in outputs],
+        initializer=[*empty, *kept.values()],
+        node=nodes,
     )
+    return own_model(own_graph, [o for o in exported.opset_import if o.domain in domains])
+
+
+def own_model(graph: GraphProto, opset_import: Iterable[onnx.OperatorSetIdProto]) -> ModelProto:
+    """A graph of ours as a model."""
+    return ModelProto(ir_version=IR_VERSION, producer_name="ttscompile", opset_import=opset_import, graph=graph)
 
 
 def only(model: ModelProto, inputs: Sequence[ValueInfoProto], outputs: Sequence[ValueInfoProto]) -> ModelProto:
@@ -143,32 +145,16 @@ def _renamed(node: NodeProto, name: str, names: dict[str, str], model: str) -> N
     for attribute in node.attribute:
         if attribute.type in (AttributeProto.GRAPH, AttributeProto.GRAPHS):
             raise LoweringError(f"{model}: {node.op_type} has a subgraph. Control flow on data cannot be compiled.")
-    attributes = []
+    inputs, outputs = ([names.get(value, value) for value in values] for values in (node.input, node.output))
+    renamed = NodeProto(name=name, op_type=node.op_type, domain=node.domain, input=inputs, output=outputs)
     for attribute in sorted(node.attribute, key=lambda a: a.name):
-        copy = AttributeProto()
-        copy.CopyFrom(attribute)
-        copy.ClearField("doc_string")
-        attributes.append(copy)
-    return NodeProto(
-        name=name,
-        op_type=node.op_type,
-        domain=node.domain,
-        input=[names.get(value, value) for value in node.input],
-        output=[names.get(value, value) for value in node.output],
-        attribute=attributes,
-    )
+        renamed.attribute.add().CopyFrom(attribute)
+        renamed.attribute[-1].ClearField("doc_string")
+    return renamed
 
 
 def _fresh_names(prefix: str, taken: set[str]) -> Iterator[str]:
-    number = 0
-    while True:
-        if f"{prefix}{number}" not in taken:
-            yield f"{prefix}{number}"
-        number += 1
-
-
-def _dims(type_: TensorType) -> list[int]:
-    return [n for n in type_.shape if isinstance(n, int)]
+    return (name for name in (f"{prefix}{number}" for number in count()) if name not in taken)
 
 
 def _dtype(type_: TensorType) -> int:

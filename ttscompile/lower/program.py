@@ -74,24 +74,24 @@ def lower_program(program: Program) -> dict[str, onnx.ModelProto]:
 
 def structural_key(graph: Graph) -> str:
     """Equal for two graphs that differ in the names of their values only; independent of the process."""
-    canonical = _canonical(graph)
-    return "\n".join(
-        [
-            repr(list(canonical.inputs.items())),
-            repr(list(canonical.constants.items())),
-            *(repr((n.name, n.op, n.args, n.kwargs, n.types)) for n in canonical.nodes),
-            repr(canonical.outputs),
-        ]
+    graph = _in_order_of_use(graph)
+    names = {name: f"i{i}" for i, name in enumerate(graph.inputs)}
+    names |= {name: f"c{i}" for i, name in enumerate(graph.constants)}
+    names |= {node.name: f"n{i}" for i, node in enumerate(graph.nodes)}
+    canonical = Graph(
+        inputs={names[n]: t for n, t in graph.inputs.items()},
+        constants={names[n]: t for n, t in graph.constants.items()},
+        nodes=tuple(replace(n.renamed(names.__getitem__), name=names[n.name], source="") for n in graph.nodes),
+        outputs=tuple(names[n] for n in graph.outputs),
     )
+    return repr(canonical)
 
 
 def _lower(graphs: dict[str, Graph]) -> dict[str, onnx.ModelProto]:
     """Lower graphs, those of one structure with one export."""
     for name, graph in graphs.items():
         if len(set(graph.outputs)) != len(graph.outputs):
-            raise LoweringError(
-                f"{name}: the outputs {graph.outputs} hold a value twice; each needs a name of its own."
-            )
+            raise LoweringError(f"{name}: the outputs {graph.outputs} hold a value twice; give each a name of its own.")
     sunk = {name: _in_order_of_use(sink_layout(graph)) for name, graph in graphs.items()}
     keys = {name: structural_key(graph) for name, graph in sunk.items()}
     first = {keys[name]: name for name in reversed(sunk)}
@@ -110,20 +110,6 @@ def _in_order_of_use(graph: Graph) -> Graph:
     used = dict.fromkeys(name for node in graph.nodes for name in node.refs() if name in graph.constants)
     order = [*used, *(name for name in graph.constants if name not in used)]
     return replace(graph, constants={name: graph.constants[name] for name in order})
-
-
-def _canonical(graph: Graph) -> Graph:
-    """The graph with its values called by their positions."""
-    graph = _in_order_of_use(graph)
-    names = {name: f"i{i}" for i, name in enumerate(graph.inputs)}
-    names |= {name: f"c{i}" for i, name in enumerate(graph.constants)}
-    names |= {node.name: f"n{i}" for i, node in enumerate(graph.nodes)}
-    return Graph(
-        inputs={names[n]: t for n, t in graph.inputs.items()},
-        constants={names[n]: t for n, t in graph.constants.items()},
-        nodes=tuple(replace(n.renamed(names.__getitem__), name=names[n.name], source="") for n in graph.nodes),
-        outputs=tuple(names[n] for n in graph.outputs),
-    )
 
 
 def _export(graphs: dict[str, Graph]) -> dict[str, onnx.ModelProto]:
@@ -160,7 +146,7 @@ def _run_exporter(graphs: list[Graph]) -> onnx.ModelProto:
     for i, graph in enumerate(graphs):
         streams = torch.export.Dim(f"B{i}", min=1)
         for type_ in (*graph.inputs.values(), *graph.constants.values()):
-            examples.append(_example(type_))
+            examples.append(torch.zeros(type_.at(EXAMPLE_STREAMS), dtype=getattr(torch, type_.dtype)))
             sizes = [(axis, n.multiple) for axis, n in enumerate(type_.shape) if isinstance(n, Batch)]
             dynamic.append({axis: multiple * streams if multiple > 1 else streams for axis, multiple in sizes})
     with _quiet(), without_stack_traces(), torch.no_grad():
@@ -169,10 +155,6 @@ def _run_exporter(graphs: list[Graph]) -> onnx.ModelProto:
         result = torch.onnx.export(program, (), dynamo=True, opset_version=OPSET, verbose=False)
     assert result is not None
     return result.model_proto
-
-
-def _example(type_: TensorType) -> torch.Tensor:
-    return torch.zeros(type_.at(EXAMPLE_STREAMS), dtype=getattr(torch, type_.dtype))
 
 
 def _build(graphs: list[Graph]) -> torch.fx.GraphModule:

@@ -48,7 +48,7 @@ from ..ir.program import Program
 from .contexts import Contexts
 from .graph_writer import GraphWriter, Weights, tensor
 from .loop import GROUP, DenoisingLoop, LoopInputs
-from .onnx_model import IR_VERSION, opsets
+from .onnx_model import opsets, own_model
 from .plan import LoweredPlan, lower_plan
 
 CORRECTION, CORRECTION_BIAS, ANCHORS = "correction", "correction_bias", "correction_anchors"
@@ -95,12 +95,7 @@ def lower_single_file(program: Program, models: Mapping[str, ModelProto], weight
     _write_actions(main, sample, spec)
     main.rename(plan.executed, "executed_plan")
     _write_cache(main, plan, stored, residuals, (spec.sampler.steps, len(groups)))
-    model = ModelProto(
-        ir_version=IR_VERSION,
-        producer_name="ttscompile",
-        opset_import=opsets(models.values()),
-        graph=main.graph("ttscompile", outputs, inputs),
-    )
+    model = own_model(main.graph("ttscompile", outputs, inputs), opsets(models.values()))
     if model.ByteSize() > LARGEST:
         raise LoweringError(
             f"the single file would have {model.ByteSize() / 1e9:.1f} GB; an ONNX file holds at most 2."
