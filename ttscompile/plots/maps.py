@@ -97,9 +97,9 @@ def plot_errors(
     above = np.argwhere(~(errors <= tolerance))
     marked = np.zeros((0, 2), int) if cells is None else np.argwhere(cells[list(steps)])
     if len(above):
-        axes.scatter(*above.T, s=9, marker="s", facecolors="none", edgecolors="#d55e00", linewidths=0.9)
+        axes.scatter(above[:, 0], above[:, 1], s=9, marker="s", facecolors="none", edgecolors="#d55e00", linewidths=0.9)
     if len(marked):
-        axes.scatter(*marked.T, s=12, marker="x", color="#f0e442", linewidths=0.9)
+        axes.scatter(marked[:, 0], marked[:, 1], s=12, marker="x", color="#f0e442", linewidths=0.9)
     told = f"{len(above)} of {errors.size} residuals differ by more than {tolerance:g} (framed)"
     if plan is not None:
         told += f"; {len(marked)} cells of plan {plan!r} are not those stored (crossed)"
