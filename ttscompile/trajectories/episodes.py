@@ -23,7 +23,7 @@ from ..core.spec import ObservationSpec
 from ..core.untrusted_json import parse_json
 from ..errors import TrajectoryError
 from .apart import frames_apart
-from .frames import Frames, few, observation_frames, require_proportion
+from .frames import Frames, few, observation_frames, one_error, require_proportion
 
 Array = npt.NDArray[Any]
 
@@ -138,7 +138,7 @@ def _npz(path: Path) -> tuple[Frames, bool]:
 
 
 _ENDS_ARE = "for each episode the row after its last, increasing"
-_SAVEZ = "Use np.savez with plain arrays."
+_SAVEZ = "Use np.savez with plain arrays"
 
 
 def read_npz(path: Path) -> dict[str, Array]:
@@ -154,21 +154,17 @@ def read_npz(path: Path) -> dict[str, Array]:
             f"{path}: expected an .npz, a zarr replay buffer of Diffusion Policy, an HDF5 file of robomimic or a"
             " LeRobot data set; found a directory that is none of these."
         )
-    try:
-        with path.open("rb") as handle:  # numpy leaves it open where it finds no archive
-            file = np.load(handle, allow_pickle=False)
-            if not isinstance(file, np.lib.npyio.NpzFile):
-                raise TrajectoryError(f"{path}: expected an .npz with several arrays; found a single one. {_SAVEZ}")
-            with file:
-                archive: Any = file.zip  # nothing has been decompressed yet
-                total = sum(entry.file_size for entry in archive.infolist())
-                require_proportion(path, total, path.stat().st_size)
-                return {name: np.asarray(file[name]) for name in file.files}
-    except TrajectoryError:
-        raise
-    except Exception as error:  # numpy parses the headers as Python text, and raises whatever its parts raise
-        told = f"{path}: cannot be read as .npz ({str(error)[:200]}): no such file, truncated, or with Python objects"
-        raise TrajectoryError(f"{told} in it, which are never loaded. Record it again. {_SAVEZ}") from error
+    hint = f": no such file, truncated, or with Python objects in it, which are never loaded. Record it again. {_SAVEZ}"
+    # numpy parses headers as Python text, and raises whatever its parts raise; it leaves open what is no archive.
+    with one_error(f"{path}: cannot be read as .npz", hint), path.open("rb") as handle:
+        file = np.load(handle, allow_pickle=False)
+        if not isinstance(file, np.lib.npyio.NpzFile):
+            raise TrajectoryError(f"{path}: expected an .npz with several arrays; found a single one. {_SAVEZ}.")
+        with file:
+            archive: Any = file.zip  # nothing has been decompressed yet
+            total = sum(entry.file_size for entry in archive.infolist())
+            require_proportion(path, total, path.stat().st_size)
+            return {name: np.asarray(file[name]) for name in file.files}
 
 
 def _other_format(path: Path) -> str | None:
@@ -194,10 +190,8 @@ def _meta(path: Path, value: Array | None) -> bool:
             meta = parse_json(text if isinstance(text, bytes) else text.encode(), MAX_META)
     frames = meta.get("frames", False) if isinstance(meta, dict) else None
     if not isinstance(frames, bool):
-        raise TrajectoryError(
-            f"{path}: expected {META!r} to be a JSON object in a string array, such as '{{\"frames\": true}}';"
-            f" found {str(value)[:80]!r}."
-        )
+        told = f"{path}: expected {META!r} to be a JSON object in a string array, such as '{{\"frames\": true}}'"
+        raise TrajectoryError(f"{told}; found {str(value)[:80]!r}.")
     return frames
 
 
@@ -229,8 +223,8 @@ def _checked(path: Path, key: str, array: Array, spec: ObservationSpec, frames: 
         cast = array.astype(wanted)
     if wanted.kind != "f" and not np.array_equal(cast, array):
         raise TrajectoryError(f"{path}: {key!r} holds numbers that {wanted} cannot; expected values of that dtype.")
-    bad = np.flatnonzero(~np.isfinite(cast.reshape(len(cast), -1)).all(1)) if wanted.kind == "f" else []
-    if len(bad):
+    if wanted.kind == "f" and not np.isfinite(cast).all():
+        bad = np.flatnonzero(~np.isfinite(cast.reshape(len(cast), -1)).all(1))
         told = f"{path}: {key!r} holds NaN or infinity in {len(bad)} rows, the first of them row {bad[0]}"
         raise TrajectoryError(f"{told}. Leave the episodes with broken sensors out.")
     return cast

@@ -27,8 +27,6 @@ BLOCK_BYTES = 32 * 2**20
 AS_NPZ = "save the observations as an .npz."
 """What can be done about any recording that is not read."""
 
-_SHOWN = 8
-
 
 @dataclass(frozen=True)
 class Frames:
@@ -109,16 +107,14 @@ def _part(path: Path, frames: Frames, key: str, part: str) -> Array:
         return array
     flat = _flat(path, name, array)
     if not count.isdecimal() or not 0 < int(count) <= flat.shape[1]:
-        raise TrajectoryError(
-            f"{path}: {part!r} for the observation {key!r}: expected after the colon how many of the"
-            f" {flat.shape[1]} numbers of {name!r} are taken."
-        )
+        told = f"{path}: {part!r} for the observation {key!r}: expected after the colon how many of the"
+        raise TrajectoryError(f"{told} {flat.shape[1]} numbers of {name!r} are taken.")
     return flat[:, : int(count)]
 
 
 def few(names: Sequence[str]) -> str:
     """The first names, and how many there are: an archive of something else may have thousands."""
-    return ", ".join(names[:_SHOWN]) + f", .. ({len(names)} in all)" * (len(names) > _SHOWN)
+    return ", ".join(names[:8]) + f", .. ({len(names)} in all)" * (len(names) > 8)
 
 
 def _flat(path: Path, name: str, array: Array) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -196,7 +196,7 @@ def _replay(
     """
     obs, correction = golden.network_observations(artifact.manifest.spec), artifact.corrections.get(name)
 
-    def episode(plans: Sequence[Any], **named: Any) -> tuple[PlanArray, npt.NDArray[Any]]:
+    def episode(plans: Iterable[Any], **named: Any) -> tuple[PlanArray, npt.NDArray[Any]]:
         made, samples = [], []
         runtime.reset()
         for order, plan in zip((1, -1), plans, strict=True):
