@@ -73,10 +73,9 @@ def check_observation(obs: Mapping[str, Any], specs: Mapping[str, ObservationSpe
         raise ObservationError(f"the observation is a {type(obs).__name__}; expected {expected}.")
     missing, unexpected = sorted(set(specs) - set(obs)), sorted(map(str, set(obs) - set(specs)))
     if missing or unexpected:
-        raise ObservationError(
-            f"expected the observation keys {sorted(specs)}; found {sorted(map(str, obs))}"
-            f" (missing: {missing}, unexpected: {unexpected}). Give exactly the keys that the policy was compiled for."
-        )
+        found = f"{sorted(map(str, obs))} (missing: {missing}, unexpected: {unexpected})"
+        remedy = "Give exactly the keys that the policy was compiled for."
+        raise ObservationError(f"expected the observation keys {sorted(specs)}; found {found}. {remedy}")
     arrays = {key: _one(key, as_array(obs[key], f"observation {key!r}"), spec) for key, spec in specs.items()}
     counts = {key: len(array) for key, array in arrays.items()}
     if len(set(counts.values())) > 1:
@@ -112,20 +111,17 @@ def _check_bounds(key: str, array: Array, spec: ObservationSpec) -> None:
     low, high = (np.asarray(each) for each in spec.bounds)
     if not spec.image:
         if (array < low).any() or (array > high).any():
-            raise ObservationError(
-                f"observation {key!r} must hold integers of {low.min():.0f} to {high.max():.0f}; found {array.min()} to"
-                f" {array.max()}. Tokens must come from the tokenizer that the policy was trained with."
-            )
+            found = f"integers of {low.min():.0f} to {high.max():.0f}; found {array.min()} to {array.max()}"
+            remedy = "Tokens must come from the tokenizer that the policy was trained with."
+            raise ObservationError(f"observation {key!r} must hold {found}. {remedy}")
         return
     least, most, room = float(array.min()), float(array.max()), 0.1 * float(high[0] - low[0])
     if least < low[0] - room or most > high[0] + room:
         remedy = "Give what the camera measures, not normalised: the policy does that itself."
         if most > high[0] + room and least >= 0 and high[0] == 1:
             remedy = "Divide by 255, channels first."
-        raise ObservationError(
-            f"observation {key!r} is an image and must hold numbers of {low[0]:g} to {high[0]:g}; found {least:.6g} to"
-            f" {most:.6g}. {remedy}"
-        )
+        found = f"numbers of {low[0]:g} to {high[0]:g}; found {least:.6g} to {most:.6g}"
+        raise ObservationError(f"observation {key!r} is an image and must hold {found}. {remedy}")
 
 
 def _image_remedy(array: Array, spec: ObservationSpec) -> str:

@@ -106,7 +106,5 @@ def fitting(artifact: Artifact) -> Iterator[None]:
     except (TtscompileError, ModuleNotFoundError):
         raise
     except Exception as error:
-        raise ArtifactError(
-            f"{artifact.path}: its manifest, tables and graphs do not fit each other"
-            f" ({type(error).__name__}: {str(error)[:300]}). Convert the checkpoint again."
-        ) from error
+        problem = f"its manifest, tables and graphs do not fit each other ({type(error).__name__}: {str(error)[:300]})"
+        raise ArtifactError(f"{artifact.path}: {problem}. Convert the checkpoint again.") from error

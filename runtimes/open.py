@@ -80,6 +80,5 @@ def open_runtime(artifact: Artifact, runtime: str = "onnxruntime", threads: int 
         with fitting(artifact):
             return Runtime(artifact, kind.make(artifact, threads))
     except ModuleNotFoundError as error:
-        raise RuntimeUnavailableError(
-            f"runtime {runtime!r} needs {error.name!r}, which is not installed. Run: pip install '{kind.install}'."
-        ) from error
+        problem = f"runtime {runtime!r} needs {error.name!r}, which is not installed"
+        raise RuntimeUnavailableError(f"{problem}. Run: pip install '{kind.install}'.") from error

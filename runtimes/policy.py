@@ -107,9 +107,8 @@ def load(
     artifact = load_artifact(path)
     if kind_of(runtime).fp32_only:
         if precision not in (None, FP32):
-            raise RuntimeUnavailableError(
-                f"runtime {runtime!r} computes in {FP32!r} alone; found precision {precision!r}. Leave it out."
-            )
+            problem = f"runtime {runtime!r} computes in {FP32!r} alone; found precision {precision!r}"
+            raise RuntimeUnavailableError(f"{problem}. Leave it out.")
         precision = FP32
     if precision is not None:
         artifact = artifact.at_precision(precision)
@@ -323,8 +322,7 @@ class CompiledPolicy:
         if plan == DENSE:
             return self._artifact.schedule(DENSE), DENSE, False
         _require_plan(self._artifact, plan)
-        record = self._manifest.plans[plan]
-        return (None if record.pruned else self._artifact.schedule(plan)), plan, True
+        return (None if self._manifest.plans[plan].pruned else self._artifact.schedule(plan)), plan, True
 
     def _example(self, batch: Mapping[str, Any]) -> Any:
         """A tensor among the observations of a batch, if there is one; what else it holds is not ours."""

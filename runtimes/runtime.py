@@ -36,19 +36,12 @@ from .settle import LoweringCache, pruner_plan, repair_plan
 
 @dataclass(frozen=True, eq=False)
 class _Settled:
-    """The plan that a call executes, and what it took to have it.
+    """The plan that a call executes, and what it took to have it."""
 
-    Attributes:
-        plans: int8 ``[B, K, blocks]``.
-        lowered: of each stream, by the backend.
-        legalised: replaced cells of each stream.
-        pruner: ms that the pruner took, from the condition values to the instructions; 0 if the plan was given.
-    """
-
-    plans: PlanArray
-    lowered: tuple[Any, ...]
-    legalised: tuple[int, ...]
-    pruner: float = 0.0
+    plans: PlanArray  # int8 [B, K, blocks]
+    lowered: tuple[Any, ...]  # of each stream, by the backend
+    legalised: tuple[int, ...]  # replaced cells of each stream
+    pruner: float = 0.0  # ms, from the condition values to the instructions; 0 if the plan was given
 
 
 class Runtime:
@@ -201,9 +194,8 @@ class Runtime:
             _, k, b = np.argwhere(rollout & dropped)[0].tolist()
             raise IllegalPlanError(
                 f"the plan reads the ROLLOUT residual of step {k}, block {b}, which an earlier call of this episode"
-                " computed with a plan of the artifact, and did not keep: no plan of the artifact reads it."
-                " Begin the episode with a matrix (one of zeros computes all, as plan='dense' does): from a first"
-                " matrix on every call keeps what it computes."
+                " computed with a plan of the artifact, and did not keep. Begin the episode with a matrix (one of zeros"
+                " computes all, as plan='dense' does): from a first matrix on every call keeps what it computes."
             )
         check = partial(require_legal, plans, self._groups, written)
         if (rollout & ~written).any():

@@ -42,10 +42,8 @@ def pruner_plan(logits: npt.NDArray[np.float32]) -> PlanArray:
         IllegalPlanError: the logits are not numbers.
     """
     if np.isnan(logits).any():
-        raise IllegalPlanError(
-            "the pruner's logits hold NaN, so there is no plan to execute: its weights are broken."
-            " Calibrate the artifact again, or use plan='dense'."
-        )
+        problem = "the pruner's logits hold NaN, so there is no plan to execute: its weights are broken."
+        raise IllegalPlanError(f"{problem} Calibrate the artifact again, or use plan='dense'.")
     plan: PlanArray = np.argmax(logits, axis=-1).astype(np.int8)
     return plan
 

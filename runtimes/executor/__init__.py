@@ -13,10 +13,10 @@ Everything that decides is a state machine without clock or thread, driven by ``
 
 from __future__ import annotations
 
-from .clock import Clock, MonotonicClock
 from .executor import AsyncExecutor
 from .feasibility import Feasibility
 from .guard import GuardLimits
+from .measure import Clock, MonotonicClock
 from .settings import ExecutorSettings
 from .statistics import ExecutorStatistics
 

@@ -28,9 +28,8 @@ from ttscompile.core.spec import FloatArray
 from ttscompile.errors import ExecutorClosedError, ExecutorError, WorkerDeadError
 from ttscompile.runtimes.arrays import check_seed
 
-from .clock import Clock, MonotonicClock
 from .feasibility import Feasibility, LatencyWindow, fast_enough
-from .measure import measure_latencies, require_prefix
+from .measure import Clock, MonotonicClock, measure_latencies, require_prefix
 from .settings import ExecutorSettings, Policy, resolve
 from .state import ExecutorState, Job
 from .statistics import ExecutorStatistics, statistics
@@ -205,10 +204,8 @@ class AsyncExecutor:
             self._news.notify_all()
         self._thread.join(timeout)
         if self._thread.is_alive():
-            raise ExecutorError(
-                f"the policy is still in a call, {timeout:g} s after close(): it hangs, or is slower than that. Its"
-                " thread is left behind; do not use the policy again."
-            )
+            what = f"the policy is still in a call, {timeout:g} s after close(): it hangs, or is slower than that"
+            raise ExecutorError(f"{what}. Its thread is left behind; do not use the policy again.")
         if not self._failure_told:
             self._raise_failure()
 
@@ -285,10 +282,9 @@ class AsyncExecutor:
         failure = self._failure
         if failure is not None:
             self._failure_told = True
-            raise WorkerDeadError(
-                f"the thread that owns the policy has ended, because a call raised {type(failure).__name__}: {failure}."
-                " Stop the robot safely; close this executor, and make another one when the cause is gone."
-            ) from failure
+            raised = f"a call raised {type(failure).__name__}: {failure}"
+            remedy = "Stop the robot safely; close this executor, and make another one when the cause is gone."
+            raise WorkerDeadError(f"the thread that owns the policy has ended, because {raised}. {remedy}") from failure
 
     # The worker's side
 
@@ -354,10 +350,8 @@ class AsyncExecutor:
         last = resolved.first + resolved.horizon + resolved.reserve
         streams, steps, channels = predicted.shape if predicted.ndim == 3 else (0, 0, 0)
         if streams != 1 or steps < last or channels != resolved.channels:
-            raise ExecutorError(
-                f"the policy's action_pred has shape {list(predicted.shape)}; expected [1, T, Da] with T of at least"
-                f" {last} and Da = {resolved.channels}."
-            )
+            expected = f"[1, T, Da] with T of at least {last} and Da = {resolved.channels}"
+            raise ExecutorError(f"the policy's action_pred has shape {list(predicted.shape)}; expected {expected}.")
         actions: npt.NDArray[np.float32] = predicted[0, resolved.first : last].astype(np.float32)
         with self._lock:
             now = self._clock.now()
@@ -377,6 +371,5 @@ def _pin(cores: tuple[int, ...]) -> None:
         os.sched_setaffinity(0, cores)
     except OSError as error:
         usable = sorted(os.sched_getaffinity(os.getpid()))
-        raise ExecutorError(
-            f"the policy's thread cannot be pinned to {cores}: {error}. This process may use {usable}."
-        ) from error
+        problem = f"the policy's thread cannot be pinned to {cores}: {error}"
+        raise ExecutorError(f"{problem}. This process may use {usable}.") from error

@@ -119,24 +119,19 @@ class Feasibility:
 
 
 def fast_enough(judged: Mapping[str, Feasibility], refuse: bool) -> tuple[str, ...]:
-    """The plans that keep up, in their order.
-
-    Args:
-        judged: by name of the plan, slowest first.
-        refuse: raise if none does; else the last is taken all the same.
+    """The plans that keep up, of those judged by name, slowest first. If none does, the last is taken all the same.
 
     Raises:
-        InfeasibleError: none keeps up; has the arithmetic of each.
+        InfeasibleError: none keeps up, and this is to be refused; has the arithmetic of each.
     """
     possible = tuple(name for name, each in judged.items() if each.feasible)
     if possible or not refuse:
         return possible or tuple(judged)[-1:]
     sums = "; ".join(f"plan {name!r}: {each.explain()}" for name, each in judged.items())
     longest = next(iter(judged.values())).max_latency
-    raise InfeasibleError(
-        f"no plan is fast enough for this loop. {sums}. Use a plan whose calls take at most {1e3 * longest:.4g} ms, a"
-        " lower rate, or more of each chunk (ExecutorSettings.horizon and reserve)."
-    )
+    remedy = "a lower rate, or more of each chunk (ExecutorSettings.horizon and reserve)"
+    plan = f"a plan whose calls take at most {1e3 * longest:.4g} ms"
+    raise InfeasibleError(f"no plan is fast enough for this loop. {sums}. Use {plan}, {remedy}.")
 
 
 class LatencyWindow:

@@ -1,13 +1,14 @@
-"""What is measured before a policy drives a robot: what its calls take, and how punctual a loop is beside them."""
+"""Time as the executor sees it; and what is measured by it: what calls take, and how punctual a loop is beside them."""
 
 from __future__ import annotations
 
 import inspect
+import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -16,8 +17,36 @@ from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import ExecutorError
 from ttscompile.measure.timer import Timer, Times
 
-from .clock import Clock
 from .settings import ExecutorSettings, Policy
+
+
+class Clock(Protocol):
+    """A clock that never goes back, and the only way in which the executor waits."""
+
+    def now(self) -> float:
+        """Seconds since some fixed moment."""
+
+    def wait(self, condition: threading.Condition, timeout: float | None) -> None:
+        """Wait until the condition is notified or ``timeout`` seconds of this clock have passed.
+
+        May return early; callers look again at what they wait for.
+
+        Args:
+            condition: held by the caller; released while waiting.
+            timeout: seconds; None for no limit.
+        """
+
+
+class MonotonicClock:
+    """``time.monotonic``: the same in every process of the machine, so frames can be stamped elsewhere."""
+
+    def now(self) -> float:
+        """Seconds since some fixed moment."""
+        return time.monotonic()
+
+    def wait(self, condition: threading.Condition, timeout: float | None) -> None:
+        """See ``Clock.wait``."""
+        condition.wait(None if timeout is None else min(timeout, threading.TIMEOUT_MAX))
 
 
 def require_prefix(policy: Policy) -> None:
@@ -26,10 +55,8 @@ def require_prefix(policy: Policy) -> None:
     refusal = getattr(policy.info, "prefix_refusal", None)
     if not takes or refusal is not None:
         why = f"this one does not: {refusal}" if takes else f"{type(policy).__name__} does not."
-        raise ExecutorError(
-            "seam='prefix' needs a policy whose predict_action takes prefix= and inpaints it;"
-            f" {why} Use seam='blend' or seam='replace'."
-        )
+        needed = "seam='prefix' needs a policy whose predict_action takes prefix= and inpaints it"
+        raise ExecutorError(f"{needed}; {why} Use seam='blend' or seam='replace'.")
 
 
 def neutral_observation(specs: dict[str, ObservationSpec]) -> dict[str, npt.NDArray[Any]]:

@@ -57,10 +57,9 @@ class Schedule:
             raise ExecutorError(f"an action was asked for {time - now:.6g} s from now. {remedy}")
         tick = self.grid.tick(time)
         if self.last is not None and tick < self.last[0]:
-            raise ExecutorError(
-                f"an action was asked for {self.last[0] - tick} ticks before the last one that was given out. Times"
-                " must not go backwards within an episode; one control loop asks for actions."
-            )
+            what = f"an action was asked for {self.last[0] - tick} ticks before the last one that was given out"
+            remedy = "Times must not go backwards within an episode; one control loop asks for actions."
+            raise ExecutorError(f"{what}. {remedy}")
         return tick
 
     def give(self, tick: int, action: FloatArray, time: float) -> None:

@@ -21,7 +21,7 @@ from .executor import AsyncExecutor
 from .protocol import Request, answer, failure, read_frame, read_request
 
 if TYPE_CHECKING:
-    from websockets.asyncio.server import Server, ServerConnection
+    from websockets.asyncio.server import ServerConnection
     from websockets.http11 import Request as Handshake
     from websockets.http11 import Response
 
@@ -90,14 +90,13 @@ class ExecutorServer:
         try:
             from websockets.asyncio.server import serve
         except ModuleNotFoundError as error:
-            raise RuntimeUnavailableError(
-                f"the server needs {error.name}, which is not installed. Run: pip install 'ttscompile[serve]'."
-            ) from error
+            problem = f"the server needs {error.name}, which is not installed"
+            raise RuntimeUnavailableError(f"{problem}. Run: pip install 'ttscompile[serve]'.") from error
         limits = self._limits
         quiet = logging.getLogger("ttscompile.serve.socket")
         quiet.setLevel(logging.CRITICAL)  # what clients do wrong is told to them
         try:
-            server: Server = await serve(
+            server = await serve(
                 self._client,
                 host,
                 port,

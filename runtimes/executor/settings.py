@@ -115,29 +115,15 @@ class ExecutorSettings:
 
 @dataclass(frozen=True)
 class Resolved:
-    """Settings with everything that follows from the policy filled in.
-
-    Attributes:
-        control_hz: ticks a second.
-        policy_hz: frames and actions a second.
-        ticks_per_step: control ticks that an action lasts.
-        horizon: actions of a chunk that are played.
-        reserve: actions after these that may be.
-        first: index of the first of them in ``action_pred``.
-        channels: Da.
-        frames: shapes and dtypes of what one frame holds.
-        max_age: seconds.
-        tiers: plans, slowest first.
-        margin_ticks: control ticks that a chunk shall be there before it is needed.
-    """
+    """Settings with everything that follows from the policy filled in; see ``ExecutorSettings``."""
 
     control_hz: float
-    policy_hz: float
-    ticks_per_step: int
+    policy_hz: float  # of frames and actions
+    ticks_per_step: int  # that an action lasts
     horizon: int
     reserve: int
-    first: int
-    channels: int
+    first: int  # index in ``action_pred`` of the first action that is played
+    channels: int  # Da
     frames: FrameSpec
     max_age: float
     tiers: tuple[str, ...]
@@ -159,10 +145,9 @@ def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> 
     policy_hz = settings.policy_hz or control_hz
     ticks_per_step = round(control_hz / policy_hz)
     if ticks_per_step < 1 or abs(ticks_per_step * policy_hz - control_hz) > 1e-6 * control_hz:
-        raise ExecutorError(
-            f"control_hz = {control_hz:g} is no multiple of policy_hz = {policy_hz:g}: an action would last"
-            f" {control_hz / policy_hz:.4g} ticks. Run the loop at a multiple of the policy's rate."
-        )
+        what = f"control_hz = {control_hz:g} is no multiple of policy_hz = {policy_hz:g}"
+        lasts = f"an action would last {control_hz / policy_hz:.4g} ticks"
+        raise ExecutorError(f"{what}: {lasts}. Run the loop at a multiple of the policy's rate.")
     chunk, tiers = info.action, settings.tiers or (info.default_plan,)
     longest = info.sample[0] - chunk.start
     horizon = settings.horizon or chunk.stop - chunk.start

@@ -67,15 +67,7 @@ def _together(work: Workspace, lowered: Instructions, keep: BoolArray) -> None:
 
 
 def _run_some(work: Workspace, lane: _Lane, k: int, done: int, kept: Sequence[bool]) -> None:
-    """A step that computes some blocks, or none.
-
-    Args:
-        work: at step k.
-        lane: of all streams.
-        k: the step.
-        done: how many cells were computed before it.
-        kept: by block, whether its residual goes into the rollout cache.
-    """
+    """Step k, which computes some blocks, or none, after ``done`` cells; ``kept`` says whose residual is, by block."""
     lowered, stream, current, blocks = lane.lowered, lane.stream, lane.current, len(kept)
     count = lowered.counts[k]
     fresh = before = _flat(work.fresh, 0)  # the first operation takes the stream from there
@@ -169,13 +161,8 @@ def _run_dense_apart(work: Workspace, lanes: Sequence[_Lane], streams: Sequence[
 class _Lane:
     """What the instructions of one plan work on: the whole batch, or one stream of it, as views.
 
-    Args:
-        lowered: the instructions.
-        stream: ``[...]``.
-        current: ``[blocks, ...]``.
-        table: ``[blocks, ...]``.
-        sums: ``[slots, ...]``.
-        entries: of the rollout cache, those that the plan reads, by flat index.
+    ``current`` and ``table`` are ``[blocks, *stream]``, ``sums`` are ``[slots, *stream]``, and ``entries`` those of the
+    rollout cache that the plan reads, by flat index.
     """
 
     def __init__(

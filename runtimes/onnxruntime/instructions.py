@@ -141,12 +141,8 @@ def instructions_of(plan: PlanArray, groups: Sequence[int]) -> Instructions:
 def _makers(cells: Cells, starts: Positions, stops: Positions) -> dict[int, int]:
     """For each gap that adds the same residuals as an earlier one, the first such gap.
 
-    With FORWARD other blocks may add them; those of one residual or in the same order are found, nearly all.
-
-    Args:
-        cells: residual of every cell, ``[K, blocks + 1]``.
-        starts: where the gaps begin, flat.
-        stops: where they end.
+    With FORWARD other blocks may add them; those of one residual or in the same order are found, nearly all. ``cells``
+    are ``[K, blocks + 1]``, the residual of each; gaps go from ``starts`` to ``stops``, flat.
     """
     total = np.cumsum(cells)
     hashed = (total[stops - 1] - total[starts - 1]) & 8191  # most are the only ones of theirs, and need no comparison
@@ -158,14 +154,9 @@ def _makers(cells: Cells, starts: Positions, stops: Positions) -> dict[int, int]
 
 
 def _slots(maker: dict[int, int], gaps: int) -> tuple[list[int], int]:
-    """A place for every sum, given to another one after its last use.
+    """The place of each gap's sum, given to another one after its last use, and how many places there are.
 
-    Args:
-        maker: see ``_makers``.
-        gaps: how many there are.
-
-    Returns:
-        Place of each gap's sum, and how many places there are: the last one is of the sums that are used once.
+    The last one is of the sums that are used once.
     """
     last_use = {first: gap for gap, first in maker.items()}
     until: list[int] = []  # of each place, the last use of the sum that it holds
@@ -180,12 +171,7 @@ def _slots(maker: dict[int, int], gaps: int) -> tuple[list[int], int]:
 
 
 def _changes(cells: Cells, made: Positions) -> BoolArray:
-    """Of reused cells in sums that are made, whether the table's row holds another residual than the one they add.
-
-    Args:
-        cells: residual of every cell, ``[K, blocks + 1]``.
-        made: the cells, flat and in order.
-    """
+    """Of cells in sums that are made, flat and in order, whether the table's row holds another residual than theirs."""
     flat, last = cells.reshape(-1), np.full(cells.shape, -1, np.int32)  # -1: the last column's, which is UNWRITTEN
     last.reshape(-1)[made] = made
     held = np.maximum.accumulate(last, axis=0).reshape(-1)[made - cells.shape[1]]

@@ -79,11 +79,9 @@ class Workspace:
         size = self._sampler.memories * horizon
         self._memory = [np.zeros((dimensions, streams, size), np.float32) for _ in range(2 * bool(size))]
         self._prediction = np.zeros_like(self.sample[0])
-        self.idle = (
-            IdleSteps(sessions[IDLE], self._sampler, manifest.spec.sample, streams, shape)
-            if IDLE in manifest.pieces
-            else None
-        )
+        self.idle: IdleSteps | None = None
+        if IDLE in manifest.pieces:
+            self.idle = IdleSteps(sessions[IDLE], self._sampler, manifest.spec.sample, streams, shape)
         self._no_correction = no_correction(self._steps, manifest.spec.sample)
         # By the correction's identity, which the entry keeps from reuse, and whether there is a prefix.
         self._advances: dict[tuple[int, bool], _Advances] = {}

@@ -110,8 +110,7 @@ class ReferenceModel:
     @classmethod
     def from_program(cls, program: Program) -> ReferenceModel:
         """The model of a program in memory, after all passes."""
-        types = [block.type for block in program.blocks]
-        groups = [block.group for block in program.blocks]
+        types, groups = zip(*((block.type, block.group) for block in program.blocks), strict=True)
         return cls(program.pieces, program.spec, types, groups, program.weights)
 
     @classmethod

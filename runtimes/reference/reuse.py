@@ -39,23 +39,14 @@ class Caches:
 
 @dataclass(frozen=True)
 class Cell:
-    """One cell for all streams.
-
-    Attributes:
-        k: step.
-        b: block.
-        group: FORWARD group of the block.
-        plan: int8 ``[B]``, the source of each stream.
-        gates: float32 ``[B, 4]``, the same one-hot, with or without a gradient.
-        type: of the residual.
-    """
+    """One cell for all streams: block b at step k."""
 
     k: int
     b: int
-    group: int
-    plan: npt.NDArray[np.int8]
-    gates: Tensor
-    type: TensorType
+    group: int  # the block's, of FORWARD
+    plan: npt.NDArray[np.int8]  # [B], the source of each stream
+    gates: Tensor  # float32 [B, 4], the same one-hot, with or without a gradient
+    type: TensorType  # of the residual
 
     @property
     def trains(self) -> bool:

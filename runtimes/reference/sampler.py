@@ -27,11 +27,7 @@ class Carried(NamedTuple):
 
 
 class TorchSampler:
-    """The sampler of a policy by its table.
-
-    Args:
-        table: of the sampler.
-    """
+    """The sampler of a policy, by its table."""
 
     def __init__(self, table: SamplerTable) -> None:
         self._table = table
