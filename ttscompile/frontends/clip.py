@@ -15,17 +15,6 @@ from torch.nn import functional
 from .clip_config import TextConfig, TowerConfig, VisionConfig
 
 
-class _Activation(nn.Module):
-    """``quick_gelu`` is ``x * sigmoid(1.702 x)``; ``gelu`` is exact."""
-
-    def __init__(self, name: str) -> None:
-        super().__init__()
-        self.quick = name == "quick_gelu"
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return x * torch.sigmoid(1.702 * x) if self.quick else functional.gelu(x)
-
-
 class _SelfAttention(nn.Module):
     def __init__(self, config: TowerConfig) -> None:
         super().__init__()
@@ -46,14 +35,17 @@ class _SelfAttention(nn.Module):
 
 
 class _FeedForward(nn.Module):
+    """With ``quick_gelu``, which is ``x * sigmoid(1.702 x)``, or the exact ``gelu`` between its two layers."""
+
     def __init__(self, config: TowerConfig) -> None:
         super().__init__()
         self.fc1 = nn.Linear(config.hidden_size, config.intermediate_size)
-        self.activation = _Activation(config.hidden_act)
+        self.quick = config.hidden_act == "quick_gelu"
         self.fc2 = nn.Linear(config.intermediate_size, config.hidden_size)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return self.fc2(self.activation(self.fc1(x)))  # type: ignore[no-any-return]
+        x = self.fc1(x)
+        return self.fc2(x * torch.sigmoid(1.702 * x) if self.quick else functional.gelu(x))  # type: ignore[no-any-return]
 
 
 class _Layer(nn.Module):

@@ -58,7 +58,6 @@ def build(payload: Mapping[str, Any], options: LoadOptions) -> tuple[nn.Module, 
     name = str(config.require("policy._target_")).rpartition(".")[2]
     if name not in (_POLICY, hybrid.POLICY):
         refuse_policy(name)
-
     weights, which = choose_weights(payload["state_dicts"], config.get("training.use_ema"))
     policy = config.require("policy")
     encoder = None
@@ -86,16 +85,12 @@ def build(payload: Mapping[str, Any], options: LoadOptions) -> tuple[nn.Module, 
         module = EncodedDenoiser(encoder, module)
         observations = hybrid.observation_specs(observed, n_obs_steps, weights)
     start = 0 if policy["pred_action_steps_only"] else n_obs_steps - 1
-    table = configured_sampler(
-        policy["noise_scheduler"],
-        policy["num_inference_steps"],
-        options,
-        step_arguments={key: policy[key] for key in policy if key not in known},
-    )
+    step_arguments = {key: policy[key] for key in policy if key not in known}
+    scheduler, steps = policy["noise_scheduler"], policy.get("num_inference_steps")
     spec = PolicySpec(
         sample=(horizon, network.config.input_dim),
         observations=observations,
-        sampler=table,
+        sampler=configured_sampler(scheduler, steps, options, step_arguments=step_arguments),
         chunk=ChunkSpec(
             action_dim=action_dim,
             start=start,
@@ -127,8 +122,8 @@ def _network_config(config: Config) -> TransformerConfig:
     unknown = sorted(set(values) - {*names, "_target_", "obs_as_cond", "p_drop_emb", "p_drop_attn"})
     if unknown:
         raise CheckpointError(
-            f"cfg.policy.model has settings that {_NETWORK} does not know: {', '.join(unknown)}. The checkpoint comes"
-            " from a changed network; use ttscompile.compile_denoiser(module, spec)."
+            f"cfg.policy.model has settings that {_NETWORK} does not know: {', '.join(unknown)}. The network was"
+            " changed; use ttscompile.compile_denoiser(module, spec)."
         )
     return TransformerConfig(**{name: values[name] for name in names if name in values})
 
@@ -138,7 +133,6 @@ def _check_policy(policy: dict[str, Any], network: TransformerConfig) -> tuple[i
     settings = Settings(policy, "cfg.policy.")
     for name in _SWITCHES:
         policy[name] = settings.flag(name, False)
-    policy["num_inference_steps"] = policy.get("num_inference_steps")
     if not isinstance(policy.get("noise_scheduler"), dict):
         raise CheckpointError("cfg.policy.noise_scheduler is missing; expected the settings of a diffusers scheduler.")
     for name in _SIZES:
@@ -148,11 +142,8 @@ def _check_policy(policy: dict[str, Any], network: TransformerConfig) -> tuple[i
     if only_steps and not as_cond:
         raise CheckpointError("cfg.policy.pred_action_steps_only needs obs_as_cond; the original refuses this, too.")
     horizon = policy["n_action_steps"] if only_steps else policy["horizon"]
-    expected = {
-        "input_dim": policy["action_dim"] + (0 if as_cond else policy["obs_dim"]),
-        "output_dim": policy["action_dim"] + (0 if as_cond else policy["obs_dim"]),
-        "cond_dim": policy["obs_dim"] if as_cond else 0,
-    }
+    channels = policy["action_dim"] + (0 if as_cond else policy["obs_dim"])
+    expected = {"input_dim": channels, "output_dim": channels, "cond_dim": policy["obs_dim"] if as_cond else 0}
     for name, value in expected.items():
         if getattr(network, name) != value:
             raise CheckpointError(
@@ -171,13 +162,8 @@ def _check_policy(policy: dict[str, Any], network: TransformerConfig) -> tuple[i
             )
     if not only_steps and policy["n_obs_steps"] > horizon:
         raise CheckpointError(f"cfg.policy: n_obs_steps = {policy['n_obs_steps']} is longer than horizon = {horizon}.")
-    return horizon, _variant(network)
-
-
-def _variant(network: TransformerConfig) -> str:
-    """What the network is, in the words of the README."""
     if not network.time_as_cond:
-        return "encoder-only"
+        return horizon, "encoder-only"
     if not network.cond_dim:
-        return "inpainting"
-    return "transformer condition encoder" if network.n_cond_layers else "token-wise condition encoder"
+        return horizon, "inpainting"
+    return horizon, f"{'transformer' if network.n_cond_layers else 'token-wise'} condition encoder"

@@ -23,14 +23,8 @@ from .transformer_for_diffusion import TransformerConfig
 
 POLICY = "DiffusionTransformerHybridImagePolicy"
 ENCODER_KEYS = frozenset({"shape_meta", "crop_shape", "obs_encoder_group_norm", "eval_fixed_crop"})
-_NETWORK_DEFAULTS = {
-    "n_layer": 8,
-    "n_cond_layers": 0,
-    "n_head": 4,
-    "n_emb": 256,
-    "causal_attn": True,
-    "time_as_cond": True,
-}
+_NETWORK_DEFAULTS = {"n_layer": 8, "n_cond_layers": 0, "n_head": 4, "n_emb": 256}
+_NETWORK_DEFAULTS |= {"causal_attn": True, "time_as_cond": True}
 NETWORK_KEYS = frozenset({*_NETWORK_DEFAULTS, "p_drop_emb", "p_drop_attn"})
 """Settings of ``cfg.policy`` beside those of the low-dimensional policy."""
 
@@ -73,12 +67,7 @@ def read_shape_meta(policy: Mapping[str, Any]) -> tuple[int, Observed]:
 
 
 def build_encoder(policy: Mapping[str, Any], observed: Observed, weights: Weights) -> ObservationEncoder:
-    """The observation encoder with its weights.
-
-    Args:
-        policy: ``cfg.policy``.
-        observed: of the same.
-        weights: of the whole policy; normalisers of images are part of the encoder.
+    """The observation encoder with its weights; normalisers of images are part of it.
 
     Raises:
         CheckpointError: settings, weights or normalisers that do not fit.
@@ -93,11 +82,15 @@ def build_encoder(policy: Mapping[str, Any], observed: Observed, weights: Weight
             continue
         channels, height, width = shape
         if crop is not None and (crop[0] >= height or crop[1] >= width):
+            found = f"crop_shape is {list(crop)}, and the images of {key!r} are {height} x {width}"
+            raise settings.error(f"{found}; expected a crop that is smaller; the original refuses this, too")
+        single = affine(weights, key, None)  # the original has one number for all channels and places
+        if len(single.scale) != 1:
             raise CheckpointError(
-                f"cfg.policy.crop_shape is {list(crop)}, and the images of {key!r} are {height} x {width}; expected a"
-                " crop that is smaller; the original refuses this, too."
+                f"normalizer.params_dict.{key} has {len(single.scale)} entries; expected one for the whole image."
+                " Normalise the images before, and fit the policy with the identity."
             )
-        inputs[key] = Camera((channels, height, width), crop, *_image_normalizer(weights, key))
+        inputs[key] = Camera((channels, height, width), crop, float(single.scale[0]), float(single.offset[0]))
     encoder = ObservationEncoder(inputs, group_norm)
     if crop is not None and not fixed and encoder.position:
         warnings.warn(
@@ -118,17 +111,6 @@ def build_encoder(policy: Mapping[str, Any], observed: Observed, weights: Weight
     return encoder
 
 
-def _image_normalizer(weights: Weights, key: str) -> tuple[float, float]:
-    """Scale and offset of the images of one key: the original has one number for all channels and places."""
-    single = affine(weights, key, None)
-    if len(single.scale) != 1:
-        raise CheckpointError(
-            f"normalizer.params_dict.{key} has {len(single.scale)} entries; expected one for the whole image, as the"
-            " original's image normaliser has. Normalise the images before, and fit the policy with the identity."
-        )
-    return float(single.scale[0]), float(single.offset[0])
-
-
 def _load_camera(module: torch.nn.Module, weights: Weights, key: str) -> None:
     """Fill the encoder of one camera, whose weights the original saves twice, under both names of one module."""
     prefix = f"{_PREFIX}{key}."
@@ -138,13 +120,13 @@ def _load_camera(module: torch.nn.Module, weights: Weights, key: str) -> None:
         if not full.startswith(prefix):
             continue
         name = full.removeprefix(prefix)
-        numbered = next((number for number in _TWINS if name.startswith(number)), None)
-        if numbered is not None:
-            name = _TWINS[numbered] + name.removeprefix(numbered)
+        for numbered, twin in _TWINS.items():
+            if name.startswith(numbered):
+                name = twin + name.removeprefix(numbered)
         if name in found and not torch.equal(found[name], value):
             raise CheckpointError(
                 f"{saved[name]} and {full} differ: both name the same tensor of the original network, which is saved"
-                " twice. The checkpoint was changed after it was saved: save it again from the policy."
+                " twice. Save the checkpoint again from the policy."
             )
         found[name] = value
         saved[name] = saved.get(name, full)
@@ -162,13 +144,7 @@ def _load_camera(module: torch.nn.Module, weights: Weights, key: str) -> None:
 
 
 def network_config(policy: Mapping[str, Any], action_dim: int, encoded: int) -> TransformerConfig:
-    """The transformer's sizes, which this policy has among its own settings.
-
-    Args:
-        policy: ``cfg.policy``, with ``obs_as_cond``.
-        action_dim: channels of the action.
-        encoded: length of what the encoder gives for one step.
-    """
+    """The transformer's sizes, which this policy has among its own settings; the encoder gives ``encoded`` channels."""
     as_cond = policy["obs_as_cond"] is True
     channels = action_dim + (0 if as_cond else encoded)
     values = {name: policy.get(name, default) for name, default in _NETWORK_DEFAULTS.items()}

@@ -96,9 +96,8 @@ def affine(weights: Weights, key: str, width: int | None) -> Affine:
         if not torch.isfinite(vector).all() or (name == "scale" and (vector == 0).any()):
             raise CheckpointError(f"{full} is {vector.tolist()}; expected finite numbers, and no zero in a scale.")
         if vector.ndim != 1 or len(vector) not in (1, width or len(vector)):
-            raise CheckpointError(
-                f"{full} has shape {tuple(vector.shape)}; expected one entry for each of {width} channels."
-            )
+            found = tuple(vector.shape)
+            raise CheckpointError(f"{full} has shape {found}; expected one entry for each of {width} channels.")
         # An identity normaliser has a single entry for all channels.
         vectors[name] = vector.expand(width or len(vector)).contiguous().numpy()
-    return Affine(scale=vectors["scale"], offset=vectors["offset"])
+    return Affine(**vectors)

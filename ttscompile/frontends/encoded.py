@@ -26,8 +26,7 @@ class EncodedDenoiser(nn.Module):
 
     def forward(self, sample: torch.Tensor, timestep: torch.Tensor, **observations: torch.Tensor) -> torch.Tensor:
         """``[B, T, D]``, ``[B]`` and the observations by key -> ``[B, T, D]``."""
-        prediction: torch.Tensor = self.denoiser(sample, timestep, self.encoder(observations))
-        return prediction
+        return self.denoiser(sample, timestep, self.encoder(observations))  # type: ignore[no-any-return]
 
 
 class Parts(NamedTuple):

@@ -9,6 +9,7 @@ with Transformers (arXiv 2212.09748): adaLN-Zero with six modulations a layer.
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -62,8 +63,7 @@ class _RotaryAttention(nn.Module):
         self.heads, self.head_width = config.num_heads, width // config.num_heads
         self.qkv_proj, self.out_proj = nn.Linear(width, 3 * width), nn.Linear(width, width)
         frequencies = config.rope_base ** -(torch.arange(0, self.head_width, 2).float() / self.head_width)
-        angles = torch.outer(torch.arange(config.horizon).float(), frequencies)
-        angles = torch.cat((angles, angles), dim=-1)
+        angles = torch.outer(torch.arange(config.horizon).float(), frequencies).repeat(1, 2)
         self.register_buffer("cos", angles.cos(), persistent=False)
         self.register_buffer("sin", angles.sin(), persistent=False)
 
@@ -101,13 +101,13 @@ class _Layer(nn.Module):
         """``[B, T, width]`` and ``[B, features]`` -> ``[B, T, width]``."""
         made = self.adaLN_modulation(features).unsqueeze(1).chunk(6, dim=-1)
         shift, scale, gate, mlp_shift, mlp_scale, mlp_gate = made
-        x = x + gate * self._attend(self.norm1(x) * (1 + scale) + shift)
-        return x + mlp_gate * self.mlp(self.norm2(x) * (1 + mlp_scale) + mlp_shift)  # type: ignore[no-any-return]
-
-    def _attend(self, x: torch.Tensor) -> torch.Tensor:
+        moved = self.norm1(x) * (1 + scale) + shift
         if self.rotary:
-            return self.attn(x)  # type: ignore[no-any-return]
-        return self.multihead_attn(x, x, x, need_weights=False)[0]  # type: ignore[no-any-return]
+            mixed = self.attn(moved)
+        else:
+            mixed, _ = self.multihead_attn(moved, moved, moved, need_weights=False)
+        x = x + gate * mixed
+        return x + mlp_gate * self.mlp(self.norm2(x) * (1 + mlp_scale) + mlp_shift)  # type: ignore[no-any-return]
 
 
 class DiffusionTransformer(nn.Module):
@@ -143,13 +143,9 @@ class DiffusionTransformer(nn.Module):
         return self.output_proj(x)  # type: ignore[no-any-return]
 
 
-class _VisionEncoder(nn.Module):
-    def __init__(self, config: VisionConfig) -> None:
-        super().__init__()
-        self.model = ClipVision(config)
-
-    def forward(self, pixels: torch.Tensor) -> torch.Tensor:
-        return self.model(pixels)  # type: ignore[no-any-return]
+def _vision_encoder(config: VisionConfig) -> nn.Module:
+    """CLIP's under the name of its weights."""
+    return nn.Sequential(OrderedDict(model=ClipVision(config)))
 
 
 class _TextEncoder(nn.Module):
@@ -188,9 +184,9 @@ class ObservationEncoder(nn.Module):
         super().__init__()
         self.frames, self.cameras, self.separate = frames, cameras, separate
         if vision is not None and separate:
-            self.vision_encoders = nn.ModuleList(_VisionEncoder(vision) for _ in range(cameras))
+            self.vision_encoders = nn.ModuleList(_vision_encoder(vision) for _ in range(cameras))
         elif vision is not None:
-            self.vision_encoder = _VisionEncoder(vision)
+            self.vision_encoder = _vision_encoder(vision)
         self.text_encoder = _TextEncoder(text, text_width)
 
     def forward(
@@ -205,21 +201,17 @@ class ObservationEncoder(nn.Module):
             mask: bool ``[B, L]``, false for padding.
         """
         parts = [state]
-        if images:
-            parts.append(self._see(images))
+        if images and self.separate:
+            seen = [encoder(image) for encoder, image in zip(self.vision_encoders, images, strict=True)]
+            parts.append(torch.cat(seen, dim=-1).reshape(-1, self.frames, self.cameras * seen[0].shape[-1]))
+        elif images:
+            together = self.vision_encoder(torch.stack(list(images), dim=1).flatten(0, 1))
+            parts.append(together.reshape(-1, self.frames, self.cameras * together.shape[-1]))
         sentence = self.text_encoder(tokens, mask)
         parts.append(sentence.unsqueeze(1).expand(-1, self.frames, -1))
         if sentence.shape[0] == 1:  # one instruction, known when the policy is compiled, for all streams
             parts[-1] = parts[-1].expand(state.shape[0], -1, -1)
         return torch.cat(parts, dim=-1).flatten(1)
-
-    def _see(self, images: Sequence[torch.Tensor]) -> torch.Tensor:
-        """Features of all cameras ``[B, To, cameras * width]``."""
-        if self.separate:
-            seen = [encoder(image) for encoder, image in zip(self.vision_encoders, images, strict=True)]
-            return torch.cat(seen, dim=-1).reshape(-1, self.frames, self.cameras * seen[0].shape[-1])
-        seen = self.vision_encoder(torch.stack(list(images), dim=1).flatten(0, 1))
-        return seen.reshape(-1, self.frames, self.cameras * seen.shape[-1])  # type: ignore[no-any-return]
 
 
 class ConditionEncoder(nn.Module):
@@ -263,8 +255,6 @@ class ConditionEncoder(nn.Module):
             assert self.geometry is not None
             # Normalised after the crop: pixels that nobody sees need no arithmetic.
             images.append(normalizer(self.geometry(observations[name].flatten(0, 1))))
-        if self.has_task:
-            tokens, mask = self.task_tokens, self.task_mask
-        else:
-            tokens, mask = (observations[name] for name in self.tokens)
+        given = (self.task_tokens, self.task_mask) if self.has_task else (observations[name] for name in self.tokens)
+        tokens, mask = given
         return self.observation_encoder(state, images, tokens, mask)  # type: ignore[no-any-return]

@@ -45,8 +45,7 @@ class ResidualBlock(nn.Module):
         self.bn2 = norm(channels)
         self.downsample = None
         if stride != 1 or channels_in != channels:
-            shortcut = nn.Conv2d(channels_in, channels, 1, stride, bias=False)
-            self.downsample = nn.Sequential(shortcut, norm(channels))
+            self.downsample = nn.Sequential(nn.Conv2d(channels_in, channels, 1, stride, bias=False), norm(channels))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """``[N, channels_in, H, W]`` -> ``[N, channels, H / stride, W / stride]``, rounded up."""
@@ -75,8 +74,7 @@ class ResNet18(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """``[N, C, H, W]`` -> ``[N, 512, H / 32, W / 32]``, rounded up."""
-        features: torch.Tensor = self.nets(x)
-        return features
+        return self.nets(x)  # type: ignore[no-any-return]
 
 
 class SpatialSoftmax(nn.Module):
@@ -167,8 +165,6 @@ class ObservationEncoder(nn.Module):
         for key in self.order:
             x = observations[key]
             if key in self.position:
-                encoded = self.cameras[self.position[key]](x.flatten(0, 1))
-                features.append(encoded.reshape(x.shape[0], x.shape[1], FEATURES))
-            else:
-                features.append(x.flatten(2))
+                x = self.cameras[self.position[key]](x.flatten(0, 1)).reshape(x.shape[0], x.shape[1], FEATURES)
+            features.append(x.flatten(2))
         return torch.cat(features, dim=-1)

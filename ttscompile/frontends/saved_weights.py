@@ -26,9 +26,8 @@ def read_tensors(path: Path) -> dict[str, torch.Tensor]:
     try:
         tensors: dict[str, torch.Tensor] = load_file(path, device="cpu")
     except Exception as error:  # what the reader raises depends on where the file is damaged
-        raise CheckpointError(
-            f"{path}: not a safetensors file, or a truncated one: {error!s:.300}. Copy it again."
-        ) from error
+        what = "not a safetensors file, or a truncated one"
+        raise CheckpointError(f"{path}: {what}: {error!s:.300}. Copy it again.") from error
     return tensors
 
 
@@ -36,11 +35,6 @@ def names_of(keys: Sequence[str]) -> str:
     """A few names and how many more there are."""
     more = f" and {len(keys) - SHOWN} more" if len(keys) > SHOWN else ""
     return ", ".join(keys[:SHOWN]) + more
-
-
-def unwrapped(name: str) -> str:
-    """The name of a weight without the levels that ``torch.compile`` and ``DistributedDataParallel`` put around it."""
-    return ".".join(part for part in name.split(".") if part not in ("_orig_mod", "module"))
 
 
 def as_float32(weights: Mapping[str, Any], where: str = "") -> dict[str, torch.Tensor]:
@@ -57,7 +51,9 @@ def as_float32(weights: Mapping[str, Any], where: str = "") -> dict[str, torch.T
         if not isinstance(value, torch.Tensor) or value.layout != torch.strided or not value.is_floating_point():
             what = f"{value.dtype} tensor" if isinstance(value, torch.Tensor) else type(value).__name__
             raise CheckpointError(f"{where}weight {name} is a {what}; expected a dense floating-point tensor.")
-    return {unwrapped(str(name)): value.detach().to(torch.float32) for name, value in weights.items()}
+    # Without the levels that torch.compile and DistributedDataParallel put around a network.
+    parts = {name: [part for part in str(name).split(".") if part not in ("_orig_mod", "module")] for name in weights}
+    return {".".join(parts[name]): value.detach().to(torch.float32) for name, value in weights.items()}
 
 
 def require_weights(
@@ -88,9 +84,8 @@ def require_weights(
         )
     for name, value in found.items():
         if value.shape != expected[name].shape:
-            raise CheckpointError(
-                f"weight {name} has shape {tuple(value.shape)}; expected {tuple(expected[name].shape)} from {source}."
-            )
+            shapes = f"{tuple(value.shape)}; expected {tuple(expected[name].shape)}"
+            raise CheckpointError(f"weight {name} has shape {shapes} from {source}.")
         if name not in masks and not torch.isfinite(value).all():
             count = int((~torch.isfinite(value)).sum())
             raise CheckpointError(f"weight {name} holds {count} values that are not finite; training diverged.")

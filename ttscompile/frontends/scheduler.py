@@ -38,11 +38,7 @@ _CLASSES: Mapping[str, type[Any]] = dict(
     zip(DIFFUSION_SAMPLERS, (DDPMScheduler, DDIMScheduler, DPMSolverMultistepScheduler), strict=True)
 )
 _NAMES = {each.__name__: name for name, each in _CLASSES.items()}
-
-
-def _settings(scheduler: type[Any]) -> frozenset[str]:
-    """Names of the settings that a scheduler class takes."""
-    return frozenset(inspect.signature(scheduler.__init__).parameters) - {"self"}
+_SETTINGS = {name: frozenset(inspect.signature(each).parameters) for name, each in _CLASSES.items()}
 
 
 def configured_sampler(
@@ -81,9 +77,8 @@ def configured_sampler(
     if spacing is not None and spacing not in SPACINGS:
         raise SpecError(f"timestep spacing {spacing!r} is not known; expected one of {', '.join(SPACINGS)}.")
     if steps is not None and (type(steps) is not int or not 1 <= steps <= MOST_STEPS):
-        raise SpecError(
-            f"{steps!r:.80} denoising steps are not possible; expected a positive whole number, {MOST_STEPS} at most."
-        )
+        expected = f"expected a positive whole number, {MOST_STEPS} at most"
+        raise SpecError(f"{steps!r:.80} denoising steps are not possible; {expected}.")
 
     name = sampler or own_name
     if name is None:
@@ -91,16 +86,14 @@ def configured_sampler(
             f"{where} is {own or 'of no class'}; expected one of {', '.join(_NAMES)}. To run on"
             f" its betas with another sampler, ask for sampler={' or '.join(map(repr, DIFFUSION_SAMPLERS))}."
         )
-    scheduler_class = _CLASSES[name]
     given = {key: value for key, value in settings.items() if key != "_target_"}
     old = given.pop("predict_epsilon", None)  # what diffusers before 0.11 called it
     if old is not None:
         predicts = "epsilon" if old else "sample"
         if given.setdefault("prediction_type", predicts) != predicts:
-            raise CheckpointError(
-                f"{where}: predict_epsilon contradicts prediction_type = {given['prediction_type']!r}."
-            )
-    unknown = sorted(set(given).difference(*map(_settings, _CLASSES.values())))
+            found = f"prediction_type = {given['prediction_type']!r}"
+            raise CheckpointError(f"{where}: predict_epsilon contradicts {found}.")
+    unknown = sorted(set(given).difference(*_SETTINGS.values()))
     if unknown and name == own_name:
         raise CheckpointError(
             f"{where} has settings that diffusers' {own} does not know: {', '.join(unknown)}."
@@ -110,7 +103,6 @@ def configured_sampler(
         given = _for_dpm_solver(given, where)
     if spacing is not None:
         given["timestep_spacing"] = spacing
-    taken = _settings(scheduler_class)
     trained = given.get("num_train_timesteps", 1000)
     if type(trained) is not int or not 1 <= trained <= MOST_TIMESTEPS:
         raise CheckpointError(f"{where}: num_train_timesteps is {trained!r:.80}; expected 1 to {MOST_TIMESTEPS}.")
@@ -120,7 +112,7 @@ def configured_sampler(
             " most. Give a number of steps: steps= in Python, --steps on the command line."
         )
     try:
-        scheduler = scheduler_class(**{key: value for key, value in given.items() if key in taken})
+        scheduler = _CLASSES[name](**{key: value for key, value in given.items() if key in _SETTINGS[name]})
         return sampler_table(
             scheduler,
             trained if steps is None else steps,
@@ -130,9 +122,8 @@ def configured_sampler(
     except TtscompileError:
         raise
     except Exception as error:  # settings of a wrong type fail wherever diffusers first uses them
-        raise CheckpointError(
-            f"{where}: diffusers refuses the settings {str(given)[:300]}: {type(error).__name__}: {str(error)[:200]}"
-        ) from error
+        refused = f"{given!s:.300}: {type(error).__name__}: {error!s:.200}"
+        raise CheckpointError(f"{where}: diffusers refuses the settings {refused}") from error
 
 
 def _for_dpm_solver(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
@@ -144,10 +135,8 @@ def _for_dpm_solver(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
     """
     clips, bound = settings.get("clip_sample", True), settings.get("clip_sample_range", 1.0)
     if clips and bound != 1:
-        raise SpecError(
-            f"{where}: clip_sample_range is {bound!r:.80}; sampler {DPM} bounds the sample at 1 or not at"
-            " all. Use ddpm or ddim."
-        )
+        found = f"clip_sample_range is {bound!r:.80}"
+        raise SpecError(f"{where}: {found}; sampler {DPM} bounds the sample at 1 or not at all. Use ddpm or ddim.")
     kept = {key: value for key, value in settings.items() if key != "variance_type"}
     blows_up = not clips and settings.get("prediction_type", "epsilon") == "epsilon"
     spacing = "leading" if blows_up else "trailing"
@@ -166,9 +155,8 @@ def _step_arguments(
     if "predict_epsilon" in kept:
         predicts = settings.get("prediction_type", "epsilon")
         if bool(kept.pop("predict_epsilon")) != (predicts == "epsilon"):
-            raise CheckpointError(
-                f"cfg.policy.predict_epsilon contradicts noise_scheduler.prediction_type = {predicts!r}."
-            )
+            found = f"noise_scheduler.prediction_type = {predicts!r}"
+            raise CheckpointError(f"cfg.policy.predict_epsilon contradicts {found}.")
     unknown = sorted(set(kept) - {"eta", "use_clipped_model_output"})
     if unknown:
         raise CheckpointError(f"cfg.policy has settings that are not known: {', '.join(unknown)}.")

@@ -45,13 +45,7 @@ class _Rows:
 
 
 class _Chains:
-    """Drives a scheduler from its first step to its last on given inputs.
-
-    Args:
-        scheduler: a configured ``DPMSolverMultistepScheduler``.
-        steps: K.
-        step_arguments: further keyword arguments of ``step``.
-    """
+    """Drives a scheduler through all its K steps on given inputs; ``step_arguments`` go to every ``step``."""
 
     def __init__(self, scheduler: Any, steps: int, step_arguments: Mapping[str, Any]) -> None:
         self._scheduler, self.steps, self._step_arguments = scheduler, steps, dict(step_arguments)
@@ -60,33 +54,22 @@ class _Chains:
     def run(
         self, samples: torch.Tensor, outs: torch.Tensor, noise: torch.Tensor, follow: bool = False
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """One chain.
+        """One chain, on samples, outputs and noise ``[K, ...]``, the noise float32 and the others float64.
 
-        Args:
-            samples: float64 ``[K, ...]``; with ``follow`` only the first is used, and the others are what comes out.
-            outs: of the network, float64 ``[K, ...]``.
-            noise: of the steps, float32 ``[K, ...]``; for stochastic solvers.
-            follow: each step starts from the sample that the step before made.
-
-        Returns:
-            The samples that went into the steps, what the scheduler remembers of each step, and the samples that came
-            out, float64 ``[K, ...]`` each.
+        With ``follow`` only the first sample is used: each step starts from what the step before made. Gives the
+        samples that went into the steps, what the scheduler remembers of each, and the samples that came out.
         """
         set_timesteps(self._scheduler, self.steps)
         given, meant, made = [], [], []
-        sample = samples[0]
         for k, timestep in enumerate(self._scheduler.timesteps):
-            sample = sample if follow else samples[k]
+            given.append(made[-1] if follow and k else samples[k])
+            arguments = {"variance_noise": noise[k], **self._step_arguments}
             try:
-                result = self._scheduler.step(
-                    outs[k], timestep, sample, variance_noise=noise[k], **self._step_arguments
-                )
+                result = self._scheduler.step(outs[k], timestep, given[-1], **arguments)
             except Exception as error:
                 raise SpecError(f"sampler {self.name}: its step at timestep {int(timestep)} failed: {error}") from error
-            given.append(sample)
             meant.append(self._scheduler.model_outputs[-1].double())
             made.append(result.prev_sample.double())
-            sample = made[-1]
         return torch.stack(given), torch.stack(meant), torch.stack(made)
 
     def numbers(self, samples: Array, outs: Array, noise: float = 0.0) -> tuple[Array, Array]:
@@ -108,8 +91,7 @@ def multistep_table(scheduler: Any, steps: int, name: str, step_arguments: Mappi
     """Measure the denoising loop of a multistep scheduler.
 
     Args:
-        scheduler: a configured ``DPMSolverMultistepScheduler``, on which ``set_timesteps`` was called; it is called
-            again.
+        scheduler: a configured ``DPMSolverMultistepScheduler`` after ``set_timesteps``, which is called again.
         steps: K.
         name: of the table.
         step_arguments: further keyword arguments of ``step``.

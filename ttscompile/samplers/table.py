@@ -9,7 +9,6 @@ measured in ``multistep``; flow matching needs no scheduler (``flow``).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,17 +23,8 @@ _FAR = 2.0**30  # an input this large saturates any clip that is there; its inve
 _TOLERANCE = 1e-8  # of the largest term of a step; float64 leaves 1e-12, a wrong form leaves 1e-3 and more
 
 
-@dataclass(frozen=True)
-class _Row:
-    """One step of the loop in float64; the columns of ``SamplerTable``."""
-
-    sample_to_x0: float
-    out_to_x0: float
-    x0_to_next: float
-    sample_to_next: float
-    out_to_next: float
-    noise_to_next: float
-    clip: float | None
+_Row = tuple[tuple[float, float, float, float, float, float], float | None]
+"""One step of the loop in float64: ``SamplerTable.COLUMNS``, and the clip."""
 
 
 class _Probe:
@@ -46,8 +36,7 @@ class _Probe:
     """
 
     def __init__(self, scheduler: Any, step_arguments: Mapping[str, Any]) -> None:
-        self._scheduler = scheduler
-        self._step_arguments = dict(step_arguments)
+        self._scheduler, self._step_arguments = scheduler, dict(step_arguments)
         self.name = type(scheduler).__name__
 
     def __call__(
@@ -84,12 +73,6 @@ def _draw(seed: int) -> torch.Tensor:
     return torch.randn(_SHAPE, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def _bound(probe: _Probe, timestep: torch.Tensor, x: float, out: float) -> float | None:
-    """The value at which x0 saturates in the direction ``(x, out)``; None if it does not."""
-    near, far = probe.fill(timestep, x, out)[0], probe.fill(timestep, 2 * x, 2 * out)[0]
-    return abs(near) if near == far else None
-
-
 def _probe_step(probe: _Probe, timestep: torch.Tensor) -> _Row:
     """Measure one row.
 
@@ -107,10 +90,12 @@ def _probe_step(probe: _Probe, timestep: torch.Tensor) -> _Row:
 
     from_sample = abs(sample_to_x0) >= abs(out_to_x0)
     gain = sample_to_x0 if from_sample else out_to_x0
-    clip = _bound(probe, timestep, _FAR * from_sample / gain, _FAR * (not from_sample) / gain)
-    if clip is None:
+    x, out = _FAR * from_sample / gain, _FAR * (not from_sample) / gain
+    near, far = probe.fill(timestep, x, out)[0], probe.fill(timestep, 2 * x, 2 * out)[0]
+    if near != far:
         sample_to_next, out_to_next = probe.fill(timestep, 1.0, 0.0)[1], probe.fill(timestep, 0.0, 1.0)[1]
-        return _Row(sample_to_x0, out_to_x0, 0.0, sample_to_next, out_to_next, noise_to_next, None)
+        return (sample_to_x0, out_to_x0, 0.0, sample_to_next, out_to_next, noise_to_next), None
+    clip = abs(near)
     if clip == 0:
         raise SpecError(f"sampler {probe.name}: at timestep {int(timestep)} x0 is clipped to zero.")
 
@@ -121,7 +106,7 @@ def _probe_step(probe: _Probe, timestep: torch.Tensor) -> _Row:
     sample_to_next = (probe.fill(timestep, x + delta, out)[1] - base) / delta
     out_to_next = (probe.fill(timestep, x, out + delta)[1] - base) / delta
     x0_to_next = (base - sample_to_next * x - out_to_next * out) / clip
-    return _Row(sample_to_x0, out_to_x0, x0_to_next, sample_to_next, out_to_next, noise_to_next, clip)
+    return (sample_to_x0, out_to_x0, x0_to_next, sample_to_next, out_to_next, noise_to_next), clip
 
 
 def _verify(
@@ -129,14 +114,10 @@ def _verify(
 ) -> torch.Tensor:
     """Hold a row against the scheduler on one input; gives ``next``."""
     x0, following = probe(timestep, x, out, seed)
-    unclipped = row.sample_to_x0 * x + row.out_to_x0 * out
-    expected_x0 = unclipped if row.clip is None else unclipped.clamp(-row.clip, row.clip)
-    terms = (
-        row.x0_to_next * expected_x0,
-        row.sample_to_next * x,
-        row.out_to_next * out,
-        row.noise_to_next * _draw(seed),
-    )
+    (sample_to_x0, out_to_x0, *to_next), clip = row
+    unclipped = sample_to_x0 * x + out_to_x0 * out
+    expected_x0 = unclipped if clip is None else unclipped.clamp(-clip, clip)
+    terms = [weight * term for weight, term in zip(to_next, (expected_x0, x, out, _draw(seed)), strict=True)]
     expected = terms[0] + terms[1] + terms[2] + terms[3]
     scale = max(1.0, float(unclipped.abs().max()), *(float(term.abs().max()) for term in terms))
     error = max(float((x0 - expected_x0).abs().max()), float((following - expected).abs().max()))
@@ -144,8 +125,7 @@ def _verify(
         raise SpecError(
             f"sampler {probe.name} does not have the form next = p * clip(a * x + b * out) + q * x + r * out + n *"
             f" noise at timestep {int(timestep)}: a random input is off by {error:.1e} (largest term {scale:.1e})."
-            " Use DDPM, DDIM or DPM-Solver++ (DPMSolverMultistepScheduler); of other multistep and dynamic samplers"
-            " nothing is known."
+            " Use DDPM, DDIM or DPM-Solver++ (DPMSolverMultistepScheduler)."
         )
     return following
 
@@ -166,10 +146,8 @@ def _refuse_known(scheduler: Any) -> None:
         )
     deviation = float(getattr(scheduler, "init_noise_sigma", 1.0))
     if deviation != 1.0:
-        raise SpecError(
-            f"sampler {name} starts from noise of standard deviation {deviation:g}; expected 1. Use DDPM, DDIM or"
-            " DPM-Solver++."
-        )
+        start = f"starts from noise of standard deviation {deviation:g}"
+        raise SpecError(f"sampler {name} {start}; expected 1. Use DDPM, DDIM or DPM-Solver++.")
 
 
 def _is_multistep(scheduler: Any) -> bool:
@@ -198,10 +176,8 @@ def sampler_table(
     _refuse_known(scheduler)
     trained = scheduler.config.get("num_train_timesteps")
     if isinstance(trained, int) and steps > trained:
-        raise SpecError(
-            f"sampler {probe.name}: {steps} denoising steps are not possible; the policy was trained with {trained}"
-            " timesteps, so expected as many at most."
-        )
+        limit = f"the policy was trained with {trained} timesteps, so expected as many at most"
+        raise SpecError(f"sampler {probe.name}: {steps} denoising steps are not possible; {limit}.")
     try:
         set_timesteps(scheduler, steps)
     except Exception as error:
@@ -213,15 +189,14 @@ def sampler_table(
             " timestep spacing, or another sampler: DDPM, DDIM, DPM-Solver++."
         )
 
-    x = _draw(1)
-    out = _draw(2)
+    x, out = _draw(1), _draw(2)
     rescale = getattr(scheduler, "scale_model_input", None)
     if rescale is not None and not torch.equal(rescale(x, timesteps[0]), x):
         raise SpecError(f"sampler {probe.name} rescales the sample before the network; use DDPM, DDIM or DPM-Solver++.")
     if _is_multistep(scheduler):
         return multistep_table(scheduler, steps, name or probe.name, step_arguments or {})
     rows = [_probe_step(probe, timestep) for timestep in timesteps]
-    clips = {row.clip for row in rows}
+    clips = {clip for _, clip in rows}
     if len(clips) != 1:
         raise SpecError(f"sampler {probe.name} clips x0 at {clips}, not alike at every step.")
 
@@ -232,10 +207,10 @@ def sampler_table(
     # And single steps, where x0 is inside its bound and where it is outside.
     for k, (timestep, row) in enumerate(zip(timesteps, rows, strict=True)):
         for factor in (0.01, 3.0):
-            reach = factor * (row.clip or 1.0) / max(abs(row.sample_to_x0), abs(row.out_to_x0))
+            (sample_to_x0, out_to_x0, *_), clip = row
+            reach = factor * (clip or 1.0) / max(abs(sample_to_x0), abs(out_to_x0))
             _verify(probe, timestep, row, reach * _draw(2 * k), reach * out, seed=k)
 
-    columns = {
-        column: np.array([getattr(row, column) for row in rows], dtype=np.float32) for column in SamplerTable.COLUMNS
-    }
+    numbers = np.array([row for row, _ in rows], dtype=np.float32)
+    columns = dict(zip(SamplerTable.COLUMNS, numbers.T.copy(), strict=True))
     return SamplerTable(name=name or probe.name, timesteps=timesteps.numpy(), clip=clips.pop(), **columns)
