@@ -55,7 +55,7 @@ def sensitivity(
         figure: a number, of the denoised samples ``[copies * N, T, D]``.
     """
     model, count = executor.model, calls.count
-    streams = executor.selector.calls(calls, np.tile(np.arange(count), copies))
+    streams = executor.select(calls, np.tile(np.arange(count), copies))
     cache: dict[int, Tensor] = {}
     computed: list[Tensor] = []
     passed: list[Tensor] = []  # the stream after additions: its gradient is that of what was added just before

@@ -86,20 +86,20 @@ STRATEGIES = (
     Strategy(
         "interval",
         "FORA, arXiv 2407.01425; EfficientVLA (arXiv 2506.10100)",
-        "published.interval:interval",
+        "published.static:interval",
         baseline=True,
     ),
     Strategy("bac", "block-wise adaptive caching (arXiv 2506.13456)", "published.bac:bac"),
     Strategy(
         "delta-dit",
         "Delta-DiT (arXiv 2406.01125)",
-        "published.delta_dit:delta_dit",
+        "published.static:delta_dit",
         least=lambda steps, blocks: blocks + steps - 1,  # one block of every step after step 0
     ),
     Strategy(
         "deepcache",
         "DeepCache (arXiv 2312.00858)",
-        "published.deepcache:deepcache",
+        "published.static:deepcache",
         least=lambda steps, blocks: blocks + (steps - 1) * min(2, blocks),  # the first and the last block of every step
     ),
     Strategy("sag", "Sparse ActionGen (arXiv 2601.12894)", "published.gates:sag"),

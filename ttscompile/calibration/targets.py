@@ -11,11 +11,10 @@ import torch
 from ..core.spec import PolicySpec
 from ..trajectories.episodes import Episode
 from .calls import Calls, Split, prepare_calls, sample_calls
-from .clock import Clock
-from .execute import Executor
+from .execute import Executor, workers
 from .progress import Bar
 from .state import StateFile
-from .workers import workers
+from .task import Clock
 
 REPEATS = 8
 """How often an observation may be learned from, each time with another noise."""
@@ -59,7 +58,7 @@ def with_targets(
         bar.update(len(path), "", clock.left())
     state.progress[key] = len(path)
     if len(path) < calls.count:
-        calls = executor.selector.calls(calls, np.arange(len(path)))
+        calls = executor.select(calls, np.arange(len(path)))
     return replace(calls, path=path)
 
 
@@ -69,11 +68,12 @@ def dense_rounds(executor: Executor, calls: Calls, begin: int = 0) -> Iterator[t
     Yields:
         Paths ``[n, K, T, D]``, in order.
     """
+    at_once = torch.get_num_threads() * TARGETS_AT_ONCE
     while begin < calls.count:
-        with workers() as some:
-            end = min(begin + some.count * TARGETS_AT_ONCE, calls.count)
-            parts = [np.arange(i, min(i + TARGETS_AT_ONCE, end)) for i in range(begin, end, TARGETS_AT_ONCE)]
-            found = some.map(lambda part: executor.run_dense(executor.selector.calls(calls, part)), parts)
+        end = min(begin + at_once, calls.count)
+        parts = [np.arange(i, min(i + TARGETS_AT_ONCE, end)) for i in range(begin, end, TARGETS_AT_ONCE)]
+        with workers() as pool:
+            found = list(pool.map(lambda part: executor.run_dense(executor.select(calls, part)), parts))
         begin = end
         yield torch.cat(found)
 

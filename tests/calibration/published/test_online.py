@@ -87,7 +87,7 @@ def test_a_call_does_not_depend_on_the_others(make_task: MakeTask, rule: Criteri
     task = make_task(30)
     together = decide(task.executor, rule, task.calls)
     for i in (0, 5):
-        alone = decide(task.executor, rule, task.executor.selector.calls(task.calls, [i]))
+        alone = decide(task.executor, rule, task.executor.select(task.calls, [i]))
         np.testing.assert_array_equal(alone.plans[0], together.plans[i])
 
 
@@ -151,7 +151,7 @@ def test_teacache_fits_its_polynomial_to_dense_calls(make_task: MakeTask) -> Non
 
 def test_changes_of_dense_calls(make_task: MakeTask) -> None:
     task = make_task(30)
-    calls = task.executor.selector.calls(task.calls, [0, 4])
+    calls = task.executor.select(task.calls, [0, 4])
     before, after = dense_changes(task.executor, calls)
     assert before.shape == after.shape == (9 * 2,)
     model, dense = task.executor.model, np.zeros((10, 6), np.int8)

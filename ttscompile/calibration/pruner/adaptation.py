@@ -53,7 +53,7 @@ class Adaptation:
         if known < self._learned:
             numbers = self._order[known : min(known + LINEARISED, self._learned)]
             task = self._task
-            calls = task.executor.selector.calls(task.calls, numbers)
+            calls = task.executor.select(task.calls, numbers)
             model = linearise(
                 task.executor, task.actions, self._schedule, calls, int(task.draw(known, 2).integers(2**31))
             )
@@ -94,7 +94,7 @@ class Adaptation:
             episodes=task.calls.episodes[learned],
             count=capacity(task.pruner),
         )
-        calls = task.executor.selector.calls(task.calls, others)
+        calls = task.executor.select(task.calls, others)
         base = task.error(self._schedule, calls)
         for count in dict.fromkeys(min(n, len(switches)) for n in COUNTS):
             weights = head_weights(task.pruner, self._schedule, switches[:count], features)

@@ -86,7 +86,7 @@ def linearise(executor: Executor, actions: Actions, plan: PlanArray, calls: Call
     bases = torch.linalg.qr(torch.randn(calls.count, actions.size, rank, generator=generator))[0]
     probes = bases.transpose(1, 2) * (actions.size / rank) ** 0.5 * weights.sqrt()[:, None]
     reaches = [
-        _reach(executor, actions, plan, executor.selector.calls(calls, numbers), probes[torch.as_tensor(numbers)])
+        _reach(executor, actions, plan, executor.select(calls, numbers), probes[torch.as_tensor(numbers)])
         for numbers in chunks(executor, calls.count)
     ]
     error = torch.einsum("nra,na->nr", probes, difference).flatten()

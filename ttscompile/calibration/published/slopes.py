@@ -42,7 +42,7 @@ def slopes(executor: Executor, actions: Actions, plan: PlanArray, reuse: Source,
     """
     total = np.zeros(plan.shape, np.float64)
     for numbers in chunks(executor, calls.count):
-        total += _summed(executor, actions, plan, reuse, executor.selector.calls(calls, numbers))
+        total += _summed(executor, actions, plan, reuse, executor.select(calls, numbers))
     return (total / calls.count).astype(np.float32)
 
 
