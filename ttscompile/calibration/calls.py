@@ -140,17 +140,9 @@ def prepare_calls(
     chosen: Sequence[tuple[int, int]],
     seed: tuple[int, ...],
 ) -> Calls:
-    """Draw the noise of calls and run the prologue.
+    """Calls without targets: draw their noise and run the prologue.
 
-    Args:
-        model: the reference model of the policy.
-        spec: the specification of the policy.
-        episodes: all recorded episodes.
-        chosen: number of the episode, and row in it, of each call.
-        seed: the seed of the noise.
-
-    Returns:
-        The calls, without targets.
+    ``chosen`` has the number of the episode, and the row in it, of each call.
     """
     draw = np.random.default_rng(seed)
     shape = (len(chosen), *spec.sample)

@@ -124,13 +124,8 @@ class CrowdedSchedules:
 def budget_of_error(crowded: CrowdedSchedules, goal: Goal, steps: int, blocks: int) -> Budget:
     """The fewest whole steps with which a crowded schedule is as good as was asked for.
 
-    Judged on calls to learn from that its correction was not fitted on: the held-out episodes stay out of it.
-
-    Args:
-        crowded: compares crowded schedules.
-        goal: of kind ``max_action_error``.
-        steps: K, the number of denoising steps.
-        blocks: number of residual blocks.
+    Judged on calls to learn from that its correction was not fitted on: the held-out episodes stay out of it. The goal
+    is of kind ``max_action_error``.
 
     Raises:
         CalibrationFailedError: no plan that reuses at least half of the cells is, or the time is up before one is.
@@ -168,11 +163,7 @@ def named_plans(
 ) -> tuple[dict[str, Found], dict[str, str]]:
     """Make ``safe`` and ``fast``, where they can be made: whole steps with a correction fitted on all calls.
 
-    Args:
-        crowded: compares crowded schedules.
-        task: has the calls that corrections are fitted on.
-        strategy: the strategy that found the target's plan.
-        cells: how many cells the target's plan computes.
+    ``strategy`` found the target's plan, which computes ``cells``.
 
     Returns:
         Plans by name, with the computed steps in their notes; and by name why there is no plan.

@@ -159,13 +159,7 @@ class Executor:
     ) -> Tensor:
         """The stream after the blocks of step k, where ``row [1, blocks]`` or ``[N, blocks]`` says what to do.
 
-        Args:
-            row: of the plan.
-            k: step.
-            stream: before the blocks.
-            calls: N of them.
-            state: of the loop; changed.
-            blocks: which blocks; None for all.
+        ``stream`` is that before the blocks, all of them or those that are given; ``state`` is changed.
         """
         for b in range(self.model.blocks) if blocks is None else blocks:
             group, column, axis = self.model.groups[b], row[:, b], self.axes[b]

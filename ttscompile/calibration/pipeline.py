@@ -27,7 +27,7 @@ from .crowded import SAFE, SHARE, CrowdedSchedules, budget_of_error, named_plans
 from .execute import Executor
 from .judge import SCHEDULE, default_of, judge, precision_record, require_success, uniform_of
 from .progress import Bar
-from .pruner.head import has_head
+from .pruner.switches import has_head
 from .result import CalibrationResult
 from .search import open_search, search_plan
 from .state import StateFile

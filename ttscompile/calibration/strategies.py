@@ -56,12 +56,7 @@ class Strategy:
         return found
 
     def require_reach(self, steps: int, blocks: int, budget: int) -> None:
-        """Refuse a budget that the strategy cannot keep.
-
-        Args:
-            steps: K, the number of denoising steps.
-            blocks: number of residual blocks.
-            budget: cells that may be computed, step 0 included.
+        """Refuse a budget of computed cells, step 0 included, that the strategy cannot keep.
 
         Raises:
             CalibrationError: it computes more; says how much sparsity it can reach.

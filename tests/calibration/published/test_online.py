@@ -10,9 +10,8 @@ import torch
 
 from tests.rounding import FLOAT64, Counted, assert_equal_but_for_rounding, bound
 from ttscompile.calibration.calls import Calls
-from ttscompile.calibration.published.criterion import Criterion, Decisions
 from ttscompile.calibration.published.dbcache import dbcache, proposals
-from ttscompile.calibration.published.online import decide, within
+from ttscompile.calibration.published.online import Criterion, Decisions, decide, within
 from ttscompile.calibration.published.teacache import dense_changes, proposal
 from ttscompile.calibration.search import plan_of
 from ttscompile.calibration.task import Found

@@ -9,9 +9,8 @@ import numpy as np
 from ...core.lattice import PlanArray, Source
 from ...runtimes.settle import pruner_plan
 from ..task import Array, Task
-from .head import capacity, has_head, head_features, head_weights
 from .linear import Matrix, linearise
-from .switches import fit_switches
+from .switches import capacity, fit_switches, has_head, head_features, head_weights
 
 LINEARISED = 32
 """Calls that an interval linearises."""
