@@ -36,13 +36,7 @@ def anchors_of(plan: PlanArray) -> BoolArray:
 
 
 def fit_correction(executor: Executor, plan: PlanArray, calls: Calls) -> Correction:
-    """The correction of a schedule.
-
-    Args:
-        executor: of the policy; its own correction is not used.
-        plan: int8 ``[K, blocks]``, legal without a rollout cache.
-        calls: with the path of the dense policy.
-    """
+    """The correction of a schedule ``[K, blocks]`` that reads no rollout cache; that of the executor is not used."""
     assert calls.path is not None
     steps, sample = executor.model.steps, (calls.initial.shape[1], calls.initial.shape[2])
     anchors, groups = anchors_of(plan), groups_of(steps, sample)

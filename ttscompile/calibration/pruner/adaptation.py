@@ -50,12 +50,9 @@ class Adaptation:
         """Linearise some more calls; with all of them, fit."""
         known = sum(len(error) for error in self._errors)
         if known < self._learned:
-            numbers = self._order[known : min(known + LINEARISED, self._learned)]
-            task = self._task
-            calls = task.executor.select(task.calls, numbers)
-            model = linearise(
-                task.executor, task.actions, self._schedule, calls, int(task.draw(known, 2).integers(2**31))
-            )
+            task, numbers = self._task, self._order[known : min(known + LINEARISED, self._learned)]
+            calls, seed = task.executor.select(task.calls, numbers), int(task.draw(known, 2).integers(2**31))
+            model = linearise(task.executor, task.actions, self._schedule, calls, seed)
             self._effects.append(model.toggles().reshape(*self._schedule.shape, len(numbers), -1))
             self._errors.append(model.error.reshape(len(numbers), -1))
             return

@@ -2,9 +2,9 @@
 
 A switch exchanges a computed cell of the schedule for a reused one when a linear function of the policy's condition
 features says that this lowers the error of the call. The number of computed cells is the same whatever the switches
-do, and the pruner's head (``passes/insert_pruner``) can express them exactly (``head_weights``). Which exchanges, and when, follows from the linear
-models: they predict the effect of every exchange on every call. What an exchange is worth is estimated on episodes
-that the function was not fitted on.
+do, and the pruner's head (``passes/insert_pruner``) can express them exactly (``head_weights``). Which exchanges, and
+when, follows from the linear models: they predict the effect of every exchange on every call. What an exchange is worth
+is estimated on episodes that the function was not fitted on.
 """
 
 from __future__ import annotations
