@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from ttscompile.artifact.load import load_artifact
-from ttscompile.calibration import latency, pipeline
-from ttscompile.calibration.budget import Goal, cells_of, goal_of
-from ttscompile.calibration.clock import Clock
+from ttscompile.calibration import budget as budgets
+from ttscompile.calibration import pipeline
+from ttscompile.calibration.budget import Goal, cells_of, goal_of, measure_budget
 from ttscompile.calibration.crowded import CrowdedSchedules, budget_of_error
-from ttscompile.calibration.latency import measure_budget
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.progress import Bar
 from ttscompile.calibration.result import CalibrationResult
 from ttscompile.calibration.state import FILE, StateFile
+from ttscompile.calibration.task import Clock
 from ttscompile.calibration.whole_steps import Errors, WholeSteps
 from ttscompile.core.lattice import Source
 from ttscompile.errors import CalibrationError, CalibrationFailedError
@@ -109,8 +109,8 @@ def _timed(monkeypatch: pytest.MonkeyPatch, step_ms: float) -> list[str]:
         asked.append(policy.last_report.plan_name)
         return float(step_ms * np.count_nonzero(policy.last_report.plan == Source.COMPUTE) / BLOCKS)
 
-    monkeypatch.setattr(latency, "median_ms", median_ms)
-    monkeypatch.setattr(latency, "_pruner_ms", lambda artifact, runtime: 0.5)
+    monkeypatch.setattr(budgets, "median_ms", median_ms)
+    monkeypatch.setattr(budgets, "_pruner_ms", lambda artifact, runtime: 0.5)
     return asked
 
 

@@ -16,7 +16,7 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.calls import split_episodes
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.pipeline import calibrate
-from ttscompile.calibration.published import bac, interval
+from ttscompile.calibration.published import bac, static
 from ttscompile.calibration.result import CalibrationResult
 from ttscompile.calibration.state import FILE
 from ttscompile.core.lattice import Source, uniform_plan
@@ -187,7 +187,7 @@ def test_no_better_than_uniform_is_a_failure_that_changes_nothing(
 ) -> None:
     before = contents(artifact)
 
-    monkeypatch.setattr(bac, "bac", interval.interval)
+    monkeypatch.setattr(bac, "bac", static.interval)
     with pytest.raises(CalibrationFailedError, match="no better than the uniform schedule"):
         quick(artifact, recording, strategy="bac")
     assert {n: c for n, c in contents(artifact).items() if n != FILE} == before

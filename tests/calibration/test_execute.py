@@ -55,7 +55,7 @@ def test_different_plans_have_different_results(make_task: MakeTask) -> None:
 def test_calls_are_selected_in_the_order_given(make_task: MakeTask) -> None:
     task = make_task(calls=4)
     with Counted() as counted:
-        some = task.executor.run_dense(task.executor.selector.calls(task.calls, [2, 0, 2]))
+        some = task.executor.run_dense(task.executor.select(task.calls, [2, 0, 2]))
     assert_equal_but_for_rounding(some, task.calls.path[[2, 0, 2]], counted.terms)
 
 

@@ -16,19 +16,18 @@ import torch
 from ttscompile import ObservationSpec
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration import targets
+from ttscompile.calibration.budget import _pruner_ms
 from ttscompile.calibration.calls import LARGEST, Actions, split_episodes
-from ttscompile.calibration.clock import Clock
-from ttscompile.calibration.compare import compare
-from ttscompile.calibration.contest import _error
+from ttscompile.calibration.compare import _error, compare
 from ttscompile.calibration.crowded import CrowdedSchedules
 from ttscompile.calibration.execute import Executor
-from ttscompile.calibration.latency import _pruner_ms
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.progress import Bar
 from ttscompile.calibration.search import open_search, search_plan
 from ttscompile.calibration.state import FILE, StateFile
 from ttscompile.calibration.strategies import NAMES
 from ttscompile.calibration.targets import draw_calls, with_targets
+from ttscompile.calibration.task import Clock
 from ttscompile.calibration.tts import Tts
 from ttscompile.core.lattice import PlanArray, Source, uniform_plan
 from ttscompile.errors import CalibrationError, CalibrationFailedError

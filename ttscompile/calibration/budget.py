@@ -1,19 +1,34 @@
-"""What a plan may cost, in the terms of whoever asks, and the number of computed cells that it comes to."""
+"""What a plan may cost, in the terms of whoever asks, and the number of computed cells that it comes to.
+
+A latency is measured, with onnxruntime on this machine.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
+
 from ..artifact.ceiling import TYPICAL_SPARSITY
-from ..artifact.manifest import Manifest
-from ..core.lattice import dense_plan
+from ..artifact.load import Artifact
+from ..artifact.manifest import Manifest, PlanRecord
+from ..core.lattice import dense_plan, sparsity, uniform_plan
+from ..core.spec import Noise
 from ..errors import CalibrationError
+from ..measure.timer import Timer
+from ..runtimes.open import open_runtime
+from ..runtimes.policy import CompiledPolicy
+from ..runtimes.runtime import Runtime
+from .task import Found
 
 SPARSITY, FLOPS, LATENCY, ERROR = "target_sparsity", "target_flops", "latency_ms", "max_action_error"
 """The ways to ask for a plan: the names of the arguments of ``calibrate``."""
+
+WARM_UP, FEWEST, MOST, SECONDS = 2, 5, 25, 2.0
+"""Calls of a plan that are not counted; that are, at least and at most; and after how long no more are made."""
 
 
 @dataclass(frozen=True)
@@ -107,50 +122,105 @@ def cells_of(goal: Goal, manifest: Manifest, pruned: bool) -> int:
     Raises:
         CalibrationError: no plan, or only the dense one, is what was asked for.
     """
-    steps, blocks = manifest.steps, len(manifest.blocks)
-    cells = _cells_of_flops(goal, manifest, pruned) if goal.kind == FLOPS else _cells_of_sparsity(goal, steps, blocks)
+    steps, blocks, flops = manifest.steps, len(manifest.blocks), manifest.flops
+    step = sum(flops.blocks)
+    fixed = flops.call(dense_plan(steps, blocks), pruned) - steps * step  # a call without its blocks
+    if goal.kind == FLOPS:  # as many whole steps as fit, and cells of average cost
+        cells = int(((1 - goal.value) * flops.dense - fixed) / step * blocks + 1e-6)
+        most, least = 1 - (fixed + step) / flops.dense, 1 - (fixed + (steps - 1) * step) / flops.dense
+        why = (
+            "prologue, stems, tails, the pruner and the dense step 0 take"
+            f" {1 - most:.4g} of a dense call, so at most {most:.4g} can be saved. Lower the target."
+        )
+    else:
+        cells = int((1 - goal.value) * steps * blocks + 1e-6)
+        most, least = 1 - 1 / steps, 1 / steps
+        why = (
+            f"step 0 of every call is dense, so at most {most:.4g} of the {steps} x {blocks} cells can be reused. Lower"
+            " the target, or convert with more denoising steps."
+        )
+    if cells < blocks:
+        raise CalibrationError(f"{goal} cannot be reached: {why}")
     if cells > (steps - 1) * blocks:
         raise CalibrationError(
             f"{goal} leaves {cells} of the {steps} x {blocks} cells to be computed, and less than one whole step to be"
-            f" reused: that is the dense policy. Ask for at least {_least(goal, manifest, pruned):.4g}."
+            f" reused: that is the dense policy. Ask for at least {least:.4g}."
         )
     return cells
 
 
-def _cells_of_sparsity(goal: Goal, steps: int, blocks: int) -> int:
-    cells = int((1 - goal.value) * steps * blocks + 1e-6)
-    if cells < blocks:
+def with_plans(artifact: Artifact, plans: Mapping[str, Found]) -> Artifact:
+    """The artifact, in memory, with more schedules: a runtime treats them as it does those of the file."""
+    records = {name: PlanRecord("schedule", sparsity(one.schedule), None) for name, one in plans.items()}
+    corrections = {name: one.correction for name, one in plans.items() if one.correction is not None}
+    return replace(
+        artifact,
+        manifest=replace(artifact.manifest, plans={**artifact.manifest.plans, **records}),
+        schedules={**artifact.schedules, **{name: one.schedule for name, one in plans.items()}},
+        corrections={**artifact.corrections, **corrections},
+    )
+
+
+def measure_budget(artifact: Artifact, goal: Goal, pruned: bool) -> Budget:
+    """The largest number of computed cells, in whole steps, whose calls fit.
+
+    Bisection over the number of steps; each candidate is the median of some calls on one stream. Where the pruner may
+    run (``pruned``), what the loop waits for it is added. The goal is of kind ``latency_ms``.
+
+    Raises:
+        CalibrationError: not even a call of one computed step fits, or a dense one does.
+    """
+    assert goal.kind == LATENCY
+    steps, blocks = artifact.manifest.steps, len(artifact.manifest.blocks)
+    names = {full: f"{full} steps" for full in range(1, steps + 1)}
+    whole = with_plans(artifact, {name: Found(uniform_plan(steps, blocks, full)) for full, name in names.items()})
+    runtime = open_runtime(whole, "onnxruntime", goal.threads)
+    policy = CompiledPolicy(whole, runtime, seed=0)
+    obs = {key: np.zeros((1, *one.shape), one.dtype) for key, one in artifact.manifest.spec.observations.items()}
+    waited = _pruner_ms(artifact, runtime) if pruned else 0.0
+    measured: dict[int, float] = {}
+
+    def fits(full: int) -> bool:
+        measured[full] = waited + median_ms(lambda: policy.predict_action(obs, plan=names[full]))
+        return measured[full] <= goal.value
+
+    here = f"on this machine with {goal.threads} thread{'s' * (goal.threads > 1)}"
+    if not fits(1):
         raise CalibrationError(
-            f"target sparsity {goal.value:g} cannot be reached: step 0 of every call is dense, so at most"
-            f" {1 - 1 / steps:.4g} of the {steps} x {blocks} cells can be reused. Lower the target, or convert with"
-            " more denoising steps."
+            f"{goal} cannot be reached: a call that computes step 0 alone takes {measured[1]:.4g} ms {here}. Allow"
+            " more, or convert with fewer denoising steps or --precision int8."
         )
-    return cells
+    if fits(steps):
+        met = f"{goal} is met by the dense policy, which takes {measured[steps]:.4g} ms {here}"
+        raise CalibrationError(f"{met}: ttscompile.load(..., plan='dense').")
+    low, high = 1, steps
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if fits(middle) else (low, middle)
+    return Budget(
+        goal, low * blocks, {"measured_ms": {str(full): round(measured[full], 3) for full in sorted(measured)}}
+    )
 
 
-def _cells_of_flops(goal: Goal, manifest: Manifest, pruned: bool) -> int:
-    """As many whole steps as fit, and cells of average cost."""
-    flops, blocks = manifest.flops, len(manifest.blocks)
-    fixed, step = _fixed(manifest, pruned), sum(flops.blocks)
-    cells = int(((1 - goal.value) * flops.dense - fixed) / step * blocks + 1e-6)
-    if cells < blocks:
-        raise CalibrationError(
-            f"target flops {goal.value:g} cannot be reached: prologue, stems, tails, the pruner and the dense step 0"
-            f" take {(fixed + step) / flops.dense:.4g} of a dense call, so at most"
-            f" {1 - (fixed + step) / flops.dense:.4g} can be saved. Lower the target."
-        )
-    return cells
+def median_ms(call: Callable[[], object]) -> float:
+    """Median wall time of a call, in milliseconds."""
+    timer = Timer(1, WARM_UP)
+    while timer.counted < FEWEST or (timer.counted < MOST and timer.seconds < SECONDS):
+        timer.round()
+        timer.time(0, call)
+    return timer.times[0].median
 
 
-def _fixed(manifest: Manifest, pruned: bool) -> float:
-    """FLOPs of a call without its blocks."""
-    plan = dense_plan(manifest.steps, len(manifest.blocks))
-    return manifest.flops.call(plan, pruned) - manifest.steps * sum(manifest.flops.blocks)
-
-
-def _least(goal: Goal, manifest: Manifest, pruned: bool) -> float:
-    """The lowest value of a goal that leaves a whole step to be reused."""
-    if goal.kind == SPARSITY:
-        return 1 / manifest.steps
-    most = _fixed(manifest, pruned) + (manifest.steps - 1) * sum(manifest.flops.blocks)
-    return 1 - most / manifest.flops.dense
+def _pruner_ms(artifact: Artifact, runtime: Runtime) -> float:
+    """For how long the loop waits for the pruner's plan, in milliseconds; whatever the plan is."""
+    spec = artifact.manifest.spec
+    obs = {
+        key: np.zeros((1, *one.shape), one.dtype if one.normalizer is None else np.float32)
+        for key, one in spec.observations.items()
+    }
+    noise = Noise(np.zeros((1, *spec.sample), np.float32), np.zeros((spec.sampler.steps, 1, *spec.sample), np.float32))
+    waits = []
+    for _ in range(WARM_UP + FEWEST):
+        waits.append(runtime.predict(obs, noise)[1].timings.wait_pruner)
+        runtime.reset()
+    return float(np.median(waits[WARM_UP:]))

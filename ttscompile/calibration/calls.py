@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,6 @@ from torch import Tensor
 
 from ..core.spec import PolicySpec
 from ..errors import CalibrationError
-from ..ir.graph import Graph
 from ..runtimes.random_calls import normalized
 from ..runtimes.reference.model import Contexts, ReferenceModel
 from ..trajectories.episodes import Episode, load_trajectories
@@ -141,17 +140,9 @@ def prepare_calls(
     chosen: Sequence[tuple[int, int]],
     seed: tuple[int, ...],
 ) -> Calls:
-    """Draw the noise of calls and run the prologue.
+    """Calls without targets: draw their noise and run the prologue.
 
-    Args:
-        model: the reference model of the policy.
-        spec: the specification of the policy.
-        episodes: all recorded episodes.
-        chosen: number of the episode, and row in it, of each call.
-        seed: the seed of the noise.
-
-    Returns:
-        The calls, without targets.
+    ``chosen`` has the number of the episode, and the row in it, of each call.
     """
     draw = np.random.default_rng(seed)
     shape = (len(chosen), *spec.sample)
@@ -163,36 +154,6 @@ def prepare_calls(
     with torch.no_grad():
         contexts = model.prologue({key: torch.from_numpy(one) for key, one in normalized(spec, observed).items()})
     return Calls(contexts, initial, noise, np.array([n for n, _ in chosen], np.int64))
-
-
-class Selector:
-    """Takes streams out of what the loop reads, whatever the layout of the values.
-
-    Args:
-        graphs: the pieces whose outputs the loop reads: ``condition``, and ``step`` if there is one.
-    """
-
-    def __init__(self, graphs: Iterable[Graph]) -> None:
-        self._axes = {name: graph.types()[name].batch_axis for graph in graphs for name in graph.outputs}
-
-    def calls(self, calls: Calls, streams: Sequence[int] | IntArray) -> Calls:
-        """These calls, in this order; a call may be taken several times."""
-        index, contexts = torch.as_tensor(np.asarray(streams, dtype=np.int64)), calls.contexts
-        steps = tuple(self._take(row, index) for row in contexts.steps) if contexts.steps[0] else contexts.steps
-        return Calls(
-            contexts=Contexts(len(index), self._take(contexts.condition, index), steps),
-            initial=calls.initial[index],
-            noise=None if calls.noise is None else calls.noise[:, index],
-            episodes=calls.episodes[index.numpy()],
-            path=None if calls.path is None else calls.path[index],
-        )
-
-    def _take(self, values: Mapping[str, Tensor], index: Tensor) -> dict[str, Tensor]:
-        taken = {}
-        for name, value in values.items():
-            axis = self._axes[name]
-            taken[name] = value if axis is None else value.index_select(axis, index)
-        return taken
 
 
 class Actions:

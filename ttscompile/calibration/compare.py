@@ -11,8 +11,9 @@ calls are apart that start alike and draw differently is the yardstick for its e
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,26 +22,53 @@ import torch
 from ..artifact.load import Artifact, load_artifact
 from ..artifact.manifest import DENSE
 from ..core.correction import FEATURES
+from ..core.lattice import Source
+from ..core.spec import FP32, Noise
 from ..errors import CalibrationError
-from ..measure.points import Frontier
+from ..measure.points import Frontier, MeasuredPoint
+from ..measure.timer import Timer
 from ..runtimes.open import open_runtime
 from ..runtimes.policy import CompiledPolicy
+from ..runtimes.random_calls import random_noise
 from ..trajectories.episodes import Episode
-from .budget import cells_of, goal_of
-from .calls import Split, load_episodes, require_seed, sample_calls, split_episodes
-from .contest import Entrant, Progress, measure
+from .budget import cells_of, goal_of, with_plans
+from .calls import LARGEST, Split, load_episodes, require_seed, sample_calls, split_episodes
 from .execute import Executor
-from .latency import with_plans
 from .search import plan_of
 from .strategies import strategy_of
 from .targets import dense_rounds, draw_calls
-from .task import Found, Task
+from .task import Array, Found, Task
 
 LEARNED = 256
 """Calls that strategies learn from, at most. ``calibrate`` takes up to 960: its corrections are better."""
 
 FRACTION = 0.25
 """Share of the episodes to judge on. It is the default of ``calibrate``: with its seed, its plans saw none of them."""
+
+WARM_UP = 2
+"""Rounds whose times do not count, where there are more than these; their actions count."""
+
+Progress = Callable[[str, int, int], None]
+"""Told what is being done, how many parts are done, and of how many."""
+
+
+@dataclass(frozen=True)
+class Entrant:
+    """A plan that takes part.
+
+    Attributes:
+        series: see ``MeasuredPoint``.
+        name: see ``MeasuredPoint``.
+        policy: the policy that runs the plan.
+        plan: the plan's name in that policy.
+        paired: whether it takes all the noise of the dense calls.
+    """
+
+    series: str
+    name: str
+    policy: CompiledPolicy
+    plan: str
+    paired: bool
 
 
 def compare(
@@ -88,9 +116,13 @@ def compare(
     artifact = load_artifact(path)
     spec = artifact.manifest.spec
     budgets = {one: cells_of(goal_of(target_sparsity=one), artifact.manifest, False) for one in sparsities}
-    compared = {_unique(other.resolve().name, others): load_artifact(other) for other in others}
-    for name, other in compared.items():
-        _require_same_policy(artifact, other, name)
+    compared: dict[str, Artifact] = {}
+    for other in others:
+        name = other.resolve().name
+        if name in compared:
+            raise CalibrationError(f"two artifacts are called {name!r}: points could not be told apart. Rename one.")
+        compared[name] = load_artifact(other)
+        _require_same_policy(artifact, compared[name], name)
     episodes = load_episodes(spec, trajectories, observation)
     split = split_episodes(len(episodes), FRACTION, seed)
     wished = [(strategy_of(name).name, sparsity) for name in strategies for sparsity in budgets]
@@ -111,29 +143,28 @@ def compare(
             cut += [name] * short
     if wished:
         progress("search", len(wished), len(wished))
-    entrants = _enter(artifact, found, compared, threads)
-    chosen = sample_calls(episodes, split.validation, calls, seed)
     warnings = _warnings(artifact, split, compared)
     if cut:
         told = f"the limit of {max_minutes:g} minutes cut the search short of {', '.join(cut)}: see --max-minutes."
-        warnings = (*warnings, told)
-    fitted = [name for name in strategies if strategy_of(name).fits_correction]
-    if fitted and learned < FEATURES * spec.sample[0]:
-        few = (
-            f"{', '.join(fitted)} fits corrections of {FEATURES * spec.sample[0]} features from at most {learned}"
-            " calls: its points are far worse than they would be after a calibration. Let it learn from more."
+        warnings.append(told)
+    fitted, features = [name for name in strategies if strategy_of(name).fits_correction], FEATURES * spec.sample[0]
+    if fitted and learned < features:
+        warnings.append(
+            f"{', '.join(fitted)} fits corrections of {features} features from at most {learned} calls: its points are"
+            " far worse than they would be after a calibration. Let it learn from more."
         )
-        warnings = (*warnings, few)
-    points, yardsticks = measure(artifact, entrants, episodes, chosen, seed, threads, progress)
-    return Frontier(points, len(chosen), split.validation, threads, yardsticks, skipped, warnings)
+    entrants = _enter(artifact, found, compared, threads)
+    chosen = sample_calls(episodes, split.validation, calls, seed)
+    points, yardsticks = _measure(artifact, entrants, episodes, chosen, seed, threads, progress)
+    return Frontier(points, len(chosen), split.validation, threads, yardsticks, skipped, tuple(warnings))
 
 
 def _task(
     artifact: Artifact, episodes: Sequence[Episode], split: Split, limit: int, seed: int, progress: Progress
 ) -> Task:
     """What strategies are given, but for the budget: calls with what the dense policy answers to them."""
-    spec, executor = artifact.manifest.spec, Executor(artifact)
-    calls = draw_calls(executor, spec, episodes, split, limit, 1, seed)["calibration"]
+    executor = Executor(artifact)
+    calls = draw_calls(executor, artifact.manifest.spec, episodes, split, limit, 1, seed)["calibration"]
     progress("dense calls to learn from", 0, calls.count)
     paths: list[torch.Tensor] = []
     for found in dense_rounds(executor, calls):
@@ -162,51 +193,108 @@ def _enter(
     return entrants
 
 
-def _unique(name: str, others: Sequence[Path]) -> str:
-    """Name of the folder; refuses two of one name.
-
-    Raises:
-        CalibrationError: there are two.
-    """
-    if sum(other.resolve().name == name for other in others) > 1:
-        raise CalibrationError(f"two artifacts are called {name!r}; their points could not be told apart. Rename one.")
-    return name
-
-
 def _require_same_policy(artifact: Artifact, other: Artifact, name: str) -> None:
-    """Refuse an artifact that was made from another checkpoint.
-
-    Raises:
-        CalibrationError: says what differs.
-    """
-    ours, theirs = artifact.manifest.spec, other.manifest.spec
-    shapes = [
-        (s.original.sample, {k: o.shape for k, o in s.observations.items()}, s.chunk.start, s.chunk.stop)
-        for s in (ours, theirs)
-    ]
+    """Refuse an artifact that was made from another checkpoint; says what differs."""
+    specs = artifact.manifest.spec, other.manifest.spec
+    ours, theirs = (
+        (s.original.sample, {k: o.shape for k, o in s.observations.items()}, s.chunk.start, s.chunk.stop) for s in specs
+    )
     # Masks and position tables are shorter where fewer steps are predicted; the weights proper are not.
-    narrower = ours.sample != theirs.sample
+    narrower = specs[0].sample != specs[1].sample
     pairs = [(value, other.weights[key]) for key, value in artifact.weights.items() if key in other.weights]
-    same = [np.array_equal(left, right) for left, right in pairs]
-    excused = [narrower and left.shape != right.shape for left, right in pairs]
-    equal = any(same) and all(a or b for a, b in zip(same, excused, strict=True))
-    if shapes[0] != shapes[1] or not equal:
-        what = f"{shapes[1]} instead of {shapes[0]}" if shapes[0] != shapes[1] else "other weights"
+    same = [np.array_equal(*pair) for pair in pairs if not narrower or pair[0].shape == pair[1].shape]
+    if ours != theirs or not (same and all(same)):
+        what = f"{theirs} instead of {ours}" if ours != theirs else "other weights"
         raise CalibrationError(
             f"{name}: expected an artifact of the same checkpoint; found {what}. Actions of different policies cannot"
             " be held against each other: convert the same checkpoint with another --sampler, --steps or --precision."
         )
 
 
-def _warnings(artifact: Artifact, split: Split, others: Mapping[str, Artifact]) -> tuple[str, ...]:
+def _warnings(artifact: Artifact, split: Split, others: Mapping[str, Artifact]) -> list[str]:
     """Plans that may have been learned from the episodes that they are judged on here."""
     found = []
     for name, one in {"this artifact": artifact, **others}.items():
-        record = one.manifest.calibration or {}
-        held_out = (record.get("episodes") or {}).get("validation")
+        held_out = ((one.manifest.calibration or {}).get("episodes") or {}).get("validation")
         if one.manifest.plans and (held_out is None or tuple(held_out) != split.validation):
             found.append(
                 f"{name}: its calibration held out the episodes {held_out}, and this comparison"
                 f" {list(split.validation)}: its plans may have been learned from them. Give the same files and --seed."
             )
-    return tuple(found)
+    return found
+
+
+def _measure(
+    artifact: Artifact,
+    entrants: Sequence[Entrant],
+    episodes: Sequence[Episode],
+    chosen: Sequence[tuple[int, int]],
+    seed: int,
+    threads: int,
+    progress: Progress,
+) -> tuple[tuple[MeasuredPoint, ...], dict[str, float]]:
+    """All entrants on all calls, in turn: a point for each, and ``Frontier.yardsticks``.
+
+    ``chosen`` has the number of the episode, and the row in it, of each call.
+    """
+    # Noise of the original's shape fits every artifact of the policy, however many steps it predicts.
+    spec, draw = artifact.manifest.spec.original, np.random.default_rng((seed, 4))
+    exact = artifact.at_precision(FP32)
+    truth = CompiledPolicy(exact, open_runtime(exact, "onnxruntime", threads))
+    errors: list[list[float]] = [[] for _ in entrants]
+    reports: list[list[tuple[float, float]]] = [[] for _ in entrants]
+    apart: dict[str, list[float]] = {"all": [], **({"steps": []} if spec.sampler.stochastic else {})}
+    timer = Timer(len(entrants), WARM_UP if len(chosen) > WARM_UP else 0)
+    for number, (episode, row) in enumerate(chosen):
+        obs = {key: array[row : row + 1] for key, array in episodes[episode].observations.items()}
+        one, two = random_noise(spec, draw), random_noise(spec, draw)
+        dense = _call(truth, obs, one, DENSE)
+        apart["all"].append(_error(_call(truth, obs, two, DENSE), dense))
+        if "steps" in apart:
+            apart["steps"].append(_error(_call(truth, obs, Noise(one.initial, two.steps), DENSE), dense))
+        for i in timer.round():
+            entrant, policy = entrants[i], entrants[i].policy
+            noise = one if entrant.paired else _adapted(one, policy, draw)
+            errors[i].append(_error(timer.time(i, partial(_call, policy, obs, noise, entrant.plan)), dense))
+            report = policy.last_report
+            assert report is not None
+            reports[i].append((float(np.mean(report.plan != Source.COMPUTE)), report.flops[0]))
+        progress("held-out calls", number + 1, len(chosen))
+    points = []
+    for entrant, wrong, times, seen in zip(entrants, errors, timer.times, reports, strict=True):
+        sparsity, flops = np.mean(seen, axis=0)
+        points.append(
+            MeasuredPoint(
+                series=entrant.series,
+                name=entrant.name,
+                sparsity=float(sparsity),
+                flops=float(flops),
+                error=float(np.mean(wrong)),
+                error_p90=float(np.quantile(wrong, 0.9)),
+                latency_ms=times.median,
+                quartiles_ms=times.quartiles,
+                noise="all" if entrant.paired else "initial",
+            )
+        )
+    return tuple(points), {name: float(np.mean(found)) for name, found in apart.items()}
+
+
+def _call(policy: CompiledPolicy, obs: Mapping[str, Array], noise: Noise, plan: str) -> Array:
+    """The executed actions of a first call, ``[Ta, Da]``."""
+    policy.reset()
+    actions: Array = policy.predict_action(obs, noise=noise, plan=plan)["action"][0]
+    return actions
+
+
+def _error(actions: Array, dense: Array) -> float:
+    with np.errstate(invalid="ignore", over="ignore"):
+        difference = np.abs(actions - dense).mean()
+    return float(np.nan_to_num(difference, nan=LARGEST, posinf=LARGEST))
+
+
+def _adapted(noise: Noise, policy: CompiledPolicy, draw: np.random.Generator) -> Noise:
+    """The same initial sample, with the draws that another sampler needs."""
+    info = policy.info
+    if not info.stochastic:
+        return Noise(noise.initial)
+    return Noise(noise.initial, draw.standard_normal((info.K, *noise.initial.shape), dtype=np.float32))

@@ -12,9 +12,10 @@ import numpy as np
 
 from ..errors import CalibrationFailedError
 from .budget import Budget, Goal
-from .clock import Clock
 from .progress import Bar
 from .state import StateFile
+from .strategies import Strategy
+from .task import Clock, Found, Task
 from .whole_steps import Errors, WholeSteps
 
 CROWDING = (2.0, 3.0, 1.5, 4.0, 1.0, 2.5, 3.5, 5.0, 0.6, 0.4)
@@ -26,6 +27,12 @@ COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 
 TRIED = (1.0, 2.0, 3.0, 4.0)
 """Those of ``CROWDING`` that are tried while only the number of steps is in question."""
+
+SAFE, FAST = "safe", "fast"
+"""Plans beside the target: one computes twice as many cells, the other half as many; the robot chooses."""
+
+SHARE = 0.2
+"""Share of the time limit that is kept from the search for these plans."""
 
 
 def crowded_steps(steps: int, full_steps: int, crowding: float) -> tuple[int, ...]:
@@ -117,26 +124,23 @@ class CrowdedSchedules:
 def budget_of_error(crowded: CrowdedSchedules, goal: Goal, steps: int, blocks: int) -> Budget:
     """The fewest whole steps with which a crowded schedule is as good as was asked for.
 
-    Judged on calls to learn from that its correction was not fitted on: the held-out episodes stay out of it.
-
-    Args:
-        crowded: compares crowded schedules.
-        goal: of kind ``max_action_error``.
-        steps: K, the number of denoising steps.
-        blocks: number of residual blocks.
+    Judged on calls to learn from that its correction was not fitted on: the held-out episodes stay out of it. The goal
+    is of kind ``max_action_error``.
 
     Raises:
         CalibrationFailedError: no plan that reuses at least half of the cells is, or the time is up before one is.
     """
     tried: dict[int, float] = {}
 
+    def failed(what: str, otherwise: str) -> CalibrationFailedError:
+        told = [f"{error:.4g} with {full} of the steps computed" for full, error in tried.items()] or ["none tried"]
+        return CalibrationFailedError(f"{what}: {', '.join(told)}. The artifact is as it was. {otherwise}.")
+
     def enough(full: int) -> bool:
         best = crowded.best(full, f"{full} steps", TRIED)
         if best is None:
-            raise CalibrationFailedError(
-                f"the time limit ended the search for a plan with an action error of at most {goal.value:g}:"
-                f" {_told(tried)}. The artifact is as it was. Allow more time, or a larger error."
-            )
+            what = f"the time limit ended the search for a plan with an action error of at most {goal.value:g}"
+            raise failed(what, "Allow more time, or a larger error")
         tried[full] = best.error
         return best.error <= goal.value
 
@@ -146,15 +150,38 @@ def budget_of_error(crowded: CrowdedSchedules, goal: Goal, steps: int, blocks: i
             break
         low = high
     else:
-        raise CalibrationFailedError(
-            f"max action error {goal.value:g} cannot be reached by a plan that reuses at least half of the cells:"
-            f" {_told(tried)}. The artifact is as it was. Allow a larger error, or use the dense plan."
-        )
+        what = f"max action error {goal.value:g} cannot be reached by a plan that reuses at least half of the cells"
+        raise failed(what, "Allow a larger error, or use the dense plan")
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (low, middle) if enough(middle) else (middle, high)
     return Budget(goal, high * blocks, {"errors": {str(full): error for full, error in sorted(tried.items())}})
 
 
-def _told(tried: dict[int, float]) -> str:
-    return ", ".join(f"{error:.4g} with {full} of the steps computed" for full, error in tried.items()) or "none tried"
+def named_plans(
+    crowded: CrowdedSchedules, task: Task, strategy: Strategy, cells: int
+) -> tuple[dict[str, Found], dict[str, str]]:
+    """Make ``safe`` and ``fast``, where they can be made: whole steps with a correction fitted on all calls.
+
+    ``strategy`` found the target's plan, which computes ``cells``.
+
+    Returns:
+        Plans by name, with the computed steps in their notes; and by name why there is no plan.
+    """
+    steps, target = task.executor.model.steps, max(1, cells // task.executor.model.blocks)
+    plans: dict[str, Found] = {}
+    skipped: dict[str, str] = {}
+    if not strategy.fits_correction:
+        return plans, dict.fromkeys((SAFE, FAST), f"strategy {strategy.name!r} fits no correction")
+    if 2 * target >= steps:
+        skipped[SAFE] = f"twice {target} of {steps} steps is the dense plan"
+    if target <= 2:
+        skipped[FAST] = f"the target computes {target} whole step{'s' * (target > 1)}: half of that is too little"
+    for name, count in ((SAFE, 2 * target), (FAST, max(2, target // 2))):
+        if name in skipped:
+            continue
+        if (best := crowded.best(count, f"plan {name}")) is None:
+            skipped[name] = "the time limit left none for it"
+        else:
+            plans[name] = task.whole_steps(best.steps)
+    return plans, skipped

@@ -8,7 +8,9 @@ business. Tests hold this against ``ReferenceModel.denoise``.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from copy import copy
 from typing import Any
 
@@ -21,8 +23,8 @@ from ..artifact.load import Artifact
 from ..core.correction import Correction
 from ..core.lattice import BoolArray, PlanArray, Source, dense_plan
 from ..errors import IllegalPlanError
-from ..runtimes.reference.model import Blocks, ReferenceModel
-from .calls import Calls, Selector
+from ..runtimes.reference.model import Blocks, Contexts, ReferenceModel
+from .calls import Calls, IntArray
 
 STREAMS = 256
 """Calls with plans of their own that go through the loop at once."""
@@ -37,7 +39,6 @@ class Executor:
     Attributes:
         correction: of the sampler's steps, for all that is run but ``run_dense``; None for none.
         model: of the policy.
-        selector: takes calls apart.
         types: of each block's residual.
         axes: of the streams in each block's residual.
         alike: whether all blocks have residuals of one type.
@@ -48,7 +49,9 @@ class Executor:
         blocks = artifact.manifest.blocks
         self.model = ReferenceModel.from_artifact(artifact)
         pieces = artifact.pieces
-        self.selector = Selector(graph for graph in (pieces.condition, pieces.step) if graph is not None)
+        read = [graph for graph in (pieces.condition, pieces.step) if graph is not None]
+        types = {name: graph.types()[name] for graph in read for name in graph.outputs}
+        self._axes = {name: one.batch_axis for name, one in types.items() if one.batch_axis is not None}
         self.types = [block.type for block in blocks]
         self.axes = [block.type.batch_axis or 0 for block in blocks]
         self.alike = len({block.type for block in blocks}) == 1
@@ -61,6 +64,23 @@ class Executor:
         other = copy(self)
         other.correction = correction
         return other
+
+    def select(self, calls: Calls, streams: Sequence[int] | IntArray) -> Calls:
+        """These calls, in this order; a call may be taken several times."""
+        index, contexts = torch.as_tensor(np.asarray(streams, dtype=np.int64)), calls.contexts
+
+        def take(values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+            chosen = {name: values[name].index_select(self._axes[name], index) for name in self._axes.keys() & values}
+            return {**values, **chosen}
+
+        steps = tuple(map(take, contexts.steps)) if contexts.steps[0] else contexts.steps
+        return Calls(
+            contexts=Contexts(len(index), take(contexts.condition), steps),
+            initial=calls.initial[index],
+            noise=None if calls.noise is None else calls.noise[:, index],
+            episodes=calls.episodes[index.numpy()],
+            path=None if calls.path is None else calls.path[index],
+        )
 
     def run(self, plan: PlanArray, calls: Calls) -> Tensor:
         """The denoised sample of every call.
@@ -81,7 +101,7 @@ class Executor:
             if plan.ndim == 2:
                 return last(self._samples(plan[None], calls))
             parts = [np.arange(i, min(i + STREAMS, len(plan))) for i in range(0, len(plan), STREAMS)]
-            return torch.cat([last(self._samples(plan[part], self.selector.calls(calls, part))) for part in parts])
+            return torch.cat([last(self._samples(plan[part], self.select(calls, part))) for part in parts])
 
     def run_dense(self, calls: Calls) -> Tensor:
         """What the dense policy answers, and how it gets there: the sample after each step, ``[N, K, T, D]``."""
@@ -140,13 +160,7 @@ class Executor:
     ) -> Tensor:
         """The stream after the blocks of step k, where ``row [1, blocks]`` or ``[N, blocks]`` says what to do.
 
-        Args:
-            row: of the plan.
-            k: step.
-            stream: before the blocks.
-            calls: N of them.
-            state: of the loop; changed.
-            blocks: which blocks; None for all.
+        ``stream`` is that before the blocks, all of them or those that are given; ``state`` is changed.
         """
         for b in range(self.model.blocks) if blocks is None else blocks:
             group, column, axis = self.model.groups[b], row[:, b], self.axes[b]
@@ -201,3 +215,20 @@ def last(samples: Iterable[Tensor]) -> Tensor:
 def _numbers(streams: BoolArray) -> Tensor:
     """Numbers of those streams that are True."""
     return torch.from_numpy(np.flatnonzero(streams))
+
+
+@contextmanager
+def workers() -> Iterator[ThreadPoolExecutor]:
+    """As many threads as torch would use for one operation, for whole calls and without gradients; torch uses one each.
+
+    The operations of a policy are small: divided among threads they spend much of their time waiting for the slowest
+    part, most of all on a machine that does something else as well. Whole calls wait for nobody; and since they are
+    divided in the same way however many workers there are, so are the results.
+    """
+    count = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with ThreadPoolExecutor(count, "ttscompile-calibration", torch.set_grad_enabled, (False,)) as pool:
+            yield pool
+    finally:
+        torch.set_num_threads(count)

@@ -18,8 +18,7 @@ from ..core.correction import Correction, groups_of
 from ..core.lattice import BoolArray, PlanArray, Source
 from ..runtimes.reference.sampler import correct, features
 from .calls import Calls
-from .execute import Executor, State
-from .workers import workers
+from .execute import Executor, State, workers
 
 STREAMS = 64
 """Calls that go through the loop at once."""
@@ -37,22 +36,16 @@ def anchors_of(plan: PlanArray) -> BoolArray:
 
 
 def fit_correction(executor: Executor, plan: PlanArray, calls: Calls) -> Correction:
-    """The correction of a schedule.
-
-    Args:
-        executor: of the policy; its own correction is not used.
-        plan: int8 ``[K, blocks]``, legal without a rollout cache.
-        calls: with the path of the dense policy.
-    """
+    """The correction of a schedule ``[K, blocks]`` that reads no rollout cache; that of the executor is not used."""
     assert calls.path is not None
     steps, sample = executor.model.steps, (calls.initial.shape[1], calls.initial.shape[2])
     anchors, groups = anchors_of(plan), groups_of(steps, sample)
     parts = [np.arange(i, min(i + STREAMS, calls.count)) for i in range(0, calls.count, STREAMS)]
-    lanes = [_Lane(executor, plan, executor.selector.calls(calls, part)) for part in parts]
+    lanes = [_Lane(executor, plan, executor.select(calls, part)) for part in parts]
     weights, biases = [], []
-    with workers() as some:
+    with workers() as pool:
         for k in range(steps):
-            pairs = some.map(partial(_Lane.predict, k=k), lanes)
+            pairs = list(pool.map(partial(_Lane.predict, k=k), lanes))
             read, missing = torch.cat([a for a, _ in pairs], 1), torch.cat([b for _, b in pairs], 1)
             weight, bias = _solve(read.double(), missing.double(), groups)
             for lane in lanes:

@@ -22,23 +22,19 @@ from ..errors import CalibrationError
 from ..ir.pieces import PRUNER
 from ..trajectories.episodes import Episode
 from ..verification.record_golden import record_plans
-from .budget import ERROR, LATENCY, Budget, Goal, cells_of, goal_of
+from .budget import ERROR, LATENCY, Budget, Goal, cells_of, goal_of, measure_budget
 from .calls import Calls, load_episodes, require_seed, split_episodes
-from .clock import Clock
-from .crowded import CrowdedSchedules, budget_of_error
+from .crowded import SAFE, SHARE, CrowdedSchedules, budget_of_error, named_plans
 from .execute import Executor
-from .judge import SCHEDULE, default_of, judge, require_success, uniform_of
-from .latency import measure_budget
-from .named import SAFE, SHARE, named_plans
-from .precision_error import precision_record
+from .judge import SCHEDULE, default_of, judge, precision_record, require_success, uniform_of
 from .progress import Bar
-from .pruner.head import has_head
+from .pruner.switches import has_head
 from .result import CalibrationResult
 from .search import open_search, search_plan
 from .state import StateFile
 from .strategies import DEFAULT, FITTED, Strategy, strategy_of
 from .targets import draw_calls, with_targets
-from .task import Found, Search, Task
+from .task import Clock, Found, Search, Task
 
 CALLS_A_MINUTE = 64
 """Calls to learn from, for each minute of the time limit."""
@@ -189,7 +185,7 @@ def calibrate(
         seconds=clock.elapsed(),
     )
     require_success(result, goal)
-    precision = precision_record(artifact, episodes, split.validation, SCHEDULE, found.schedule, found.correction, seed)
+    precision = precision_record(artifact, episodes, split.validation, found, seed)
     _write(Path(path), artifact, result, plans, precision)
     state.remove()
     return result

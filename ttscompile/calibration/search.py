@@ -6,9 +6,8 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 
-from .clock import Clock
 from .strategies import strategy_of
-from .task import Found, Search, Task
+from .task import Clock, Found, Search, Task
 
 CLOSING_SHARE = 0.3
 """What a search does at the end is left out where it would take more than this share of the time: on Push-T an interval

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -21,19 +20,6 @@ BYTES = 2**28
 """Memory for what the blocks compute; gradients and what they need take three to four times as much."""
 
 
-@dataclass(frozen=True, eq=False)
-class Sensitivity:
-    """What each cell of a plan does, by its number ``k * blocks + b``.
-
-    Attributes:
-        computed: what the block computes there, or would, for each call: ``[N, size]``.
-        gradients: of the figure in what the cell adds, for each stream: ``[copies * N, size]``.
-    """
-
-    computed: list[Tensor]
-    gradients: list[Tensor]
-
-
 def chunks(executor: Executor, count: int) -> Iterator[IntArray]:
     """Numbers of ``count`` calls, as many at once as there is memory for."""
     each = 4 * executor.model.steps * sum(math.prod(type_.at(1)) for type_ in executor.types)
@@ -43,7 +29,7 @@ def chunks(executor: Executor, count: int) -> Iterator[IntArray]:
 
 def sensitivity(
     executor: Executor, plan: PlanArray, reuse: Source, calls: Calls, copies: int, figure: Callable[[Tensor], Tensor]
-) -> Sensitivity:
+) -> tuple[list[Tensor], list[Tensor]]:
     """Run the plan, and go back from a figure.
 
     Args:
@@ -53,9 +39,13 @@ def sensitivity(
         calls: the N calls to run.
         copies: how many streams there are of each call, one after the other: ``[copies * N]``.
         figure: a number, of the denoised samples ``[copies * N, T, D]``.
+
+    Returns:
+        By the number of a cell, ``k * blocks + b``: what its block computes there, or would, for each call
+        (``[N, size]``), and the gradient of the figure in what the cell adds, for each stream (``[copies * N, size]``).
     """
     model, count = executor.model, calls.count
-    streams = executor.selector.calls(calls, np.tile(np.arange(count), copies))
+    streams = executor.select(calls, np.tile(np.arange(count), copies))
     cache: dict[int, Tensor] = {}
     computed: list[Tensor] = []
     passed: list[Tensor] = []  # the stream after additions: its gradient is that of what was added just before
@@ -85,7 +75,7 @@ def sensitivity(
     streams.initial.requires_grad_()
     gradients = torch.autograd.grad(figure(last(executor.samples(streams, blocks))), passed)
     axes = executor.axes * model.steps
-    return Sensitivity(computed, [_rows(gradients[i], axis) for i, axis in zip(position, axes, strict=True)])
+    return computed, [_rows(gradients[i], axis) for i, axis in zip(position, axes, strict=True)]
 
 
 def _rows(values: Tensor, axis: int) -> Tensor:

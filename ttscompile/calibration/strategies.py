@@ -56,12 +56,7 @@ class Strategy:
         return found
 
     def require_reach(self, steps: int, blocks: int, budget: int) -> None:
-        """Refuse a budget that the strategy cannot keep.
-
-        Args:
-            steps: K, the number of denoising steps.
-            blocks: number of residual blocks.
-            budget: cells that may be computed, step 0 included.
+        """Refuse a budget of computed cells, step 0 included, that the strategy cannot keep.
 
         Raises:
             CalibrationError: it computes more; says how much sparsity it can reach.
@@ -86,20 +81,20 @@ STRATEGIES = (
     Strategy(
         "interval",
         "FORA, arXiv 2407.01425; EfficientVLA (arXiv 2506.10100)",
-        "published.interval:interval",
+        "published.static:interval",
         baseline=True,
     ),
     Strategy("bac", "block-wise adaptive caching (arXiv 2506.13456)", "published.bac:bac"),
     Strategy(
         "delta-dit",
         "Delta-DiT (arXiv 2406.01125)",
-        "published.delta_dit:delta_dit",
+        "published.static:delta_dit",
         least=lambda steps, blocks: blocks + steps - 1,  # one block of every step after step 0
     ),
     Strategy(
         "deepcache",
         "DeepCache (arXiv 2312.00858)",
-        "published.deepcache:deepcache",
+        "published.static:deepcache",
         least=lambda steps, blocks: blocks + (steps - 1) * min(2, blocks),  # the first and the last block of every step
     ),
     Strategy("sag", "Sparse ActionGen (arXiv 2601.12894)", "published.gates:sag"),

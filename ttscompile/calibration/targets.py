@@ -11,11 +11,10 @@ import torch
 from ..core.spec import PolicySpec
 from ..trajectories.episodes import Episode
 from .calls import Calls, Split, prepare_calls, sample_calls
-from .clock import Clock
-from .execute import Executor
+from .execute import Executor, workers
 from .progress import Bar
 from .state import StateFile
-from .workers import workers
+from .task import Clock
 
 REPEATS = 8
 """How often an observation may be learned from, each time with another noise."""
@@ -32,14 +31,7 @@ def with_targets(
 ) -> Calls:
     """The calls with what the dense policy answers to them; the first of them where the time does not do for all.
 
-    Args:
-        executor: runs the policy.
-        name: what the calls are called in the state.
-        calls: calls whose targets are not known yet.
-        least: as many are needed whatever the time.
-        state: remembers what was computed.
-        clock: with the limit of the calibration.
-        bar: shows the progress.
+    ``least`` of them are needed whatever the time; ``name`` is what they are called in the state.
     """
     known = state.get("targets").get(name)
     sample = calls.initial.shape[1:]
@@ -59,7 +51,7 @@ def with_targets(
         bar.update(len(path), "", clock.left())
     state.progress[key] = len(path)
     if len(path) < calls.count:
-        calls = executor.selector.calls(calls, np.arange(len(path)))
+        calls = executor.select(calls, np.arange(len(path)))
     return replace(calls, path=path)
 
 
@@ -69,11 +61,12 @@ def dense_rounds(executor: Executor, calls: Calls, begin: int = 0) -> Iterator[t
     Yields:
         Paths ``[n, K, T, D]``, in order.
     """
+    at_once = torch.get_num_threads() * TARGETS_AT_ONCE
     while begin < calls.count:
-        with workers() as some:
-            end = min(begin + some.count * TARGETS_AT_ONCE, calls.count)
-            parts = [np.arange(i, min(i + TARGETS_AT_ONCE, end)) for i in range(begin, end, TARGETS_AT_ONCE)]
-            found = some.map(lambda part: executor.run_dense(executor.selector.calls(calls, part)), parts)
+        end = min(begin + at_once, calls.count)
+        parts = [np.arange(i, min(i + TARGETS_AT_ONCE, end)) for i in range(begin, end, TARGETS_AT_ONCE)]
+        with workers() as pool:
+            found = list(pool.map(lambda part: executor.run_dense(executor.select(calls, part)), parts))
         begin = end
         yield torch.cat(found)
 
@@ -81,24 +74,15 @@ def dense_rounds(executor: Executor, calls: Calls, begin: int = 0) -> Iterator[t
 def draw_calls(
     executor: Executor, spec: PolicySpec, episodes: Sequence[Episode], split: Split, limit: int, judged: int, seed: int
 ) -> dict[str, Calls]:
-    """The calls to learn from and those that plans are judged on, without targets.
+    """The calls to learn from, ``calibration``, and those that plans are judged on, ``validation``, without targets.
 
-    Args:
-        executor: runs the policy.
-        spec: the specification of the policy.
-        episodes: all recorded episodes.
-        split: which episodes are for what.
-        limit: calls to learn from, at most.
-        judged: calls to judge on, at most.
-        seed: the seed of the choice of calls and of their noise.
-
-    Returns:
-        ``calibration`` and ``validation``.
+    There are at most ``limit`` and ``judged`` of them; the seed is that of their choice and of their noise.
     """
-    sets = {}
-    for number, (name, chosen, count) in enumerate(
-        (("calibration", split.calibration, limit), ("validation", split.validation, judged))
-    ):
-        drawn = sample_calls(episodes, chosen, count, seed, REPEATS if name == "calibration" else 1)
-        sets[name] = prepare_calls(executor.model, spec, episodes, drawn, (seed, 2, number))
-    return sets
+    drawn = {
+        "calibration": sample_calls(episodes, split.calibration, limit, seed, REPEATS),
+        "validation": sample_calls(episodes, split.validation, judged, seed),
+    }
+    return {
+        name: prepare_calls(executor.model, spec, episodes, chosen, (seed, 2, number))
+        for number, (name, chosen) in enumerate(drawn.items())
+    }

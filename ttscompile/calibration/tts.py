@@ -17,7 +17,7 @@ import numpy as np
 from ..core.lattice import PlanArray
 from .crowded import crowded_family
 from .pruner.adaptation import Adaptation
-from .pruner.head import has_head
+from .pruner.switches import has_head
 from .task import Array, Found, Task
 
 DISTANCES = (8, 4, 2, 1)

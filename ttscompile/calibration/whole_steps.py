@@ -49,9 +49,9 @@ class WholeSteps:
         self._executor, self._actions, self._calls = executor, actions, calls
         order = np.random.default_rng((seed, 3, 0)).permutation(calls.count)
         compared = max(1, min(COMPARED, calls.count // 4))
-        select = executor.selector.calls
-        self._compared = select(calls, order[:compared])
-        self._fitted = select(calls, order[compared:][:FITTED]) if calls.count > 1 else self._compared
+        self._compared = self._fitted = executor.select(calls, order[:compared])
+        if calls.count > 1:
+            self._fitted = executor.select(calls, order[compared:][:FITTED])
 
     @property
     def steps(self) -> int:

@@ -9,8 +9,14 @@ import pytest
 import torch
 
 from ttscompile.artifact.load import load_artifact
-from ttscompile.calibration.pruner.head import capacity, has_head, head_features, head_weights
-from ttscompile.calibration.pruner.switches import Switch, fit_switches
+from ttscompile.calibration.pruner.switches import (
+    Switch,
+    capacity,
+    fit_switches,
+    has_head,
+    head_features,
+    head_weights,
+)
 from ttscompile.core.lattice import PlanArray, Source, whole_steps_plan
 from ttscompile.runtimes.settle import pruner_plan
 

@@ -82,7 +82,7 @@ def test_the_budget_goes_to_all_blocks_alike_and_then_to_those_that_gain_most() 
 
 def test_statistics_of_a_dense_call(make_task: MakeTask) -> None:
     task = make_task(20)
-    calls = task.executor.selector.calls(task.calls, [0, 1])
+    calls = task.executor.select(task.calls, [0, 1])
     residuals = dense_residuals(task.executor, calls)
     similarity, change = dense_statistics(task.executor, calls)
     assert similarity.shape == (6, 10, 10)
@@ -96,7 +96,7 @@ def test_statistics_of_a_dense_call(make_task: MakeTask) -> None:
 
 def test_the_residuals_are_those_of_the_reference(make_task: MakeTask) -> None:
     task = make_task(20)
-    calls = task.executor.selector.calls(task.calls, [3])
+    calls = task.executor.select(task.calls, [3])
     dense = np.zeros((10, 6), np.int8)
     with Counted() as counted:
         rollout = task.executor.model.denoise(calls.contexts, calls.initial, calls.noise, dense)

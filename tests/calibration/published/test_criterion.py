@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ttscompile.calibration.published.criterion import Criterion, Decisions, relative_change
+from ttscompile.calibration.published.online import Criterion, Decisions, relative_change
 from ttscompile.core.lattice import Source
 from ttscompile.errors import ArtifactError, IllegalPlanError
 

@@ -10,9 +10,8 @@ import torch
 
 from tests.rounding import FLOAT64, Counted, assert_equal_but_for_rounding, bound
 from ttscompile.calibration.calls import Calls
-from ttscompile.calibration.published.criterion import Criterion, Decisions
 from ttscompile.calibration.published.dbcache import dbcache, proposals
-from ttscompile.calibration.published.online import decide, within
+from ttscompile.calibration.published.online import Criterion, Decisions, decide, within
 from ttscompile.calibration.published.teacache import dense_changes, proposal
 from ttscompile.calibration.search import plan_of
 from ttscompile.calibration.task import Found
@@ -87,7 +86,7 @@ def test_a_call_does_not_depend_on_the_others(make_task: MakeTask, rule: Criteri
     task = make_task(30)
     together = decide(task.executor, rule, task.calls)
     for i in (0, 5):
-        alone = decide(task.executor, rule, task.executor.selector.calls(task.calls, [i]))
+        alone = decide(task.executor, rule, task.executor.select(task.calls, [i]))
         np.testing.assert_array_equal(alone.plans[0], together.plans[i])
 
 
@@ -151,7 +150,7 @@ def test_teacache_fits_its_polynomial_to_dense_calls(make_task: MakeTask) -> Non
 
 def test_changes_of_dense_calls(make_task: MakeTask) -> None:
     task = make_task(30)
-    calls = task.executor.selector.calls(task.calls, [0, 4])
+    calls = task.executor.select(task.calls, [0, 4])
     before, after = dense_changes(task.executor, calls)
     assert before.shape == after.shape == (9 * 2,)
     model, dense = task.executor.model, np.zeros((10, 6), np.int8)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ttscompile.calibration.published import deepcache, delta_dit, gates
+from ttscompile.calibration.published import gates, static
 from ttscompile.calibration.published.gates import Gates
 from ttscompile.calibration.search import plan_of
 from ttscompile.calibration.strategies import strategy_of
@@ -21,31 +21,31 @@ def drawn(plan: PlanArray) -> list[str]:
 
 
 def test_deepcache_keeps_the_outermost_blocks_fresh() -> None:
-    assert drawn(deepcache.edge_plan(6, 5, 2, 1)) == ["CCCCC", "C...C", "C...C", "CCCCC", "C...C", "C...C"]
+    assert drawn(static.edge_plan(6, 5, 2, 1)) == ["CCCCC", "C...C", "C...C", "CCCCC", "C...C", "C...C"]
 
 
 def test_deepcache_spends_the_budget_on_full_steps() -> None:
-    found = deepcache.candidates(6, 5, budget=21)
+    found = static.edge_plans(6, 5, budget=21)
     assert [parameters for _, parameters in found] == [{"edge": 1, "full_steps": 3}]  # 3 * 5 + 3 * 2
     assert drawn(found[0][0]) == ["CCCCC", "C...C", "CCCCC", "C...C", "CCCCC", "C...C"]
-    wider = deepcache.candidates(6, 5, budget=27)  # 5 * 5 + 2, and 3 * 5 + 3 * 4
+    wider = static.edge_plans(6, 5, budget=27)  # 5 * 5 + 2, and 3 * 5 + 3 * 4
     assert [parameters for _, parameters in wider] == [{"edge": 1, "full_steps": 5}, {"edge": 2, "full_steps": 3}]
 
 
 @pytest.mark.parametrize("blocks", [1, 2])
 def test_deepcache_with_nothing_between_the_outermost_blocks_is_dense(blocks: int) -> None:
-    ((plan, _),) = deepcache.candidates(4, blocks, 4 * blocks)
+    ((plan, _),) = static.edge_plans(4, blocks, 4 * blocks)
     assert (plan == Source.COMPUTE).all()
     assert strategy_of("deepcache").least(4, blocks) == 4 * blocks
 
 
 def test_delta_dit_keeps_the_front_fresh_and_then_the_rear() -> None:
-    plan = delta_dit.delta_plan(8, 4, full_steps=2, fresh=1, boundary=6)
+    plan = static.delta_plan(8, 4, full_steps=2, fresh=1, boundary=6)
     assert drawn(plan) == ["CCCC", "C...", "C...", "C...", "CCCC", "C...", "...C", "...C"]
 
 
 def test_delta_dit_spends_the_budget_on_full_steps() -> None:
-    found = delta_dit.candidates(8, 4, budget=17)  # 3 * 4 + 5 * 1, or 8 * 2 and no full step
+    found = static.delta_plans(8, 4, budget=17)  # 3 * 4 + 5 * 1, or 8 * 2 and no full step
     assert [parameters for _, parameters in found] == [
         {"fresh": 1, "full_steps": 3, "boundary": boundary} for boundary in (2, 4, 6)
     ]
@@ -53,14 +53,14 @@ def test_delta_dit_spends_the_budget_on_full_steps() -> None:
 
 
 def test_delta_dit_of_one_block_is_dense() -> None:
-    found = delta_dit.candidates(4, 1, 4)
+    found = static.delta_plans(4, 1, 4)
     assert all((plan == Source.COMPUTE).all() for plan, _ in found)
 
 
 def test_a_rule_takes_the_parameters_with_the_lowest_error(make_task: MakeTask) -> None:
     task = make_task(34)
     found, _ = plan_of("delta-dit", task)
-    plans = [plan for plan, _ in delta_dit.candidates(10, 6, 34)]
+    plans = [plan for plan, _ in static.delta_plans(10, 6, 34)]
     errors = [task.error(plan, task.calls) for plan in plans]
     assert len(plans) > 3
     np.testing.assert_array_equal(found.schedule, plans[int(np.argmin(errors))])

@@ -9,9 +9,8 @@ import numpy as np
 from ...core.lattice import PlanArray, Source
 from ...runtimes.settle import pruner_plan
 from ..task import Array, Task
-from .head import capacity, has_head, head_features, head_weights
 from .linear import Matrix, linearise
-from .switches import fit_switches
+from .switches import capacity, fit_switches, has_head, head_features, head_weights
 
 LINEARISED = 32
 """Calls that an interval linearises."""
@@ -51,12 +50,9 @@ class Adaptation:
         """Linearise some more calls; with all of them, fit."""
         known = sum(len(error) for error in self._errors)
         if known < self._learned:
-            numbers = self._order[known : min(known + LINEARISED, self._learned)]
-            task = self._task
-            calls = task.executor.selector.calls(task.calls, numbers)
-            model = linearise(
-                task.executor, task.actions, self._schedule, calls, int(task.draw(known, 2).integers(2**31))
-            )
+            task, numbers = self._task, self._order[known : min(known + LINEARISED, self._learned)]
+            calls, seed = task.executor.select(task.calls, numbers), int(task.draw(known, 2).integers(2**31))
+            model = linearise(task.executor, task.actions, self._schedule, calls, seed)
             self._effects.append(model.toggles().reshape(*self._schedule.shape, len(numbers), -1))
             self._errors.append(model.error.reshape(len(numbers), -1))
             return
@@ -94,7 +90,7 @@ class Adaptation:
             episodes=task.calls.episodes[learned],
             count=capacity(task.pruner),
         )
-        calls = task.executor.selector.calls(task.calls, others)
+        calls = task.executor.select(task.calls, others)
         base = task.error(self._schedule, calls)
         for count in dict.fromkeys(min(n, len(switches)) for n in COUNTS):
             weights = head_weights(task.pruner, self._schedule, switches[:count], features)

@@ -86,7 +86,7 @@ def linearise(executor: Executor, actions: Actions, plan: PlanArray, calls: Call
     bases = torch.linalg.qr(torch.randn(calls.count, actions.size, rank, generator=generator))[0]
     probes = bases.transpose(1, 2) * (actions.size / rank) ** 0.5 * weights.sqrt()[:, None]
     reaches = [
-        _reach(executor, actions, plan, executor.selector.calls(calls, numbers), probes[torch.as_tensor(numbers)])
+        _reach(executor, actions, plan, executor.select(calls, numbers), probes[torch.as_tensor(numbers)])
         for numbers in chunks(executor, calls.count)
     ]
     error = torch.einsum("nra,na->nr", probes, difference).flatten()
@@ -100,12 +100,12 @@ def _reach(executor: Executor, actions: Actions, plan: PlanArray, calls: Calls, 
     def projected(samples: Tensor) -> Tensor:
         return (actions.executed(samples).reshape(rank, count, -1) * probes.transpose(0, 1)).sum()
 
-    found = sensitivity(executor, plan, Source.TIMESTEP, calls, rank, projected)
+    computed, gradients = sensitivity(executor, plan, Source.TIMESTEP, calls, rank, projected)
     reach = np.empty((blocks, steps, steps, count * rank), np.float32)
     for b in range(blocks):
-        slopes = torch.stack(found.gradients[b::blocks], 1)
+        slopes = torch.stack(gradients[b::blocks], 1)
         slopes = slopes.reshape(rank, count, *slopes.shape[1:])
-        products = slopes @ torch.stack(found.computed[b::blocks], 1).transpose(1, 2)  # [R, N, K added, K computed]
+        products = slopes @ torch.stack(computed[b::blocks], 1).transpose(1, 2)  # [R, N, K added, K computed]
         reach[b] = products.permute(2, 3, 1, 0).flatten(2).numpy()
     summed = np.zeros((blocks, steps + 1, *reach.shape[2:]), np.float32)
     np.cumsum(reach, axis=1, out=summed[:, 1:])

@@ -1,6 +1,6 @@
-"""Strategies that others have published: one module each, and what several of them share.
+"""Strategies that others have published, and what several of them share.
 
-``fixed`` has the strategies of one interval, ``online`` and ``criterion`` those that decide during a call, ``slopes``
-the gradients that ``gates`` follows. All strategies are listed, each with its source, in
-``calibration.strategies``.
+``static`` has those that follow a rule; ``fixed`` what all of one interval share; ``online`` what those share that
+decide during a call; ``slopes`` has the gradients that ``gates`` follows. All strategies are listed, each with its
+source, in ``calibration.strategies``.
 """

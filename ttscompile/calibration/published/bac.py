@@ -43,8 +43,8 @@ FEED_FORWARD = "feed_forward"
 def bac(task: Task) -> Found:
     """The schedule of the scheduler and the union."""
     model = task.executor.model
-    calls, select = task.some_calls(DENSE_CALLS), task.executor.selector.calls
-    found = [dense_statistics(task.executor, select(calls, [i])) for i in task.clock.in_time(range(calls.count))]
+    calls, run = task.some_calls(DENSE_CALLS), task.executor
+    found = [dense_statistics(run, run.select(calls, [i])) for i in task.clock.in_time(range(calls.count))]
     similarity, change = (np.mean([one[part] for one in found], axis=0) for part in range(2))
     most = min(model.steps, task.budget // model.blocks + 1)
     schedules = [best_schedules(one, most) for one in similarity]

@@ -12,9 +12,8 @@ from collections.abc import Sequence
 
 from ...errors import CalibrationError
 from ..task import Found, Task
-from .criterion import Criterion
 from .fixed import fixed
-from .online import online
+from .online import Criterion, online
 
 FIRST = (1, 2, 3)
 """Blocks, not layers: a layer of a transformer decoder is three."""

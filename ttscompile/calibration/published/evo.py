@@ -38,7 +38,6 @@ class Evo(NothingAfter):
         self._least = min(LEAST, task.budget // model.blocks)
         self._population: BoolArray = self._first()
         self._errors = np.full(len(self._population), np.inf)
-        self._generation = 0
 
     @property
     def plan(self) -> PlanArray:
@@ -48,12 +47,7 @@ class Evo(NothingAfter):
     @property
     def loss(self) -> float:
         """Error of the best schedule on the calls that all plans are compared on."""
-        return float(self._errors.min()) if self._generation else float("nan")
-
-    @property
-    def done(self) -> bool:
-        """Whether all generations were measured."""
-        return self._generation >= self.intervals
+        return float(self._errors.min()) if self._interval else float("nan")
 
     def advance(self, interval: int) -> None:
         """Measure the first generation, or breed another one."""
@@ -64,24 +58,24 @@ class Evo(NothingAfter):
             best = int(np.argmin(self._errors))
             self._population = np.concatenate([self._population[best : best + 1], children])
             self._errors = np.append(self._errors[best], self._measure(children))
-        self._generation = interval + 1
+        self._interval = interval + 1
 
     def state(self) -> dict[str, Array]:
         """The current generation."""
         return {
             "population": self._population.astype(np.int8),
             "errors": self._errors,
-            "generation": np.array(self._generation),
+            "generation": np.array(self._interval),
         }
 
     def restore(self, state: Mapping[str, Array]) -> None:
         """Go back to where ``state`` was taken."""
         self._population = np.array(state["population"], np.bool_)
-        self._errors, self._generation = np.array(state["errors"]), int(state["generation"])
+        self._errors, self._interval = np.array(state["errors"]), int(state["generation"])
 
     def found(self) -> Found:
         """The best schedule, and no pruner."""
-        return Found(self.plan, {"generations": self._generation})
+        return Found(self.plan, {"generations": self._interval})
 
     def _first(self) -> BoolArray:
         """Whole-step plans, and random ones."""
@@ -96,7 +90,8 @@ class Evo(NothingAfter):
         """All of the next generation but the best of this one."""
         children = []
         for _ in range(POPULATION - 1):
-            first, second = (self._population[self._winner(draw)] for _ in range(2))
+            rivals = [draw.integers(len(self._population), size=TOURNAMENT) for _ in range(2)]
+            first, second = (self._population[some[np.argmin(self._errors[some])]] for some in rivals)
             child = first.copy()
             if draw.random() < CROSSOVER:
                 child = np.where(draw.random(child.shape) < 0.5, first, second)
@@ -104,11 +99,6 @@ class Evo(NothingAfter):
                 child = mutate(child, draw)
             children.append(repair(child, self._task.budget, self._least, draw))
         return np.stack(children)
-
-    def _winner(self, draw: np.random.Generator) -> int:
-        """The best of a few at random."""
-        chosen = draw.integers(len(self._population), size=TOURNAMENT)
-        return int(chosen[np.argmin(self._errors[chosen])])
 
     def _measure(self, computed: BoolArray) -> Array:
         """Mean error of each plan; infinite where there was no time for it."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from functools import wraps
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,18 +22,12 @@ class Fixed(NothingAfter):
     Args:
         task: see ``Task``.
         choose: the function that makes the plan.
-
-    Attributes:
-        done: whether the plan was made.
     """
-
-    intervals = 1
 
     def __init__(self, task: Task, choose: Callable[[Task], Found]) -> None:
         self._task, self._choose = task, choose
         model = task.executor.model
         self._found = Found(dense_plan(model.steps, model.blocks))
-        self.done = False
 
     @property
     def loss(self) -> float:
@@ -47,7 +41,7 @@ class Fixed(NothingAfter):
 
     def advance(self, interval: int) -> None:
         """Make the plan."""
-        self._found, self.done = self._choose(self._task), True
+        self._found, self._interval = self._choose(self._task), 1
 
     def state(self) -> dict[str, Array]:
         """The plan."""
@@ -58,7 +52,7 @@ class Fixed(NothingAfter):
         """Go back to where ``state`` was taken."""
         notes = json.loads(state["notes"].tobytes())
         self._found = Found(np.array(state["plan"], np.int8), notes, error=float(state["error"]))
-        self.done = True
+        self._interval = 1
 
     def found(self) -> Found:
         """The schedule, and no pruner."""
@@ -67,12 +61,7 @@ class Fixed(NothingAfter):
 
 def fixed(choose: Callable[[Task], Found]) -> Callable[[Task], Fixed]:
     """Make a strategy of a function that chooses a plan; a decorator."""
-
-    @wraps(choose)
-    def strategy(task: Task) -> Fixed:
-        return Fixed(task, choose)
-
-    return strategy
+    return partial(Fixed, choose=choose)
 
 
 def best_of(task: Task, candidates: Sequence[tuple[PlanArray, Mapping[str, Any]]]) -> Found:

@@ -16,6 +16,7 @@ more cells than the budget and shrinks, as the sparsity loss does in the papers.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -69,18 +70,13 @@ class Gates(NothingAfter):
         self._scores = begin.astype(np.float64)
         self._mean, self._size = np.zeros(shape), np.zeros(shape)
         self.plan = self._cells(task.budget)
-        self.loss, self._interval = float("nan"), 0
-
-    @property
-    def done(self) -> bool:
-        """Whether all gradient steps are done."""
-        return self._interval >= self.intervals
+        self.loss = float("nan")
 
     def advance(self, interval: int) -> None:
         """One gradient step, then the plan of the scores on calls that are always the same."""
         task = self._task
         numbers = task.draw(interval, 0).permutation(task.calls.count)[:BATCH]
-        calls = task.executor.selector.calls(task.calls, numbers)
+        calls = task.executor.select(task.calls, numbers)
         gradient = slopes(task.executor, task.actions, self._cells(self._room(interval)), self._reuse, calls)
         self._step(gradient.astype(np.float64), interval)
         plan = self._cells(task.budget)
@@ -131,16 +127,6 @@ class Gates(NothingAfter):
         return plan.reshape(self._fixed.shape)
 
 
-def sag(task: Task) -> Gates:
-    """Cells read the residual of the last computed block of their kind."""
-    return Gates(task, Source.FORWARD)
-
-
-def dip_go(task: Task) -> Gates:
-    """Cells read their own last residual."""
-    return Gates(task, Source.TIMESTEP)
-
-
-def l2c(task: Task) -> Gates:
-    """Cells read their own last residual, which is of the step before."""
-    return Gates(task, Source.TIMESTEP, whole=2)
+sag = partial(Gates, reuse=Source.FORWARD)
+dip_go = partial(Gates, reuse=Source.TIMESTEP)
+l2c = partial(Gates, reuse=Source.TIMESTEP, whole=2)

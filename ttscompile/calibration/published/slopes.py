@@ -42,7 +42,7 @@ def slopes(executor: Executor, actions: Actions, plan: PlanArray, reuse: Source,
     """
     total = np.zeros(plan.shape, np.float64)
     for numbers in chunks(executor, calls.count):
-        total += _summed(executor, actions, plan, reuse, executor.selector.calls(calls, numbers))
+        total += _summed(executor, actions, plan, reuse, executor.select(calls, numbers))
     return (total / calls.count).astype(np.float32)
 
 
@@ -61,11 +61,11 @@ def _summed(
     def error(samples: Tensor) -> Tensor:
         return (actions.executed(samples) - actions.executed(calls.targets)).abs().mean(-1).sum()
 
-    found = sensitivity(executor, plan, reuse, calls, 1, error)
+    would, gradients = sensitivity(executor, plan, reuse, calls, 1, error)
     computed, values = (plan == Source.COMPUTE).reshape(-1), np.zeros(plan.size, np.float64)
     for chain in chains(plan, reuse, executor.model.groups):
-        f = torch.stack([found.computed[i] for i in chain])  # [cells, N, size]
-        until = torch.cumsum(torch.stack([found.gradients[i] for i in chain]), 0)
+        f = torch.stack([would[i] for i in chain])  # [cells, N, size]
+        until = torch.cumsum(torch.stack([gradients[i] for i in chain]), 0)
         until = torch.cat([torch.zeros_like(until[:1]), until])
         places = np.flatnonzero(computed[chain])
         number = np.searchsorted(places, np.arange(len(chain)))  # of the first computed cell not before

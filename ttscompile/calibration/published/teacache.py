@@ -16,9 +16,8 @@ import numpy as np
 from ..calls import Calls
 from ..execute import Executor
 from ..task import Array, Found, Task
-from .criterion import Criterion, relative_change
 from .fixed import fixed
-from .online import online
+from .online import Criterion, online, relative_change
 
 DEGREE = 4
 
