@@ -1,4 +1,4 @@
-"""``manifest.json``: the records of ``manifest`` to bytes, and strictly back.
+"""``manifest.json``: the records of ``manifest`` to bytes, and strictly back; and what they describe, as a hash.
 
 Nothing but numpy is needed to read one.
 """
@@ -70,6 +70,44 @@ def from_json(root: Value) -> Manifest:
     return manifest
 
 
+def identities(manifest: Manifest) -> tuple[str, str]:
+    """Identity and model identity of what a manifest describes; its own two fields are not read.
+
+    The model identity covers weights, tables, graphs, sampler, normalisers, observations, chunk and block table. The
+    identity covers that, the pruner's weights, all plans, which of them is the default, and blocks of another
+    precision: a calibration, which computes in fp32, belongs to the model with or without them. Neither covers what
+    people are told: source, FLOPs, reasons, sparsities, errors, calibration record, versions.
+
+    Returns:
+        Two sha256 of 64 digits.
+    """
+    document = to_json(manifest)
+    hashes = {name: record.sha256 for name, record in manifest.files.items()}
+    pieces = {name: {**piece, "file": hashes[piece["file"]]} for name, piece in document["pieces"].items()}
+    pruner = pieces.pop(PRUNER, None)
+    model = {
+        "spec": {key: value for key, value in document["spec"].items() if key != "source"},
+        "blocks": [{key: block[key] for key in ("kind", "type", "group")} for block in document["blocks"]],
+        "pieces": pieces,
+        "contexts": document["contexts"],
+        "features": document["features"],
+        "program": hashes[manifest.stores.program],
+        "weights": hashes[manifest.stores.weights],
+    }
+    model_identity = _checksum(model)
+    whole: dict[str, Any] = {
+        "model": model_identity,
+        "pruner": [pruner, hashes.get(manifest.stores.pruner or "")],
+        "plans": [hashes.get(manifest.stores.plans or ""), {n: plan.kind for n, plan in manifest.plans.items()}],
+        "default_plan": manifest.default_plan,
+    }
+    if manifest.precision is not None:
+        record = manifest.precision
+        models = {name: hashes[file] for name, file in record.models.items()}
+        whole["precision"] = {"name": record.name, "weights": hashes[record.weights], "models": models}
+    return _checksum(whole), model_identity
+
+
 def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:
     blocks = len(manifest.blocks)
     if len(manifest.flops.blocks) != blocks:
@@ -126,5 +164,5 @@ def _check_schema(members: Mapping[str, Value], where: str) -> None:
     )
 
 
-def _checksum(document: Mapping[str, Any]) -> str:
+def _checksum(document: object) -> str:
     return hashlib.sha256(dump_compact(document)).hexdigest()

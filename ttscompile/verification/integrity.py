@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ..artifact.archive import is_checkpoint
 from ..artifact.codec import encode
-from ..artifact.files import verify as verify_file
+from ..artifact.files import check_file
 from ..artifact.load import Artifact, load_artifact, read_manifest
 from ..artifact.manifest import MANIFEST
 from ..errors import ArtifactError
@@ -58,7 +58,7 @@ def _wrong_files(directory: Path) -> list[str]:
     wrong = []
     for name, record in manifest.files.items():
         try:
-            verify_file(directory / name, record)
+            check_file(directory / name, record)
         except ArtifactError as error:
             wrong.append(str(error))
     # Two spellings of one document have one checksum.
