@@ -195,7 +195,7 @@ def test_tables_that_do_not_fit(written: Path, table: np.ndarray | None) -> None
         (lambda d: d.update(more=1), "unknown"),
         (lambda d: d["streams"].update(tail="elsewhere"), "program.json.streams.tail: .*stream_2.*elsewhere"),
         (lambda d: d["streams"].pop("stem"), "has no stream of 'stem'"),
-        (lambda d: d["graphs"]["stem"]["nodes"][0].update(op="os.system"), r"program.json.graphs.stem.nodes\[0\].op: .*os.system"),
+        (lambda d: d["graphs"]["stem"]["nodes"][0].update(op="os.system"), r"graphs.stem.nodes\[0\].op: .*os.system"),
         (lambda d: d["graphs"]["stem"]["constants"][0].update(name="none"), "values computed before"),
         (lambda d: d["graphs"]["stem"]["constants"].append({"name": "x", "type": {"dtype": "float32", "shape": [1]}}),
          "expected the constant 'x' : .*found none"),

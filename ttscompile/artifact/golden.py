@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from ..artifact import tensors
 from ..core.spec import FloatArray, Noise, PolicySpec
 from ..errors import ArtifactError
 from ..ir.graph import TensorType
+from . import tensors
 from .strict_json import REMEDY
 
 if TYPE_CHECKING:
@@ -174,11 +174,7 @@ def load_golden(artifact: Artifact) -> Golden:
 
 
 def load_golden_plans(artifact: Artifact, streams: int) -> dict[str, GoldenPlan]:
-    """Records of the plans of an artifact by name; empty if it has none.
-
-    Args:
-        artifact: opened.
-        streams: B of the record of the original network.
+    """Records of the plans of an artifact by name, of B ``streams`` as its ``Golden`` has; empty if it has none.
 
     Raises:
         ArtifactError: records that do not fit.

@@ -13,30 +13,12 @@ import numpy.typing as npt
 from ..core.lattice import plan_flops, sparsity
 from ..core.update import update_flops
 from ..errors import ArtifactError
+from ..ir import pieces as names
 from ..ir.flops import graph_flops
-from ..ir.graph import Graph, TensorType
+from ..ir.graph import Graph
 from ..ir.joint import join
-from ..ir.pieces import (
-    ADVANCE,
-    CONDITION,
-    CONTEXT,
-    DENSE_STEP,
-    IDLE,
-    IDLE_OUTPUTS,
-    JOINT,
-    PRUNER,
-    RESIDUAL,
-    STEM,
-    STEP,
-    STREAM,
-    TAIL,
-    TOTAL,
-    advance_context,
-    advance_inputs,
-    advance_outputs,
-    dense_step_outputs,
-)
-from ..ir.program import Binding, Pieces, Program
+from ..ir.program import Binding, Program
+from . import tensors
 from .bind import REPORT, interface
 from .load import check_schedule
 from .manifest import DENSE, BlockRecord, ContextRecord, FlopsRecord, Manifest, PieceRecord, PlanRecord, Requires
@@ -108,19 +90,24 @@ def context_records(program: Program) -> dict[str, ContextRecord]:
     """
     pieces = program.pieces
     readers = {name: piece.contexts for name, piece in pieces.loop.items()}
+    computed = {Binding.TABLE: set(pieces.tables), Binding.CONDITION: set(pieces.condition.outputs)}
     if pieces.step is not None:
-        readers = {STEP: dict(pieces.step.inputs), **readers}
+        readers = {names.STEP: dict(pieces.step.inputs), **readers}
+        computed[Binding.STEP] = set(pieces.step.outputs)
     records: dict[str, ContextRecord] = {}
     for piece, contexts in readers.items():
         for name, kind in contexts.items():
             binding, known = pieces.bindings.get(name), records.get(name)
             if known is not None and known.type != kind:
                 raise ArtifactError(f"{piece}: context {name!r} is {kind} here and {known.type} elsewhere. {REPORT}")
-            if binding is None or not _available(name, binding, kind, pieces, program.spec.sampler.steps):
+            if binding is None or name not in computed.get(binding, ()):
                 shown = "no binding" if binding is None else f"the binding {binding.value}"
                 raise ArtifactError(
                     f"{piece}: context {name!r} : {kind} has {shown}, and nothing computes it. {REPORT}"
                 )
+            if binding is Binding.TABLE:
+                wanted = {name: (kind.dtype, (program.spec.sampler.steps, *kind.at(1)))}
+                tensors.check_arrays("table", {name: pieces.tables[name]}, wanted, piece, REPORT)
             records[name] = ContextRecord(binding=binding, type=kind)
     return records
 
@@ -139,7 +126,7 @@ def piece_records(
     Raises:
         ArtifactError: models and pieces do not have the same names, inputs or outputs.
     """
-    expected = {name: one for name, one in _interfaces(program).items() if name != IDLE or IDLE in models}
+    expected = {name: one for name, one in _interfaces(program).items() if name != names.IDLE or names.IDLE in models}
     if set(models) != set(expected):
         raise ArtifactError(f"expected the ONNX models {sorted(expected)}; found {sorted(models)}. {REPORT}")
     records = {}
@@ -177,14 +164,7 @@ def plan_records(
     default_plan: str,
     record: Mapping[str, Any],
 ) -> dict[str, PlanRecord]:
-    """Records of schedules and of the pruner's plan; see ``write.update_calibration``.
-
-    Args:
-        manifest: of the artifact.
-        pruned: whether the pruner makes a plan.
-        schedules: int8 ``[K, blocks]`` by name.
-        default_plan: what it will be.
-        record: of the calibration.
+    """Records of schedules and, if it makes one (``pruned``), of the pruner's plan; see ``write.update_calibration``.
 
     Raises:
         ArtifactError: names that cannot be, or sparsities that are no shares.
@@ -202,11 +182,11 @@ def plan_records(
     if pruned:
         if manifest.stores.pruner is None:
             raise ArtifactError("the artifact has no pruner whose weights could be set. Convert the checkpoint again.")
-        name = PRUNER if default_plan in {DENSE, *plans} else default_plan
+        name = names.PRUNER if default_plan in {DENSE, *plans} else default_plan
         if name in plans or _PLAN_NAME.fullmatch(name) is None:
             raise ArtifactError(f"the pruner's plan cannot be called {name!r}. Give the schedule another name.")
         shares = {key: record.get(key) for key in ("sparsity", "flops_sparsity")}
-        plans[name] = from_json(PlanRecord, Value({"kind": PRUNER, **shares}, "calibration record"))
+        plans[name] = from_json(PlanRecord, Value({"kind": names.PRUNER, **shares}, "calibration record"))
     if default_plan not in {DENSE, *plans}:
         raise ArtifactError(f"default plan {default_plan!r}: expected one of {[DENSE, *plans]}.")
     return plans
@@ -231,30 +211,27 @@ def _interfaces(program: Program) -> dict[str, PieceRecord]:
         return PieceRecord("", tuple(inputs), stream, tuple(dict.fromkeys(contexts)), outputs)
 
     condition, step, pruner, tail, stem = pieces.condition, pieces.step, pieces.pruner, pieces.tail, pieces.stem
-    found = {CONDITION: record(condition.inputs, condition.outputs)}
+    found = {names.CONDITION: record(condition.inputs, condition.outputs)}
     if step is not None:
-        found[STEP] = record(step.inputs, step.outputs, contexts=step.inputs)
+        found[names.STEP] = record(step.inputs, step.outputs, contexts=step.inputs)
     if pruner is not None:
-        found[PRUNER] = record(pruner.inputs, pruner.outputs)
+        found[names.PRUNER] = record(pruner.inputs, pruner.outputs)
     for name, piece in pieces.loop.items():
         if piece is not tail:
             found[name] = record(piece.graph.inputs, piece.graph.outputs, piece.stream, piece.contexts)
-    own = [advance_context(name, n) for name, piece in ((TAIL, tail), (STEM, stem)) for n in piece.contexts]
-    around = (*advance_inputs(sampler), *own)
-    found[ADVANCE] = record(around, advance_outputs(sampler), STREAM, (*tail.contexts, *stem.contexts))
+    own = [
+        names.advance_context(name, n)
+        for name, piece in ((names.TAIL, tail), (names.STEM, stem))
+        for n in piece.contexts
+    ]
+    around = (*names.advance_inputs(sampler), *own)
+    found[names.ADVANCE] = record(
+        around, names.advance_outputs(sampler), names.STREAM, (*tail.contexts, *stem.contexts)
+    )
     joint = join([tuple(piece.contexts.values()) for piece in pieces.blocks])
-    found[JOINT] = record(joint.inputs, (RESIDUAL,), STREAM)
+    found[names.JOINT] = record(joint.inputs, (names.RESIDUAL,), names.STREAM)
     read = dict.fromkeys(name for piece in pieces.blocks for name in piece.contexts)
-    whole = (STREAM, *(CONTEXT + name for name in read))
-    found[DENSE_STEP] = record(whole, dense_step_outputs(len(pieces.blocks)), STREAM, read)
-    found[IDLE] = record((TOTAL,), IDLE_OUTPUTS)
+    whole = (names.STREAM, *(names.CONTEXT + name for name in read))
+    found[names.DENSE_STEP] = record(whole, names.dense_step_outputs(len(pieces.blocks)), names.STREAM, read)
+    found[names.IDLE] = record((names.TOTAL,), names.IDLE_OUTPUTS)
     return found
-
-
-def _available(name: str, binding: Binding, kind: TensorType, pieces: Pieces, steps: int) -> bool:
-    if binding is Binding.TABLE:
-        table = pieces.tables.get(name)
-        return table is not None and table.shape == (steps, *kind.at(1)) and str(table.dtype) == kind.dtype
-    if binding is Binding.CONDITION:
-        return name in pieces.condition.outputs
-    return binding is Binding.STEP and pieces.step is not None and name in pieces.step.outputs

@@ -61,9 +61,6 @@ class Entry:
 def read_header(path: Path) -> dict[str, Entry]:
     """Read and check the header of a safetensors file.
 
-    Args:
-        path: the file.
-
     Returns:
         The entries in the order of their data.
 

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from ..artifact import tensors
 from ..core.correction import Correction
 from ..errors import ArtifactError
 from ..ir.pieces import PRUNER
 from ..ir.program import Binding, Program
 from ..measure.versions import VERSION
+from . import records, tensors
 from .bind import LoweredBlocks, bind, places_of, store_blocks
 from .codec import decode, encode, identities
 from .files import (
@@ -44,17 +44,6 @@ from .load import (
     read_manifest,
 )
 from .manifest import DENSE, FORMAT, MANIFEST, SCHEMA_VERSION, Manifest, Stores, abbreviated
-from .records import (
-    PRUNER_PREFIX,
-    block_records,
-    calibration_record,
-    constants,
-    context_records,
-    flops_record,
-    piece_records,
-    plan_records,
-    requirements,
-)
 from .strict_json import dump_compact
 
 if TYPE_CHECKING:
@@ -63,8 +52,6 @@ if TYPE_CHECKING:
 PROGRAM = "program.json"
 WEIGHTS = "weights.safetensors"
 GOLDEN = "golden.safetensors"
-PLANS, GOLDEN_PLANS = "plans", "golden_plans"
-"""Stores that a calibration replaces, beside the pruner's."""
 
 _STALE = re.compile(
     rf"(pruner-[0-9a-f]+\.(onnx|safetensors)|(golden_)?plans-[0-9a-f]+\.safetensors|\..+{re.escape(PARTIAL)})"
@@ -164,13 +151,13 @@ def update_calibration(
             )
         manifest = replace(
             artifact.manifest,
-            plans=plan_records(artifact.manifest, pruner_weights is not None, schedules, default_plan, record),
+            plans=records.plan_records(artifact.manifest, pruner_weights is not None, schedules, default_plan, record),
             default_plan=default_plan,
-            calibration=calibration_record(record),
+            calibration=records.calibration_record(record),
         )
         try:
             arrays = _plan_arrays(manifest, schedules, corrections or {})
-            manifest = _store(directory, manifest, PLANS, arrays)
+            manifest = _store(directory, manifest, "plans", arrays)
             if pruner_weights is not None:
                 manifest = _store_pruner(artifact, manifest, pruner_weights)
             after = replace(
@@ -180,7 +167,7 @@ def update_calibration(
                 corrections=dict(corrections or {}),
                 pruner=artifact.pruner if pruner_weights is None else pruner_weights,
             )
-            manifest = _store(directory, manifest, GOLDEN_PLANS, {} if golden is None else plan_arrays(golden(after)))
+            manifest = _store(directory, manifest, "golden_plans", {} if golden is None else plan_arrays(golden(after)))
             content = encode(_identified(manifest))
             manifest = decode(content)  # refuses what nobody could load
             replace_file(directory / MANIFEST, content)
@@ -202,12 +189,12 @@ def _fill(
 ) -> Manifest:
     """Write all files of a new artifact into an empty folder."""
     graphs = program.pieces.graphs()
-    values = constants(program, graphs)
-    contexts = context_records(program)
-    requires = requirements(models)
+    values = records.constants(program, graphs)
+    contexts = records.context_records(program)
+    requires = records.requirements(models)
     files = {name: f"{name}.onnx" for name in models}
 
-    pruner = {name: value for name, value in values.items() if name.startswith(PRUNER_PREFIX)}
+    pruner = {name: value for name, value in values.items() if name.startswith(records.PRUNER_PREFIX)}
     stored = {name: value for name, value in values.items() if name not in pruner}
     tables = {TABLE_PREFIX + n: program.pieces.tables[n] for n, c in contexts.items() if c.binding is Binding.TABLE}
     write_synced(folder / WEIGHTS, tensors.serialize({**stored, **tables}))
@@ -219,7 +206,7 @@ def _fill(
         write_synced(folder / pruner_file, content)
         places.update(places_of(folder / pruner_file, pruner))
 
-    pieces = piece_records(program, models, files)
+    pieces = records.piece_records(program, models, files)
     for name in pieces:
         write_synced(folder / files[name], bind(models[name], places, name))
     precision = None if blocks is None else store_blocks(folder, blocks, pieces, places)
@@ -238,11 +225,11 @@ def _fill(
             identity="",
             model_identity="",
             spec=program.spec,
-            blocks=block_records(program),
+            blocks=records.block_records(program),
             pieces=pieces,
             contexts=contexts,
             features=program.pieces.features,
-            flops=flops_record(program),
+            flops=records.flops_record(program),
             plans={},
             default_plan=DENSE,
             calibration=None,
