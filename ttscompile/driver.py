@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 from torch import nn
 
+from .artifact.bind import LoweredBlocks
 from .artifact.files import replace_file
 from .artifact.load import load_artifact
-from .artifact.precision import LoweredBlocks
 from .artifact.write import require_replaceable, write_artifact
 from .capture.export import capture
 from .capture.narrow import narrow, unneeded

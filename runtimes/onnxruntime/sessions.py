@@ -23,7 +23,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.artifact.files import verify
+from ttscompile.artifact.files import check_file
 from ttscompile.artifact.load import Artifact
 from ttscompile.artifact.manifest import PieceRecord
 from ttscompile.core.spec import FP32
@@ -76,7 +76,7 @@ def open_blocks(artifact: Artifact, threads: int) -> dict[str, Any]:
         ArtifactError: the artifact on disk is no longer the one that was loaded, or onnxruntime refuses a graph.
     """
     for name, record in artifact.manifest.files.items():
-        verify(artifact.path / name, record)
+        check_file(artifact.path / name, record)
     return _open_blocks(artifact, threads)
 
 

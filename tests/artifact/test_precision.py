@@ -15,9 +15,9 @@ from tests.artifact.folders import contents, flip
 from tests.artifact.tiny import HORIZON, WIDTH, tiny_models, tiny_program
 from tests.rounding import assert_equal_but_for_rounding
 from ttscompile.artifact import codec
+from ttscompile.artifact.bind import LoweredBlocks
 from ttscompile.artifact.load import load_artifact, read_manifest
 from ttscompile.artifact.manifest import Manifest, PrecisionError
-from ttscompile.artifact.precision import LoweredBlocks
 from ttscompile.artifact.strict_json import Value
 from ttscompile.artifact.write import update_calibration, write_artifact
 from ttscompile.core.lattice import uniform_plan

@@ -42,8 +42,7 @@ def artifact(rng: random.Random, path: Path) -> Callable[[], None]:
 
 def rehash(path: Path, document: Any) -> None:
     """Write a manifest whose sizes, hashes, identities and checksum are right, as far as it can be read."""
-    from ttscompile.artifact.codec import from_json
-    from ttscompile.artifact.identity import identities
+    from ttscompile.artifact.codec import from_json, identities
     from ttscompile.artifact.strict_json import Value, dump_compact
 
     if isinstance(document, dict):

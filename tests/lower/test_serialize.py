@@ -1,4 +1,4 @@
-"""``ir.serialize``: graphs as JSON, and JSON that is not a graph."""
+"""``artifact.graph_json``: graphs as JSON, and JSON that is not a graph."""
 
 from __future__ import annotations
 
@@ -14,13 +14,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.lower.modules import ALL, captured
+from ttscompile.artifact.graph_json import DTYPES, ENUM_KINDS, graph_from_json, graph_to_json
+from ttscompile.artifact.strict_json import Value
 from ttscompile.errors import ArtifactError
 from ttscompile.ir.graph import GETITEM, Argument, Batch, Enum, Graph, Node, Ref, TensorType
-from ttscompile.ir.serialize import DTYPES, ENUM_KINDS, graph_from_json, graph_to_json
+
+
+def read(document: Any) -> Graph:
+    return graph_from_json(Value(document, "program.json: graphs.stem"))
 
 
 def through_text(graph: Graph) -> Graph:
-    return graph_from_json(json.loads(json.dumps(graph_to_json(graph), allow_nan=False)))
+    return read(json.loads(json.dumps(graph_to_json(graph), allow_nan=False)))
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -99,39 +104,45 @@ def setter(*path: Any, to: Any) -> Callable[[dict[str, Any]], None]:
 
 
 HOSTILE: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
-    "missing field": (lambda d: d.pop("outputs"), "graph is not valid: expected an object with exactly the keys"),
-    "unknown field": (setter("code", to="x"), "exactly the keys"),
-    "unknown node field": (setter("nodes", 0, "source", to="/home/me/x.py"), r"nodes\[0\] .*exactly the keys"),
-    "nodes not a list": (setter("nodes", to={}), "nodes .*a list of at most"),
+    "missing field": (
+        lambda d: d.pop("outputs"),
+        r"graphs\.stem: expected an object with the keys .*missing: \['outputs'\]",
+    ),
+    "unknown field": (setter("code", to="x"), r"graphs\.stem: .*unknown: \['code'\]"),
+    "unknown node field": (
+        setter("nodes", 0, "source", to="/home/me/x.py"),
+        r"nodes\[0\]: .*the keys .*unknown: \['source'\]",
+    ),
+    "nodes not a list": (setter("nodes", to={}), "nodes: .*a list of at most"),
     "node not an object": (setter("nodes", 0, to=[]), r"nodes\[0\]"),
-    "python op": (setter("nodes", 0, "op", to="os.system"), r"nodes\[0\].op .*found os.system"),
+    "python op": (setter("nodes", 0, "op", to="os.system"), r"nodes\[0\].op: .*found 'os.system'"),
     "dunder path": (setter("nodes", 0, "op", to="aten.add.Tensor.__globals__"), r"nodes\[0\].op"),
     "op with a line break": (setter("nodes", 0, "op", to="aten.add.Tensor\n"), r"nodes\[0\].op"),
     "op not text": (setter("nodes", 0, "op", to=7), r"nodes\[0\].op"),
     "unknown kind of argument": (setter("nodes", 0, "args", 2, to={"eval": "1"}), r"args\[2\]"),
     "two tags": (setter("nodes", 0, "args", 2, to={"ref": "x", "batch": 1}), r"args\[2\]"),
-    "unknown value": (setter("nodes", 0, "args", 0, to={"ref": "q"}), r"nodes\[0\].args .*found %q"),
-    "value from the future": (setter("nodes", 0, "args", 0, to={"ref": "y"}), r"nodes\[0\].args .*found %y"),
-    "unknown output": (setter("outputs", 0, to="q"), r"outputs\[0\] .*found %q"),
-    "two values of a name": (setter("nodes", 1, "name", to="x"), r"nodes\[1\].name .*'x' a second time"),
+    "unknown value": (setter("nodes", 0, "args", 0, to={"ref": "q"}), r"nodes\[0\]: .*computed before .*%q"),
+    "value from the future": (setter("nodes", 0, "args", 0, to={"ref": "y"}), r"nodes\[0\]: .*computed before .*%y"),
+    "unknown output": (setter("outputs", 0, to="q"), r"outputs\[0\]: .*found 'q'"),
+    "two values of a name": (setter("nodes", 1, "name", to="x"), r"nodes\[1\].name: .*no other value has; found 'x'"),
     "empty name": (setter("inputs", 0, "name", to=""), r"inputs\[0\].name"),
     "control character": (setter("inputs", 0, "name", to="a\x00b"), r"inputs\[0\].name"),
     "long name": (setter("inputs", 0, "name", to="a" * 513), r"inputs\[0\].name"),
-    "getitem out of range": (setter("nodes", 1, "args", 1, to=2), r"nodes\[1\] .*getitem"),
-    "getitem of what": (setter("nodes", 1, "args", to=[0, {"ref": "s"}]), r"nodes\[1\] .*getitem"),
+    "getitem out of range": (setter("nodes", 1, "args", 1, to=2), r"nodes\[1\]: .*getitem of a value"),
+    "getitem of what": (setter("nodes", 1, "args", to=[0, {"ref": "s"}]), r"nodes\[1\]: .*getitem of a value"),
     "dtype": (setter("inputs", 0, "type", "dtype", to="object"), r"inputs\[0\].type.dtype"),
     "dtype not text": (setter("inputs", 0, "type", "dtype", to=["float32"]), r"inputs\[0\].type.dtype"),
     "negative size": (setter("inputs", 0, "type", "shape", 1, to=-1), r"shape\[1\]"),
     "huge size": (setter("inputs", 0, "type", "shape", 1, to=2**41), r"shape\[1\]"),
     "true as a size": (setter("inputs", 0, "type", "shape", 1, to=True), r"shape\[1\]"),
     "zero batches": (setter("inputs", 0, "type", "shape", 0, to={"batch": 0}), r"shape\[0\].batch"),
-    "rank": (setter("inputs", 0, "type", "shape", to=[1] * 17), r"type.shape .*at most 16"),
+    "rank": (setter("inputs", 0, "type", "shape", to=[1] * 17), r"type.shape: .*at most 16"),
     "no result": (setter("nodes", 2, "types", to=[]), r"nodes\[2\].types"),
-    "huge integer": (setter("nodes", 0, "args", 2, to=2**63), r"args\[2\] .*64 bits"),
-    "not finite": (setter("nodes", 0, "args", 2, to=math.inf), r"args\[2\] .*finite"),
+    "huge integer": (setter("nodes", 0, "args", 2, to=2**63), r"args\[2\]: .*64-bit"),
+    "not finite": (setter("nodes", 0, "args", 2, to=math.inf), r"args\[2\]: .*finite"),
     "strange float": (setter("nodes", 0, "args", 2, to={"float": "1e999"}), r"args\[2\]"),
     "deep list": (setter("nodes", 0, "args", 2, to=[[[[1]]]]), r"args\[2\].* 3 deep"),
-    "long list": (setter("nodes", 0, "args", 1, to=[0] * 70_000), r"args\[1\] .*at most 65536"),
+    "long list": (setter("nodes", 0, "args", 1, to=[0] * 70_000), r"args\[1\]: .*at most 65536"),
     "long text": (setter("nodes", 0, "args", 2, to="a" * 513), r"args\[2\]"),
     "enum kind": (setter("nodes", 2, "kwargs", "alpha", "enum", 0, to="module"), "kwargs.alpha.enum"),
     "enum name": (setter("nodes", 2, "kwargs", "alpha", "enum", 1, to="a.b"), "kwargs.alpha.enum"),
@@ -144,17 +155,17 @@ HOSTILE: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
 def test_what_is_no_graph_is_refused_with_its_place(case: str) -> None:
     change, message = HOSTILE[case]
     changed = copy.deepcopy(document())
-    graph_from_json(changed)
+    read(changed)
     change(changed)
     with pytest.raises(ArtifactError, match=message) as caught:
-        graph_from_json(changed)
+        read(changed)
     assert len(str(caught.value)) < 1000
 
 
 @pytest.mark.parametrize("value", [None, [], "x", 3, {"inputs": []}])
 def test_other_documents(value: object) -> None:
-    with pytest.raises(ArtifactError, match="graph is not valid"):
-        graph_from_json(value)
+    with pytest.raises(ArtifactError, match="graphs.stem: expected an object"):
+        read(value)
 
 
 def test_arguments_that_cannot_be_written_name_the_node() -> None:

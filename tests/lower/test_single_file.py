@@ -24,7 +24,7 @@ from tests.runtimes.plans import random_plan
 from tests.runtimes.toys import pencil_program, toy_program
 from ttscompile import Noise, legalize
 from ttscompile.artifact import load_artifact
-from ttscompile.artifact.precision import LoweredBlocks
+from ttscompile.artifact.bind import LoweredBlocks
 from ttscompile.artifact.write import write_artifact
 from ttscompile.core.correction import Correction, no_correction
 from ttscompile.core.lattice import Source

@@ -13,9 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ttscompile.artifact import tensors
-from ttscompile.artifact.codec import encode
+from ttscompile.artifact.codec import encode, identities
 from ttscompile.artifact.files import describe
-from ttscompile.artifact.identity import identities
 from ttscompile.artifact.load import read_manifest
 from ttscompile.artifact.manifest import MANIFEST
 

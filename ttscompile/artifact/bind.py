@@ -1,15 +1,19 @@
-"""Weights of ONNX models as external data: references into the artifact's safetensors files."""
+"""Weights of ONNX models as external data: references into the artifact's safetensors files, at any precision."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ..errors import ArtifactError
+from . import tensors
+from .files import write_synced
+from .manifest import PieceRecord, PrecisionError, PrecisionRecord
 
 if TYPE_CHECKING:
     from onnx import GraphProto, ModelProto, TensorProto
@@ -17,6 +21,8 @@ if TYPE_CHECKING:
 EMBEDDED_BYTES = 256
 """Tensors up to this size are stored in the model: onnxruntime's shape inference reads shapes and axes, and refuses to
 do so from external data."""
+
+REPORT = "This is an error in ttscompile; please report it."
 
 
 @dataclass(frozen=True)
@@ -36,40 +42,95 @@ class Place:
     length: int
 
 
-def bind(model: ModelProto, places: Mapping[str, Place], piece: str) -> ModelProto:
-    """A copy of a model whose empty initializers have their values.
+@dataclass(frozen=True)
+class LoweredBlocks:
+    """What ``lower_precision`` made of residual blocks.
+
+    Attributes:
+        name: of the precision.
+        models: by block, and of the piece ``blocks`` if the artifact has it.
+        weights: the constants that these models have and the program has not.
+        error: as measured; None if it was not.
+    """
+
+    name: str
+    models: Mapping[str, ModelProto]
+    weights: Mapping[str, npt.NDArray[Any]]
+    error: PrecisionError | None = None
+
+
+def places_of(path: Path, values: Mapping[str, npt.NDArray[Any]]) -> dict[str, Place]:
+    """Where these arrays lie in a safetensors file that holds them."""
+    offsets = tensors.offsets(path)
+    return {name: Place(value, path.name, *offsets[name]) for name, value in values.items()}
+
+
+def bind(model: ModelProto, places: Mapping[str, Place], piece: str, *, again: bool = False) -> bytes:
+    """The bytes of a model whose empty initializers have their values.
 
     Args:
         model: from ``lower``; initializers that are constants of the program hold no data.
         places: by name of the constant.
         piece: name of the model, for messages.
+        again: the model is bound already; the constants in ``places`` get new values.
 
     Raises:
         ArtifactError: an empty initializer that is no constant of the program, or is one of another type.
     """
-    bound = _copy(model)
+    from onnx import ModelProto
+
+    bound = ModelProto()
+    bound.CopyFrom(model)
     for tensor in _initializers(bound.graph):
-        if _is_empty(tensor):
-            if tensor.name not in places:
-                raise ArtifactError(
-                    f"ONNX model {piece!r}: initializer {tensor.name!r} has no data and is no constant of the program."
-                    " This is an error in ttscompile's lowering; please report it."
-                )
-            _set(tensor, places[tensor.name], piece)
-    return bound
+        if not (_is_empty(tensor) or (again and tensor.name in places)):
+            continue
+        if tensor.name not in places:
+            raise ArtifactError(
+                f"ONNX model {piece!r}: initializer {tensor.name!r} has no data and is no constant of the program."
+                f" {REPORT}"
+            )
+        _set(tensor, places[tensor.name], piece)
+    return bytes(bound.SerializeToString(deterministic=True))
 
 
-def rebind(model: ModelProto, places: Mapping[str, Place], piece: str) -> ModelProto:
-    """A copy of a bound model in which the constants in ``places`` have new values.
+def interface(model: ModelProto) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names of a model's inputs, without those that are initialized, and of its outputs."""
+    initialized = {tensor.name for tensor in model.graph.initializer}
+    inputs = tuple(value.name for value in model.graph.input if value.name not in initialized)
+    return inputs, tuple(value.name for value in model.graph.output)
+
+
+def store_blocks(
+    folder: Path, blocks: LoweredBlocks, pieces: Mapping[str, PieceRecord], places: Mapping[str, Place]
+) -> PrecisionRecord:
+    """Write blocks beside those in fp32, which the reference runtime computes with, into the folder of a new artifact.
+
+    Args:
+        folder: of the artifact.
+        blocks: what to write.
+        pieces: of the artifact.
+        places: of the program's constants, which these models read too.
 
     Raises:
-        ArtifactError: a constant of another type.
+        ArtifactError: a model that does not fit its piece, or a constant that has the name of another.
     """
-    bound = _copy(model)
-    for tensor in _initializers(bound.graph):
-        if tensor.name in places:
-            _set(tensor, places[tensor.name], piece)
-    return bound
+    where = f"precision {blocks.name!r}"
+    if taken := sorted(set(blocks.weights) & set(places)):
+        raise ArtifactError(f"{where}: expected constants of new names; found {taken[0]!r}. {REPORT}")
+    file = f"weights_{blocks.name}.safetensors"
+    write_synced(folder / file, tensors.serialize(blocks.weights))
+    places = {**places, **places_of(folder / file, blocks.weights)}
+    files = {}
+    for name, model in blocks.models.items():
+        (inputs, outputs), piece = interface(model), pieces.get(name)
+        if piece is None or (inputs, outputs) != (piece.inputs, piece.outputs):
+            expected = "no such piece" if piece is None else (list(piece.inputs), list(piece.outputs))
+            raise ArtifactError(
+                f"{where}: {name!r} reads {list(inputs)} and gives {list(outputs)}; expected {expected}. {REPORT}"
+            )
+        files[name] = f"{name}_{blocks.name}.onnx"
+        write_synced(folder / files[name], bind(model, places, name))
+    return PrecisionRecord(name=blocks.name, weights=file, models=files, error=blocks.error)
 
 
 def _set(tensor: TensorProto, place: Place, piece: str) -> None:
@@ -80,7 +141,7 @@ def _set(tensor: TensorProto, place: Place, piece: str) -> None:
     if dtype != place.value.dtype or shape != place.value.shape:
         raise ArtifactError(
             f"ONNX model {piece!r}: initializer {tensor.name!r} is {dtype}{list(shape)}; the program's constant is"
-            f" {place.value.dtype}{list(place.value.shape)}. This is an error in ttscompile; please report it."
+            f" {place.value.dtype}{list(place.value.shape)}. {REPORT}"
         )
     for values in ("raw_data", "float_data", "int32_data", "int64_data", "double_data", "uint64_data", "external_data"):
         tensor.ClearField(values)
@@ -109,11 +170,3 @@ def _initializers(graph: GraphProto) -> Iterator[TensorProto]:
         for attribute in node.attribute:
             for inner in (attribute.g, *attribute.graphs):
                 yield from _initializers(inner)
-
-
-def _copy(model: ModelProto) -> ModelProto:
-    from onnx import ModelProto
-
-    copy = ModelProto()
-    copy.CopyFrom(model)
-    return copy

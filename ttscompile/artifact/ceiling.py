@@ -16,23 +16,14 @@ SOLVER_STEPS = 16
 
 
 def usual_sparsity(steps: int) -> float:
-    """Share of the cells to reuse where no budget is given.
-
-    Args:
-        steps: K.
-    """
+    """Share of the cells of K steps to reuse where no budget is given."""
     return min(TYPICAL_SPARSITY, 1 - min(FEWEST_STEPS, steps // 2) / steps)
 
 
 def few_steps(manifest: Manifest) -> str | None:
-    """A warning where the steps are too few for ``TYPICAL_SPARSITY``, with the ceiling; None where they are not.
-
-    Args:
-        manifest: of the artifact.
-    """
+    """A warning where the steps are too few for ``TYPICAL_SPARSITY``, with the ceiling; None where they are not."""
     steps = manifest.steps
-    most = 1 - 1 / steps
-    if most >= TYPICAL_SPARSITY:
+    if (most := 1 - 1 / steps) >= TYPICAL_SPARSITY:
         return None
     return (
         f"K = {steps} denoising steps: step 0 is always computed, so at most {most:.1%} of the cells can be reused, and"
@@ -45,9 +36,6 @@ def many_steps(manifest: Manifest) -> str | None:
 
     On Push-T five of the 16 steps of DPM-Solver++ are a little faster than five of the 100 of DDPM, and score no less
     (`docs/decisions.md`).
-
-    Args:
-        manifest: of the artifact.
     """
     sampler = manifest.spec.sampler
     if sampler.name not in ("ddpm", "ddim") or sampler.steps < 2 * SOLVER_STEPS:

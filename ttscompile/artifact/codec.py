@@ -1,4 +1,4 @@
-"""``manifest.json``: the records of ``manifest`` to bytes, and strictly back.
+"""``manifest.json``: the records of ``manifest`` to bytes, and strictly back; and what they describe, as a hash.
 
 Nothing but numpy is needed to read one.
 """
@@ -13,7 +13,7 @@ from ..errors import ArtifactError
 from ..ir.pieces import ADVANCE, CONDITION, OF_ALL_BLOCKS, PRUNER, STEM, block_name
 from . import typed_json
 from .manifest import DENSE, FORMAT, MANIFEST, SCHEMA_VERSION, Manifest, PrecisionRecord
-from .strict_json import Value, dump, dump_compact, parse
+from .strict_json import REMEDY, Value, dump, dump_compact, parse
 
 MAX_MANIFEST_BYTES = 32 * 2**20
 
@@ -30,21 +30,24 @@ def decode(content: bytes, where: str = MANIFEST) -> Manifest:
     Raises:
         ArtifactError: no manifest, another schema version, or one that was changed or damaged.
     """
-    root = parse(content, where, MAX_MANIFEST_BYTES)
-    members = root.members()
-    if "format" not in members or members["format"].data != FORMAT:
+    document = {key: member.data for key, member in parse(content, where, MAX_MANIFEST_BYTES).members().items()}
+    if document.get("format") != FORMAT:
         raise ArtifactError(
             f"{where}: expected the manifest of a ttscompile artifact (format {FORMAT!r}); found another document."
             " Give the directory that 'ttscompile convert' wrote."
         )
-    _check_schema(members, where)
-    checksum = members.pop("checksum", None)
-    document = {key: member.data for key, member in members.items()}
-    if checksum is None or checksum.data != _checksum(document):
+    found, writer = document.get("schema_version"), document.get("ttscompile_version")
+    if found != SCHEMA_VERSION or type(found) is not int:
+        install = f"ttscompile=={writer}, which wrote it" if isinstance(writer, str) else "the ttscompile that wrote it"
         raise ArtifactError(
-            f"{where}: expected the checksum of its content; found"
-            f" {'none' if checksum is None else 'another'}. The manifest was changed or damaged since it was written:"
-            " copy the artifact again, or convert the checkpoint again."
+            f"{where}: schema_version: expected {SCHEMA_VERSION}, the only one that this ttscompile reads; found"
+            f" {found!r}. Convert the checkpoint again with this version, or install {install}."
+        )
+    checksum = document.pop("checksum", None)
+    if checksum != _checksum(document):
+        raise ArtifactError(
+            f"{where}: expected the checksum of its content; found {'none' if checksum is None else 'another'}."
+            f" {REMEDY}"
         )
     return from_json(Value(document, where))
 
@@ -62,12 +65,50 @@ def from_json(root: Value) -> Manifest:
         ArtifactError: names the path in the document, expected and found.
     """
     members = root.members()
-    members.pop("format", None)
-    manifest = typed_json.from_json(Manifest, Value({key: one.data for key, one in members.items()}, root.path))
+    document = {key: member.data for key, member in members.items() if key != "format"}
+    manifest = typed_json.from_json(Manifest, Value(document, root.path))
     if manifest.precision is not None:
         _check_precision(manifest, manifest.precision, members["precision"])
     _check_parts(manifest, members)
     return manifest
+
+
+def identities(manifest: Manifest) -> tuple[str, str]:
+    """Identity and model identity of what a manifest describes; its own two fields are not read.
+
+    The model identity covers weights, tables, graphs, sampler, normalisers, observations, chunk and block table. The
+    identity covers that, the pruner's weights, all plans, which of them is the default, and blocks of another
+    precision: a calibration, which computes in fp32, belongs to the model with or without them. Neither covers what
+    people are told: source, FLOPs, reasons, sparsities, errors, calibration record, versions.
+
+    Returns:
+        Two sha256 of 64 digits.
+    """
+    document = to_json(manifest)
+    hashes = {name: record.sha256 for name, record in manifest.files.items()}
+    pieces = {name: {**piece, "file": hashes[piece["file"]]} for name, piece in document["pieces"].items()}
+    pruner = pieces.pop(PRUNER, None)
+    model = {
+        "spec": {key: value for key, value in document["spec"].items() if key != "source"},
+        "blocks": [{key: block[key] for key in ("kind", "type", "group")} for block in document["blocks"]],
+        "pieces": pieces,
+        "contexts": document["contexts"],
+        "features": document["features"],
+        "program": hashes[manifest.stores.program],
+        "weights": hashes[manifest.stores.weights],
+    }
+    model_identity = _checksum(model)
+    whole: dict[str, Any] = {
+        "model": model_identity,
+        "pruner": [pruner, hashes.get(manifest.stores.pruner or "")],
+        "plans": [hashes.get(manifest.stores.plans or ""), {n: plan.kind for n, plan in manifest.plans.items()}],
+        "default_plan": manifest.default_plan,
+    }
+    if manifest.precision is not None:
+        record = manifest.precision
+        models = {name: hashes[file] for name, file in record.models.items()}
+        whole["precision"] = {"name": record.name, "weights": hashes[record.weights], "models": models}
+    return _checksum(whole), model_identity
 
 
 def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:
@@ -114,17 +155,5 @@ def _check_precision(manifest: Manifest, record: PrecisionRecord, value: Value) 
         value.fail("a file for each model and one for the weights, which nothing else uses")
 
 
-def _check_schema(members: Mapping[str, Value], where: str) -> None:
-    found = members["schema_version"].data if "schema_version" in members else None
-    if found == SCHEMA_VERSION and type(found) is int:
-        return
-    writer = members["ttscompile_version"].data if "ttscompile_version" in members else None
-    install = f"ttscompile=={writer}, which wrote it" if isinstance(writer, str) else "the ttscompile that wrote it"
-    raise ArtifactError(
-        f"{where}: schema_version: expected {SCHEMA_VERSION}, the only one that this ttscompile reads; found {found!r}."
-        f" Convert the checkpoint again with this version, or install {install}."
-    )
-
-
-def _checksum(document: Mapping[str, Any]) -> str:
+def _checksum(document: object) -> str:
     return hashlib.sha256(dump_compact(document)).hexdigest()

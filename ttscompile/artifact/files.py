@@ -35,7 +35,7 @@ def content_hash(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()[:16]
 
 
-def verify(path: Path, record: FileRecord) -> None:
+def check_file(path: Path, record: FileRecord) -> None:
     """Raise unless the file is what its record says.
 
     Raises:
@@ -131,6 +131,22 @@ def exchange(one: Path, other: Path) -> bool:
 
 
 @contextmanager
+def lock_folder(path: Path) -> Iterator[None]:
+    """Keep other processes that ask from working in a folder; a crash releases it.
+
+    Raises:
+        BlockingIOError: another process has it.
+        OSError: no permission, or a file system without locks.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
 def new_folder(target: Path) -> Iterator[Path]:
     """An empty folder beside ``target`` for what will take its place; gone after the block, if it is still there.
 
@@ -138,16 +154,15 @@ def new_folder(target: Path) -> Iterator[Path]:
     """
     name = re.compile(rf"\.{re.escape(target.name)}\.[0-9a-f]{{8}}{re.escape(PARTIAL)}")
     for path in [path for path in target.parent.iterdir() if name.fullmatch(path.name)]:
-        _remove_abandoned(path)
+        with suppress(OSError), lock_folder(path):  # or somebody works in it, or removed it
+            shutil.rmtree(path, ignore_errors=True)
     partial = beside(target)
     partial.mkdir()
-    descriptor = os.open(partial, os.O_RDONLY)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield partial
+        with lock_folder(partial):
+            yield partial
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-        os.close(descriptor)
 
 
 def recover(target: Path) -> None:
@@ -160,13 +175,3 @@ def recover(target: Path) -> None:
 
 def _replaced(target: Path) -> Path:
     return target.with_name(f".{target.name}.replaced")
-
-
-def _remove_abandoned(path: Path) -> None:
-    with suppress(OSError):  # somebody works in it, or removed it
-        descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            shutil.rmtree(path, ignore_errors=True)
-        finally:
-            os.close(descriptor)

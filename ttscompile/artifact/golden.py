@@ -17,11 +17,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from ..artifact import tensors
 from ..core.spec import FloatArray, Noise, PolicySpec
 from ..errors import ArtifactError
 from ..ir.graph import TensorType
-from .manifest import Manifest
+from . import tensors
 from .strict_json import REMEDY
 
 if TYPE_CHECKING:
@@ -35,8 +34,7 @@ DIGITS = 16
 PATTERN = 16384
 """Numbers of one stream's observation that are stored; a larger observation repeats them."""
 
-_OBSERVATION, _NORMALIZED, _DRAWS = "observation/", "normalized/", "draws"
-_PLAN_FIELDS = ("plan", "path", "sample")
+_PREFIXES = {"observations": "observation/", "normalized": "normalized/"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,62 +91,11 @@ class Golden:
         """All of it by name, for a file."""
         found: dict[str, Array] = {}
         for name, value in vars(self).items():
-            if isinstance(value, Mapping):
-                prefix = _OBSERVATION if name == "observations" else _NORMALIZED
-                found |= {prefix + key: array for key, array in value.items()}
+            if name in _PREFIXES:
+                found |= {_PREFIXES[name] + key: array for key, array in value.items()}
             elif value is not None:
                 found[name] = value
         return found
-
-    @classmethod
-    def of(cls, arrays: Mapping[str, Array], manifest: Manifest) -> Golden:
-        """Inverse of ``arrays``.
-
-        Raises:
-            ArtifactError: it is not the record of such a policy.
-        """
-        spec, blocks = manifest.spec, len(manifest.blocks)
-        streams = len(arrays["initial"]) if "initial" in arrays and arrays["initial"].ndim == 3 else 0
-        anchors, evaluated = (len(arrays[n]) if n in arrays and arrays[n].ndim else 0 for n in ("steps", "evaluated"))
-        sample = (streams, *spec.sample)
-        wanted: dict[str, tuple[tuple[int, ...], str]] = {
-            "initial": (sample, "float32"),
-            "steps": ((anchors,), "int64"),
-            "scales": ((blocks,), "float32"),
-            "residuals": ((anchors, blocks, streams, DIGITS), "float32"),
-            "evaluated": ((evaluated,), "int64"),
-            "inputs": ((evaluated, *sample), "float32"),
-            "outputs": ((evaluated, *sample), "float32"),
-            "predictions": ((manifest.steps, streams, DIGITS), "float32"),
-            "path": ((manifest.steps, streams, DIGITS), "float32"),
-            "sample": (sample, "float32"),
-            "actions": ((streams, spec.sample[0], spec.chunk.action_dim), "float32"),
-            "executed": ((streams, spec.chunk.stop - spec.chunk.start, spec.chunk.action_dim), "float32"),
-        }
-        if spec.sampler.stochastic:
-            wanted[_DRAWS] = ((manifest.steps, *sample), "float32")
-        for key, one in spec.observations.items():
-            dtype = one.dtype if one.normalizer is None else "float32"
-            wanted[_OBSERVATION + key] = ((streams, pattern_size(one.shape)), one.dtype)
-            wanted[_NORMALIZED + key] = ((streams, pattern_size(one.shape)), dtype)
-        found = {name: (array.shape, str(array.dtype)) for name, array in arrays.items()}
-        in_range = all(
-            name in arrays and ((arrays[name] >= 0) & (arrays[name] < manifest.steps)).all()
-            for name in ("steps", "evaluated")
-        )
-        if found != wanted or not streams or not anchors or not evaluated or not in_range:
-            wrong = sorted(name for name in {*wanted, *found} if wanted.get(name) != found.get(name))
-            name = wrong[0] if wrong else "steps"
-            raise ArtifactError(
-                f"golden record: expected {wanted.get(name, 'no array')} for {name!r} of steps 0..{manifest.steps - 1};"
-                f" found {found.get(name, 'none')}. {REMEDY}"
-            )
-        mappings = {
-            name: {key: arrays[prefix + key] for key in spec.observations}
-            for name, prefix in (("observations", _OBSERVATION), ("normalized", _NORMALIZED))
-        }
-        single = {each.name: arrays.get(each.name) for each in fields(cls) if each.name not in mappings}
-        return cls(**mappings, **single)  # type: ignore[arg-type]
 
     def raw_observations(self, spec: PolicySpec) -> dict[str, Array]:
         """What ``predict_action`` is given, ``[B, ...]``."""
@@ -178,29 +125,7 @@ class GoldenPlan:
 
 def plan_arrays(plans: Mapping[str, GoldenPlan]) -> dict[str, Array]:
     """Records of plans by name, for a file."""
-    return {f"{name}/{field}": getattr(one, field) for name, one in plans.items() for field in _PLAN_FIELDS}
-
-
-def plans_of(arrays: Mapping[str, Array], manifest: Manifest, streams: int) -> dict[str, GoldenPlan]:
-    """Inverse of ``plan_arrays``.
-
-    Raises:
-        ArtifactError: these are no records of the artifact's plans.
-    """
-    names = sorted({name.rpartition("/")[0] for name in arrays})
-    wanted = {
-        "plan": ((2, streams, manifest.steps, len(manifest.blocks)), "int8"),
-        "path": ((2, manifest.steps, streams, DIGITS), "float32"),
-        "sample": ((2, streams, *manifest.spec.sample), "float32"),
-    }
-    expected = {f"{name}/{field}": one for name in names for field, one in wanted.items()}
-    found = {name: (array.shape, str(array.dtype)) for name, array in arrays.items()}
-    if found != expected or set(names) != set(manifest.plans):
-        raise ArtifactError(
-            f"golden record of plans: expected {', '.join(_PLAN_FIELDS)} of {sorted(manifest.plans)}; found"
-            f" {sorted(arrays)}. {REMEDY}"
-        )
-    return {name: GoldenPlan(**{field: arrays[f"{name}/{field}"] for field in _PLAN_FIELDS}) for name in names}
+    return {f"{name}/{field}": array for name, one in plans.items() for field, array in vars(one).items()}
 
 
 def load_golden(artifact: Artifact) -> Golden:
@@ -209,27 +134,63 @@ def load_golden(artifact: Artifact) -> Golden:
     Raises:
         ArtifactError: it has none, or one that does not fit.
     """
-    name = artifact.manifest.stores.golden
-    if name is None:
+    manifest, spec, steps = artifact.manifest, artifact.manifest.spec, artifact.manifest.steps
+    if manifest.stores.golden is None:
         raise ArtifactError(
             f"{artifact.path}: expected a golden record of the original network; found none: it was written by"
             " 'write_artifact' alone. Convert the checkpoint with 'ttscompile convert', or use compile_denoiser."
         )
-    return Golden.of(tensors.read(artifact.path / name), artifact.manifest)
+    arrays, where = tensors.read(artifact.path / manifest.stores.golden), f"{artifact.path}: golden record"
+    kept = {name: arrays.get(name, np.zeros(0)) for name in ("initial", "steps", "evaluated")}
+    streams, anchors, evaluated = (len(array) if array.ndim else 0 for array in kept.values())
+    sample, projected = (streams, *spec.sample), (steps, streams, DIGITS)
+    float32: dict[str, tuple[int, ...]] = {
+        "initial": sample,
+        "scales": (len(manifest.blocks),),
+        "residuals": (anchors, len(manifest.blocks), streams, DIGITS),
+        "inputs": (evaluated, *sample),
+        "outputs": (evaluated, *sample),
+        "predictions": projected,
+        "path": projected,
+        "sample": sample,
+        "actions": (streams, spec.sample[0], spec.chunk.action_dim),
+        "executed": (streams, spec.chunk.stop - spec.chunk.start, spec.chunk.action_dim),
+    }
+    if spec.sampler.stochastic:
+        float32["draws"] = (steps, *sample)
+    wanted = {name: ("float32", shape) for name, shape in float32.items()}
+    wanted |= {"steps": ("int64", (anchors,)), "evaluated": ("int64", (evaluated,))}
+    for key, one in spec.observations.items():
+        shape = (streams, pattern_size(one.shape))
+        wanted[_PREFIXES["observations"] + key] = (one.dtype, shape)
+        wanted[_PREFIXES["normalized"] + key] = (one.dtype if one.normalizer is None else "float32", shape)
+    tensors.check_arrays("array", arrays, wanted, where)
+    at = np.concatenate([kept["steps"], kept["evaluated"]])
+    if not (streams and anchors and evaluated and ((at >= 0) & (at < steps)).all()):
+        raise ArtifactError(f"{where}: expected streams, and steps of 0..{steps - 1}; found none, or others. {REMEDY}")
+    mappings = {name: {key: arrays[start + key] for key in spec.observations} for name, start in _PREFIXES.items()}
+    single = {each.name: arrays.get(each.name) for each in fields(Golden) if each.name not in mappings}
+    return Golden(**mappings, **single)  # type: ignore[arg-type]
 
 
 def load_golden_plans(artifact: Artifact, streams: int) -> dict[str, GoldenPlan]:
-    """Records of the plans of an artifact by name; empty if it has none.
-
-    Args:
-        artifact: opened.
-        streams: B of the record of the original network.
+    """Records of the plans of an artifact by name, of B ``streams`` as its ``Golden`` has; empty if it has none.
 
     Raises:
         ArtifactError: records that do not fit.
     """
-    name = artifact.manifest.stores.golden_plans
-    return {} if name is None else plans_of(tensors.read(artifact.path / name), artifact.manifest, streams)
+    manifest = artifact.manifest
+    if manifest.stores.golden_plans is None:
+        return {}
+    arrays = tensors.read(artifact.path / manifest.stores.golden_plans)
+    kinds: dict[str, tuple[str, tuple[int, ...]]] = {
+        "plan": ("int8", (2, streams, manifest.steps, len(manifest.blocks))),
+        "path": ("float32", (2, manifest.steps, streams, DIGITS)),
+        "sample": ("float32", (2, streams, *manifest.spec.sample)),
+    }
+    wanted = {f"{name}/{field}": kind for name in manifest.plans for field, kind in kinds.items()}
+    tensors.check_arrays("array", arrays, wanted, f"{artifact.path}: golden record of plans")
+    return {name: GoldenPlan(**{field: arrays[f"{name}/{field}"] for field in kinds}) for name in manifest.plans}
 
 
 def pattern_size(shape: tuple[int, ...]) -> int:

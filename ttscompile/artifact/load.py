@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,28 +14,33 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..artifact import tensors
 from ..core.correction import Correction
 from ..core.lattice import PlanArray, Source, check_plan, dense_plan
 from ..core.spec import FP32
 from ..errors import ArtifactError, IllegalPlanError
-from ..ir.graph import Graph
+from ..ir.graph import Graph, TensorType
 from ..ir.pieces import CONDITION, PRUNER, STEM, STEP, TAIL, LoopPiece, block_name
 from ..ir.program import Binding, Pieces
-from ..ir.serialize import graph_from_json
 from ..measure.versions import release
+from . import tensors
 from .archive import Unpacked, is_checkpoint, unpack
-from .codec import decode
-from .files import verify
-from .identity import identities
+from .codec import decode, identities
+from .files import check_file
+from .graph_json import graph_from_json
 from .manifest import DENSE, MANIFEST, Manifest, Requires, abbreviated
 from .onnx_files import check_model
-from .size import check_size
 from .strict_json import REMEDY, Value, parse
 
 TABLE_PREFIX = "table/"
 CORRECTION_PREFIX = "correction/"
 CORRECTION_FIELDS = tuple(field.name for field in fields(Correction))
+
+FREE_BYTES = 2**30
+MAX_RATIO = 64
+"""Buffers of one stream may take so many times the bytes of the artifact's files, or ``FREE_BYTES``. Push-T: 0.3."""
+
+_HISTORY = 16
+"""Samples that a runtime keeps beside those of every step, and then some."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,13 +118,12 @@ class Artifact:
         Raises:
             ArtifactError: ``program.json`` is not valid, or asks for a constant that the artifact lacks.
         """
-        graphs = {}
+        graphs, stored = {}, {**self.pruner, **self.weights}
         for name, value in self._document.keys("graphs", "streams")["graphs"].members().items():
-            try:
-                graphs[name] = graph_from_json(value.data)
-            except ArtifactError as error:
-                raise ArtifactError(f"{value.path}: {error}") from error
-            self._check_constants(graphs[name], value.path)
+            graphs[name] = graph_from_json(value)
+            constants = graphs[name].constants
+            kinds = {n: (kind.dtype, kind.at(1)) for n, kind in constants.items()}
+            tensors.check_arrays("constant", {n: stored[n] for n in constants if n in stored}, kinds, value.path)
         return MappingProxyType(graphs)
 
     def graph(self, name: str) -> Graph:
@@ -157,13 +162,6 @@ class Artifact:
             bindings={name: context.binding for name, context in self.manifest.contexts.items()},
             features=self.manifest.features,
         )
-
-    def _check_constants(self, graph: Graph, where: str) -> None:
-        for name, kind in graph.constants.items():
-            array = self.weights.get(name, self.pruner.get(name))
-            if array is None or array.shape != kind.at(1) or str(array.dtype) != kind.dtype:
-                found = "none" if array is None else f"{array.dtype}{list(array.shape)}"
-                raise ArtifactError(f"{where}: expected the constant {name!r} : {kind}; found {found}. {REMEDY}")
 
 
 def load_artifact(path: str | Path) -> Artifact:
@@ -222,20 +220,23 @@ def _load_directory(directory: Path) -> Artifact:
     manifest = read_manifest(directory)
     _check_runtime(manifest.requires, directory)
     for name, record in manifest.files.items():
-        verify(directory / name, record)
+        check_file(directory / name, record)
     if identities(manifest) != (manifest.identity, manifest.model_identity):
         raise ArtifactError(
             f"{directory}: expected the identity {manifest.short_identity}; its content has"
             f" {abbreviated(identities(manifest)[0])}. {REMEDY}"
         )
-    check_size(manifest, directory)
+    _check_size(manifest, directory)
     models = {piece.file for piece in manifest.pieces.values()}
     for name in sorted(models | (set(manifest.precision.models.values()) if manifest.precision else set())):
         check_model(directory / name, manifest.files)
     stored = tensors.read(directory / manifest.stores.weights)
     tables = {n.removeprefix(TABLE_PREFIX): a for n, a in stored.items() if n.startswith(TABLE_PREFIX)}
+    kinds = {n: c.type for n, c in manifest.contexts.items() if c.binding is Binding.TABLE}
+    wanted = {name: (kind.dtype, (manifest.steps, *kind.at(1))) for name, kind in kinds.items()}
+    tensors.check_arrays("table", tables, wanted, directory / manifest.stores.weights)
     schedules, corrections = _plans(directory, manifest)
-    artifact = Artifact(
+    return Artifact(
         path=directory,
         manifest=manifest,
         weights=MappingProxyType({n: a for n, a in stored.items() if not n.startswith(TABLE_PREFIX)}),
@@ -244,9 +245,6 @@ def _load_directory(directory: Path) -> Artifact:
         schedules=schedules,
         corrections=corrections,
     )
-    _check_tables(artifact)
-    _check_schedules(artifact)
-    return artifact
 
 
 def _optional(directory: Path, name: str | None) -> Mapping[str, npt.NDArray[Any]]:
@@ -256,55 +254,28 @@ def _optional(directory: Path, name: str | None) -> Mapping[str, npt.NDArray[Any
 def _plans(directory: Path, manifest: Manifest) -> tuple[Mapping[str, PlanArray], Mapping[str, Correction]]:
     """Schedules, and the corrections that belong to plans."""
     stored = _optional(directory, manifest.stores.plans)
-    schedules = {name: array for name, array in stored.items() if not name.startswith(CORRECTION_PREFIX)}
-    parts = {name.removeprefix(CORRECTION_PREFIX): array for name, array in stored.items() if name not in schedules}
-    names = {name.rpartition("/")[0] for name in parts}
     where = directory / (manifest.stores.plans or MANIFEST)
-    if not names <= set(manifest.plans) or {f"{n}/{f}" for n in names for f in CORRECTION_FIELDS} != set(parts):
+    schedules = {name: array for name, array in stored.items() if not name.startswith(CORRECTION_PREFIX)}
+    expected = sorted(name for name, plan in manifest.plans.items() if not plan.pruned)
+    if expected != sorted(schedules):
+        raise ArtifactError(f"{where}: expected schedules {expected}; found {sorted(schedules)}. {REMEDY}")
+    parts = {name.removeprefix(CORRECTION_PREFIX): array for name, array in stored.items() if name not in schedules}
+    names = sorted({name.rpartition("/")[0] for name in parts})
+    if not set(names) <= set(manifest.plans) or {f"{n}/{f}" for n in names for f in CORRECTION_FIELDS} != set(parts):
         raise ArtifactError(
             f"{where}: expected corrections of plans among {sorted(manifest.plans)}, each with"
             f" {', '.join(CORRECTION_FIELDS)}; found {sorted(parts)}. {REMEDY}"
         )
     corrections = {}
-    for name in sorted(names):
-        try:
+    try:
+        for name, plan in schedules.items():
+            check_schedule(name, plan, manifest)
+        for name in names:
             corrections[name] = Correction(**{field: parts[f"{name}/{field}"] for field in CORRECTION_FIELDS})
             corrections[name].require_fit(manifest.steps, manifest.spec.sample)
-        except IllegalPlanError as error:
-            raise ArtifactError(f"{where}: {name}: {error} {REMEDY}") from error
+    except IllegalPlanError as error:
+        raise ArtifactError(f"{where}: {name}: {error} {REMEDY}") from error
     return MappingProxyType(schedules), MappingProxyType(corrections)
-
-
-def _check_tables(artifact: Artifact) -> None:
-    manifest = artifact.manifest
-    expected = {n: c.type for n, c in manifest.contexts.items() if c.binding is Binding.TABLE}
-    where = artifact.path / manifest.stores.weights
-    if set(expected) != set(artifact.tables):
-        raise ArtifactError(
-            f"{where}: expected tables of {sorted(expected)}; found {sorted(artifact.tables)}. {REMEDY}"
-        )
-    for name, kind in expected.items():
-        table, shape = artifact.tables[name], (manifest.steps, *kind.at(1))
-        if table.shape != shape or str(table.dtype) != kind.dtype:
-            raise ArtifactError(
-                f"{where}: expected the table {name!r} : {kind.dtype}{list(shape)};"
-                f" found {table.dtype}{list(table.shape)}. {REMEDY}"
-            )
-
-
-def _check_schedules(artifact: Artifact) -> None:
-    manifest = artifact.manifest
-    names = {name for name, plan in manifest.plans.items() if not plan.pruned}
-    where = artifact.path / (manifest.stores.plans or MANIFEST)
-    if names != set(artifact.schedules):
-        raise ArtifactError(
-            f"{where}: expected schedules {sorted(names)}; found {sorted(artifact.schedules)}. {REMEDY}"
-        )
-    for name, plan in artifact.schedules.items():
-        try:
-            check_schedule(name, plan, manifest)
-        except IllegalPlanError as error:
-            raise ArtifactError(f"{where}: {error} {REMEDY}") from error
 
 
 def check_schedule(name: str, plan: npt.NDArray[Any], manifest: Manifest) -> None:
@@ -337,3 +308,32 @@ def _check_runtime(requires: Requires, directory: Path) -> None:
             f"{directory}: its graphs (opset {requires.opset}) need onnxruntime >= {requires.onnxruntime}; {found} is"
             f" installed. Run: pip install 'onnxruntime>={requires.onnxruntime}'."
         )
+
+
+def _check_size(manifest: Manifest, directory: Path) -> None:
+    """Raise if the values that a manifest declares are out of proportion to its files: it may declare what it likes."""
+    allowed = max(FREE_BYTES, MAX_RATIO * sum(record.bytes for record in manifest.files.values()))
+    total = sum(_bytes(manifest))
+    if total > allowed:
+        raise ArtifactError(
+            f"{directory}: expected a policy whose values take at most {allowed} bytes, {MAX_RATIO} times its"
+            f" files; its manifest declares {total}. {REMEDY}"
+        )
+
+
+def _bytes(manifest: Manifest) -> Iterator[int]:
+    """Sizes of what a runtime allocates for one stream, about; Python's integers do not overflow."""
+    steps, (horizon, channels) = manifest.steps, manifest.spec.sample
+    drawn = horizon + manifest.spec.left_out  # noise is drawn for the original's steps, too
+    yield 4 * drawn * channels * (steps + _HISTORY)
+    yield 4 * steps * channels * (_HISTORY * horizon) * horizon  # the sampler's update, a matrix a step and channel
+    for spec in manifest.spec.observations.values():
+        yield math.prod(spec.shape) * np.dtype(spec.dtype).itemsize
+    for context in manifest.contexts.values():
+        yield _nbytes(context.type) * (1 if context.binding is Binding.CONDITION else steps)
+    for block in manifest.blocks:
+        yield 4 * _nbytes(block.type)
+
+
+def _nbytes(kind: TensorType) -> int:
+    return math.prod(kind.at(1)) * np.dtype(kind.dtype).itemsize

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TypeAlias
 
 from ..errors import ArtifactError
 from .manifest import FileRecord
@@ -18,13 +17,10 @@ from .strict_json import REMEDY
 MAX_BYTES = 512 * 2**20
 MAX_DEPTH = 32
 
-_Schema: TypeAlias = dict[int, str]
-
 # Fields through which a tensor can be reached, by message; all others are skipped.
-_GRAPH: _Schema = {1: "node", 5: "tensor", 15: "sparse"}
-_FIELDS: Mapping[str, _Schema] = {
+_FIELDS: Mapping[str, Mapping[int, str]] = {
     "model": {7: "graph", 20: "training", 25: "function"},
-    "graph": _GRAPH,
+    "graph": {1: "node", 5: "tensor", 15: "sparse"},
     "training": {1: "graph", 2: "graph"},
     "function": {7: "node", 11: "attribute"},
     "node": {5: "attribute"},
@@ -36,11 +32,7 @@ _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 
 
 def check_model(path: Path, files: Mapping[str, FileRecord]) -> None:
-    """Raise unless all weights of a model are in it, or in ranges of the artifact's files.
-
-    Args:
-        path: the model.
-        files: of the artifact, checked.
+    """Raise unless all weights of a model are in it, or in ranges of the artifact's files, which were checked.
 
     Raises:
         ArtifactError: unreadable, no such model, or weights elsewhere.
@@ -67,14 +59,11 @@ def _tensors(message: memoryview, kind: str, depth: int) -> Iterator[memoryview]
     """All tensors below a message."""
     if depth > MAX_DEPTH:
         raise ValueError("messages too deep in each other")
-    inner = _FIELDS[kind]
     for number, value in _read(message):
-        below = inner.get(number)
-        if below is None or value is None:
-            continue
-        if below == "tensor":
+        below = _FIELDS[kind].get(number)
+        if below == "tensor" and value is not None:
             yield value
-        else:
+        elif below is not None and value is not None:
             yield from _tensors(value, below, depth + 1)
 
 

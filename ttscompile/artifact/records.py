@@ -1,40 +1,29 @@
-"""From a compiled program and its ONNX models to the records of the manifest; checks that they fit each other."""
+"""From a compiled program, its ONNX models and its plans to the records of the manifest; checks that they fit."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import numpy.typing as npt
 
+from ..core.lattice import plan_flops, sparsity
 from ..core.update import update_flops
 from ..errors import ArtifactError
+from ..ir import pieces as names
 from ..ir.flops import graph_flops
-from ..ir.graph import Graph, TensorType
+from ..ir.graph import Graph
 from ..ir.joint import join
-from ..ir.pieces import (
-    ADVANCE,
-    CONDITION,
-    CONTEXT,
-    DENSE_STEP,
-    IDLE,
-    IDLE_OUTPUTS,
-    JOINT,
-    PRUNER,
-    RESIDUAL,
-    STEM,
-    STEP,
-    STREAM,
-    TAIL,
-    TOTAL,
-    advance_context,
-    advance_inputs,
-    advance_outputs,
-    dense_step_outputs,
-)
-from ..ir.program import Binding, Pieces, Program
-from .manifest import BlockRecord, ContextRecord, FlopsRecord, PieceRecord, Requires
+from ..ir.program import Binding, Program
+from . import tensors
+from .bind import REPORT, interface
+from .load import check_schedule
+from .manifest import DENSE, BlockRecord, ContextRecord, FlopsRecord, Manifest, PieceRecord, PlanRecord, Requires
+from .strict_json import Value, dump_compact, parse
+from .typed_json import from_json
 
 if TYPE_CHECKING:
     from onnx import ModelProto
@@ -44,7 +33,7 @@ MAX_OPSET, MAX_IR = 23, 11
 """What ``ONNXRUNTIME`` reads: 1.22.1 refuses opset 23, 1.23.2 opens and runs it (tried). Also in pyproject.toml."""
 
 PRUNER_PREFIX = "pruner."
-_REPORT = "This is an error in ttscompile; please report it."
+_PLAN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.%-]{0,63}")
 
 
 def constants(program: Program, graphs: Mapping[str, Graph]) -> dict[str, npt.NDArray[Any]]:
@@ -59,7 +48,7 @@ def constants(program: Program, graphs: Mapping[str, Graph]) -> dict[str, npt.ND
             value = program.weights.get(name)
             if value is None or value.shape != kind.at(1) or str(value.dtype) != kind.dtype:
                 shown = "none" if value is None else f"{value.dtype}{list(value.shape)}"
-                raise ArtifactError(f"{piece}: constant {name!r} is {kind}; its value is {shown}. {_REPORT}")
+                raise ArtifactError(f"{piece}: constant {name!r} is {kind}; its value is {shown}. {REPORT}")
             found[name] = value
     return dict(sorted(found.items()))
 
@@ -72,7 +61,7 @@ def block_records(program: Program) -> tuple[BlockRecord, ...]:
     """
     graphs = [piece.graph for piece in program.pieces.blocks]
     if len(graphs) != len(program.blocks):
-        raise ArtifactError(f"the program has {len(program.blocks)} blocks and {len(graphs)} block graphs. {_REPORT}")
+        raise ArtifactError(f"the program has {len(program.blocks)} blocks and {len(graphs)} block graphs. {REPORT}")
     return tuple(
         BlockRecord(kind=b.kind, type=b.type, group=b.group, flops=graph_flops(graph), reason=b.reason)
         for b, graph in zip(program.blocks, graphs, strict=True)
@@ -101,19 +90,24 @@ def context_records(program: Program) -> dict[str, ContextRecord]:
     """
     pieces = program.pieces
     readers = {name: piece.contexts for name, piece in pieces.loop.items()}
+    computed = {Binding.TABLE: set(pieces.tables), Binding.CONDITION: set(pieces.condition.outputs)}
     if pieces.step is not None:
-        readers = {STEP: dict(pieces.step.inputs), **readers}
+        readers = {names.STEP: dict(pieces.step.inputs), **readers}
+        computed[Binding.STEP] = set(pieces.step.outputs)
     records: dict[str, ContextRecord] = {}
     for piece, contexts in readers.items():
         for name, kind in contexts.items():
             binding, known = pieces.bindings.get(name), records.get(name)
             if known is not None and known.type != kind:
-                raise ArtifactError(f"{piece}: context {name!r} is {kind} here and {known.type} elsewhere. {_REPORT}")
-            if binding is None or not _available(name, binding, kind, pieces, program.spec.sampler.steps):
+                raise ArtifactError(f"{piece}: context {name!r} is {kind} here and {known.type} elsewhere. {REPORT}")
+            if binding is None or name not in computed.get(binding, ()):
                 shown = "no binding" if binding is None else f"the binding {binding.value}"
                 raise ArtifactError(
-                    f"{piece}: context {name!r} : {kind} has {shown}, and nothing computes it. {_REPORT}"
+                    f"{piece}: context {name!r} : {kind} has {shown}, and nothing computes it. {REPORT}"
                 )
+            if binding is Binding.TABLE:
+                wanted = {name: (kind.dtype, (program.spec.sampler.steps, *kind.at(1)))}
+                tensors.check_arrays("table", {name: pieces.tables[name]}, wanted, piece, REPORT)
             records[name] = ContextRecord(binding=binding, type=kind)
     return records
 
@@ -132,19 +126,16 @@ def piece_records(
     Raises:
         ArtifactError: models and pieces do not have the same names, inputs or outputs.
     """
-    expected = {name: one for name, one in _interfaces(program).items() if name != IDLE or IDLE in models}
+    expected = {name: one for name, one in _interfaces(program).items() if name != names.IDLE or names.IDLE in models}
     if set(models) != set(expected):
-        raise ArtifactError(f"expected the ONNX models {sorted(expected)}; found {sorted(models)}. {_REPORT}")
+        raise ArtifactError(f"expected the ONNX models {sorted(expected)}; found {sorted(models)}. {REPORT}")
     records = {}
     for name, wanted in expected.items():
-        model = models[name].graph
-        initialized = {tensor.name for tensor in model.initializer}
-        inputs = tuple(value.name for value in model.input if value.name not in initialized)
-        results = tuple(value.name for value in model.output)
+        inputs, results = interface(models[name])
         if (set(inputs), results) != (set(wanted.inputs), wanted.outputs):
             raise ArtifactError(
                 f"ONNX model {name!r}: expected inputs {list(wanted.inputs)} and outputs {list(wanted.outputs)}; found"
-                f" {list(inputs)} and {list(results)}. {_REPORT}"
+                f" {list(inputs)} and {list(results)}. {REPORT}"
             )
         records[name] = replace(wanted, file=files[name], inputs=inputs)
     return records
@@ -161,9 +152,53 @@ def requirements(models: Mapping[str, ModelProto]) -> Requires:
     if opset > MAX_OPSET or ir > MAX_IR:
         raise ArtifactError(
             f"the ONNX models need opset {opset} and IR version {ir}; onnxruntime {ONNXRUNTIME} reads opset {MAX_OPSET}"
-            f" and IR version {MAX_IR}. {_REPORT}"
+            f" and IR version {MAX_IR}. {REPORT}"
         )
     return Requires(onnxruntime=ONNXRUNTIME, opset=opset)
+
+
+def plan_records(
+    manifest: Manifest,
+    pruned: bool,
+    schedules: Mapping[str, npt.NDArray[np.int8]],
+    default_plan: str,
+    record: Mapping[str, Any],
+) -> dict[str, PlanRecord]:
+    """Records of schedules and, if it makes one (``pruned``), of the pruner's plan; see ``write.update_calibration``.
+
+    Raises:
+        ArtifactError: names that cannot be, or sparsities that are no shares.
+        IllegalPlanError: a schedule that does not fit the policy.
+    """
+    plans = {}
+    for name in sorted(schedules):
+        if _PLAN_NAME.fullmatch(name) is None or name == DENSE:
+            raise ArtifactError(f"schedule {name!r}: expected letters, digits and _ . % - and not 'dense'.")
+        plan = np.asarray(schedules[name])
+        check_schedule(name, plan, manifest)
+        total = manifest.steps * sum(manifest.flops.blocks)
+        weighed = 1 - plan_flops(plan, manifest.flops.blocks) / total if total else sparsity(plan)
+        plans[name] = PlanRecord(kind="schedule", sparsity=sparsity(plan), flops_sparsity=weighed)
+    if pruned:
+        if manifest.stores.pruner is None:
+            raise ArtifactError("the artifact has no pruner whose weights could be set. Convert the checkpoint again.")
+        name = names.PRUNER if default_plan in {DENSE, *plans} else default_plan
+        if name in plans or _PLAN_NAME.fullmatch(name) is None:
+            raise ArtifactError(f"the pruner's plan cannot be called {name!r}. Give the schedule another name.")
+        shares = {key: record.get(key) for key in ("sparsity", "flops_sparsity")}
+        plans[name] = from_json(PlanRecord, Value({"kind": names.PRUNER, **shares}, "calibration record"))
+    if default_plan not in {DENSE, *plans}:
+        raise ArtifactError(f"default plan {default_plan!r}: expected one of {[DENSE, *plans]}.")
+    return plans
+
+
+def calibration_record(record: Mapping[str, Any]) -> dict[str, Any]:
+    """The record as it will be read back."""
+    try:
+        content = dump_compact(dict(record))
+    except (TypeError, ValueError) as error:
+        raise ArtifactError(f"calibration record: expected JSON; found {error}. Convert arrays to lists.") from error
+    return {key: value.data for key, value in parse(content, "calibration record").members().items()}
 
 
 def _interfaces(program: Program) -> dict[str, PieceRecord]:
@@ -176,30 +211,27 @@ def _interfaces(program: Program) -> dict[str, PieceRecord]:
         return PieceRecord("", tuple(inputs), stream, tuple(dict.fromkeys(contexts)), outputs)
 
     condition, step, pruner, tail, stem = pieces.condition, pieces.step, pieces.pruner, pieces.tail, pieces.stem
-    found = {CONDITION: record(condition.inputs, condition.outputs)}
+    found = {names.CONDITION: record(condition.inputs, condition.outputs)}
     if step is not None:
-        found[STEP] = record(step.inputs, step.outputs, contexts=step.inputs)
+        found[names.STEP] = record(step.inputs, step.outputs, contexts=step.inputs)
     if pruner is not None:
-        found[PRUNER] = record(pruner.inputs, pruner.outputs)
+        found[names.PRUNER] = record(pruner.inputs, pruner.outputs)
     for name, piece in pieces.loop.items():
         if piece is not tail:
             found[name] = record(piece.graph.inputs, piece.graph.outputs, piece.stream, piece.contexts)
-    own = [advance_context(name, n) for name, piece in ((TAIL, tail), (STEM, stem)) for n in piece.contexts]
-    around = (*advance_inputs(sampler), *own)
-    found[ADVANCE] = record(around, advance_outputs(sampler), STREAM, (*tail.contexts, *stem.contexts))
+    own = [
+        names.advance_context(name, n)
+        for name, piece in ((names.TAIL, tail), (names.STEM, stem))
+        for n in piece.contexts
+    ]
+    around = (*names.advance_inputs(sampler), *own)
+    found[names.ADVANCE] = record(
+        around, names.advance_outputs(sampler), names.STREAM, (*tail.contexts, *stem.contexts)
+    )
     joint = join([tuple(piece.contexts.values()) for piece in pieces.blocks])
-    found[JOINT] = record(joint.inputs, (RESIDUAL,), STREAM)
+    found[names.JOINT] = record(joint.inputs, (names.RESIDUAL,), names.STREAM)
     read = dict.fromkeys(name for piece in pieces.blocks for name in piece.contexts)
-    whole = (STREAM, *(CONTEXT + name for name in read))
-    found[DENSE_STEP] = record(whole, dense_step_outputs(len(pieces.blocks)), STREAM, read)
-    found[IDLE] = record((TOTAL,), IDLE_OUTPUTS)
+    whole = (names.STREAM, *(names.CONTEXT + name for name in read))
+    found[names.DENSE_STEP] = record(whole, names.dense_step_outputs(len(pieces.blocks)), names.STREAM, read)
+    found[names.IDLE] = record((names.TOTAL,), names.IDLE_OUTPUTS)
     return found
-
-
-def _available(name: str, binding: Binding, kind: TensorType, pieces: Pieces, steps: int) -> bool:
-    if binding is Binding.TABLE:
-        table = pieces.tables.get(name)
-        return table is not None and table.shape == (steps, *kind.at(1)) and str(table.dtype) == kind.dtype
-    if binding is Binding.CONDITION:
-        return name in pieces.condition.outputs
-    return binding is Binding.STEP and pieces.step is not None and name in pieces.step.outputs

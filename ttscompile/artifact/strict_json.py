@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
@@ -35,13 +34,13 @@ class Value:
         """
         raise ArtifactError(f"{self.path}: expected {expected}; found {_shorten(self.data)}. {REMEDY}")
 
-    def keys(self, *required: str, optional: Sequence[str] = ()) -> dict[str, Value]:
-        """The members of an object that has exactly these keys, or some of the optional ones too."""
+    def keys(self, *names: str) -> dict[str, Value]:
+        """The members of an object that has exactly these keys."""
         members = self.members()
-        missing = [key for key in required if key not in members]
-        unknown = [key for key in members if key not in (*required, *optional)]
+        missing = [key for key in names if key not in members]
+        unknown = [key for key in members if key not in names]
         if missing or unknown:
-            self.fail(f"an object with the keys {', '.join(required)} (missing: {missing}, unknown: {unknown})")
+            self.fail(f"an object with the keys {', '.join(names)} (missing: {missing}, unknown: {unknown})")
         return members
 
     def members(self) -> dict[str, Value]:
@@ -50,10 +49,10 @@ class Value:
             self.fail("an object")
         return {key: Value(item, f"{self.path}.{key}") for key, item in self.data.items()}
 
-    def items(self) -> list[Value]:
+    def items(self, most: int | None = None) -> list[Value]:
         """The items of a list."""
-        if not isinstance(self.data, list):
-            self.fail("a list")
+        if not isinstance(self.data, list) or (most is not None and len(self.data) > most):
+            self.fail("a list" if most is None else f"a list of at most {most} items")
         return [Value(item, f"{self.path}[{i}]") for i, item in enumerate(self.data)]
 
     def text(self, *allowed: str) -> str:
@@ -68,12 +67,12 @@ class Value:
             self.fail("true or false")
         return self.data
 
-    def integer(self, least: int | None = 0) -> int:
+    def integer(self, least: int | None = 0, most: int = 2**63 - 1) -> int:
         """An integer, by default not negative; a boolean is none."""
         if not isinstance(self.data, int) or isinstance(self.data, bool):
             self.fail("an integer")
-        if not -(2**63) <= self.data < 2**63 or (least is not None and self.data < least):
-            self.fail("a 64-bit integer" if least is None else f"a 64-bit integer of at least {least}")
+        if not (-(2**63) if least is None else least) <= self.data <= most:
+            self.fail("a 64-bit integer" if least is None else f"a 64-bit integer of at least {least}, at most {most}")
         return self.data
 
     def number(self) -> float:
@@ -87,18 +86,6 @@ class Value:
         if not math.isfinite(number):
             self.fail("a finite number")
         return number
-
-    def share(self) -> float:
-        """A number in 0..1."""
-        number = self.number()
-        if not 0 <= number <= 1:
-            self.fail("a number in 0..1")
-        return number
-
-    @property
-    def absent(self) -> bool:
-        """Whether the value is ``null``."""
-        return self.data is None
 
 
 def parse(content: bytes, where: str, limit: int = MAX_BYTES) -> Value:

@@ -61,9 +61,6 @@ class Entry:
 def read_header(path: Path) -> dict[str, Entry]:
     """Read and check the header of a safetensors file.
 
-    Args:
-        path: the file.
-
     Returns:
         The entries in the order of their data.
 
@@ -127,6 +124,34 @@ def read(path: Path) -> Mapping[str, Array]:
             for name, entry in entries.items()
         }
     )
+
+
+def check_arrays(
+    kind: str,
+    arrays: Mapping[str, Array],
+    wanted: Mapping[str, tuple[str, tuple[int, ...]]],
+    where: object,
+    remedy: str = REMEDY,
+) -> None:
+    """Raise unless these are exactly the arrays that are wanted.
+
+    Args:
+        kind: what each of them is, for messages.
+        arrays: by name.
+        wanted: dtype and shape by name.
+        where: they come from, for messages.
+        remedy: what to do.
+
+    Raises:
+        ArtifactError: names the first that is missing, too many, or of another dtype or shape.
+    """
+    found = {name: (str(array.dtype), array.shape) for name, array in arrays.items()}
+    wrong = sorted(name for name in {*wanted, *found} if wanted.get(name) != found.get(name))
+    if wrong:
+        both = wanted.get(wrong[0]), found.get(wrong[0])
+        expected, other = ("none" if one is None else f"{one[0]}{list(one[1])}" for one in both)
+        count = f" ({len(wrong)} differ)" if len(wrong) > 1 else ""
+        raise ArtifactError(f"{where}: expected the {kind} {wrong[0]!r} : {expected}; found {other}{count}. {remedy}")
 
 
 def serialize(arrays: Mapping[str, Array]) -> bytes:

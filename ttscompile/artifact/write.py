@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -14,19 +13,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from ..artifact import tensors
 from ..core.correction import Correction
 from ..errors import ArtifactError
 from ..ir.pieces import PRUNER
 from ..ir.program import Binding, Program
-from ..ir.serialize import graph_to_json
 from ..measure.versions import VERSION
-from .bind import Place, bind, rebind
-from .codec import decode, encode
+from . import records, tensors
+from .bind import LoweredBlocks, bind, places_of, store_blocks
+from .codec import decode, encode, identities
 from .files import (
     PARTIAL,
     content_hash,
     describe,
+    lock_folder,
     new_folder,
     recover,
     replace_file,
@@ -35,7 +34,7 @@ from .files import (
     write_synced,
 )
 from .golden import Golden, GoldenPlan, plan_arrays
-from .identity import identities
+from .graph_json import graph_to_json
 from .load import (
     CORRECTION_FIELDS,
     CORRECTION_PREFIX,
@@ -45,17 +44,6 @@ from .load import (
     read_manifest,
 )
 from .manifest import DENSE, FORMAT, MANIFEST, SCHEMA_VERSION, Manifest, Stores, abbreviated
-from .plan_records import calibration_record, plan_records
-from .precision import LoweredBlocks, store_blocks
-from .records import (
-    PRUNER_PREFIX,
-    block_records,
-    constants,
-    context_records,
-    flops_record,
-    piece_records,
-    requirements,
-)
 from .strict_json import dump_compact
 
 if TYPE_CHECKING:
@@ -163,12 +151,13 @@ def update_calibration(
             )
         manifest = replace(
             artifact.manifest,
-            plans=plan_records(artifact.manifest, pruner_weights is not None, schedules, default_plan, record),
+            plans=records.plan_records(artifact.manifest, pruner_weights is not None, schedules, default_plan, record),
             default_plan=default_plan,
-            calibration=calibration_record(record),
+            calibration=records.calibration_record(record),
         )
         try:
-            manifest = _store_plans(directory, manifest, schedules, corrections or {})
+            arrays = _plan_arrays(manifest, schedules, corrections or {})
+            manifest = _store(directory, manifest, "plans", arrays)
             if pruner_weights is not None:
                 manifest = _store_pruner(artifact, manifest, pruner_weights)
             after = replace(
@@ -178,7 +167,7 @@ def update_calibration(
                 corrections=dict(corrections or {}),
                 pruner=artifact.pruner if pruner_weights is None else pruner_weights,
             )
-            manifest = _store_golden_plans(directory, manifest, {} if golden is None else golden(after))
+            manifest = _store(directory, manifest, "golden_plans", {} if golden is None else plan_arrays(golden(after)))
             content = encode(_identified(manifest))
             manifest = decode(content)  # refuses what nobody could load
             replace_file(directory / MANIFEST, content)
@@ -200,26 +189,26 @@ def _fill(
 ) -> Manifest:
     """Write all files of a new artifact into an empty folder."""
     graphs = program.pieces.graphs()
-    values = constants(program, graphs)
-    contexts = context_records(program)
-    requires = requirements(models)
+    values = records.constants(program, graphs)
+    contexts = records.context_records(program)
+    requires = records.requirements(models)
     files = {name: f"{name}.onnx" for name in models}
 
-    pruner = {name: value for name, value in values.items() if name.startswith(PRUNER_PREFIX)}
+    pruner = {name: value for name, value in values.items() if name.startswith(records.PRUNER_PREFIX)}
     stored = {name: value for name, value in values.items() if name not in pruner}
     tables = {TABLE_PREFIX + n: program.pieces.tables[n] for n, c in contexts.items() if c.binding is Binding.TABLE}
     write_synced(folder / WEIGHTS, tensors.serialize({**stored, **tables}))
-    places = _places(folder / WEIGHTS, stored)
+    places = places_of(folder / WEIGHTS, stored)
     pruner_file = None
     if PRUNER in graphs:
         content = tensors.serialize(pruner)
-        pruner_file, files[PRUNER] = _pruner_names(content)
+        pruner_file, files[PRUNER] = (f"{PRUNER}-{content_hash(content)}{kind}" for kind in (".safetensors", ".onnx"))
         write_synced(folder / pruner_file, content)
-        places.update(_places(folder / pruner_file, pruner))
+        places.update(places_of(folder / pruner_file, pruner))
 
-    pieces = piece_records(program, models, files)
+    pieces = records.piece_records(program, models, files)
     for name in pieces:
-        write_synced(folder / files[name], bind(models[name], places, name).SerializeToString(deterministic=True))
+        write_synced(folder / files[name], bind(models[name], places, name))
     precision = None if blocks is None else store_blocks(folder, blocks, pieces, places)
     if golden is not None:
         write_synced(folder / GOLDEN, tensors.serialize(golden.arrays()))
@@ -236,11 +225,11 @@ def _fill(
             identity="",
             model_identity="",
             spec=program.spec,
-            blocks=block_records(program),
+            blocks=records.block_records(program),
             pieces=pieces,
             contexts=contexts,
             features=program.pieces.features,
-            flops=flops_record(program),
+            flops=records.flops_record(program),
             plans={},
             default_plan=DENSE,
             calibration=None,
@@ -252,17 +241,6 @@ def _fill(
     )
     write_synced(folder / MANIFEST, encode(manifest))
     return manifest
-
-
-def _places(path: Path, values: Mapping[str, npt.NDArray[Any]]) -> dict[str, Place]:
-    offsets = tensors.offsets(path)
-    return {name: Place(value, path.name, *offsets[name]) for name, value in values.items()}
-
-
-def _pruner_names(content: bytes) -> tuple[str, str]:
-    """Names of the pruner's weights and of its ONNX model, by the content of the weights."""
-    digits = content_hash(content)
-    return f"{PRUNER}-{digits}.safetensors", f"{PRUNER}-{digits}.onnx"
 
 
 def _identified(manifest: Manifest) -> Manifest:
@@ -283,26 +261,21 @@ def require_replaceable(directory: str | os.PathLike[str]) -> None:
         raise ArtifactError(f"{target}: expected a directory, or nothing; found a file. Give another output directory.")
     entries = sorted(path.name for path in target.iterdir())
     foreign = [name for name in entries if _OURS.fullmatch(name) is None]
-    if entries and (foreign or MANIFEST not in entries or FORMAT.encode() not in _start(target / MANIFEST)):
+    manifest = target / MANIFEST
+    ours = MANIFEST in entries and not foreign and FORMAT.encode() in manifest.read_bytes()[:256]
+    if entries and not ours:
         raise ArtifactError(
             f"{target}: expected an empty directory or a ttscompile artifact; found one that holds"
             f" {', '.join((foreign or entries)[:5])}. Give another output directory, or remove this one yourself."
         )
 
 
-def _start(path: Path) -> bytes:
-    with path.open("rb") as file:
-        return file.read(256)
-
-
 @contextmanager
 def _locked(directory: Path) -> Iterator[None]:
-    """Keep other processes from changing the artifact; a crash releases it."""
+    """Keep other processes from changing the artifact."""
     with ExitStack() as held:
         try:
-            descriptor = os.open(directory, os.O_RDONLY)
-            held.callback(os.close, descriptor)
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            held.enter_context(lock_folder(directory))
         except BlockingIOError:
             raise ArtifactError(
                 f"{directory}: another process is changing the artifact. Try again when it is done."
@@ -312,71 +285,49 @@ def _locked(directory: Path) -> Iterator[None]:
         yield
 
 
-def _store_plans(
-    directory: Path,
-    manifest: Manifest,
-    schedules: Mapping[str, npt.NDArray[np.int8]],
-    corrections: Mapping[str, Correction],
-) -> Manifest:
-    """Write the file of schedules and corrections beside the old one."""
+def _plan_arrays(
+    manifest: Manifest, schedules: Mapping[str, npt.NDArray[np.int8]], corrections: Mapping[str, Correction]
+) -> dict[str, npt.NDArray[Any]]:
     arrays: dict[str, npt.NDArray[Any]] = dict(schedules)
     for plan, correction in corrections.items():
         if plan not in manifest.plans:
             raise ArtifactError(f"correction of {plan!r}: expected a plan of the artifact, {sorted(manifest.plans)}.")
         correction.require_fit(manifest.steps, manifest.spec.sample)
         arrays |= {f"{CORRECTION_PREFIX}{plan}/{name}": getattr(correction, name) for name in CORRECTION_FIELDS}
-    old = manifest.stores.plans
-    files = {name: record for name, record in manifest.files.items() if name != old}
-    name = None
+    return arrays
+
+
+def _store(directory: Path, manifest: Manifest, store: str, arrays: Mapping[str, npt.NDArray[Any]]) -> Manifest:
+    """Write the file of a store beside the old one; without arrays there is none."""
+    files = {name: record for name, record in manifest.files.items() if name != getattr(manifest.stores, store)}
+    stores: dict[str, Any] = {store: None}
     if arrays:
         content = tensors.serialize(arrays)
-        name = f"plans-{content_hash(content)}.safetensors"
-        replace_file(directory / name, content)
-        files[name] = describe(directory / name)
-    return replace(manifest, files=files, stores=replace(manifest.stores, plans=name))
-
-
-def _store_golden_plans(directory: Path, manifest: Manifest, plans: Mapping[str, GoldenPlan]) -> Manifest:
-    """Write the record of the plans beside the old one."""
-    old = manifest.stores.golden_plans
-    files = {name: record for name, record in manifest.files.items() if name != old}
-    name = None
-    if plans:
-        content = tensors.serialize(plan_arrays(plans))
-        name = f"golden_plans-{content_hash(content)}.safetensors"
-        replace_file(directory / name, content)
-        files[name] = describe(directory / name)
-    return replace(manifest, files=files, stores=replace(manifest.stores, golden_plans=name))
+        path = directory / f"{store}-{content_hash(content)}.safetensors"
+        replace_file(path, content)
+        stores[store], files[path.name] = path.name, describe(path)
+    return replace(manifest, files=files, stores=replace(manifest.stores, **stores))
 
 
 def _store_pruner(artifact: Artifact, manifest: Manifest, weights: Mapping[str, npt.NDArray[Any]]) -> Manifest:
     """Write the pruner's weights, and its model that refers to them, beside the old ones."""
     import onnx
 
-    expected = {name: (value.shape, value.dtype) for name, value in artifact.pruner.items()}
     values = {name: np.asarray(value) for name, value in weights.items()}
-    found = {name: (value.shape, value.dtype) for name, value in values.items()}
-    if expected != found:
-        wrong = sorted(name for name in {*expected, *found} if expected.get(name) != found.get(name))
-        raise ArtifactError(
-            f"{artifact.path}: pruner weights: expected {expected.get(wrong[0], 'no')} for {wrong[0]!r}; found"
-            f" {found.get(wrong[0], 'none')} ({len(wrong)} differ). Calibrate this artifact again."
-        )
+    expected = {name: (str(value.dtype), value.shape) for name, value in artifact.pruner.items()}
+    tensors.check_arrays("pruner's weight", values, expected, artifact.path, "Calibrate this artifact again.")
     piece = manifest.pieces[PRUNER]
-    gone = {piece.file, manifest.stores.pruner}
-    content = tensors.serialize(values)
-    weights_name, model_name = _pruner_names(content)
-    replace_file(artifact.path / weights_name, content)
     model = onnx.load(artifact.path / piece.file, load_external_data=False)
-    bound = rebind(model, _places(artifact.path / weights_name, values), PRUNER)
-    replace_file(artifact.path / model_name, bound.SerializeToString(deterministic=True))
-    files = {name: record for name, record in manifest.files.items() if name not in gone}
-    files.update({name: describe(artifact.path / name) for name in (weights_name, model_name)})
+    manifest = _store(artifact.path, manifest, PRUNER, values)
+    path = artifact.path / str(manifest.stores.pruner)
+    content = bind(model, places_of(path, values), PRUNER, again=True)
+    path = path.with_suffix(".onnx")
+    replace_file(path, content)
+    files = {name: record for name, record in manifest.files.items() if name != piece.file}
     return replace(
         manifest,
-        files=files,
-        pieces={**manifest.pieces, PRUNER: replace(piece, file=model_name)},
-        stores=replace(manifest.stores, pruner=weights_name),
+        files={**files, path.name: describe(path)},
+        pieces={**manifest.pieces, PRUNER: replace(piece, file=path.name)},
     )
 
 

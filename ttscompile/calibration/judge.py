@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..artifact.load import Artifact
-from ..artifact.manifest import DENSE, PRUNER, UNIFORM, Manifest
+from ..artifact.manifest import DENSE, UNIFORM, Manifest
 from ..core.lattice import PlanArray, uniform_plan
 from ..errors import CalibrationFailedError
 from ..ir.pieces import PRUNER

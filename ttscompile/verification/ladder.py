@@ -11,7 +11,7 @@ from typing import Any
 
 from ..artifact.archive import is_checkpoint
 from ..artifact.codec import encode
-from ..artifact.files import verify as verify_file
+from ..artifact.files import check_file
 from ..artifact.golden import load_golden, load_golden_plans
 from ..artifact.load import Artifact, load_artifact, read_manifest
 from ..artifact.manifest import MANIFEST
@@ -125,7 +125,7 @@ def _wrong_files(directory: Path) -> list[str]:
     wrong = []
     for name, record in manifest.files.items():
         try:
-            verify_file(directory / name, record)
+            check_file(directory / name, record)
         except ArtifactError as error:
             wrong.append(str(error))
     # Two spellings of one document have one checksum.
