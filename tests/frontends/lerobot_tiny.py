@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from safetensors.torch import save_file
 
-from ttscompile.frontends.clip_config import TextConfig, VisionConfig
+from ttscompile.frontends.clip import TextConfig, VisionConfig
 from ttscompile.frontends.lerobot import Network
 from ttscompile.frontends.lerobot_config import read_lerobot_config
 

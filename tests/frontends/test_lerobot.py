@@ -22,7 +22,7 @@ from ttscompile.core.spec import Noise, ObservationSpec
 from ttscompile.driver import transform
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends import load_checkpoint_policy
-from ttscompile.frontends.clip_config import TextConfig
+from ttscompile.frontends.clip import TextConfig
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions

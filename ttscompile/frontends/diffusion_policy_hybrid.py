@@ -33,7 +33,6 @@ _TWINS = {"nets.0.": "backbone.", "nets.1.": "pool.", "nets.3.": "linear."}
 _GRID = ("pool.pos_x", "pool.pos_y")
 _ROUNDING = 2**-8  # of numbers up to 1 that were saved as bfloat16; the grid itself is known exactly
 
-
 Observed = Mapping[str, tuple[str, tuple[int, ...]]]
 """Type (``rgb`` or ``low_dim``) and shape by key, in the order in which the encoder concatenates their features."""
 

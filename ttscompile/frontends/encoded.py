@@ -30,12 +30,7 @@ class EncodedDenoiser(nn.Module):
 
 
 class Parts(NamedTuple):
-    """What the original evaluates of a policy's network, and how often.
-
-    Attributes:
-        encoder: once a call, on the observations alone; None where there is none.
-        denoiser: at every step.
-    """
+    """What the original evaluates: the encoder, if there is one, once a call; the denoiser at every step."""
 
     encoder: nn.Module | None
     denoiser: nn.Module

@@ -83,9 +83,7 @@ class Family:
                 raise CheckpointError(
                     f"{path}: the option {name} is for {takers} policies; this is one of {self.title}. Leave it out."
                 )
-        load: Callable[[Path, LoadOptions], tuple[nn.Module, PolicySpec]]
-        load = import_module(f".{self.module}", __package__).load
-        return load(path, options)
+        return import_module(f".{self.module}", __package__).load(path, options)  # type: ignore[no-any-return]
 
 
 def _is_lerobot(path: Path) -> bool:

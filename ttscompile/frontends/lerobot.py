@@ -16,7 +16,7 @@ from torch import nn
 from ..core.spec import ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
 from ..errors import CheckpointError, SpecError
 from ..samplers.flow import METHODS, flow_matching_table
-from .clip_config import NAME_FOLDER, TextConfig, VisionConfig, encoder_config, find_encoder
+from .clip import NAME_FOLDER, TextConfig, VisionConfig, encoder_config, find_encoder
 from .encoded import EncodedDenoiser
 from .families import LoadOptions
 from .image_geometry import ResizeCrop
@@ -224,13 +224,7 @@ def _read_weights(path: Path) -> dict[str, torch.Tensor]:
 
 
 class Network(nn.Module):
-    """Denoiser and observation encoder, under the names of their weights; made without them.
-
-    Args:
-        config: of the policy.
-        vision: of its image encoders; None without cameras.
-        text: of its text encoder.
-    """
+    """Denoiser and observation encoder, under the names of their weights; ``vision`` is None without cameras."""
 
     def __init__(self, config: LeRobotConfig, vision: VisionConfig | None, text: TextConfig) -> None:
         super().__init__()

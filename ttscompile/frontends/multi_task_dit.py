@@ -17,8 +17,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from .clip import ClipText, ClipVision
-from .clip_config import TextConfig, VisionConfig
+from .clip import ClipText, ClipVision, TextConfig, VisionConfig
 from .image_geometry import ResizeCrop
 from .lerobot_processors import Normalizer
 from .transformer_for_diffusion import SinusoidalEmbedding
@@ -143,11 +142,6 @@ class DiffusionTransformer(nn.Module):
         return self.output_proj(x)  # type: ignore[no-any-return]
 
 
-def _vision_encoder(config: VisionConfig) -> nn.Module:
-    """CLIP's under the name of its weights."""
-    return nn.Sequential(OrderedDict(model=ClipVision(config)))
-
-
 class _TextEncoder(nn.Module):
     def __init__(self, config: TextConfig, width: int) -> None:
         super().__init__()
@@ -173,20 +167,16 @@ class ObservationEncoder(nn.Module):
     """
 
     def __init__(
-        self,
-        cameras: int,
-        vision: VisionConfig | None,
-        text: TextConfig,
-        text_width: int,
-        separate: bool,
-        frames: int,
+        self, cameras: int, vision: VisionConfig | None, text: TextConfig, text_width: int, separate: bool, frames: int
     ) -> None:
         super().__init__()
         self.frames, self.cameras, self.separate = frames, cameras, separate
-        if vision is not None and separate:
-            self.vision_encoders = nn.ModuleList(_vision_encoder(vision) for _ in range(cameras))
-        elif vision is not None:
-            self.vision_encoder = _vision_encoder(vision)
+        if vision is not None:
+            each = (nn.Sequential(OrderedDict(model=ClipVision(vision))) for _ in range(cameras if separate else 1))
+            if separate:
+                self.vision_encoders = nn.ModuleList(each)
+            else:
+                (self.vision_encoder,) = each
         self.text_encoder = _TextEncoder(text, text_width)
 
     def forward(

@@ -25,7 +25,8 @@ _U_NET = (
     " policy: Diffusion Policy's configurations named train_diffusion_transformer_*, or LeRobot's multi_task_dit."
 )
 _INNER = "Give its folder pretrained_model."
-_JAX = "Convert it to PyTorch with the tool of its project (openpi: convert_jax_model_to_pytorch.py)."
+_JAX_FILES = r"(^|/)(_METADATA|_CHECKPOINT_METADATA|manifest\.ocdbt)$|\.msgpack$"
+_JAX = f"Convert it to PyTorch with the tool of its project (openpi: convert_jax_model_to_pytorch.py). {_BUILD}."
 _OCTO = "Octo denoises with a small MLP on one readout token, not with a transformer: no residuals worth reusing."
 _HYBRID_VLA = "It denoises inside its language model, in one sequence with the text: it has no action head to compile."
 _MOST_FILES = 10_000  # looked at in a directory; somebody may give the root of a disk
@@ -71,11 +72,7 @@ DIRECTORIES = (
     Refusal(r"^manifest\.json$", _ARTIFACT, _LOAD),
     Refusal(r"^adapter_config\.json$", "a PEFT adapter without the weights that it adapts", _MERGE),
     Refusal(r"^(example_batch|octo[^/]*)\.msgpack$", "an Octo model", _OCTO),
-    Refusal(
-        r"(^|/)(_METADATA|_CHECKPOINT_METADATA|manifest\.ocdbt)$|\.msgpack$",
-        "a JAX checkpoint (Orbax or msgpack)",
-        f"{_JAX} {_BUILD}.",
-    ),
+    Refusal(_JAX_FILES, "a JAX checkpoint (Orbax or msgpack)", _JAX),
     Refusal(r"(^|/)pretrained_model/config\.json$", "a directory around what lerobot saved", _INNER),
     Refusal(r"^config\.json: (lang|img|state)_adaptor\b", "RDT", f"{_HEAD} Its sampler is dpmsolver++."),
     Refusal(r"^config\.json: model_type=gr00t", "a GR00T model", _HEAD),

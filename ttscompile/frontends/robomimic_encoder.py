@@ -10,6 +10,7 @@ Source: robomimic 0.2 (Mandlekar et al., arXiv 2108.03298) as Diffusion Policy c
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -54,35 +55,20 @@ class ResidualBlock(nn.Module):
         return torch.relu(inner + shortcut)
 
 
-class ResNet18(nn.Module):
-    """ResNet-18 without its pooling and classifier; ``nets`` numbers the layers as the checkpoint does."""
-
-    def __init__(self, channels: int, norm: Norm) -> None:
-        super().__init__()
-        layers: list[nn.Module] = [
-            nn.Conv2d(channels, 64, 7, stride=2, padding=3, bias=False),
-            norm(64),
-            nn.ReLU(),
-            nn.MaxPool2d(3, stride=2, padding=1),
-        ]
-        width = 64
-        for channels_out, stride in _STAGES:
-            first = ResidualBlock(width, channels_out, stride, norm)
-            layers.append(nn.Sequential(first, ResidualBlock(channels_out, channels_out, 1, norm)))
-            width = channels_out
-        self.nets = nn.Sequential(*layers)
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """``[N, C, H, W]`` -> ``[N, 512, H / 32, W / 32]``, rounded up."""
-        return self.nets(x)  # type: ignore[no-any-return]
+def _resnet18(channels: int, norm: Norm) -> nn.Module:
+    """ResNet-18 without its pooling and classifier: ``[N, C, H, W]`` -> ``[N, 512, H / 32, W / 32]``, rounded up."""
+    stem = nn.Conv2d(channels, 64, 7, stride=2, padding=3, bias=False)
+    layers: list[nn.Module] = [stem, norm(64), nn.ReLU(), nn.MaxPool2d(3, stride=2, padding=1)]
+    width = 64
+    for channels_out, stride in _STAGES:
+        first = ResidualBlock(width, channels_out, stride, norm)
+        layers.append(nn.Sequential(first, ResidualBlock(channels_out, channels_out, 1, norm)))
+        width = channels_out
+    return nn.Sequential(OrderedDict(nets=nn.Sequential(*layers)))  # as the checkpoint names and numbers them
 
 
 class SpatialSoftmax(nn.Module):
-    """Expected position, in -1..1, of each of 32 learned keypoints under a softmax over the image.
-
-    Args:
-        height, width: of the feature map.
-    """
+    """Expected position, in -1..1, of each of 32 learned keypoints under a softmax over a map of ``height x width``."""
 
     temperature: torch.Tensor
     pos_x: torch.Tensor
@@ -129,7 +115,7 @@ class CameraEncoder(nn.Module):
         channels, height, width = camera.shape
         self.crop = ResizeCrop(height, width, crop=camera.crop)
         height, width = self.crop.size
-        self.backbone = ResNet18(channels, norm)
+        self.backbone = _resnet18(channels, norm)
         self.pool = SpatialSoftmax(math.ceil(height / _SHRINKS), math.ceil(width / _SHRINKS))
         self.linear = nn.Linear(2 * KEYPOINTS, FEATURES)
 

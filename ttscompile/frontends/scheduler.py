@@ -27,6 +27,7 @@ from ..errors import CheckpointError, SpecError, TtscompileError
 from ..samplers.flow import METHODS
 from ..samplers.table import sampler_table
 from .families import DIFFUSION_SAMPLERS, SPACINGS, LoadOptions
+from .settings import Settings
 
 MOST_TIMESTEPS = 10_000
 """Of the training; in use are 50 to 1000. diffusers computes each in Python."""
@@ -160,8 +161,7 @@ def _step_arguments(
     unknown = sorted(set(kept) - {"eta", "use_clipped_model_output"})
     if unknown:
         raise CheckpointError(f"cfg.policy has settings that are not known: {', '.join(unknown)}.")
-    if "use_clipped_model_output" in kept and type(kept["use_clipped_model_output"]) is not bool:
-        raise CheckpointError("cfg.policy.use_clipped_model_output must be true or false.")
+    Settings(kept, "cfg.policy.").flag("use_clipped_model_output", False)
     if "eta" in kept and not isinstance(kept["eta"], (int, float)):
         raise CheckpointError(f"cfg.policy.eta is {kept['eta']!r}; expected a number.")
     return kept if name == own_name else {}

@@ -93,13 +93,7 @@ class SinusoidalEmbedding(nn.Module):
 
 
 class Layers(nn.Module):
-    """Pre-norm layers of PyTorch, one after the other.
-
-    Args:
-        layer: ``nn.TransformerEncoderLayer`` or ``nn.TransformerDecoderLayer``.
-        config: sizes.
-        count: number of layers.
-    """
+    """Pre-norm ``nn.TransformerEncoderLayer`` or ``nn.TransformerDecoderLayer`` in a row."""
 
     def __init__(self, layer: type[nn.Module], config: TransformerConfig, count: int) -> None:
         super().__init__()

@@ -60,7 +60,8 @@ class _Chains:
         samples that went into the steps, what the scheduler remembers of each, and the samples that came out.
         """
         set_timesteps(self._scheduler, self.steps)
-        given, meant, made = (list[torch.Tensor]() for _ in range(3))
+        given, meant = [], []
+        made: list[torch.Tensor] = []
         for k, timestep in enumerate(self._scheduler.timesteps):
             given.append(made[-1] if follow and k else samples[k])
             arguments = {"variance_noise": noise[k], **self._step_arguments}

@@ -28,12 +28,7 @@ _Row = tuple[tuple[float, float, float, float, float, float], float | None]
 
 
 class _Probe:
-    """Calls one scheduler's ``step`` on chosen inputs, in float64.
-
-    Args:
-        scheduler: a configured diffusers scheduler, on which ``set_timesteps`` was called.
-        step_arguments: further keyword arguments of ``step``, for instance ``eta``.
-    """
+    """Calls one scheduler's ``step`` on chosen inputs, in float64, with ``step_arguments`` (``eta``, say) added."""
 
     def __init__(self, scheduler: Any, step_arguments: Mapping[str, Any]) -> None:
         self._scheduler, self._step_arguments = scheduler, dict(step_arguments)
