@@ -46,14 +46,7 @@ class Contexts:
             self._rows.update(self._step_values(models[STEP], weights))
 
     def value(self, w: GraphWriter, name: str, k: str, type_: TensorType) -> str:
-        """A context at step k.
-
-        Args:
-            w: where it is read.
-            name: of the context.
-            k: value of the step's index.
-            type_: of the context.
-        """
+        """A context at the step whose index is the value ``k``; ``w`` writes where it is read."""
         binding = self._pieces.bindings[name]
         if binding is Binding.CONDITION:
             return self._conditions[name]
