@@ -49,6 +49,8 @@ from .verification.record_golden import record_original
 if TYPE_CHECKING:
     from onnx import ModelProto
 
+    Models = Mapping[str, ModelProto]
+
 Explain = Callable[[str, tuple[str, ...]], None]
 """Called with the name of each stage and what it did, one note a line."""
 
@@ -184,9 +186,7 @@ def _write(path: Path, content: bytes) -> None:
         raise ArtifactError(f"{path}: the single file cannot be written: {error}. Give another path.") from error
 
 
-def _lower_blocks(
-    program: Program, models: Mapping[str, ModelProto], precision: str, explain: Explain
-) -> LoweredBlocks:
+def _lower_blocks(program: Program, models: Models, precision: str, explain: Explain) -> LoweredBlocks:
     """Residual blocks of another precision than fp32, and the error that they make."""
     lowered, weights, notes = lower_precision(models, program.weights, precision)
     lowered |= lower_all_blocks(program.pieces.blocks, {**models, **lowered})

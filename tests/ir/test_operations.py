@@ -17,16 +17,23 @@ from tests.lower.modules import ALL, captured
 from tests.lower.sessions import run
 from tests.passes.graphs import B, Builder
 from tests.passes.specs import toy_spec
+from tests.rounding import bound
 from ttscompile.capture.export import capture
-from ttscompile.errors import CaptureError
+from ttscompile.errors import CaptureError, LoweringError
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.flops import graph_flops
 from ttscompile.ir.graph import Graph, Node, TensorType
 from ttscompile.ir.operations import OPERATIONS, Linear, Movement, axes_along, operation, permutation
 from ttscompile.lower.program import lower_graph
 
-LOWERED = [name for name, row in OPERATIONS.items() if row.onnx]
-UNLOWERED = [name for name, row in OPERATIONS.items() if not row.onnx]
+UNLOWERED = """
+    cumprod searchsorted hypot copysign fmax fmin lgamma digamma erfinv i0 special_i0 hstack vstack dstack column_stack
+    isin cdist cummax cummin median nanmedian kthvalue linalg_eigh linalg_inv linalg_solve linalg_qr linalg_cholesky
+    matrix_exp
+""".split()
+"""What torch's exporter has no ONNX form for: it can stand only in what is computed at compile time."""
+
+LOWERED = [name for name in OPERATIONS if name not in UNLOWERED]
 CHUNKS = [LOWERED[i : i + 50] for i in range(0, len(LOWERED), 50)]
 
 
@@ -83,7 +90,7 @@ def test_every_row_is_exercised_and_has_the_types_of_meta_tensors(names: list[st
     assert_types(graph, names[0])
 
 
-@pytest.mark.parametrize("names", CHUNKS[:2], ids=lambda names: f"{names[0]} to {names[-1]}")
+@pytest.mark.parametrize("names", CHUNKS, ids=lambda names: f"{names[0]} to {names[-1]}")
 def test_a_row_with_an_onnx_form_computes_the_same_in_onnxruntime(names: list[str]) -> None:
     graph, weights, numbers = _captured(tuple(names))
     inputs = values(dict(graph.inputs), 3)
@@ -91,7 +98,24 @@ def test_a_row_with_an_onnx_form_computes_the_same_in_onnxruntime(names: list[st
     (found,) = run(lower_graph(graph, "examples"), weights, inputs)
     both = zip(names, torch.from_numpy(found).split(numbers, 1), expected.split(numbers, 1), strict=True)
     for name, left, right in both:
-        torch.testing.assert_close(left, right, equal_nan=True, msg=lambda m, n=name: f"{n}: {m}")
+        wide = {"rtol": 0.0, "atol": _cancelled(inputs["obs"], right)} if name == "group_norm" else {}
+        torch.testing.assert_close(left, right, equal_nan=True, msg=lambda m, n=name: f"{n}: {m}", **wide)
+
+
+def _cancelled(obs: Tensor, normalised: Tensor) -> float:
+    """Rounding of a variance that is taken as mean of squares less square of mean, as onnxruntime's normalisation does.
+
+    The sums of a group of 12 numbers are off by their rounding, which is so much more of the small difference.
+    """
+    groups = (obs.sigmoid() * 0.8 + 0.1).double().reshape(-1, 12)
+    lost = groups.square().mean(1) / groups.var(1, correction=0)
+    return bound(12) * float(lost.max() * normalised.abs().max())
+
+
+@pytest.mark.parametrize("name", UNLOWERED)
+def test_a_row_without_an_onnx_form_is_refused_by_name(name: str) -> None:
+    with pytest.raises(LoweringError, match=r"piece 'examples' could not be exported .*Its operations are .*aten\."):
+        lower_graph(_captured((name,))[0], "examples")
 
 
 @pytest.mark.parametrize("name", ALL)

@@ -28,10 +28,8 @@ def unify_batch(left: Graph, right: Graph) -> Graph:
     if left.constants != right.constants:
         raise CaptureError(f"the module makes constants that depend on the batch size.{REMEDY}")
     if len(left.nodes) != len(right.nodes) or left.outputs != right.outputs:
-        raise CaptureError(
-            f"the module takes {len(left.nodes)} operations for a batch of {BATCHES[0]} and {len(right.nodes)} for"
-            f" {BATCHES[1]}.{REMEDY}"
-        )
+        counts = f"{len(left.nodes)} operations for a batch of {BATCHES[0]} and {len(right.nodes)} for {BATCHES[1]}"
+        raise CaptureError(f"the module takes {counts}.{REMEDY}")
     nodes = tuple(_node(a, b) for a, b in zip(left.nodes, right.nodes, strict=True))
     return Graph(inputs, left.constants, nodes, left.outputs)
 

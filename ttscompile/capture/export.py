@@ -130,10 +130,11 @@ def _traced(
             with without_stack_traces():  # each operation keeps the one that it was captured with
                 return exported.run_decompositions({}), examples
     except Exception as error:  # torch.export raises whatever the user's code or its own machinery raises
+        place = _innermost("".join(traceback.format_tb(error.__traceback__)))
+        called = ", ".join(f"{name} {tuple(value.shape)} {value.dtype}" for name, value in examples.items())
         raise CaptureError(
-            f"torch.export could not capture {type(module).__name__}: {type(error).__name__} at {_place(error)}:"
-            f" {_ADVICE.split(str(error))[0].strip()}\n"
-            f"It was called with {', '.join(f'{n} {tuple(t.shape)} {t.dtype}' for n, t in examples.items())}."
+            f"torch.export could not capture {type(module).__name__}: {type(error).__name__} at {place}:"
+            f" {_ADVICE.split(str(error))[0].strip()}\nIt was called with {called}."
             " A denoiser must be one step (no sampling loop), without data-dependent control flow, for any batch size."
         ) from error
     finally:
@@ -195,12 +196,9 @@ def _as_arguments(inputs: Mapping[str, torch.Tensor], spec: PolicySpec) -> dict[
 
 def _examples(spec: PolicySpec, streams: int) -> dict[str, torch.Tensor]:
     generator = torch.Generator().manual_seed(0)
-    examples = {
-        spec.sample_argument: torch.randn(streams, *spec.sample, generator=generator),
-        spec.timestep_argument: torch.full(
-            (streams,), spec.sampler.timesteps[0].item(), dtype=torch.from_numpy(spec.sampler.timesteps).dtype
-        ),
-    }
+    sample = torch.randn(streams, *spec.sample, generator=generator)
+    timestep = torch.from_numpy(spec.sampler.timesteps)[:1].repeat(streams)
+    examples = {spec.sample_argument: sample, spec.timestep_argument: timestep}
     for key, observation in spec.observations.items():
         value = torch.randn(streams, *observation.shape, generator=generator)
         examples[key] = value.to(getattr(torch, observation.dtype))
@@ -228,16 +226,19 @@ class _Converter:
         state = {**self.exported.state_dict, **self.exported.constants}
         placeholders = [n for n in self.exported.graph.nodes if n.op == "placeholder"]
         users = [n for n in placeholders if kinds[n.name].kind is InputKind.USER_INPUT]
-        self.symbol = self._batch_symbol(users[0]) if self.symbolic else None
+        if self.symbolic:
+            size = users[0].meta["val"].shape[0]
+            if isinstance(size, int):
+                what = f"the module works for a batch of {size} only: its code fixes the size"
+                raise CaptureError(f"{what}. Take sizes from the inputs.")
+            self.symbol = size.node.expr
         for fx_node, key in zip(users, self.examples, strict=True):
             self.names[fx_node] = key
             inputs[key] = self._type(fx_node, fx_node.meta["val"])
         for fx_node in placeholders:
-            if fx_node in self.names:
+            if fx_node in self.names or not fx_node.users:
                 continue
             target = str(kinds[fx_node.name].target)
-            if not fx_node.users:
-                continue
             if target in inputs:
                 raise CaptureError(
                     f"the module has a weight called {target}, as an observation is. Rename one of them."
@@ -250,14 +251,6 @@ class _Converter:
             if fx_node.op == "call_function" and (node := self._node(fx_node)) is not None:
                 nodes.append(node)
         return Graph(inputs, constants, tuple(nodes), (self._output(spec, inputs),)), weights
-
-    def _batch_symbol(self, sample: torch.fx.Node) -> Any:
-        size = sample.meta["val"].shape[0]
-        if isinstance(size, int):
-            raise CaptureError(
-                f"the module works for a batch of {size} only: its code fixes the size. Take sizes from the inputs."
-            )
-        return size.node.expr
 
     def _size(self, fx_node: torch.fx.Node, size: Any) -> Size:
         if isinstance(size, int):
@@ -326,21 +319,17 @@ class _Converter:
             return tuple(self._argument(fx_node, a) for a in argument)
         if argument is None or isinstance(argument, bool | int | float | str):
             return argument
-        for kind, cls in (("dtype", torch.dtype), ("memory_format", torch.memory_format), ("layout", torch.layout)):
-            if isinstance(argument, cls):
-                return Enum(kind, str(argument).removeprefix("torch."))
+        if isinstance(argument, torch.dtype | torch.memory_format | torch.layout):
+            return Enum(type(argument).__name__, str(argument).removeprefix("torch."))
         if isinstance(argument, torch.device):
             return Enum("device", "cpu")  # the artifact runs where it is loaded
         raise CaptureError(f"%{fx_node.name} ({_source(fx_node)}) has an argument of type {type(argument).__name__}.")
 
     def _output(self, spec: PolicySpec, inputs: Mapping[str, TensorType]) -> str:
         outputs = self.exported.graph_signature.output_specs
-        mutated = [o.target for o in outputs if o.kind is not OutputKind.USER_OUTPUT]
-        if mutated:
-            raise CaptureError(
-                f"the module changes its own buffers or inputs {mutated} when called; a denoiser must be pure."
-                " Change a clone of them instead."
-            )
+        if mutated := [o.target for o in outputs if o.kind is not OutputKind.USER_OUTPUT]:
+            what = f"the module changes its own buffers or inputs {mutated} when called; a denoiser must be pure"
+            raise CaptureError(f"{what}. Change a clone of them instead.")
         (output,) = [n for n in self.exported.graph.nodes if n.op == "output"]
         results = output.args[0]
         if len(results) != 1 or not isinstance(results[0], torch.fx.Node):
@@ -355,11 +344,6 @@ class _Converter:
 def _source(fx_node: torch.fx.Node) -> str:
     """Where the module's code makes this node."""
     return _innermost(fx_node.meta.get("stack_trace") or "")
-
-
-def _place(error: Exception) -> str:
-    """Where the module's code raises this."""
-    return _innermost("".join(traceback.format_tb(error.__traceback__)))
 
 
 def _innermost(trace: str) -> str:

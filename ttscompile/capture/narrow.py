@@ -56,12 +56,7 @@ def narrow(module: nn.Module, spec: PolicySpec, prediction_horizon: int) -> tupl
 
 
 def unneeded(module: nn.Module, spec: PolicySpec) -> str | None:
-    """A hint where ``narrow`` could leave out steps; None where it could not.
-
-    Args:
-        module: see ``narrow``.
-        spec: see ``narrow``.
-    """
+    """A hint where ``narrow``, of the same arguments, could leave out steps; None where it could not."""
     (horizon, _), chunk = spec.sample, spec.chunk
     try:
         if chunk.stop == horizon or not _difference(module, spec, chunk.stop) <= TOLERANCE:
@@ -76,10 +71,8 @@ def unneeded(module: nn.Module, spec: PolicySpec) -> str | None:
 
 def _difference(module: nn.Module, spec: PolicySpec, steps: int) -> float:
     """Largest difference of the first steps' prediction with and without those after them, over its deviation."""
-    draw = np.random.default_rng(0)
-    observations = {
-        key: torch.from_numpy(one.draw_normalized(draw, _STREAMS)) for key, one in spec.observations.items()
-    }
+    draw, given = np.random.default_rng(0), spec.observations.items()
+    observations = {key: torch.from_numpy(one.draw_normalized(draw, _STREAMS)) for key, one in given}
     sample = torch.from_numpy(draw.standard_normal((_STREAMS, *spec.sample), dtype=np.float32))
     timesteps, found = torch.from_numpy(spec.sampler.timesteps), list[float]()
     with torch.inference_mode():

@@ -56,7 +56,6 @@ class Operation:
         filled: the one value of every number of the result, whatever the first argument holds.
         dropout: the place and the name of the argument that makes it draw random numbers.
         flops: FLOPs of a node for one stream; None counts as none.
-        onnx: whether it has an ONNX form. Without one it can stand only in what is computed at compile time.
     """
 
     name: str = ""
@@ -68,7 +67,6 @@ class Operation:
     filled: Callable[[Node], Argument] | None = None
     dropout: tuple[int, str] | None = None
     flops: Callable[[Node, Types], int] | None = None
-    onnx: bool = True
 
 
 def find_operation(op: str) -> Operation | None:
@@ -219,6 +217,7 @@ _GROUPS: tuple[tuple[str, Operation], ...] = (
     ("exp exp2 expm1 log log2 log10 log1p sqrt rsqrt square reciprocal special_expm1 special_log1p", _ELEMENTWISE),
     ("sin cos tan sinh cosh asin acos atan asinh acosh atanh arcsin arccos arctan deg2rad rad2deg", _ELEMENTWISE),
     ("abs absolute sign sgn ceil floor round trunc fix frac nan_to_num _to_copy", _ELEMENTWISE),
+    ("lgamma digamma erfinv i0 special_i0", _ELEMENTWISE),
     ("pow float_power remainder fmod atan2 arctan2 hypot copysign heaviside xlogy logaddexp logaddexp2", _ELEMENTWISE),
     ("maximum minimum max.other min.other fmax fmin clamp clip clamp_min clamp_max", _ELEMENTWISE),
     ("where masked_fill lerp addcmul addcdiv", _ELEMENTWISE),
@@ -238,9 +237,7 @@ _GROUPS: tuple[tuple[str, Operation], ...] = (
     ("conv_transpose1d conv_transpose2d conv_transpose3d", replace(_CONVOLUTION, flops=_spreading)),
     ("layer_norm rms_norm", _NORM),
     ("scaled_dot_product_attention", Operation(dropout=(4, "dropout_p"), flops=_attention)),
-    ("softmax log_softmax cumsum", Operation(along=1)),
-    ("cumprod", Operation(along=1, onnx=False)),
-    ("searchsorted", Operation(onnx=False)),
+    ("softmax log_softmax cumsum cumprod", Operation(along=1)),
     ("gru.input lstm.input", _RECURRENT),
     # Values that read no number, and what only gives its shape and type.
     ("zeros zeros_like new_zeros zero", Operation(filled=lambda node: 0)),
@@ -252,7 +249,7 @@ _GROUPS: tuple[tuple[str, Operation], ...] = (
     ("arange linspace logspace eye empty empty_like new_empty scalar_tensor type_as copy meshgrid", Operation()),
     ("sum mean prod amax amin max min argmax argmin any all std var std_mean var_mean logsumexp", Operation()),
     ("norm linalg_vector_norm linalg_norm sort argsort topk diff trapezoid", Operation()),
-    ("index index_select gather take_along_dim embedding one_hot isin bucketize", Operation()),
+    ("index index_select gather take_along_dim embedding one_hot isin bucketize searchsorted", Operation()),
     ("index_put index_add index_copy index_fill scatter scatter_add select_scatter slice_scatter", Operation()),
     ("group_norm instance_norm _native_batch_norm_legit_no_training cosine_similarity pairwise_distance", Operation()),
     ("avg_pool1d avg_pool2d max_pool1d max_pool2d adaptive_avg_pool1d adaptive_avg_pool2d", Operation()),
@@ -260,8 +257,7 @@ _GROUPS: tuple[tuple[str, Operation], ...] = (
     ("pixel_shuffle pixel_unshuffle im2col unfold grid_sampler glu prelu cross linalg_cross", Operation()),
     ("broadcast_tensors block_diag diag_embed rot90 cdist _weight_norm linalg_det", Operation()),
     ("cummax cummin median nanmedian quantile kthvalue count_nonzero nansum nanmean", Operation()),
-    ("linalg_eigh linalg_inv linalg_solve linalg_qr linalg_cholesky matrix_exp", Operation(onnx=False)),
-    ("lgamma digamma erfinv i0 special_i0", replace(_ELEMENTWISE, onnx=False)),
+    ("linalg_eigh linalg_inv linalg_solve linalg_qr linalg_cholesky matrix_exp", Operation()),
 )
 
 OPERATIONS: Mapping[str, Operation] = {

@@ -64,11 +64,9 @@ def fuse_advance(tail: LoopPiece, stem: LoopPiece, spec: PolicySpec) -> Graph:
         inputs |= {advance_context(name, context): type_ for context, type_ in piece.contexts.items()}
     constants = {**tail.graph.constants, **stem.graph.constants}
     results = advance_outputs(spec.sampler)
-    if clash := sorted((constants.keys() & inputs.keys()) | (constants.keys() & set(results))):
-        raise LoweringError(
-            f"the module has weights called {clash}, which are names of the compiled loop's own values."
-            " Rename these parameters or buffers in the module."
-        )
+    if clash := sorted(constants.keys() & {*inputs, *results}):
+        what = f"the module has weights called {clash}, which are names of the compiled loop's own values"
+        raise LoweringError(f"{what}. Rename these parameters or buffers in the module.")
     taken = {*inputs, *constants, *results}
     nodes, prediction = _moved(tail, TAIL, STREAM, taken)
     turned = inputs[SAMPLE]

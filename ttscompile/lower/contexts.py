@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from onnx import ModelProto
 
 from ..errors import LoweringError
-from ..ir.graph import Batch, TensorType
+from ..ir.graph import TensorType
 from ..ir.pieces import CONDITION, STEP
 from ..ir.program import Binding, Pieces
 from .graph_writer import GraphWriter, Weights
@@ -46,14 +46,7 @@ class Contexts:
             self._rows.update(self._step_values(models[STEP], weights))
 
     def value(self, w: GraphWriter, name: str, k: str, type_: TensorType) -> str:
-        """A context at step k.
-
-        Args:
-            w: where it is read.
-            name: of the context.
-            k: value of the step's index.
-            type_: of the context.
-        """
+        """A context at the step whose index is the value ``k``; ``w`` writes where it is read."""
         binding = self._pieces.bindings[name]
         if binding is Binding.CONDITION:
             return self._conditions[name]
@@ -104,9 +97,7 @@ def _sizes(type_: TensorType) -> list[tuple[int, int]]:
 
 def _batch_axis(name: str, type_: TensorType) -> int:
     axis = type_.batch_axis
-    if axis is None or type_.shape[axis] != Batch():
-        raise LoweringError(
-            f"context {name!r} : {type_} cannot be repeated for B streams: expected an axis of size B."
-            " Convert without the single file."
-        )
+    if axis is None:
+        what = f"context {name!r} : {type_} cannot be repeated for B streams: expected an axis of size B"
+        raise LoweringError(f"{what}. Convert without the single file.")
     return axis

@@ -45,25 +45,14 @@ class _Declined(Exception):
 
 @dataclass(frozen=True)
 class _Affine:
-    """``y[t] = x[t] @ matrix + constant[t]``.
+    """``y[t] = x[t] @ matrix + constant[t]``."""
 
-    Attributes:
-        matrix: ``[n, m]``.
-        constant: ``[T, m]``.
-    """
-
-    matrix: Wide
-    constant: Wide
+    matrix: Wide  # [n, m]
+    constant: Wide  # [T, m]
 
 
 def lower_idle(pieces: Pieces, weights: Weights, opset: int) -> tuple[ModelProto | None, str]:
-    """The model, or None and why there is none.
-
-    Args:
-        pieces: of the program.
-        weights: values of the constants.
-        opset: of the model.
-    """
+    """The model of a program with these pieces and values of constants, or None and why there is none."""
     try:
         return _lower(pieces, weights, opset), ""
     except _Declined as reason:
@@ -118,16 +107,10 @@ def _write(kind: TensorType, turned: bool, stem: _Affine, head: _Affine, eps: fl
 
 
 def _affine(graph: Graph, weights: Weights, turned_in: bool = False, turned_out: bool = False) -> _Affine:
-    """What an affine graph does to every token of its input.
+    """What an affine graph in float64 does to every token of its one input; what is turned has its tokens first.
 
     Its operations say that it is affine; that all tokens meet the same matrix, and no token another, is tried on random
     numbers, of which an affine map that is another one agrees with none.
-
-    Args:
-        graph: of one input and one output, float64.
-        weights: values of the constants.
-        turned_in: the input has its tokens first.
-        turned_out: the output has.
     """
     _require_affine(graph)
     ((name, kind),) = graph.inputs.items()

@@ -39,19 +39,12 @@ class _Atom:
 
 @dataclass(frozen=True)
 class _View:
-    """A value as a rearrangement of a computed one.
+    """A value as a rearrangement of a computed one."""
 
-    Attributes:
-        base: the computed value.
-        order: its factors in memory order; none of size 1.
-        dims: the factors of each of this value's axes, outermost first.
-        picks: factors of the base at which one index was selected.
-    """
-
-    base: str
-    order: tuple[_Atom, ...]
-    dims: tuple[tuple[_Atom, ...], ...]
-    picks: tuple[tuple[_Atom, int], ...] = ()
+    base: str  # the computed value
+    order: tuple[_Atom, ...]  # its factors in memory order; none of size 1
+    dims: tuple[tuple[_Atom, ...], ...]  # the factors of each of this value's axes, outermost first
+    picks: tuple[tuple[_Atom, int], ...] = ()  # factors of the base at which one index was selected
 
 
 def sink_layout(graph: Graph) -> Graph:

@@ -36,19 +36,12 @@ MOST_ROWS = 2**31 // (255 * LARGEST) - 1
 
 @dataclass(frozen=True)
 class _Product:
-    """``x @ w + bias`` with a constant ``w``.
+    """``x @ w + bias`` with a constant ``w``."""
 
-    Attributes:
-        x: name of the float32 input.
-        weight: name of the constant.
-        transposed: whether the constant is ``w.T``.
-        bias: name of a constant ``[columns]``; empty if there is none.
-    """
-
-    x: str
-    weight: str
-    transposed: bool
-    bias: str
+    x: str  # name of the float32 input
+    weight: str  # name of the constant
+    transposed: bool  # whether the constant is w.T
+    bias: str  # name of a constant [columns]; empty if there is none
 
 
 def lower_precision(
@@ -72,13 +65,12 @@ def lower_precision(
     made: dict[str, ModelProto] = {}
     constants: dict[str, Array] = {}
     blocks = [name for name in models if is_block(name)]
-    replaced = 0
     for name in blocks:
         model, new = quantize_model(models[name], weights)
         if new:
             made[name] = model
             constants.update(new)
-            replaced += sum(node.op_type == _PRODUCT for node in model.graph.node)
+    replaced = sum(node.op_type == _PRODUCT for model in made.values() for node in model.graph.node)
     if not made:
         raise LoweringError(
             f"precision {precision!r}: none of the {len(blocks)} residual blocks multiplies by a constant float32"
@@ -86,8 +78,8 @@ def lower_precision(
         )
     megabytes = sum(value.nbytes for value in constants.values()) / 1e6
     note = f"{precision}: {replaced} matrices of {len(made)} of {len(blocks)} blocks, {megabytes:.1f} MB"
-    left = [name for name in blocks if name not in made]
-    return made, constants, (note, *(f"{name} stays fp32: no product with constant weights" for name in left))
+    left = (f"{name} stays fp32: no product with constant weights" for name in blocks if name not in made)
+    return made, constants, (note, *left)
 
 
 def require_precision(precision: str) -> None:
@@ -111,8 +103,7 @@ def quantize_model(model: ModelProto, weights: Mapping[str, Array]) -> tuple[Mod
         A new model, and the constants that it has and ``model`` has not, by name: int8 ``[rows, columns]`` and
         float32 ``[columns]``. No constants if there was nothing to replace.
     """
-    declared = {tensor.name for tensor in model.graph.initializer}
-    known = {name: value for name, value in weights.items() if name in declared}
+    known = {t.name: weights[t.name] for t in model.graph.initializer if t.name in weights}
     flipped = {
         node.output[0]: node.input[0]
         for node in model.graph.node
@@ -130,10 +121,8 @@ def quantize_model(model: ModelProto, weights: Mapping[str, Array]) -> tuple[Mod
         return quantized, {}
     read = {name for node in nodes for name in node.input} | {value.name for value in model.graph.output}
     kept = [tensor for tensor in model.graph.initializer if tensor.name in read]
-    added = [
-        TensorProto(name=name, dims=value.shape, data_type=helper.np_dtype_to_tensor_dtype(value.dtype))
-        for name, value in constants.items()
-    ]
+    types = {name: helper.np_dtype_to_tensor_dtype(value.dtype) for name, value in constants.items()}
+    added = [TensorProto(name=n, dims=value.shape, data_type=types[n]) for n, value in constants.items()]
     for field, values in (("node", nodes), ("initializer", [*added, *kept])):
         quantized.graph.ClearField(field)
         getattr(quantized.graph, field).extend(values)

@@ -96,11 +96,9 @@ def lower_single_file(program: Program, models: Mapping[str, ModelProto], weight
     main.rename(plan.executed, "executed_plan")
     _write_cache(main, plan, stored, residuals, (spec.sampler.steps, len(groups)))
     model = own_model(main.graph("ttscompile", outputs, inputs), opsets(models.values()))
-    if model.ByteSize() > LARGEST:
-        raise LoweringError(
-            f"the single file would have {model.ByteSize() / 1e9:.1f} GB; an ONNX file holds at most 2."
-            " Convert without the single file and use the artifact."
-        )
+    if (size := model.ByteSize()) > LARGEST:
+        what = f"the single file would have {size / 1e9:.1f} GB; an ONNX file holds at most 2"
+        raise LoweringError(f"{what}. Convert without the single file and use the artifact.")
     return model
 
 
@@ -126,10 +124,8 @@ def _interface(spec: PolicySpec, stream: TensorType, count: int) -> tuple[list[V
         tensor("rollout_index_next", np.int64, [steps, count]),
     ]
     if clash := sorted(set(spec.observations) & {value.name for value in (*own, *outputs)}):
-        raise LoweringError(
-            f"the observations {clash} have names of the single file's own inputs or outputs. Rename them, or convert"
-            " without the single file."
-        )
+        what = f"the observations {clash} have names of the single file's own inputs or outputs"
+        raise LoweringError(f"{what}. Rename them, or convert without the single file.")
     return [*inputs, *own], outputs
 
 
@@ -187,14 +183,9 @@ def _write_actions(main: GraphWriter, sample: str, spec: PolicySpec) -> None:
 
 
 def _write_cache(main: GraphWriter, plan: LoweredPlan, stored: str, computed: str, lattice: tuple[int, int]) -> None:
-    """The next call's rollout cache: rows that were there and were not computed anew, then those computed.
+    """The next call's rollout cache: rows that were ``stored`` and not computed anew, then those ``computed``.
 
-    Args:
-        main: writer of the main graph.
-        plan: as lowered.
-        stored: rows that were there.
-        computed: residuals of the computed cells, in order.
-        lattice: K and N.
+    The latter are residuals of the computed cells, in order; the lattice is K and N.
     """
     keep, index, anew = (
         main.op("Reshape", value, main.constant([-1])) for value in ("rollout_keep", "rollout_index", plan.computed)
