@@ -190,7 +190,9 @@ def load_golden_plans(artifact: Artifact, streams: int) -> dict[str, GoldenPlan]
     }
     wanted = {f"{name}/{field}": kind for name in manifest.plans for field, kind in kinds.items()}
     tensors.check_arrays("array", arrays, wanted, f"{artifact.path}: golden record of plans")
-    return {name: GoldenPlan(**{field: arrays[f"{name}/{field}"] for field in kinds}) for name in manifest.plans}
+    return {
+        name: GoldenPlan(**{field: arrays[f"{name}/{field}"] for field in kinds}) for name in sorted(manifest.plans)
+    }
 
 
 def pattern_size(shape: tuple[int, ...]) -> int:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from typing import Any
 
 from ..errors import ArtifactError
@@ -23,7 +24,7 @@ MAX_DEPTH = 3
 MAX_ITEMS = 65_536
 MAX_SIZE = 2**40
 
-DTYPES = frozenset({"bool", "uint8", "int8", "int16", "int32", "int64", "float16", "bfloat16", "float32", "float64"})
+DTYPES = ("bool", "uint8", "int8", "int16", "int32", "int64", "float16", "bfloat16", "float32", "float64")
 ENUM_KINDS = frozenset({"dtype", "memory_format", "layout", "device"})
 
 _OP = re.compile(r"aten\.[A-Za-z_][A-Za-z0-9_]*\.[A-Za-z_][A-Za-z0-9_]*")
@@ -58,13 +59,14 @@ def graph_from_json(document: Value) -> Graph:
     constants = _typed_names(members["constants"], results)
     nodes = []
     for item in members["nodes"].items(MAX_LIST):
-        node = _node(item)
+        parts = item.keys("name", "op", "args", "kwargs", "types")
+        node = _node(parts)
         unknown = [name for name in node.refs() if name not in results]
         if unknown:
             item.fail(f"values computed before (unknown: %{unknown[0]})")
         if node.op == GETITEM and not _is_getitem(node, results):
             item.fail("getitem of a value and the number of one of its results")
-        _define(results, item.members()["name"], len(node.types))
+        _define(results, parts["name"], len(node.types))
         nodes.append(node)
     outputs = members["outputs"].items(MAX_LIST)
     for output in outputs:
@@ -125,15 +127,14 @@ def _type(value: Value) -> TensorType:
     members = value.keys("dtype", "shape")
     sizes = members["shape"].items(MAX_RANK)
     shape = tuple(_batch(n) if isinstance(n.data, dict) else n.integer(0, MAX_SIZE) for n in sizes)
-    return TensorType(shape, members["dtype"].text(*sorted(DTYPES)))
+    return TensorType(shape, members["dtype"].text(*DTYPES))
 
 
 def _batch(value: Value) -> Batch:
     return Batch(value.keys("batch")["batch"].integer(1, MAX_SIZE))
 
 
-def _node(value: Value) -> Node:
-    members = value.keys("name", "op", "args", "kwargs", "types")
+def _node(members: Mapping[str, Value]) -> Node:
     op = members["op"].text()
     if op != GETITEM and (len(op) > MAX_NAME or not _OP.fullmatch(op)):
         members["op"].fail("aten.NAME.OVERLOAD or getitem")
