@@ -6,6 +6,7 @@ import hashlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from ttscompile.errors import NoResidualBlocksError
 from ttscompile.ir.dataflow import between, dominators, reachable_from, reaching
@@ -44,8 +45,7 @@ class BlockTable:
         )
 
 
-@dataclass(frozen=True)
-class _Link:
+class _Link(NamedTuple):
     """One addition ``result = stream + residual`` on the chain."""
 
     stream: str
@@ -128,9 +128,8 @@ def _main_stream(graph: Graph, links: list[_Link], declined: list[str]) -> list[
         flops = sum(node_flops(n, types) for n in between(graph, link.stream, link.residual))
         work[types[link.result]] += 1 + flops
     main = work.most_common(1)[0][0]
-    for link in links:
-        if types[link.result] != main:
-            declined.append(f"%{link.result}: a residual of {types[link.result]}, beside the main stream of {main}")
+    others = [link.result for link in links if types[link.result] != main]
+    declined += [f"%{result}: a residual of {types[result]}, beside the main stream of {main}" for result in others]
     return [link for link in links if types[link.result] == main]
 
 

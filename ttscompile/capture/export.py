@@ -260,10 +260,8 @@ class _Converter:
             return int(expression)
         multiple = expression / (self.symbol or 1)  # a number of streams has none; then this size depends on values
         if not multiple.is_Integer:
-            raise CaptureError(
-                f"size {expression} at %{fx_node.name} ({_source(fx_node)}) is not a multiple of the batch size."
-                " Only the batch may vary; write the other sizes as numbers."
-            )
+            what = f"size {expression} at %{fx_node.name} ({_source(fx_node)}) is not a multiple of the batch size."
+            raise CaptureError(f"{what} Only the batch may vary; write the other sizes as numbers.")
         return Batch(int(multiple))
 
     def _type(self, fx_node: torch.fx.Node, value: Any) -> TensorType:

@@ -29,7 +29,7 @@ class Joint:
     Attributes:
         slots: inputs that carry contexts, and their types; a block reads some of them.
         places: for each block its contexts in order, as names of slots.
-        turns: for each block the value of each boolean ``which.0``, ``which.1``, ...; true takes the first branch.
+        turns: for each block the values of ``which.0``, ``which.1``, ...; true takes the first branch.
     """
 
     slots: tuple[tuple[str, TensorType], ...]

@@ -83,10 +83,8 @@ def operation(op: str, where: str = "a graph") -> Operation:
     """
     row = find_operation(op)
     if row is None:
-        raise CaptureError(
-            f"operation {op!r} of {where} has no row in the table of operations, so nothing is known of it."
-            " Write it with other operations, or add it to ttscompile/ir/operations.py."
-        )
+        what = f"operation {op!r} of {where} has no row in the table of operations, so nothing is known of it."
+        raise CaptureError(f"{what} Write it with other operations, or add it to ttscompile/ir/operations.py.")
     return row
 
 

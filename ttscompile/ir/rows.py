@@ -28,19 +28,12 @@ class _Layout(NamedTuple):
 
 @dataclass(frozen=True)
 class Rows:
-    """How a value crosses.
+    """How a value crosses."""
 
-    Attributes:
-        name: of the value ``[.., m * B, ..]``.
-        type: of that value.
-        crossing: its name where it crosses.
-        unfolded: its type there, with an axis of size B.
-    """
-
-    name: str
-    type: TensorType
-    crossing: str
-    unfolded: TensorType
+    name: str  # of the value [.., m * B, ..]
+    type: TensorType  # of that value
+    crossing: str  # its name where it crosses
+    unfolded: TensorType  # its type there, with an axis of size B
 
     def leave(self) -> Node:
         """The node that makes the crossing value."""
@@ -73,10 +66,8 @@ def _rows(name: str, type_: TensorType, layout: _Layout | None) -> Rows:
     axis = _axis(type_)
     assert axis is not None
     if layout is None:
-        raise PassError(
-            f"%{name} : {type_} has several rows a stream, and it cannot be seen which. Double the batch with"
-            " torch.cat, repeat or repeat_interleave, and keep its order."
-        )
+        what = f"%{name} : {type_} has several rows a stream, and it cannot be seen which."
+        raise PassError(f"{what} Double the batch with torch.cat, repeat or repeat_interleave, and keep its order.")
     factors: list[Size] = [n for n in (layout.copies, Batch(), layout.rows) if n != 1]
     shape = (*type_.shape[:axis], *factors, *type_.shape[axis + 1 :])
     return Rows(name, type_, f"{name}.rows", replace(type_, shape=shape))

@@ -24,11 +24,10 @@ from ..ir.graph import Argument, Batch, Enum, Graph, Node, Ref, TensorType
 from ..ir.pieces import ADVANCE, IDLE, TAIL
 from ..ir.program import Program
 from .advance import fuse_advance
-from .attention import flatten_attention
 from .idle import lower_idle
 from .joint import lower_all_blocks
 from .layout import sink_layout
-from .onnx_model import name_model, only
+from .onnx_model import flatten_attention, name_model, only
 
 OPSET = 23
 """Has Gelu (20) and Attention (23). Measured with onnxruntime 1.31, 1 thread, blocks of width 256, 16 tokens, 4 heads:
