@@ -15,7 +15,7 @@ from safetensors.torch import load_file
 from torch.nn import functional
 
 import ttscompile
-from tests.rounding import Counted, assert_equal_but_for_rounding, bound
+from tests.rounding import Counted, allowed, amplified, assert_equal_but_for_rounding, bound
 from ttscompile.artifact.load import load_artifact
 from ttscompile.cli import main
 from ttscompile.core.spec import Noise, ObservationSpec
@@ -204,8 +204,9 @@ def test_samplers_against_plain_loops(tmp_path: Path, objective: str, options: d
     flow = objective != "sample"
     changes = {"objective": "flow_matching", "integration_method": objective} if flow else {"prediction_type": "sample"}
     module, spec = load(save_policy(tmp_path, **PLAIN, **changes), **options)
-    obs, x = observe(spec), torch.randn(2, 8, DA)
-    found = eager_policy(module, spec)(obs, Noise(x.numpy().copy()))
+    obs, x = observe(spec), torch.randn(2, 8, DA, generator=torch.Generator().manual_seed(0))
+    noise = x.numpy().copy()
+    found = eager_policy(module, spec)(obs, Noise(noise))
     with torch.inference_mode(), Counted() as counted:
         condition = module.encoder({spec.arguments[key]: value for key, value in obs.items()})
 
@@ -231,7 +232,9 @@ def test_samplers_against_plain_loops(tmp_path: Path, objective: str, options: d
                 c = network(x + h / 2 * b, t + h / 2)
                 x = x + h / 6 * (a + 2 * b + 2 * c + network(x + h * c, t + h))
             assert spec.sampler.steps == (4 * steps if objective == "rk4" else steps)
-    assert_equal_but_for_rounding(found, x, counted.terms, counted.angle)
+    # A clipped sample is smaller than the noise that it was computed from, whose rounding it has.
+    atol = allowed(np.maximum(np.abs(noise).max(), np.abs(x)), amplified(counted.terms, spec.sampler), counted.angle)
+    np.testing.assert_allclose(found, x, rtol=0, atol=atol)
 
 
 def test_rk4_with_plain_attention_compiles(tmp_path: Path) -> None:
