@@ -54,7 +54,7 @@ class Family:
 def smolvla() -> Family:
     return Family(
         title="SmolVLA action expert",
-        verified="lerobot 7427f31 `denoise_step`, `euler_integrate`, 1e-5",
+        verified="lerobot 7427f31 `denoise_step`, `euler_integrate`, up to the rounding of float32",
         module=SmolVLAHead(width=24, heads=4, groups=2, channels=8, hidden=40, layers=4, actions=5),
         conditions=("prefix_mask", "keys", "values"),
         sampler=flow_matching_table(10, start=1.0, end=0.0),
@@ -69,7 +69,7 @@ def rdt() -> Family:
     solver = diffusers.DPMSolverMultistepScheduler(beta_schedule="squaredcos_cap_v2", prediction_type="sample")
     return Family(
         title="RDT-1B",
-        verified="RoboticsDiffusionTransformer deb71d8 `conditional_sample`, 1e-5",
+        verified="RoboticsDiffusionTransformer deb71d8 `conditional_sample`, up to the rounding of float32",
         module=RDTHead(width=32, heads=4, layers=4, horizon=6, actions=5, lengths=(9, 8), features=(12, 10)),
         conditions=("language", "language_mask", "image", "state", "action_mask", "frequency"),
         sampler=sampler_table(solver, 5, name="dpmsolver++"),
@@ -83,7 +83,7 @@ def rdt() -> Family:
 def pi0() -> Family:
     return Family(
         title="pi0 action expert",
-        verified="lerobot 7427f31 `denoise_step`, `euler_integrate`, 1e-5",
+        verified="lerobot 7427f31 `denoise_step`, `euler_integrate`, up to the rounding of float32",
         module=PiHead(width=24, heads=4, groups=1, channels=8, hidden=40, layers=2, actions=5, adaptive=False),
         conditions=("prefix_mask", "keys", "values", "state"),
         sampler=flow_matching_table(10, start=1.0, end=0.0),
@@ -96,7 +96,7 @@ def pi0() -> Family:
 def pi05() -> Family:
     return Family(
         title="pi0.5 action expert",
-        verified="lerobot 7427f31 `denoise_step`, `euler_integrate`, 1e-5",
+        verified="lerobot 7427f31 `denoise_step`, `euler_integrate`, up to the rounding of float32",
         module=PiHead(width=24, heads=4, groups=1, channels=8, hidden=40, layers=2, actions=5, adaptive=True),
         conditions=("prefix_mask", "keys", "values"),
         sampler=flow_matching_table(10, start=1.0, end=0.0),
@@ -109,7 +109,7 @@ def pi05() -> Family:
 def groot() -> Family:
     return Family(
         title="GR00T N1.7 action head",
-        verified="lerobot 7427f31 `get_action_with_features`, 1e-5",
+        verified="lerobot 7427f31 `get_action_with_features`, up to the rounding of float32",
         module=GR00THead(24, heads=3, layers=4, source=20, out=16, actions=5, embodiments=2, embodiment=1),
         conditions=("features", "state"),
         sampler=flow_matching_table(4),
@@ -124,7 +124,7 @@ def cogact() -> Family:
     solver = diffusers.DDIMScheduler(100, beta_schedule="squaredcos_cap_v2", clip_sample=False)
     return Family(
         title="CogACT action model, guidance 1.5",
-        verified="CogACT b174a1b `forward_with_cfg`, `ddim_sample_loop`, 1e-4",
+        verified="CogACT b174a1b `forward_with_cfg`, `ddim_sample_loop`, up to the rounding of float32",
         module=CogACTHead(24, heads=3, layers=2, horizon=6, actions=5, cognition=18, guidance=1.5),
         conditions=("cognition",),
         sampler=sampler_table(solver, 10, name="ddim"),
@@ -139,7 +139,7 @@ def dit_policy() -> Family:
     solver = diffusers.DDIMScheduler(100, beta_schedule="squaredcos_cap_v2")
     return Family(
         title="DiT-Policy",
-        verified="dit-policy ba22ee3 `get_actions`, 1e-4",
+        verified="dit-policy ba22ee3 `get_actions`, up to the rounding of float32",
         module=DiTPolicyHead(24, heads=3, layers=2, hidden=40, waves=16, horizon=6, actions=5),
         conditions=("tokens",),
         sampler=sampler_table(solver, 8, name="ddim"),

@@ -233,7 +233,9 @@ def test_samplers_against_plain_loops(tmp_path: Path, objective: str, options: d
                 x = x + h / 6 * (a + 2 * b + 2 * c + network(x + h * c, t + h))
             assert spec.sampler.steps == (4 * steps if objective == "rk4" else steps)
     # A clipped sample is smaller than the noise that it was computed from, whose rounding it has.
-    atol = allowed(np.maximum(np.abs(noise).max(), np.abs(x.numpy())), amplified(counted.terms, spec.sampler), counted.angle)
+    atol = allowed(
+        np.maximum(np.abs(noise).max(), np.abs(x.numpy())), amplified(counted.terms, spec.sampler), counted.angle
+    )
     np.testing.assert_allclose(found, x, rtol=0, atol=atol)
 
 
