@@ -113,8 +113,12 @@ def _cancelled(obs: Tensor, normalised: Tensor) -> float:
 
 
 @pytest.mark.parametrize("name", UNLOWERED)
-def test_a_row_without_an_onnx_form_is_refused_by_name(name: str) -> None:
-    with pytest.raises(LoweringError, match=r"piece 'examples' could not be exported .*Its operations are .*aten\."):
+def test_a_row_without_an_onnx_form_is_refused(name: str) -> None:
+    unknown, loop = (
+        r"piece 'examples' could not be exported .*Its operations are .*aten\.",
+        "SequenceMap has a subgraph",
+    )
+    with pytest.raises(LoweringError, match=loop if name.endswith("stack") else unknown):
         lower_graph(_captured((name,))[0], "examples")
 
 
