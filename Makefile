@@ -44,6 +44,8 @@ test-avx2: export MKL_ENABLE_INSTRUCTIONS := AVX2
 test-avx2: export ONEDNN_MAX_CPU_ISA := AVX2
 test-avx2: export OPENBLAS_CORETYPE := Haswell
 test-avx2: export NPY_DISABLE_CPU_FEATURES := X86_V4 AVX512_ICL AVX512_SPR
+# torch.compile keeps what it compiled, and takes it again under other switches, where it computes something else.
+test-avx2: export TORCHINDUCTOR_CACHE_DIR := $(CURDIR)/build/inductor-avx2
 test-avx2: $(READY)
 	$(BIN)/pytest -n logical --dist loadfile --benchmark-disable -m "not alone and not soak"
 

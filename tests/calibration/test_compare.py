@@ -22,7 +22,7 @@ from ttscompile.cli import main
 from ttscompile.cli.compare import default_sparsities
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import CalibrationError, OutputError
-from ttscompile.measure.points import Frontier, MeasuredPoint
+from ttscompile.measure.points import Comparison, MeasuredPoint
 from ttscompile.plots.frontier import plot_frontier
 
 from . import policies
@@ -50,15 +50,15 @@ def other_sampler(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def frontier(planned: Path, other_sampler: Path, recording: Path) -> Frontier:
+def frontier(planned: Path, other_sampler: Path, recording: Path) -> Comparison:
     return compare(planned, [recording], ["interval", "tts"], [0.5, 0.8], [other_sampler], calls=8, intervals=8)
 
 
-def points(frontier: Frontier) -> dict[tuple[str, str], MeasuredPoint]:
+def points(frontier: Comparison) -> dict[tuple[str, str], MeasuredPoint]:
     return {(point.series, point.name): point for point in frontier.points}
 
 
-def test_every_plan_is_measured_on_the_same_calls(frontier: Frontier) -> None:
+def test_every_plan_is_measured_on_the_same_calls(frontier: Comparison) -> None:
     found = points(frontier)
     assert list(found) == [
         ("this artifact", "dense"),
@@ -82,7 +82,7 @@ def test_every_plan_is_measured_on_the_same_calls(frontier: Frontier) -> None:
     assert frontier.calls == 8
 
 
-def test_it_says_where_plans_may_have_been_learned_from_these_episodes(planned: Path, frontier: Frontier) -> None:
+def test_it_says_where_plans_may_have_been_learned_from_these_episodes(planned: Path, frontier: Comparison) -> None:
     assert len(frontier.warnings) == 1
     assert frontier.warnings[0].startswith(
         "this artifact: its calibration held out the episodes [0, 1], and this comparison"
@@ -149,12 +149,12 @@ def _point(name: str, latency: float, error: float) -> MeasuredPoint:
 
 def test_the_frontier_is_what_nothing_beats() -> None:
     some = [_point("slow", 9, 0), _point("beaten", 5, 4), _point("good", 4, 2), _point("fast", 1, 7)]
-    frontier = Frontier(tuple(some), 1, (0,), 1, {}, {}, ())
+    frontier = Comparison(tuple(some), 1, (0,), 1, {}, {}, ())
     assert [point.name for point in frontier.efficient()] == ["fast", "good", "slow"]
     assert [point["efficient"] for point in frontier.to_json()["points"]] == [True, False, True, True]
 
 
-def test_the_picture_has_the_points_and_needs_a_folder(frontier: Frontier, tmp_path: Path) -> None:
+def test_the_picture_has_the_points_and_needs_a_folder(frontier: Comparison, tmp_path: Path) -> None:
     path = tmp_path / "f.png"
     arguments: tuple[Any, ...] = (frontier.points, frontier.efficient(), frontier.yardsticks)
     plot_frontier(*arguments, path, "title")

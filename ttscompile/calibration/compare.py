@@ -25,7 +25,7 @@ from ..core.correction import FEATURES
 from ..core.lattice import Source
 from ..core.spec import FP32, Noise
 from ..errors import CalibrationError
-from ..measure.points import Frontier, MeasuredPoint
+from ..measure.points import Comparison, MeasuredPoint
 from ..measure.timer import Timer
 from ..runtimes.open import open_runtime
 from ..runtimes.policy import CompiledPolicy
@@ -86,7 +86,7 @@ def compare(
     intervals: int | None = None,
     max_minutes: float = 3.0,
     progress: Progress = lambda what, done, total: None,
-) -> Frontier:
+) -> Comparison:
     """Measure plans against each other. Nothing is written.
 
     Args:
@@ -156,7 +156,7 @@ def compare(
     entrants = _enter(artifact, found, compared, threads)
     chosen = sample_calls(episodes, split.validation, calls, seed)
     points, yardsticks = _measure(artifact, entrants, episodes, chosen, seed, threads, progress)
-    return Frontier(points, len(chosen), split.validation, threads, yardsticks, skipped, tuple(warnings))
+    return Comparison(points, len(chosen), split.validation, threads, yardsticks, skipped, tuple(warnings))
 
 
 def _task(
@@ -233,7 +233,7 @@ def _measure(
     threads: int,
     progress: Progress,
 ) -> tuple[tuple[MeasuredPoint, ...], dict[str, float]]:
-    """All entrants on all calls, in turn: a point for each, and ``Frontier.yardsticks``.
+    """All entrants on all calls, in turn: a point for each, and ``Comparison.yardsticks``.
 
     ``chosen`` has the number of the episode, and the row in it, of each call.
     """

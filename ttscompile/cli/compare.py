@@ -20,7 +20,7 @@ from ttscompile.plots.frontier import plot_frontier
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from ttscompile.measure.points import Frontier
+    from ttscompile.measure.points import Comparison
 
 
 def default_sparsities(steps: int) -> tuple[float, ...]:
@@ -144,7 +144,7 @@ def compare(
         say(told, f"wrote {picture}")
 
 
-def _print(found: Frontier, output: Console, threads: str) -> None:
+def _print(found: Comparison, output: Console, threads: str) -> None:
     """The comparison as a table, and what is compared."""
     efficient = found.efficient()
     made = table("", "plan", "error", "90th pct.", "ms a call", "quartiles", "GFLOP", "reused", "frontier")
@@ -166,7 +166,7 @@ def _print(found: Frontier, output: Console, threads: str) -> None:
         f"Error: mean absolute difference of the executed actions, in their units, from those of the dense policy in"
         f" fp32 with the same observation and noise; {found.calls} calls of episodes that no strategy here learned"
         f" from. Latency: medians of the same calls, one stream, {threads}."
-        " Frontier: no other plan is faster and more accurate.",
+        " Comparison: no other plan is faster and more accurate.",
     )
     told = {"steps": "the same initial sample and other draws", "all": "other noise altogether"}
     apart = "; ".join(f"by {error:.4g} with {told[name]}" for name, error in found.yardsticks.items())

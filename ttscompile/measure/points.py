@@ -56,7 +56,7 @@ def efficient(points: Sequence[AnyPoint]) -> tuple[AnyPoint, ...]:
 
 
 @dataclass(frozen=True)
-class Frontier:
+class Comparison:
     """The outcome of a comparison.
 
     Attributes:

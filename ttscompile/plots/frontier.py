@@ -30,7 +30,7 @@ def plot_frontier(
     Args:
         points: of all series; those without an error (the dense policy) are told in the title: the axis is logarithmic.
         efficient: points that no other beats, fastest first.
-        yardsticks: errors that are drawn as level lines, by their key in ``Frontier.yardsticks``.
+        yardsticks: errors that are drawn as level lines, by their key in ``Comparison.yardsticks``.
         path: see ``write_picture``.
         title: over the picture.
 

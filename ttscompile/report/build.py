@@ -184,14 +184,14 @@ def _frontier(artifact: Artifact, latencies: Sequence[Latency], compared: Compar
         yardsticks = {}
         text = "Errors from the calibration record, latencies measured now. ttscompile compare measures more of it."
     if not any(point.error > 0 for point in points):
-        return Section("Frontier", ("There is no error to hold against a latency: calibrate the artifact first.",))
+        return Section("Comparison", ("There is no error to hold against a latency: calibrate the artifact first.",))
     best = efficient(points)
     png = pictures.frontier_picture(points, best, yardsticks, f"artifact {manifest.short_identity}")
     alt = "Points: action error against latency of each plan. The table has the figures."
     drawn = Picture(png, "Action error against latency: down and left is better.", alt)
     rows = tuple((p.series, p.name, f"{p.error:.4g}", ms(p.latency_ms), "yes" if p in best else "") for p in points)
     head = ("", "plan", "action error", "ms a call", "on the frontier")
-    return Section("Frontier", (text,), (Table(head, rows),), (drawn,))
+    return Section("Comparison", (text,), (Table(head, rows),), (drawn,))
 
 
 def _calibration(record: Mapping[str, Any] | None) -> Section:
