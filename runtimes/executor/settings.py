@@ -115,15 +115,29 @@ class ExecutorSettings:
 
 @dataclass(frozen=True)
 class Resolved:
-    """Settings with everything that follows from the policy filled in; see ``ExecutorSettings``."""
+    """Settings with everything that follows from the policy filled in; see ``ExecutorSettings``.
+
+    Attributes:
+        control_hz: ticks a second.
+        policy_hz: frames and actions a second.
+        ticks_per_step: control ticks that an action lasts.
+        horizon: actions of a chunk that are played.
+        reserve: actions after these that may be.
+        first: index in ``action_pred`` of the first action that is played.
+        channels: Da.
+        frames: what one frame holds.
+        max_age: of the newest frame of a window when a call starts, seconds.
+        tiers: plans, slowest first.
+        margin_ticks: control ticks that a chunk shall be there before it is needed.
+    """
 
     control_hz: float
-    policy_hz: float  # of frames and actions
-    ticks_per_step: int  # that an action lasts
+    policy_hz: float
+    ticks_per_step: int
     horizon: int
     reserve: int
-    first: int  # index in ``action_pred`` of the first action that is played
-    channels: int  # Da
+    first: int
+    channels: int
     frames: FrameSpec
     max_age: float
     tiers: tuple[str, ...]

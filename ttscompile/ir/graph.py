@@ -71,14 +71,23 @@ GETITEM = "getitem"
 
 @dataclass(frozen=True)
 class Node:
-    """One operation."""
+    """One operation.
 
-    name: str  # of its result, unique in the graph
-    op: str  # full ATen name, aten.linear.default, or getitem
-    args: tuple[Argument, ...]  # positional arguments; values are Ref, lists are tuples
-    kwargs: tuple[tuple[str, Argument], ...]  # keyword arguments, sorted by name
-    types: tuple[TensorType, ...]  # one type a result; a node with one result has one
-    source: str = ""  # where it comes from in the user's code (file:line), for messages; never written to an artifact
+    Attributes:
+        name: of its result, unique in the graph.
+        op: full ATen name, ``aten.linear.default``, or ``getitem``.
+        args: positional arguments; values are ``Ref``, lists are tuples.
+        kwargs: keyword arguments, sorted by name.
+        types: one type a result; a node with one result has one.
+        source: where it comes from in the user's code (file:line), for messages; never written to an artifact.
+    """
+
+    name: str
+    op: str
+    args: tuple[Argument, ...]
+    kwargs: tuple[tuple[str, Argument], ...]
+    types: tuple[TensorType, ...]
+    source: str = ""
 
     @property
     def type(self) -> TensorType:
@@ -113,12 +122,19 @@ class Node:
 
 @dataclass(frozen=True)
 class Graph:
-    """A straight-line function."""
+    """A straight-line function.
 
-    inputs: Mapping[str, TensorType]  # name and type of each input, in order
-    constants: Mapping[str, TensorType]  # name and type of each weight; their values live in the program's weights
-    nodes: tuple[Node, ...]  # in topological order
-    outputs: tuple[str, ...]  # names of values
+    Attributes:
+        inputs: name and type of each input, in order.
+        constants: name and type of each weight; their values live in the program's weights.
+        nodes: in topological order.
+        outputs: names of values.
+    """
+
+    inputs: Mapping[str, TensorType]
+    constants: Mapping[str, TensorType]
+    nodes: tuple[Node, ...]
+    outputs: tuple[str, ...]
 
     def types(self) -> dict[str, TensorType]:
         """Type of every value; of a node with several results the type of the first."""

@@ -102,10 +102,15 @@ IDLE_OUTPUTS = (BASE, PRODUCT, SHIFT)
 
 @dataclass(frozen=True)
 class LoopPiece:
-    """A piece that runs at every step: stem, a block, or tail."""
+    """A piece that runs at every step: stem, a block, or tail.
 
-    graph: Graph  # of one output
-    stream: str  # the input that carries the sample (of the stem) or the residual stream; the others are contexts
+    Attributes:
+        graph: of one output.
+        stream: the input that carries the sample (of the stem) or the residual stream; the others are contexts.
+    """
+
+    graph: Graph
+    stream: str
 
     @property
     def type(self) -> TensorType:

@@ -30,25 +30,42 @@ class Binding(enum.Enum):
 
 @dataclass(frozen=True)
 class Block:
-    """One residual block ``x <- x + f(x, context)``."""
+    """One residual block ``x <- x + f(x, context)``.
 
-    index: int  # position in the order of execution
-    kind: str  # self_attention, cross_attention, feed_forward or a structural signature
-    stream: str  # value that flows in, a_{i-1}
-    result: str  # value that flows out, a_i
-    residual: str | None  # value that is added; None for a coarse block, whose residual is result - stream
-    type: TensorType  # of stream, residual and result
-    group: int  # number of its FORWARD group: blocks of one kind and one shape
-    reason: str = ""  # why it is coarse; empty for a plain residual
+    Attributes:
+        index: position in the order of execution.
+        kind: ``self_attention``, ``cross_attention``, ``feed_forward`` or a structural signature.
+        stream: value that flows in, ``a_{i-1}``.
+        result: value that flows out, ``a_i``.
+        residual: value that is added; None for a coarse block, whose residual is ``result - stream``.
+        type: of stream, residual and result.
+        group: number of its FORWARD group: blocks of one kind and one shape.
+        reason: why it is coarse; empty for a plain residual.
+    """
+
+    index: int
+    kind: str
+    stream: str
+    result: str
+    residual: str | None
+    type: TensorType
+    group: int
+    reason: str = ""
 
 
 @dataclass(frozen=True)
 class Loop:
-    """The pieces that run at every step. What they read beside the stream are contexts."""
+    """The pieces that run at every step. What they read beside the stream are contexts.
 
-    stem: LoopPiece  # sample -> residual stream
-    blocks: tuple[LoopPiece, ...]  # residual stream -> residual
-    tail: LoopPiece  # residual stream -> prediction
+    Attributes:
+        stem: sample -> residual stream.
+        blocks: residual stream -> residual.
+        tail: residual stream -> prediction.
+    """
+
+    stem: LoopPiece
+    blocks: tuple[LoopPiece, ...]
+    tail: LoopPiece
 
     @property
     def loop(self) -> dict[str, LoopPiece]:
@@ -111,12 +128,19 @@ class Pieces(Loop):
 
 @dataclass(frozen=True)
 class Phase:
-    """What every phase has."""
+    """What every phase has.
 
-    spec: PolicySpec  # the policy beside its network
-    denoiser: Graph  # graph of one evaluation: inputs sample, timestep, observations; output the prediction
-    weights: Mapping[str, npt.NDArray[np.generic]]  # value of every constant of every graph
-    dense_flops: int = field(default=0, kw_only=True)  # of one call as the module makes it: K evaluations, one stream
+    Attributes:
+        spec: the policy beside its network.
+        denoiser: graph of one evaluation: inputs ``sample``, ``timestep``, observations; output the prediction.
+        weights: value of every constant of every graph.
+        dense_flops: of one call as the module makes it: K evaluations, one stream.
+    """
+
+    spec: PolicySpec
+    denoiser: Graph
+    weights: Mapping[str, npt.NDArray[np.generic]]
+    dense_flops: int = field(default=0, kw_only=True)
 
     def graphs(self) -> dict[str, Graph]:
         """Every graph by name."""
@@ -134,11 +158,17 @@ class Captured(Phase):
 
 @dataclass(frozen=True)
 class Cut(Phase):
-    """The denoiser cut along its residual stream (``Partition``)."""
+    """The denoiser cut along its residual stream (``Partition``).
 
-    blocks: tuple[Block, ...]  # block table
-    prologue: Graph  # observations and timestep -> contexts: what the loop reads and does not compute
-    loop: Loop  # the pieces that read the sample
+    Attributes:
+        blocks: block table.
+        prologue: observations and timestep -> contexts: what the loop reads and does not compute.
+        loop: the pieces that read the sample.
+    """
+
+    blocks: tuple[Block, ...]
+    prologue: Graph
+    loop: Loop
 
     def graphs(self) -> dict[str, Graph]:
         """Every graph by name."""
@@ -151,10 +181,15 @@ class Cut(Phase):
 
 @dataclass(frozen=True)
 class Program(Phase):
-    """The denoiser in pieces that each run when what they read is known (``Hoist``): what is lowered and executed."""
+    """The denoiser in pieces that each run when what they read is known (``Hoist``): what is lowered and executed.
 
-    blocks: tuple[Block, ...]  # block table
-    pieces: Pieces  # the denoiser cut up
+    Attributes:
+        blocks: block table.
+        pieces: the denoiser cut up.
+    """
+
+    blocks: tuple[Block, ...]
+    pieces: Pieces
 
     def graphs(self) -> dict[str, Graph]:
         """Every graph by name."""

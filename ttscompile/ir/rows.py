@@ -28,12 +28,19 @@ class _Layout(NamedTuple):
 
 @dataclass(frozen=True)
 class Rows:
-    """How a value crosses."""
+    """How a value crosses.
 
-    name: str  # of the value [.., m * B, ..]
-    type: TensorType  # of that value
-    crossing: str  # its name where it crosses
-    unfolded: TensorType  # its type there, with an axis of size B
+    Attributes:
+        name: of the value [.., m * B, ..].
+        type: of that value.
+        crossing: its name where it crosses.
+        unfolded: its type there, with an axis of size B.
+    """
+
+    name: str
+    type: TensorType
+    crossing: str
+    unfolded: TensorType
 
     def leave(self) -> Node:
         """The node that makes the crossing value."""
