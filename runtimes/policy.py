@@ -128,9 +128,6 @@ class CompiledPolicy:
         seed: of the noise that is drawn when none is given.
         plan: see ``load``.
 
-    Attributes:
-        last_report: what the last call did; None before the first.
-
     Raises:
         IllegalPlanError: the artifact has no plan of this name.
     """
@@ -142,9 +139,14 @@ class CompiledPolicy:
         _require_plan(artifact, self._default)
         self._prefix_refusal = prefix_refusal(artifact.manifest.spec)
         self._rng = np.random.default_rng(check_seed(seed))
-        self.last_report: CallReport | None = None
+        self._report: CallReport | None = None
         self._queues = Queues(artifact.manifest.spec.observations)
         self._lock = threading.Lock()
+
+    @property
+    def last_report(self) -> CallReport | None:
+        """What the last call did; None before the first, and after one that was refused."""
+        return self._report
 
     @property
     def info(self) -> PolicyInfo:
@@ -281,7 +283,7 @@ class CompiledPolicy:
         self, obs_dict: Mapping[str, Any], noise: Noise | None, plan: str | npt.ArrayLike | None, prefix: Any = None
     ) -> FloatArray:
         """One call; the actions ``[B, T, Da]``."""
-        self.last_report = None
+        self._report = None
         spec = self._manifest.spec
         obs = check_observation(obs_dict, spec.observations)
         streams = len(next(iter(obs.values())))
@@ -293,7 +295,7 @@ class CompiledPolicy:
         correction = None if name is None else self._artifact.corrections.get(name)
         noise = self._draw(streams) if noise is None else noise
         normalized = {key: spec.observations[key].normalized(array) for key, array in obs.items()}
-        sample, self.last_report = self._runtime.predict(
+        sample, self._report = self._runtime.predict(
             normalized, noise, matrix, plan_name=name, repair=repair, correction=correction, prefix=prefix
         )
         return spec.chunk.unnormalized(sample)

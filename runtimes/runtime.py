@@ -65,7 +65,7 @@ class Runtime:
         for schedule in artifact.schedules.values():
             self._lowering.lower(schedule)
         self._helper = ThreadPoolExecutor(1, "ttscompile-pruner") if PRUNER in self._manifest.pieces else None
-        if self._helper is not None and any(plan.kind == PRUNER for plan in self._manifest.plans.values()):
+        if self._helper is not None and any(plan.pruned for plan in self._manifest.plans.values()):
             self._helper.submit(lambda: None).result()  # the thread is there before the first call
         self._matrices = False  # whether one was ever given
         self._written: BoolArray | None = None

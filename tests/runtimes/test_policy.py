@@ -81,6 +81,8 @@ def test_the_default_plan_is_dense_until_calibration(quick: CompiledPolicy) -> N
     report = quick.last_report
     assert report is not None
     assert (report.plan_name, report.computed, report.legalised) == ("dense", (25, 25), (0, 0))
+    with pytest.raises(AttributeError):
+        quick.last_report = None  # type: ignore[misc]
 
 
 def test_plans_of_the_artifact_by_name(own_artifact: Artifact) -> None:
