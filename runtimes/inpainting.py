@@ -19,10 +19,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ttscompile.core.correction import groups_of
+from ttscompile.core.given import plain
 from ttscompile.core.spec import ChunkSpec, FloatArray, PolicySpec, SamplerTable
 from ttscompile.errors import ObservationError
 
-from .arrays import as_array, check_finite
+from .arrays import check_numbers
 
 TOLERANCE = 1e-3
 """Of the levels of a path that is one: tables are float32, and schedules round."""
@@ -117,9 +118,9 @@ def check_prefix(prefix: Any, streams: int, spec: PolicySpec, refusal: str | Non
         refusal: see ``prefix_refusal``.
 
     Raises:
-        ObservationError: of another kind, dtype or shape, too long or not finite; or the policy takes none.
+        ObservationError: of another kind, dtype or shape, too long, not finite or too large; or the policy takes none.
     """
-    array = as_array(prefix, "prefix")
+    array = plain(prefix, "prefix", ObservationError)
     room = spec.sample[0] - spec.chunk.start
     shape = (streams, array.shape[1] if array.ndim == 3 else 0, spec.chunk.action_dim)
     if array.shape != shape or array.dtype != np.float32:
@@ -131,7 +132,7 @@ def check_prefix(prefix: Any, streams: int, spec: PolicySpec, refusal: str | Non
         raise ObservationError(f"prefix holds {shape[1]} actions; the chunk has {rest}. Give at most {room}.")
     if shape[1] and refusal is not None:
         raise ObservationError(f"the policy takes no prefix: {refusal} Call it without one.")
-    check_finite(array, "prefix", "Only actions that can be executed can be committed.")
+    check_numbers(array, spec.chunk.normalizer, "prefix", "Only actions that can be executed can be committed.")
     return array
 
 

@@ -199,7 +199,7 @@ class ExecutorServer:
         frames, (control_hz, policy_hz) = executor.frames, executor.rates
         return {
             "observation": {
-                key: {"shape": list(shape), "dtype": frames.dtypes[key]} for key, shape in frames.shapes.items()
+                key: {"shape": list(spec.shape), "dtype": spec.dtype} for key, spec in frames.specs.items()
             },
             "n_obs_steps": frames.steps,
             "control_hz": control_hz,

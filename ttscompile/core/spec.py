@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,11 @@ FloatArray = npt.NDArray[np.float32]
 FP32, INT8 = "fp32", "int8"
 PRECISIONS = (FP32, INT8)
 """Names of what the weights of residual blocks can be asked for in."""
+
+LARGEST = 1e6
+"""No number that goes into the network, normalised, is larger, either way; what is cannot be from training. A range
+maps to -1..1, and of N samples none is further than sqrt(N - 1) deviations from their mean. A network multiplies up to
+four of its numbers (a gated product of two, and a LayerNorm squares that): this leaves 1e14 for weights and sums."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +50,11 @@ class Affine:
             raise SpecError(f"normaliser scale {self.scale.shape} and offset {self.offset.shape} differ in length.")
         if (self.scale == 0).any():
             raise SpecError(f"normaliser scale is zero at {np.flatnonzero(self.scale == 0).tolist()}: not invertible.")
+
+    @cached_property
+    def reach(self) -> float:
+        """Numbers up to this size, either way, are normalised to at most ``LARGEST`` in every entry."""
+        return float(((LARGEST - np.abs(self.offset, dtype=np.float64)) / np.abs(self.scale)).min())
 
     def normalize(self, x: npt.NDArray[np.float32]) -> FloatArray:
         """``x * scale + offset`` over the last axis."""
@@ -176,6 +187,11 @@ class ObservationSpec:
     def frames(self) -> int | None:
         """To, the number of frames that the first axis holds; None without such an axis."""
         return self.shape[0] if self.window and len(self.shape) > 1 else None
+
+    @property
+    def one_frame(self) -> ObservationSpec:
+        """The same of one frame, where there are several."""
+        return replace(self, shape=self.shape[1:], window=False)
 
     @property
     def image(self) -> bool:
