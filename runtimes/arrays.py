@@ -164,17 +164,18 @@ def check_numbers(array: Array, normalizer: Affine | None, what: str, remedy: st
     reach = LARGEST if normalizer is None else normalizer.reach
     if -reach <= least and most <= reach:  # not so if any is NaN
         return least, most
-    with np.errstate(all="ignore"):
-        sizes = np.abs(array if normalizer is None else normalizer.normalize(array))
-    finite = np.isfinite(array)
-    beyond = ~(sizes <= LARGEST) if finite.all() else ~finite
-    if beyond.any():
-        first = tuple(np.argwhere(beyond)[0].tolist())
-        number, size = f"{array[first]:.6g}", "" if normalizer is None else f" ({sizes[first]:.3g} when normalised)"
-        expected, size = ("finite", "") if not finite.all() else (f"at most {LARGEST:g} when normalised", size)
-        found = f"{number} at index {first}{size}, {np.count_nonzero(beyond)} such values in all"
-        raise ObservationError(f"{what} must be {expected}; found {found}. {remedy}")
-    return least, most
+    wrong, expected, normalised = ~np.isfinite(array), "finite", ""
+    if not wrong.any():
+        with np.errstate(all="ignore"):
+            values = array if normalizer is None else normalizer.normalize(array)
+        wrong, expected = ~(np.abs(values) <= LARGEST), f"between -{LARGEST:g} and {LARGEST:g}"
+        if not wrong.any():
+            return least, most
+        if normalizer is not None:
+            expected, normalised = f"{expected} when normalised", f" ({values[wrong][0]:.6g} when normalised)"
+    first = tuple(np.argwhere(wrong)[0].tolist())
+    found = f"{array[first]:.6g} at index {first}{normalised}, {np.count_nonzero(wrong)} such values in all"
+    raise ObservationError(f"{what} must be {expected}; found {found}. {remedy}")
 
 
 def check_noise(noise: Noise, streams: int, spec: PolicySpec) -> Noise:

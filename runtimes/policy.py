@@ -103,7 +103,7 @@ def load(
         RuntimeUnavailableError: the runtime cannot be had on this machine.
         TtscompileError: the seed is no whole number of at least 0.
     """
-    check_seed(seed)
+    seed = check_seed(seed)
     artifact = load_artifact(path)
     if kind_of(runtime).fp32_only:
         if precision not in (None, FP32):
@@ -182,7 +182,7 @@ class CompiledPolicy:
         Raises:
             TtscompileError: the seed is no whole number of at least 0; nothing was done.
         """
-        check_seed(seed)
+        seed = check_seed(seed)
         with self._alone():
             self._runtime.reset()
             self._queues.reset()

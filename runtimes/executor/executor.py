@@ -176,7 +176,7 @@ class AsyncExecutor:
             ExecutorClosedError: after ``close``.
             TtscompileError: the seed is no whole number of at least 0; the episode goes on.
         """
-        check_seed(seed)
+        seed = check_seed(seed)
         with self._lock:
             state = self._checked()
             state.reset()

@@ -173,7 +173,7 @@ def test_a_baseline_that_diverges_is_worse_than_any_plan(
 
 
 def test_a_negative_seed_is_refused(artifact: Path, recording: Path) -> None:
-    with pytest.raises(CalibrationError, match="seed: expected an integer of at least 0; found -1"):
+    with pytest.raises(CalibrationError, match="seed must be an integer of at least 0; found -1"):
         calibrate(artifact, [recording], 0.7, seed=-1, progress=False)
     with pytest.raises(CalibrationError, match="found -1"):
         compare(artifact, [recording], [], [], seed=-1)

@@ -90,6 +90,19 @@ def listed(value: Any, what: str, error: Errors, dtype: str) -> Array:
         raise error(f"{what} is no array of numbers ({failure!s:.200}); expected {dtype}.") from failure
 
 
+def numbers(value: Any, what: str, error: Errors, dtype: str = "float32") -> Array:
+    """The same as numbers of a dtype; what that cannot hold becomes infinite.
+
+    Raises:
+        TtscompileError: of the class ``error``: no array, or not of numbers.
+    """
+    array = listed(value, what, error, dtype)
+    if array.dtype.kind not in "biuf":
+        raise error(f"{what} has dtype {array.dtype!s:.80}; expected numbers, {dtype}.")
+    with np.errstate(over="ignore"):
+        return array.astype(dtype)
+
+
 def _rows(value: Any, what: str, error: Errors, dtype: str) -> Any:
     """A list with the arrays in it made plain."""
     if isinstance(value, list | tuple):

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..core.given import integer
 from ..core.spec import ObservationSpec
 from ..core.untrusted_json import parse_json
 from ..errors import TrajectoryError
@@ -72,8 +73,11 @@ def load_trajectories(
     Raises:
         TrajectoryError: names the file, what was expected, what it holds, and what to do.
     """
+    action_steps = integer(action_steps, "action_steps", TrajectoryError, 1)
     if isinstance(paths, str | os.PathLike):
         paths = [paths]
+    if no_path := [type(path).__name__ for path in paths if not isinstance(path, str | os.PathLike)]:
+        raise TrajectoryError(f"expected paths of recordings; found a {no_path[0]}. {_SAVEZ}, and give the file.")
     if not paths:
         raise TrajectoryError("no trajectory files were given. Name at least one .npz with recorded episodes.")
     different: dict[bytes, Episode] = {}  # one that is there twice could be learned from and held out at once
