@@ -75,8 +75,8 @@ class Node:
 
     Attributes:
         name: of its result, unique in the graph.
-        op: full ATen name, ``aten.linear.default``, or ``getitem``.
-        args: positional arguments; values are ``Ref``, lists are tuples.
+        op: full ATen name, aten.linear.default, or getitem.
+        args: positional arguments; values are Ref, lists are tuples.
         kwargs: keyword arguments, sorted by name.
         types: one type a result; a node with one result has one.
         source: where it comes from in the user's code (file:line), for messages; never written to an artifact.

@@ -34,10 +34,10 @@ class Block:
 
     Attributes:
         index: position in the order of execution.
-        kind: ``self_attention``, ``cross_attention``, ``feed_forward`` or a structural signature.
-        stream: value that flows in, ``a_{i-1}``.
-        result: value that flows out, ``a_i``.
-        residual: value that is added; None for a coarse block, whose residual is ``result - stream``.
+        kind: self_attention, cross_attention, feed_forward or a structural signature.
+        stream: value that flows in, a_{i-1}.
+        result: value that flows out, a_i.
+        residual: value that is added; None for a coarse block, whose residual is result - stream.
         type: of stream, residual and result.
         group: number of its FORWARD group: blocks of one kind and one shape.
         reason: why it is coarse; empty for a plain residual.
@@ -132,7 +132,7 @@ class Phase:
 
     Attributes:
         spec: the policy beside its network.
-        denoiser: graph of one evaluation: inputs ``sample``, ``timestep``, observations; output the prediction.
+        denoiser: graph of one evaluation: inputs sample, timestep, observations; output the prediction.
         weights: value of every constant of every graph.
         dense_flops: of one call as the module makes it: K evaluations, one stream.
     """

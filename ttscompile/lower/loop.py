@@ -51,14 +51,14 @@ class LoopInputs:
     """Names of values that the loop reads.
 
     Attributes:
-        initial: sample at step 0, ``[B, T, D]``.
-        offset: of the sampler's updates, ``[K, D, B, T]``.
-        update: matrices of the sampler's updates, ``[K, G, R, (1 + S) T]``.
-        anchors: bool ``[K]``; after these steps sample and prediction enter the history.
-        history: before step 0, ``[D, B, 4 T]``.
-        memory: of the sampler, before step 0: ``[D, B, S T]``; None if it has none.
-        rows: rollout cache ``[R, E]``, with a residual as a row of E numbers.
-        index: int64 ``[K, N]``; which row is the residual of a cell.
+        initial: sample at step 0, [B, T, D].
+        offset: of the sampler's updates, [K, D, B, T].
+        update: matrices of the sampler's updates, [K, G, R, (1 + S) T].
+        anchors: bool [K]; after these steps sample and prediction enter the history.
+        history: before step 0, [D, B, 4 T].
+        memory: of the sampler, before step 0: [D, B, S T]; None if it has none.
+        rows: rollout cache [R, E], with a residual as a row of E numbers.
+        index: int64 [K, N]; which row is the residual of a cell.
     """
 
     initial: str

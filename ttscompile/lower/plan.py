@@ -23,22 +23,22 @@ class LoweredPlan:
     """Names of values; K steps, N blocks, G gaps.
 
     Attributes:
-        executed: int8 ``[K, N]``; the plan after making step 0 dense and ROLLOUT of the never computed TIMESTEP.
-        computed: bool ``[K, N]``.
-        position: int64 ``[K, N + 1]``; how many blocks of the step are computed before this one.
+        executed: int8 [K, N]; the plan after making step 0 dense and ROLLOUT of the never computed TIMESTEP.
+        computed: bool [K, N].
+        position: int64 [K, N + 1]; how many blocks of the step are computed before this one.
         computed_steps: int64 scalar; S, how many steps have a computed block.
-        steps: int64 ``[S]``; which.
-        idle: int64 ``[S]``; how many steps without one follow.
-        first_row: int64 ``[K]``; first gap of each step.
-        stop_row: int64 ``[K]``; one past its last.
-        from_table: float32 ``[G, N]``; how often the gap adds each block's last computed residual.
-        from_step: float32 ``[G, N]``; the same of blocks computed earlier in the step.
-        from_rollout: float32 ``[G, N]``; the same of the step's entries of the rollout cache.
-        in_step: bool ``[K, N + 1]``; whether the gap before a block, or the step's last, reads ``from_step``.
-        rollout: bool ``[K, N]``.
-        any_rollout: bool ``[K]``.
-        same: bool ``[K]``; the step is idle, and adds what the idle step before added.
-        any_of_group: bool ``[K, groups of blocks]``; any block of it is computed.
+        steps: int64 [S]; which.
+        idle: int64 [S]; how many steps without one follow.
+        first_row: int64 [K]; first gap of each step.
+        stop_row: int64 [K]; one past its last.
+        from_table: float32 [G, N]; how often the gap adds each block's last computed residual.
+        from_step: float32 [G, N]; the same of blocks computed earlier in the step.
+        from_rollout: float32 [G, N]; the same of the step's entries of the rollout cache.
+        in_step: bool [K, N + 1]; whether the gap before a block, or the step's last, reads ``from_step``.
+        rollout: bool [K, N].
+        any_rollout: bool [K].
+        same: bool [K]; the step is idle, and adds what the idle step before added.
+        any_of_group: bool [K, groups of blocks]; any block of it is computed.
     """
 
     executed: str
