@@ -69,27 +69,28 @@ def read_observation(
     return arrays, example
 
 
-def check_observation(arrays: Mapping[str, Array], specs: Mapping[str, ObservationSpec]) -> int:
-    """Raise unless arrays ``[B, ...]`` have their specified shapes and dtypes, numbers that can be, and one B.
+def check_observation(arrays: Mapping[str, Array], specs: Mapping[str, ObservationSpec]) -> dict[str, Array]:
+    """Copies of arrays ``[B, ...]`` of their specified shapes and dtypes, with numbers that can be, and one B.
+
+    They are copied before their numbers are looked at: another thread may write into the caller's.
 
     Args:
         arrays: from ``read_observation``.
         specs: by key, of the policy.
 
-    Returns:
-        B.
-
     Raises:
         ObservationError: names the key, what was expected, what was found and the remedy.
     """
+    own = {}
     for key, spec in specs.items():
         _check_kind(key, arrays[key], spec)
-        check_values(key, arrays[key], spec)
-    counts = {key: len(array) for key, array in arrays.items()}
+        own[key] = arrays[key].copy()
+        check_values(key, own[key], spec)
+    counts = {key: len(array) for key, array in own.items()}
     if len(set(counts.values())) > 1:
         differ = f"observations hold different numbers of streams: {counts}"
         raise ObservationError(f"{differ}. The first axis of all must be the same.")
-    return next(iter(counts.values()))
+    return own
 
 
 def _check_kind(key: str, array: Array, spec: ObservationSpec) -> None:
@@ -179,7 +180,7 @@ def check_numbers(array: Array, normalizer: Affine | None, what: str, remedy: st
 
 
 def check_noise(noise: Noise, streams: int, spec: PolicySpec) -> Noise:
-    """The noise of a call as float32 arrays that fit it.
+    """The noise of a call as float32 arrays that fit it, copies of the caller's.
 
     Args:
         noise: the caller's; where the policy predicts fewer steps than the original, with as many as either. If the
@@ -210,5 +211,6 @@ def _noise(value: Any, what: str, axes: str, shape: tuple[int, ...], left_out: i
     if array.shape != shape or array.dtype != np.float32:
         expected = f"float32 {axes} = {list(shape)}; found {array.dtype} {list(array.shape)}"
         raise ObservationError(f"{what} must be {expected}. Use rng.standard_normal(shape, dtype=np.float32).")
-    check_numbers(array, None, what, "Draw it again.")
-    return array
+    own: FloatArray = array.copy()
+    check_numbers(own, None, what, "Draw it again.")
+    return own

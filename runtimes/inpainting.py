@@ -109,7 +109,7 @@ def prefix_refusal(spec: PolicySpec) -> str | None:
 
 
 def check_prefix(prefix: Any, streams: int, spec: PolicySpec, refusal: str | None) -> FloatArray:
-    """A prefix as a float32 array ``[B, N, Da]`` that fits the policy.
+    """A prefix as a float32 array ``[B, N, Da]`` that fits the policy, a copy of the caller's.
 
     Args:
         prefix: the caller's.
@@ -132,8 +132,9 @@ def check_prefix(prefix: Any, streams: int, spec: PolicySpec, refusal: str | Non
         raise ObservationError(f"prefix holds {shape[1]} actions; the chunk has {rest}. Give at most {room}.")
     if shape[1] and refusal is not None:
         raise ObservationError(f"the policy takes no prefix: {refusal} Call it without one.")
-    check_numbers(array, spec.chunk.normalizer, "prefix", "Only actions that can be executed can be committed.")
-    return array
+    own: FloatArray = array.copy()
+    check_numbers(own, spec.chunk.normalizer, "prefix", "Only actions that can be executed can be committed.")
+    return own
 
 
 def known_samples(spec: PolicySpec, prefix: FloatArray, initial: FloatArray) -> Known | None:

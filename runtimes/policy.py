@@ -292,7 +292,8 @@ class CompiledPolicy:
         """One call; the actions ``[B, T, Da]``, which are finite."""
         self._report = None
         spec = self._manifest.spec
-        streams = check_observation(obs, spec.observations)
+        obs = check_observation(obs, spec.observations)
+        streams = len(next(iter(obs.values())))
         self._runtime.require_streams(streams)
         if prefix is not None:
             prefix = check_prefix(prefix, streams, spec, self._prefix_refusal)

@@ -48,16 +48,17 @@ class Queues:
         Raises:
             ObservationError: an array does not fit.
         """
-        streams = check_observation(frame, self._frame_specs)
+        own = check_observation(frame, self._frame_specs)
+        streams = len(next(iter(own.values())))
         before = len(next(iter(self._frames.values()))[-1]) if self._frames else streams
         if streams != before:
             found = f"the frame holds {streams} streams, and the frames before {before}"
             raise ObservationError(f"{found}. The number of streams may change only after reset().")
         frames: Frames = {}
-        for key, value in frame.items():
-            length, own = self._specs[key].frames or 1, value.copy()  # the caller may not change it any more
-            frames[key] = deque(self._frames.get(key, [own] * length), maxlen=length)
-            frames[key].append(own)
+        for key, value in own.items():
+            length = self._specs[key].frames or 1
+            frames[key] = deque(self._frames.get(key, [value] * length), maxlen=length)
+            frames[key].append(value)
         return frames
 
     def keep(self, frames: Frames) -> None:

@@ -285,7 +285,7 @@ def test_observations_that_disagree_about_the_streams_are_refused() -> None:
 
     specs = {"a": ObservationSpec((2,)), "b": ObservationSpec((1, 2), dtype="int64")}
     fits = {"a": OBS, "b": np.zeros((2, 1, 2), np.int64)}
-    assert check_observation(fits, specs) == 2
+    assert list(check_observation(fits, specs)) == ["a", "b"]
     with pytest.raises(ObservationError, match=r"\{'a': 1, 'b': 2\}"):
         check_observation(fits | {"a": OBS[:1]}, specs)
 

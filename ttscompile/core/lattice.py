@@ -67,12 +67,12 @@ def check_plan(plan: npt.ArrayLike, steps: int, blocks: int, streams: int) -> Pl
 
 
 def _sources(plan: npt.ArrayLike) -> npt.NDArray[Any]:
-    """A plan of any shape and integer dtype, which holds nothing but sources.
+    """A copy of a plan of any shape and integer dtype, which holds nothing but sources.
 
     Raises:
         IllegalPlanError: it does not.
     """
-    array = listed(plan, "plan", IllegalPlanError, "int8")
+    array = listed(plan, "plan", IllegalPlanError, "int8").copy()
     if array.dtype.kind not in "iu":
         raise IllegalPlanError(
             f"plan has dtype {array.dtype}; expected an integer array of ttscompile.Source. Use plan.astype(np.int8)."
