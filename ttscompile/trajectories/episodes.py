@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.given import integer
-from ..core.spec import ObservationSpec
+from ..core.spec import LARGEST, ObservationSpec
 from ..core.untrusted_json import parse_json
 from ..errors import TrajectoryError
 from .apart import frames_apart
@@ -74,7 +74,7 @@ def load_trajectories(
         TrajectoryError: names the file, what was expected, what it holds, and what to do.
     """
     action_steps = integer(action_steps, "action_steps", TrajectoryError, 1)
-    if isinstance(paths, str | os.PathLike):
+    if isinstance(paths, str | os.PathLike) or not isinstance(paths, Iterable):
         paths = [paths]
     if no_path := [type(path).__name__ for path in paths if not isinstance(path, str | os.PathLike)]:
         raise TrajectoryError(f"expected paths of recordings; found a {no_path[0]}. {_SAVEZ}, and give the file.")
@@ -231,6 +231,16 @@ def _checked(path: Path, key: str, array: Array, spec: ObservationSpec, frames: 
         bad = np.flatnonzero(~np.isfinite(cast.reshape(len(cast), -1)).all(1))
         told = f"{path}: {key!r} holds NaN or infinity in {len(bad)} rows, the first of them row {bad[0]}"
         raise TrajectoryError(f"{told}. Leave the episodes with broken sensors out.")
+    reach = LARGEST if spec.normalizer is None else spec.normalizer.reach
+    if wanted.kind == "f" and cast.size and max(-float(cast.min()), float(cast.max())) > reach:
+        with np.errstate(over="ignore"):
+            beyond = ~(np.abs(spec.normalized(cast)).reshape(len(cast), -1) <= LARGEST).all(1)
+        if beyond.any():
+            told = (
+                f"{path}: {key!r} holds numbers beyond {LARGEST:g} when normalised in {np.count_nonzero(beyond)} rows"
+            )
+            first = f"the first of them row {np.flatnonzero(beyond)[0]}"
+            raise TrajectoryError(f"{told}, {first}. Leave the episodes with broken sensors out.")
     return cast
 
 
