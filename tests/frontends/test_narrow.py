@@ -96,7 +96,7 @@ def test_what_a_specification_leaves_out_is_checked_too(payload: Build, save: Sa
     module, spec = load_checkpoint_policy(save(payload(causal_attn=False)))
     with pytest.raises(SpecError, match=r"is 4, but these steps depend on the 2 after them"):
         ttscompile.compile_denoiser(module, replace(spec, sample=(KEPT, spec.sample[1]), left_out=HORIZON - KEPT))
-    with pytest.raises(SpecError, match=r"prediction_horizon is 0"):
+    with pytest.raises(SpecError, match="prediction_horizon must be an integer of at least 1; found 0"):
         ttscompile.compile_denoiser(module, spec, prediction_horizon=0)
 
 

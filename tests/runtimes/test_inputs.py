@@ -269,11 +269,8 @@ FLOATS = st.floats(width=32, allow_nan=False, allow_infinity=False)
 SIZES = st.sampled_from([1.0, 1e3, 1e6, 1e12, 1e19, 1e30, 3.4e38])
 
 
-@settings(max_examples=150, deadline=None)
-@given(data=st.data())
-def test_no_finite_number_gives_a_warning_or_actions_that_are_none(
-    both: list[CompiledPolicy], data: st.DataObject
-) -> None:
+def refused_or_finite(both: list[CompiledPolicy], data: st.DataObject) -> None:
+    """Finite numbers give finite actions without a warning in both runtimes, or are refused, if they are too large."""
     rng = np.random.default_rng(data.draw(st.integers(0, 2**32)))
 
     def some(*shape: int) -> np.ndarray:
@@ -298,6 +295,21 @@ def test_no_finite_number_gives_a_warning_or_actions_that_are_none(
     assert len(made) in ((2,) if seen else (0, 2))
     for found in made:
         assert np.isfinite(found).all()
+
+
+@settings(max_examples=150, deadline=None)
+@given(data=st.data())
+def test_no_finite_number_gives_a_warning_or_actions_that_are_none(
+    both: list[CompiledPolicy], data: st.DataObject
+) -> None:
+    refused_or_finite(both, data)
+
+
+@pytest.mark.soak
+@settings(max_examples=10_000, deadline=None)
+@given(data=st.data())
+def test_ten_thousand_of_them(both: list[CompiledPolicy], data: st.DataObject) -> None:
+    refused_or_finite(both, data)
 
 
 @pytest.mark.parametrize("runtime", RUNTIMES)
