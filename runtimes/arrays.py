@@ -13,7 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ttscompile.core.given import integer, is_tensor, plain
-from ttscompile.core.spec import LARGEST, Affine, FloatArray, Noise, ObservationSpec, PolicySpec
+from ttscompile.core.spec import FloatArray, Noise, ObservationSpec, PolicySpec
+from ttscompile.core.values import check_numbers, check_values
 from ttscompile.errors import ObservationError, TtscompileError
 
 Array: TypeAlias = npt.NDArray[Any]
@@ -85,7 +86,7 @@ def check_observation(arrays: Mapping[str, Array], specs: Mapping[str, Observati
     for key, spec in specs.items():
         _check_kind(key, arrays[key], spec)
         own[key] = arrays[key].copy()
-        check_values(key, own[key], spec)
+        check_values(own[key], spec, f"observation {key!r}", ObservationError)
     counts = {key: len(array) for key, array in own.items()}
     if len(set(counts.values())) > 1:
         differ = f"observations hold different numbers of streams: {counts}"
@@ -108,38 +109,6 @@ def _check_kind(key: str, array: Array, spec: ObservationSpec) -> None:
     raise ObservationError(f"observation {key!r} has the wrong dtype: expected {expected}; found {found}.{remedy}")
 
 
-def check_values(key: str, array: Array, spec: ObservationSpec) -> None:
-    """Raise unless the numbers of an observation are such that a policy can have been trained with.
-
-    They are finite, and normalised not above ``LARGEST``; tokens and images are within their bounds. Images may
-    overshoot by a tenth of the range, as resizing with a cubic filter does at edges. One of 0..255 in place of 0..1
-    would give actions that look like actions.
-
-    Raises:
-        ObservationError: says how many are not, and where the first is.
-    """
-    tokens = spec.bounds is not None and array.dtype.kind in "iu"
-    if array.dtype.kind == "f" or spec.normalizer is not None:
-        remedy = "Look for the sensor, the unit or the division that made it."
-        least, most = check_numbers(array, spec.normalizer, f"observation {key!r}", remedy)
-    if spec.bounds is None or not (spec.image or tokens):
-        return
-    low, high = (np.asarray(each) for each in spec.bounds)
-    if tokens:
-        if (array < low).any() or (array > high).any():
-            found = f"integers of {low.min():.0f} to {high.max():.0f}; found {array.min()} to {array.max()}"
-            remedy = "Tokens must come from the tokenizer that the policy was trained with."
-            raise ObservationError(f"observation {key!r} must hold {found}. {remedy}")
-        return
-    room = 0.1 * float(high[0] - low[0])
-    if least < low[0] - room or most > high[0] + room:
-        remedy = "Give what the camera measures, not normalised: the policy does that itself."
-        if most > high[0] + room and least >= 0 and high[0] == 1:
-            remedy = "Divide by 255, channels first."
-        found = f"numbers of {low[0]:g} to {high[0]:g}; found {least:.6g} to {most:.6g}"
-        raise ObservationError(f"observation {key!r} is an image and must hold {found}. {remedy}")
-
-
 def _image_remedy(array: Array, spec: ObservationSpec) -> str:
     """What to do with an image of bytes, or with its channels last; nothing for other arrays."""
     remedy = ""
@@ -148,35 +117,6 @@ def _image_remedy(array: Array, spec: ObservationSpec) -> str:
     if spec.image and array.shape[-3:] == (*spec.shape[-2:], spec.shape[-3]) != spec.shape[-3:]:
         remedy += " Its channels are last: use np.moveaxis(image, -1, -3)."
     return remedy
-
-
-def check_numbers(array: Array, normalizer: Affine | None, what: str, remedy: str) -> tuple[float, float]:
-    """Raise unless numbers are finite, and normalised not above ``LARGEST``, either way.
-
-    Returns:
-        The least and the largest of them, as they are; zeros if there are none.
-
-    Raises:
-        ObservationError: says how many are not, and where the first is.
-    """
-    if not array.size:
-        return 0.0, 0.0
-    least, most = float(array.min()), float(array.max())
-    reach = LARGEST if normalizer is None else normalizer.reach
-    if -reach <= least and most <= reach:  # not so if any is NaN
-        return least, most
-    wrong, expected, normalised = ~np.isfinite(array), "finite", ""
-    if not wrong.any():
-        with np.errstate(all="ignore"):
-            values = array if normalizer is None else normalizer.normalize(array)
-        wrong, expected = ~(np.abs(values) <= LARGEST), f"between -{LARGEST:g} and {LARGEST:g}"
-        if not wrong.any():
-            return least, most
-        if normalizer is not None:
-            expected, normalised = f"{expected} when normalised", f" ({values[wrong][0]:.6g} when normalised)"
-    first = tuple(np.argwhere(wrong)[0].tolist())
-    found = f"{array[first]:.6g} at index {first}{normalised}, {np.count_nonzero(wrong)} such values in all"
-    raise ObservationError(f"{what} must be {expected}; found {found}. {remedy}")
 
 
 def check_noise(noise: Noise, streams: int, spec: PolicySpec) -> Noise:
@@ -212,5 +152,5 @@ def _noise(value: Any, what: str, axes: str, shape: tuple[int, ...], left_out: i
         expected = f"float32 {axes} = {list(shape)}; found {array.dtype} {list(array.shape)}"
         raise ObservationError(f"{what} must be {expected}. Use rng.standard_normal(shape, dtype=np.float32).")
     own: FloatArray = array.copy()
-    check_numbers(own, None, what, "Draw it again.")
+    check_numbers(own, None, what, "Draw it again.", ObservationError)
     return own

@@ -21,9 +21,8 @@ import numpy.typing as npt
 from ttscompile.core.correction import groups_of
 from ttscompile.core.given import plain
 from ttscompile.core.spec import ChunkSpec, FloatArray, PolicySpec, SamplerTable
+from ttscompile.core.values import check_numbers
 from ttscompile.errors import ObservationError
-
-from .arrays import check_numbers
 
 TOLERANCE = 1e-3
 """Of the levels of a path that is one: tables are float32, and schedules round."""
@@ -133,7 +132,8 @@ def check_prefix(prefix: Any, streams: int, spec: PolicySpec, refusal: str | Non
     if shape[1] and refusal is not None:
         raise ObservationError(f"the policy takes no prefix: {refusal} Call it without one.")
     own: FloatArray = array.copy()
-    check_numbers(own, spec.chunk.normalizer, "prefix", "Only actions that can be executed can be committed.")
+    remedy = "Only actions that can be executed can be committed."
+    check_numbers(own, spec.chunk.normalizer, "prefix", remedy, ObservationError)
     return own
 
 

@@ -16,8 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ttscompile.core.spec import ObservationSpec
+from ttscompile.core.values import check_values
 from ttscompile.errors import ObservationError
-from ttscompile.runtimes.arrays import check_values, read_observation
+from ttscompile.runtimes.arrays import read_observation
 
 Array: TypeAlias = npt.NDArray[Any]
 Frame: TypeAlias = dict[str, Array]
@@ -67,7 +68,7 @@ class FrameSpec:
             what = f"one frame of observation {key!r} must be {spec.dtype} {list(spec.shape)}"
             raise ObservationError(f"{what}; found {array.dtype!s:.80} {list(array.shape)}. {remedy}".rstrip())
         own = array.copy()  # and then looked at: another thread may write into the caller's
-        check_values(key, own, spec)
+        check_values(own, spec, f"observation {key!r}", ObservationError)
         return own
 
     def observation(self, frames: list[Frame]) -> dict[str, Array]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import random
+from typing import Any
 
 import numpy as np
 import pytest
 
 from ttscompile import Affine, ObservationSpec
+from ttscompile.core.values import check_values
 from ttscompile.errors import ObservationError, StaleObservationError
-from ttscompile.runtimes.arrays import check_values
 from ttscompile.runtimes.executor import ExecutorSettings
 from ttscompile.runtimes.executor.window import FrameSpec
 
@@ -114,9 +115,9 @@ def test_a_frame_is_held_against_what_the_policy_takes_before_it_is_kept() -> No
 def test_a_frame_is_copied_before_it_is_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
     given = np.array([1.0, 2.0], np.float32)
 
-    def spoiled(key: str, array: np.ndarray, spec: ObservationSpec) -> None:
+    def spoiled(array: np.ndarray, *others: Any) -> None:
         given[:] = np.nan
-        check_values(key, array, spec)
+        check_values(array, *others)
 
     monkeypatch.setattr("ttscompile.runtimes.executor.window.check_values", spoiled)
     assert FrameSpec.of({"obs": ObservationSpec((2,))}, 1).check({"obs": given})["obs"].tolist() == [1, 2]

@@ -19,8 +19,8 @@ from ttscompile import Affine, ChunkSpec, Noise, ObservationSpec, Source
 from ttscompile.artifact import Artifact
 from ttscompile.core.lattice import check_plan, legalize, uniform_plan
 from ttscompile.core.spec import LARGEST
+from ttscompile.core.values import check_numbers, check_values
 from ttscompile.errors import IllegalPlanError, NonFiniteActionsError, ObservationError, TtscompileError
-from ttscompile.runtimes.arrays import check_numbers, check_values
 from ttscompile.runtimes.inpainting import check_prefix
 from ttscompile.runtimes.policy import CompiledPolicy, load
 
@@ -205,15 +205,16 @@ def test_what_is_written_after_the_check_changes_nothing(
                 :
             ] = 99
 
-    def checked(array: Any, normalizer: Any, what: str, remedy: str) -> Any:
+    def checked(array: Any, normalizer: Any, what: str, *others: Any) -> Any:
         spoil(what)
-        return check_numbers(array, normalizer, what, remedy)
+        return check_numbers(array, normalizer, what, *others)
 
     def plan_checked(*arguments: Any) -> Any:
         made = check_plan(*arguments)
         spoil("plan")
         return made
 
+    monkeypatch.setattr("ttscompile.core.values.check_numbers", checked)
     monkeypatch.setattr("ttscompile.runtimes.arrays.check_numbers", checked)
     monkeypatch.setattr("ttscompile.runtimes.runtime.check_plan", plan_checked)
     np.testing.assert_array_equal(actions(policy, obs, noise, plan), expected)
@@ -255,9 +256,9 @@ def test_the_limit_is_the_limit_in_every_entry(policy: CompiledPolicy) -> None:
                 actions(policy, obs)
     normalizer = Affine(np.array([1e8, 1.0]), np.array([-5e8, 0.0]))  # the first was constant in training
     assert normalizer.reach < 0
-    check_values("x", np.array([[5.0, 3.0]], np.float32), ObservationSpec((2,), normalizer))
+    check_values(np.array([[5.0, 3.0]], np.float32), ObservationSpec((2,), normalizer), "x", ObservationError)
     with pytest.raises(ObservationError, match=r"found 5\.1 at index \(0, 0\)"):
-        check_values("x", np.array([[5.1, 3.0]], np.float32), ObservationSpec((2,), normalizer))
+        check_values(np.array([[5.1, 3.0]], np.float32), ObservationSpec((2,), normalizer), "x", ObservationError)
 
 
 @pytest.fixture(scope="module")

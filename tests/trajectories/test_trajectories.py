@@ -206,13 +206,16 @@ def test_numbers_that_a_call_would_refuse_are_refused_in_a_recording(file: Path)
     content = arrays()
     content["obs"][3, 1, 2] = -1e30
     with pytest.raises(
-        TrajectoryError, match=r"'obs' holds numbers beyond 1e\+06 when normalised in 1 rows, .* row 3\."
+        TrajectoryError, match=r"npz: 'obs' must be between .* 1e\+06; found -1e\+30 at index \(3, 1, 2\)"
     ):
         load(saved(file, **content))
     content["obs"][3, 1, 2] = 2e6
     normalizer = Affine(np.array([1.0, 1.0, 0.4]), np.zeros(3))
     specs = SPECS | {"obs": ObservationSpec((2, 3), normalizer)}
     assert load(saved(file, **content), specs)[1].observations["obs"][1, 1, 2] == 2e6
+    specs |= {"goal": ObservationSpec((4,), dtype="int64", bounds=(0.0, 9.0))}
+    with pytest.raises(TrajectoryError, match="npz: 'goal' must hold integers of 0 to 9; found 0 to 19"):
+        load(saved(file, **content), specs)
 
 
 def test_integers_that_would_wrap_are_refused(tmp_path: Path) -> None:

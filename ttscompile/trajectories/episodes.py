@@ -20,8 +20,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.given import integer
-from ..core.spec import LARGEST, ObservationSpec
+from ..core.spec import ObservationSpec
 from ..core.untrusted_json import parse_json
+from ..core.values import check_values
 from ..errors import TrajectoryError
 from .apart import frames_apart
 from .frames import Frames, few, observation_frames, one_error, require_proportion
@@ -231,16 +232,8 @@ def _checked(path: Path, key: str, array: Array, spec: ObservationSpec, frames: 
         bad = np.flatnonzero(~np.isfinite(cast.reshape(len(cast), -1)).all(1))
         told = f"{path}: {key!r} holds NaN or infinity in {len(bad)} rows, the first of them row {bad[0]}"
         raise TrajectoryError(f"{told}. Leave the episodes with broken sensors out.")
-    reach = LARGEST if spec.normalizer is None else spec.normalizer.reach
-    if wanted.kind == "f" and cast.size and max(-float(cast.min()), float(cast.max())) > reach:
-        with np.errstate(over="ignore"):
-            beyond = ~(np.abs(spec.normalized(cast)).reshape(len(cast), -1) <= LARGEST).all(1)
-        if beyond.any():
-            told = (
-                f"{path}: {key!r} holds numbers beyond {LARGEST:g} when normalised in {np.count_nonzero(beyond)} rows"
-            )
-            first = f"the first of them row {np.flatnonzero(beyond)[0]}"
-            raise TrajectoryError(f"{told}, {first}. Leave the episodes with broken sensors out.")
+    if cast.size:
+        check_values(cast, spec, f"{path}: {key!r}", TrajectoryError)
     return cast
 
 
