@@ -147,7 +147,7 @@ def test_the_command_refuses_in_one_message(payload: Build, save: Save, tmp_path
 
 def test_steps_left_out_are_a_number(payload: Build, save: Save) -> None:
     _, spec = load_checkpoint_policy(save(payload()))
-    with pytest.raises(SpecError, match="left_out is -1"):
+    with pytest.raises(SpecError, match="left_out must be an integer of at least 0; found -1"):
         replace(spec, left_out=-1)
 
 
