@@ -1,4 +1,7 @@
-"""What callers give: numpy arrays or torch tensors, checked against the policy's specification. Imports no torch."""
+"""What callers give, checked against the policy's specification. Imports no torch.
+
+Everything comes through ``core.given.plain`` first, so that what is checked here is what is computed with.
+"""
 
 from __future__ import annotations
 
@@ -9,50 +12,23 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from ttscompile.core.given import integer, is_tensor, plain
 from ttscompile.core.spec import FloatArray, Noise, ObservationSpec, PolicySpec
+from ttscompile.core.values import check_numbers, check_values
 from ttscompile.errors import ObservationError, TtscompileError
 
 Array: TypeAlias = npt.NDArray[Any]
 
-
-def is_tensor(value: object) -> bool:
-    """Whether this is a torch tensor; if torch was never imported, nothing is."""
-    torch = sys.modules.get("torch")
-    return torch is not None and isinstance(value, torch.Tensor)
+_MISSING = object()
 
 
 def check_seed(seed: int | None) -> int | None:
-    """The seed, or None for none.
+    """The seed as Python's integer, or None for none.
 
     Raises:
         TtscompileError: not a whole number of at least 0.
     """
-    if seed is None or (isinstance(seed, int | np.integer) and not isinstance(seed, bool) and seed >= 0):
-        return seed
-    raise TtscompileError(f"seed: expected an integer of at least 0, or None for another sequence; found {seed!r}.")
-
-
-def as_array(value: Any, what: str) -> Array:
-    """The numpy array of an array or tensor; no copy if it can be helped.
-
-    Args:
-        value: what the caller gave.
-        what: for the message, ``observation 'obs'``.
-
-    Raises:
-        ObservationError: neither an array nor a tensor, or a tensor of a dtype that numpy lacks.
-    """
-    if is_tensor(value):
-        try:
-            array: Array = value.detach().cpu().numpy()
-        except TypeError as error:
-            problem = f"{what} is a tensor of dtype {value.dtype}, which numpy does not have"
-            raise ObservationError(f"{problem}. Convert it with .float().") from error
-        return array
-    if isinstance(value, np.ndarray):
-        return value
-    expected = "expected a numpy array or a torch tensor. Use np.asarray(..., dtype=np.float32)."
-    raise ObservationError(f"{what} is a {type(value).__name__}; {expected}")
+    return None if seed is None else integer(seed, "seed", TtscompileError, more=", or None for another sequence")
 
 
 def like(array: Array, example: Any) -> Any:
@@ -62,66 +38,75 @@ def like(array: Array, example: Any) -> Any:
     return sys.modules["torch"].from_numpy(array).to(example.device)
 
 
-def check_observation(obs: Mapping[str, Any], specs: Mapping[str, ObservationSpec]) -> dict[str, Array]:
-    """Observations as numpy arrays ``[B, ...]`` of their specified shapes and dtypes, finite, with one B.
+def read_observation(
+    obs: Mapping[str, Any], specs: Mapping[str, ObservationSpec], others: bool = False
+) -> tuple[dict[str, Array], Any]:
+    """The arrays of an observation by key, each taken from the mapping once: it may give something else the next time.
+
+    Args:
+        obs: the caller's.
+        specs: by key, of the policy.
+        others: leave keys alone that are not the policy's, rather than refuse them.
+
+    Returns:
+        The arrays, not checked; and the first of them that came as a tensor, as it came, or None.
 
     Raises:
-        ObservationError: names the key, what was expected, what was found and the remedy.
+        ObservationError: no mapping, another set of keys, or what ``plain`` refuses.
     """
     if not isinstance(obs, Mapping):
         expected = f"a dictionary with the keys {sorted(specs)}"
         raise ObservationError(f"the observation is a {type(obs).__name__}; expected {expected}.")
-    missing, unexpected = sorted(set(specs) - set(obs)), sorted(map(str, set(obs) - set(specs)))
-    if missing or unexpected:
+    given = {key: value for key in specs if (value := obs.get(key, _MISSING)) is not _MISSING}
+    if len(given) < len(specs) or (not others and len(obs) != len(specs)):
+        missing, unexpected = sorted(specs.keys() - given.keys()), sorted(map(str, obs.keys() - specs.keys()))
         found = f"{sorted(map(str, obs))} (missing: {missing}, unexpected: {unexpected})"
         remedy = "Give exactly the keys that the policy was compiled for."
         raise ObservationError(f"expected the observation keys {sorted(specs)}; found {found}. {remedy}")
-    arrays = {key: _one(key, as_array(obs[key], f"observation {key!r}"), spec) for key, spec in specs.items()}
-    counts = {key: len(array) for key, array in arrays.items()}
+    example = next((value for value in given.values() if is_tensor(value)), None)
+    arrays = {
+        key: plain(value, f"observation {key!r}", ObservationError, specs[key].dtype) for key, value in given.items()
+    }
+    return arrays, example
+
+
+def check_observation(arrays: Mapping[str, Array], specs: Mapping[str, ObservationSpec]) -> dict[str, Array]:
+    """Copies of arrays ``[B, ...]`` of their specified shapes and dtypes, with numbers that can be, and one B.
+
+    They are copied before their numbers are looked at: another thread may write into the caller's.
+
+    Args:
+        arrays: from ``read_observation``.
+        specs: by key, of the policy.
+
+    Raises:
+        ObservationError: names the key, what was expected, what was found and the remedy.
+    """
+    own = {}
+    for key, spec in specs.items():
+        _check_kind(key, arrays[key], spec)
+        own[key] = arrays[key].copy()
+        check_values(own[key], spec, f"observation {key!r}", ObservationError)
+    counts = {key: len(array) for key, array in own.items()}
     if len(set(counts.values())) > 1:
         differ = f"observations hold different numbers of streams: {counts}"
         raise ObservationError(f"{differ}. The first axis of all must be the same.")
-    return arrays
+    return own
 
 
-def _one(key: str, array: Array, spec: ObservationSpec) -> Array:
+def _check_kind(key: str, array: Array, spec: ObservationSpec) -> None:
+    """Raise unless an array has the shape and the dtype of its specification."""
+    if array.shape[1:] == spec.shape and len(array) > 0 and array.dtype == spec.dtype:
+        return
     expected = f"{spec.dtype} [B, {', '.join(map(str, spec.shape))}]"
-    found = f"{array.dtype} {list(array.shape)}"
-    if array.shape[1:] != spec.shape or array.ndim != len(spec.shape) + 1 or len(array) < 1:
+    found = f"{array.dtype!s:.80} {list(array.shape)}"
+    if array.shape[1:] != spec.shape or len(array) < 1:
         single = " A single stream needs a first axis of 1: use obs[None]."
         remedy = single if array.shape == spec.shape else _image_remedy(array, spec)
         raise ObservationError(f"observation {key!r} has the wrong shape: expected {expected}; found {found}.{remedy}")
-    if str(array.dtype) != spec.dtype:
-        remedy = f" Convert it with .astype(np.{spec.dtype}), after making sure that its units are those of training."
-        remedy = _image_remedy(array, spec) or remedy
-        raise ObservationError(f"observation {key!r} has the wrong dtype: expected {expected}; found {found}.{remedy}")
-    check_finite(array, f"observation {key!r}", "Look for the sensor, or the division, that made it.")
-    _check_bounds(key, array, spec)
-    return array
-
-
-def _check_bounds(key: str, array: Array, spec: ObservationSpec) -> None:
-    """Raise unless the numbers of tokens and images are within their bounds.
-
-    Images may overshoot by a tenth of the range, as resizing with a cubic filter does at edges. One of 0..255 in place
-    of 0..1 would give actions that look like actions.
-    """
-    if spec.bounds is None or not (spec.image or array.dtype.kind in "iu"):
-        return
-    low, high = (np.asarray(each) for each in spec.bounds)
-    if not spec.image:
-        if (array < low).any() or (array > high).any():
-            found = f"integers of {low.min():.0f} to {high.max():.0f}; found {array.min()} to {array.max()}"
-            remedy = "Tokens must come from the tokenizer that the policy was trained with."
-            raise ObservationError(f"observation {key!r} must hold {found}. {remedy}")
-        return
-    least, most, room = float(array.min()), float(array.max()), 0.1 * float(high[0] - low[0])
-    if least < low[0] - room or most > high[0] + room:
-        remedy = "Give what the camera measures, not normalised: the policy does that itself."
-        if most > high[0] + room and least >= 0 and high[0] == 1:
-            remedy = "Divide by 255, channels first."
-        found = f"numbers of {low[0]:g} to {high[0]:g}; found {least:.6g} to {most:.6g}"
-        raise ObservationError(f"observation {key!r} is an image and must hold {found}. {remedy}")
+    remedy = f" Convert it with .astype(np.{spec.dtype}), after making sure that its units are those of training."
+    remedy = _image_remedy(array, spec) or remedy
+    raise ObservationError(f"observation {key!r} has the wrong dtype: expected {expected}; found {found}.{remedy}")
 
 
 def _image_remedy(array: Array, spec: ObservationSpec) -> str:
@@ -134,22 +119,8 @@ def _image_remedy(array: Array, spec: ObservationSpec) -> str:
     return remedy
 
 
-def check_finite(array: Array, what: str, remedy: str) -> None:
-    """Raise if an array of floats holds NaN or infinity.
-
-    Raises:
-        ObservationError: says how many and where the first is.
-    """
-    if array.dtype.kind != "f" or np.isfinite(array).all():
-        return
-    bad = np.argwhere(~np.isfinite(array))
-    first = tuple(bad[0].tolist())
-    found = f"{array[first]} at index {first}, {len(bad)} such values in all"
-    raise ObservationError(f"{what} must be finite; found {found}. {remedy}")
-
-
 def check_noise(noise: Noise, streams: int, spec: PolicySpec) -> Noise:
-    """The noise of a call as float32 arrays that fit it.
+    """The noise of a call as float32 arrays that fit it, copies of the caller's.
 
     Args:
         noise: the caller's; where the policy predicts fewer steps than the original, with as many as either. If the
@@ -174,11 +145,12 @@ def check_noise(noise: Noise, streams: int, spec: PolicySpec) -> Noise:
 
 
 def _noise(value: Any, what: str, axes: str, shape: tuple[int, ...], left_out: int) -> FloatArray:
-    array = as_array(value, what)
+    array = plain(value, what, ObservationError)
     if left_out and array.shape == (*shape[:-2], shape[-2] + left_out, shape[-1]):
         array = array[..., : shape[-2], :]
     if array.shape != shape or array.dtype != np.float32:
         expected = f"float32 {axes} = {list(shape)}; found {array.dtype} {list(array.shape)}"
         raise ObservationError(f"{what} must be {expected}. Use rng.standard_normal(shape, dtype=np.float32).")
-    check_finite(array, what, "Draw it again.")
-    return array
+    own: FloatArray = array.copy()
+    check_numbers(own, None, what, "Draw it again.", ObservationError)
+    return own

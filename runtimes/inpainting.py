@@ -19,10 +19,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ttscompile.core.correction import groups_of
+from ttscompile.core.given import plain
 from ttscompile.core.spec import ChunkSpec, FloatArray, PolicySpec, SamplerTable
+from ttscompile.core.values import check_numbers
 from ttscompile.errors import ObservationError
-
-from .arrays import as_array, check_finite
 
 TOLERANCE = 1e-3
 """Of the levels of a path that is one: tables are float32, and schedules round."""
@@ -108,7 +108,7 @@ def prefix_refusal(spec: PolicySpec) -> str | None:
 
 
 def check_prefix(prefix: Any, streams: int, spec: PolicySpec, refusal: str | None) -> FloatArray:
-    """A prefix as a float32 array ``[B, N, Da]`` that fits the policy.
+    """A prefix as a float32 array ``[B, N, Da]`` that fits the policy, a copy of the caller's.
 
     Args:
         prefix: the caller's.
@@ -117,9 +117,9 @@ def check_prefix(prefix: Any, streams: int, spec: PolicySpec, refusal: str | Non
         refusal: see ``prefix_refusal``.
 
     Raises:
-        ObservationError: of another kind, dtype or shape, too long or not finite; or the policy takes none.
+        ObservationError: of another kind, dtype or shape, too long, not finite or too large; or the policy takes none.
     """
-    array = as_array(prefix, "prefix")
+    array = plain(prefix, "prefix", ObservationError)
     room = spec.sample[0] - spec.chunk.start
     shape = (streams, array.shape[1] if array.ndim == 3 else 0, spec.chunk.action_dim)
     if array.shape != shape or array.dtype != np.float32:
@@ -131,8 +131,10 @@ def check_prefix(prefix: Any, streams: int, spec: PolicySpec, refusal: str | Non
         raise ObservationError(f"prefix holds {shape[1]} actions; the chunk has {rest}. Give at most {room}.")
     if shape[1] and refusal is not None:
         raise ObservationError(f"the policy takes no prefix: {refusal} Call it without one.")
-    check_finite(array, "prefix", "Only actions that can be executed can be committed.")
-    return array
+    own: FloatArray = array.copy()
+    remedy = "Only actions that can be executed can be committed."
+    check_numbers(own, spec.chunk.normalizer, "prefix", remedy, ObservationError)
+    return own
 
 
 def known_samples(spec: PolicySpec, prefix: FloatArray, initial: FloatArray) -> Known | None:

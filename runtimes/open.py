@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ttscompile.artifact.load import Artifact
+from ttscompile.core.given import integer
 from ttscompile.errors import RuntimeUnavailableError
 
 from .backend import Backend, fitting
@@ -72,9 +73,7 @@ def open_runtime(artifact: Artifact, runtime: str = "onnxruntime", threads: int 
         RuntimeUnavailableError: no runtime of this name, its packages are missing, or the threads cannot be had.
         ArtifactError: the parts of the artifact do not fit each other.
     """
-    if not isinstance(threads, int) or isinstance(threads, bool) or not 1 <= threads <= MOST_THREADS:
-        expected = f"an integer of at least 1 and at most {MOST_THREADS}"
-        raise RuntimeUnavailableError(f"threads must be {expected}; found {threads!r}.")
+    threads = integer(threads, "threads", RuntimeUnavailableError, 1, MOST_THREADS)
     kind = kind_of(runtime)
     try:
         with fitting(artifact):

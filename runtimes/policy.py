@@ -15,9 +15,9 @@ import numpy.typing as npt
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import DENSE
 from ttscompile.core.spec import FP32, ChunkSpec, FloatArray, Noise, ObservationSpec
-from ttscompile.errors import IllegalPlanError, RuntimeUnavailableError, TtscompileError
+from ttscompile.errors import IllegalPlanError, NonFiniteActionsError, RuntimeUnavailableError, TtscompileError
 
-from .arrays import check_observation, check_seed, is_tensor, like
+from .arrays import Array, check_observation, check_seed, like, read_observation
 from .inpainting import check_prefix, prefix_refusal
 from .liveness import RolloutNeeds, rollout_needs
 from .open import kind_of, open_runtime
@@ -103,7 +103,7 @@ def load(
         RuntimeUnavailableError: the runtime cannot be had on this machine.
         TtscompileError: the seed is no whole number of at least 0.
     """
-    check_seed(seed)
+    seed = check_seed(seed)
     artifact = load_artifact(path)
     if kind_of(runtime).fp32_only:
         if precision not in (None, FP32):
@@ -128,9 +128,6 @@ class CompiledPolicy:
         seed: of the noise that is drawn when none is given.
         plan: see ``load``.
 
-    Attributes:
-        last_report: what the last call did; None before the first.
-
     Raises:
         IllegalPlanError: the artifact has no plan of this name.
     """
@@ -142,9 +139,14 @@ class CompiledPolicy:
         _require_plan(artifact, self._default)
         self._prefix_refusal = prefix_refusal(artifact.manifest.spec)
         self._rng = np.random.default_rng(check_seed(seed))
-        self.last_report: CallReport | None = None
+        self._report: CallReport | None = None
         self._queues = Queues(artifact.manifest.spec.observations)
         self._lock = threading.Lock()
+
+    @property
+    def last_report(self) -> CallReport | None:
+        """What the last call did; None before the first, and after one that was refused."""
+        return self._report
 
     @property
     def info(self) -> PolicyInfo:
@@ -180,7 +182,7 @@ class CompiledPolicy:
         Raises:
             TtscompileError: the seed is no whole number of at least 0; nothing was done.
         """
-        check_seed(seed)
+        seed = check_seed(seed)
         with self._alone():
             self._runtime.reset()
             self._queues.reset()
@@ -211,13 +213,16 @@ class CompiledPolicy:
             ``action [B, Ta, Da]``, what to execute, and ``action_pred [B, T, Da]``, of the kind that came in.
 
         Raises:
-            ObservationError: an observation, noise or prefix that does not fit, or a prefix where
-                ``info.prefix_refusal`` says that there can be none; nothing was executed.
+            ObservationError: an observation, noise or prefix that does not fit, is not finite, or is larger than any
+                that a policy can have seen (``core.spec.LARGEST``); or a prefix where ``info.prefix_refusal`` says that
+                there can be none. Nothing was executed.
             IllegalPlanError: a plan that is unknown, malformed or illegal; nothing was executed.
+            NonFiniteActionsError: the arithmetic overflowed, and the episode has ended.
         """
         with self._alone():
-            predicted = self._predict(obs_dict, noise, plan, prefix)
-            example, chunk = self._example(obs_dict), self._manifest.spec.chunk
+            spec = self._manifest.spec
+            obs, example = read_observation(obs_dict, spec.observations)
+            predicted, chunk = self._predict(obs, noise, plan, prefix), spec.chunk
             executed = predicted[:, chunk.start : chunk.stop]
             return {"action": like(executed.copy(), example), "action_pred": like(predicted.copy(), example)}
 
@@ -238,13 +243,15 @@ class CompiledPolicy:
         Raises:
             ObservationError: a frame or noise that does not fit; nothing was executed, and the frame was not kept.
             IllegalPlanError: as ``predict_action``.
+            NonFiniteActionsError: as ``predict_action``.
         """
         with self._alone():
-            frames = self._queues.after(batch)
+            obs, example = read_observation(batch, self._manifest.spec.observations, others=True)
+            frames = self._queues.after(obs)
             if self._queues.empty:
                 self._queues.extend(self._chunk(self._queues.observation(frames), noise, plan))
             self._queues.keep(frames)
-            return like(self._queues.pop().copy(), self._example(batch))
+            return like(self._queues.pop().copy(), example)
 
     def predict_action_chunk(
         self, batch: Mapping[str, Any], noise: Noise | None = None, plan: str | npt.ArrayLike | None = None
@@ -261,29 +268,31 @@ class CompiledPolicy:
         Raises:
             ObservationError: a window, a frame or noise that does not fit; nothing was executed or kept.
             IllegalPlanError: as ``predict_action``.
+            NonFiniteActionsError: as ``predict_action``.
         """
         with self._alone():
             specs = self._manifest.spec.observations
-            if isinstance(batch, Mapping) and is_window(batch, specs):
-                chunk = self._chunk({key: value for key, value in batch.items() if key in specs}, noise, plan)
+            obs, example = read_observation(batch, specs, others=True)
+            if is_window(obs, specs):
+                chunk = self._chunk(obs, noise, plan)
             else:
-                frames = self._queues.after(batch)
+                frames = self._queues.after(obs)
                 chunk = self._chunk(self._queues.observation(frames), noise, plan)
                 self._queues.keep(frames)
-            return like(chunk.copy(), self._example(batch))
+            return like(chunk.copy(), example)
 
-    def _chunk(self, obs: Mapping[str, Any], noise: Noise | None, plan: str | npt.ArrayLike | None) -> FloatArray:
+    def _chunk(self, obs: Mapping[str, Array], noise: Noise | None, plan: str | npt.ArrayLike | None) -> FloatArray:
         """What is executed of a call, ``[B, Ta, Da]``."""
         chunk = self._manifest.spec.chunk
         return self._predict(obs, noise, plan)[:, chunk.start : chunk.stop]
 
     def _predict(
-        self, obs_dict: Mapping[str, Any], noise: Noise | None, plan: str | npt.ArrayLike | None, prefix: Any = None
+        self, obs: Mapping[str, Array], noise: Noise | None, plan: str | npt.ArrayLike | None, prefix: Any = None
     ) -> FloatArray:
-        """One call; the actions ``[B, T, Da]``."""
-        self.last_report = None
+        """One call; the actions ``[B, T, Da]``, which are finite."""
+        self._report = None
         spec = self._manifest.spec
-        obs = check_observation(obs_dict, spec.observations)
+        obs = check_observation(obs, spec.observations)
         streams = len(next(iter(obs.values())))
         self._runtime.require_streams(streams)
         if prefix is not None:
@@ -292,11 +301,22 @@ class CompiledPolicy:
         matrix, name, repair = self._plan(plan)
         correction = None if name is None else self._artifact.corrections.get(name)
         noise = self._draw(streams) if noise is None else noise
-        normalized = {key: spec.observations[key].normalized(array) for key, array in obs.items()}
-        sample, self.last_report = self._runtime.predict(
-            normalized, noise, matrix, plan_name=name, repair=repair, correction=correction, prefix=prefix
-        )
-        return spec.chunk.unnormalized(sample)
+        with np.errstate(all="ignore"):  # onnxruntime and torch raise no flags either: a call is judged by its actions
+            normalized = {key: spec.observations[key].normalized(array) for key, array in obs.items()}
+            sample, report = self._runtime.predict(
+                normalized, noise, matrix, plan_name=name, repair=repair, correction=correction, prefix=prefix
+            )
+            actions = spec.chunk.unnormalized(sample)
+        if not np.isfinite(actions).all():
+            self._runtime.reset()  # what it kept may not be finite either
+            bad = f"{np.count_nonzero(~np.isfinite(actions))} of {actions.size}"
+            raise NonFiniteActionsError(
+                f"{bad} numbers of the actions are not finite: the arithmetic of plan {report.plan_name!r} overflowed."
+                " Look at the observation. If it is as in training, weights or plan are damaged: run 'ttscompile"
+                " verify', and try plan='dense'. The episode has ended, as by reset()."
+            )
+        self._report = report
+        return actions
 
     def _draw(self, streams: int) -> Noise:
         """Noise of all steps of the original's horizon: a seed means the same however many are predicted."""
@@ -308,25 +328,16 @@ class CompiledPolicy:
         steps = self._rng.standard_normal((spec.sampler.steps, *shape), dtype=np.float32)
         return Noise(initial, steps[:, :, :predicted])
 
-    def _plan(self, plan: str | npt.ArrayLike | None) -> tuple[npt.NDArray[Any] | None, str | None, bool]:
+    def _plan(self, plan: str | npt.ArrayLike | None) -> tuple[npt.ArrayLike | None, str | None, bool]:
         """Matrix (None: the pruner's), name (None: the caller's matrix), and whether illegal reads are repaired."""
         if plan is None:
             plan = self._default
         if not isinstance(plan, str):
-            given: Any = plan
-            try:
-                return np.asarray(given.numpy(force=True) if is_tensor(given) else given), None, False
-            except (TypeError, ValueError) as error:
-                expected = "int8 [K, blocks] or [B, K, blocks] of ttscompile.Source"
-                raise IllegalPlanError(f"the plan is no matrix of integers ({error}); expected {expected}.") from error
+            return plan, None, False
         if plan == DENSE:
             return self._artifact.schedule(DENSE), DENSE, False
         _require_plan(self._artifact, plan)
         return (None if self._manifest.plans[plan].pruned else self._artifact.schedule(plan)), plan, True
-
-    def _example(self, batch: Mapping[str, Any]) -> Any:
-        """A tensor among the observations of a batch, if there is one; what else it holds is not ours."""
-        return next((batch[key] for key in self._manifest.spec.observations if is_tensor(batch[key])), None)
 
     @contextmanager
     def _alone(self) -> Iterator[None]:

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -30,10 +28,7 @@ class Queues:
 
     def __init__(self, specs: Mapping[str, ObservationSpec]) -> None:
         self._specs = specs
-        self._frame_specs = {
-            key: spec if spec.frames is None else replace(spec, shape=spec.shape[1:], window=False)
-            for key, spec in specs.items()
-        }
+        self._frame_specs = {key: spec if spec.frames is None else spec.one_frame for key, spec in specs.items()}
         self._frames: Frames = {}
         self._actions: deque[FloatArray] = deque()
 
@@ -41,30 +36,29 @@ class Queues:
         """A new episode."""
         self._frames, self._actions = {}, deque()
 
-    def after(self, batch: Mapping[str, Any]) -> Frames:
+    def after(self, frame: Mapping[str, Array]) -> Frames:
         """The frames with one more of every stream; the first of an episode fills the window. Nothing is kept yet.
 
         A call that fails after this, and is made again, must not push its frame twice: ``keep`` what it used when it
         succeeded.
 
         Args:
-            batch: by key ``[B, ...]``, arrays or tensors: of a window's key one frame. Other keys are left alone.
+            frame: by key ``[B, ...]``, from ``read_observation``: of a window's key one frame.
 
         Raises:
-            ObservationError: a key is missing or does not fit.
+            ObservationError: an array does not fit.
         """
-        known = {k: batch[k] for k in self._frame_specs if k in batch} if isinstance(batch, Mapping) else batch
-        frame = check_observation(known, self._frame_specs)
-        streams = len(next(iter(frame.values())))
+        own = check_observation(frame, self._frame_specs)
+        streams = len(next(iter(own.values())))
         before = len(next(iter(self._frames.values()))[-1]) if self._frames else streams
         if streams != before:
             found = f"the frame holds {streams} streams, and the frames before {before}"
             raise ObservationError(f"{found}. The number of streams may change only after reset().")
         frames: Frames = {}
-        for key, value in frame.items():
-            length, own = self._specs[key].frames or 1, value.copy()  # the caller may not change it any more
-            frames[key] = deque(self._frames.get(key, [own] * length), maxlen=length)
-            frames[key].append(own)
+        for key, value in own.items():
+            length = self._specs[key].frames or 1
+            frames[key] = deque(self._frames.get(key, [value] * length), maxlen=length)
+            frames[key].append(value)
         return frames
 
     def keep(self, frames: Frames) -> None:
@@ -92,7 +86,6 @@ class Queues:
         return self._actions.popleft()
 
 
-def is_window(batch: Mapping[str, Any], specs: Mapping[str, ObservationSpec]) -> bool:
-    """Whether a batch holds whole windows ``[B, To, ...]`` rather than one frame ``[B, ...]`` of each."""
-    ranks = [(np.ndim(batch[key]), spec) for key, spec in specs.items() if spec.frames is not None and key in batch]
-    return all(rank == len(spec.shape) + 1 for rank, spec in ranks)
+def is_window(arrays: Mapping[str, Array], specs: Mapping[str, ObservationSpec]) -> bool:
+    """Whether these are whole windows ``[B, To, ...]`` rather than one frame ``[B, ...]`` of each."""
+    return all(arrays[key].ndim == len(spec.shape) + 1 for key, spec in specs.items() if spec.frames is not None)

@@ -65,7 +65,7 @@ class Runtime:
         for schedule in artifact.schedules.values():
             self._lowering.lower(schedule)
         self._helper = ThreadPoolExecutor(1, "ttscompile-pruner") if PRUNER in self._manifest.pieces else None
-        if self._helper is not None and any(plan.kind == PRUNER for plan in self._manifest.plans.values()):
+        if self._helper is not None and any(plan.pruned for plan in self._manifest.plans.values()):
             self._helper.submit(lambda: None).result()  # the thread is there before the first call
         self._matrices = False  # whether one was ever given
         self._written: BoolArray | None = None
@@ -171,7 +171,7 @@ class Runtime:
     def _prune_beside_first_step(self, written: BoolArray) -> tuple[_Settled, float]:
         """Step 0, and meanwhile the plan of the steps after it; ms that the loop stood still for it."""
         assert self._helper is not None
-        pruning: Future[_Settled] = self._helper.submit(_prune, self.backend, self._lowering, self._groups, written)
+        pruning: Future[_Settled] = self._helper.submit(_prune, self.backend, self._lowering, written)
         try:
             self.backend.first_step()
             ready = time.perf_counter()
@@ -186,7 +186,7 @@ class Runtime:
         """
         streams, steps, blocks = written.shape
         if repair:
-            plans, legalised = repair_plan(plan, self._groups, written)
+            plans, legalised = repair_plan(plan, written)
         else:
             plans, legalised = check_plan(plan, steps, blocks, streams), (0,) * streams
         rollout = plans == Source.ROLLOUT.value  # numpy takes five times as long to compare with the enum itself
@@ -203,12 +203,10 @@ class Runtime:
         return _Settled(plans, tuple(self._lowering.lower(one, check) for one in plans), legalised)
 
 
-def _prune(
-    backend: Backend[Any], lowering: LoweringCache[Any], groups: tuple[int, ...], written: BoolArray
-) -> _Settled:
+def _prune(backend: Backend[Any], lowering: LoweringCache[Any], written: BoolArray) -> _Settled:
     """The pruner's plan and its instructions. Not a method: the helper must not keep the runtime alive."""
     start = time.perf_counter()
-    plans, legalised = repair_plan(pruner_plan(backend.logits()), groups, written)
+    plans, legalised = repair_plan(pruner_plan(backend.logits()), written)
     lowered = tuple(lowering.lower(one) for one in plans)
     return _Settled(plans, lowered, legalised, _milliseconds(start, time.perf_counter()))
 

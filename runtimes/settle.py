@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Generic, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.core.lattice import BoolArray, PlanArray, check_plan, legalize
+from ttscompile.core.lattice import BoolArray, PlanArray, check_plan, without_illegal_reads
 from ttscompile.errors import IllegalPlanError
 
 Lowered = TypeVar("Lowered")
 
 
-def repair_plan(plan: npt.ArrayLike, groups: Sequence[int], written: BoolArray) -> tuple[PlanArray, tuple[int, ...]]:
+def repair_plan(plan: npt.ArrayLike, written: BoolArray) -> tuple[PlanArray, tuple[int, ...]]:
     """The plan of every stream without illegal reads.
 
     Args:
         plan: ``[K, blocks]`` or ``[B, K, blocks]``.
-        groups: FORWARD group of each block.
         written: bool ``[B, K, blocks]``; rollout entries that exist.
 
     Returns:
@@ -31,7 +30,7 @@ def repair_plan(plan: npt.ArrayLike, groups: Sequence[int], written: BoolArray) 
     """
     streams, steps, blocks = written.shape
     plans = check_plan(plan, steps, blocks, streams)
-    legal, _ = legalize(plans, groups, written)
+    legal = without_illegal_reads(plans, written)
     return legal, tuple(int(n) for n in np.count_nonzero(legal != plans, axis=(1, 2)))
 
 

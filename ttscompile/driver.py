@@ -17,8 +17,9 @@ from .artifact.load import load_artifact
 from .artifact.write import require_replaceable, write_artifact
 from .capture.export import capture
 from .capture.narrow import narrow, unneeded
+from .core.given import integer
 from .core.spec import FP32, PolicySpec
-from .errors import ArtifactError, PassError
+from .errors import ArtifactError, PassError, SpecError
 from .frontends import load_checkpoint_policy
 from .frontends.encoded import parts
 from .frontends.families import LoadOptions
@@ -148,6 +149,8 @@ def compile_denoiser(
     """
     if precision != FP32:
         require_precision(precision)
+    if prediction_horizon is not None:
+        prediction_horizon = integer(prediction_horizon, "prediction_horizon", SpecError, 1)
     if prediction_horizon is not None or spec.left_out:
         kept = spec.sample[0] if prediction_horizon is None else prediction_horizon
         spec, changed = narrow(module, spec.original, kept)

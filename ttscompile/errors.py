@@ -43,6 +43,10 @@ class ObservationError(TtscompileError):
     """An observation, noise, or a prefix of actions that does not fit the specification of the policy."""
 
 
+class NonFiniteActionsError(TtscompileError):
+    """A call of a policy whose arithmetic overflowed: its actions are not numbers that a robot can be given."""
+
+
 class IllegalPlanError(TtscompileError):
     """A plan that has the wrong shape or reads a residual which was never computed."""
 

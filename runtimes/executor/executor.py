@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ttscompile.core.spec import FloatArray
-from ttscompile.errors import ExecutorClosedError, ExecutorError, WorkerDeadError
+from ttscompile.errors import ExecutorClosedError, ExecutorError, NonFiniteActionsError, WorkerDeadError
 from ttscompile.runtimes.arrays import check_seed
 
 from .feasibility import Feasibility, LatencyWindow, fast_enough
@@ -176,7 +176,7 @@ class AsyncExecutor:
             ExecutorClosedError: after ``close``.
             TtscompileError: the seed is no whole number of at least 0; the episode goes on.
         """
-        check_seed(seed)
+        seed = check_seed(seed)
         with self._lock:
             state = self._checked()
             state.reset()
@@ -346,8 +346,11 @@ class AsyncExecutor:
         resolved = self._resolved
         obs = resolved.frames.observation(job.frames)
         prefix = {} if job.prefix is None else {"prefix": job.prefix[None]}
-        predicted = np.asarray(self._policy.predict_action(obs, plan=job.plan, **prefix)["action_pred"])
         last = resolved.first + resolved.horizon + resolved.reserve
+        try:
+            predicted = np.asarray(self._policy.predict_action(obs, plan=job.plan, **prefix)["action_pred"])
+        except NonFiniteActionsError:  # the guard refuses them, as it does those of a policy that gives them out
+            predicted = np.full((1, last, resolved.channels), np.nan, np.float32)
         streams, steps, channels = predicted.shape if predicted.ndim == 3 else (0, 0, 0)
         if streams != 1 or steps < last or channels != resolved.channels:
             expected = f"[1, T, Da] with T of at least {last} and Da = {resolved.channels}"

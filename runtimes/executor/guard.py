@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ttscompile.core.given import numbers
 from ttscompile.core.spec import Affine, FloatArray
 from ttscompile.errors import ExecutorError
 
@@ -36,7 +37,7 @@ class GuardLimits:
             raise ExecutorError(f"the guard's margin must not be negative; found {self.margin}.")
         for name in ("max_step", "max_jerk"):
             limit = getattr(self, name)
-            if limit is not None and not (np.asarray(limit) > 0).all():
+            if limit is not None and not (_numbers(limit, name) > 0).all():
                 raise ExecutorError(f"the guard's {name} must be positive; found {limit}.")
 
 
@@ -102,11 +103,16 @@ class Guard:
         return None
 
 
+def _numbers(limit: float | Sequence[float], name: str) -> FloatArray:
+    """A limit as an array of the shape that it was given in."""
+    return numbers(limit, f"the guard's {name}", ExecutorError)
+
+
 def _vector(limit: float | Sequence[float] | None, channels: int, name: str, default: FloatArray) -> FloatArray:
     """A limit as one number a channel."""
     if limit is None:
         return default
-    array = np.asarray(limit, dtype=np.float32)
+    array = _numbers(limit, name)
     if array.shape not in ((), (channels,)) or np.isnan(array).any():
         expected = f"a number, or one for each of {channels} channels"
         raise ExecutorError(f"the guard's {name} must be {expected}; found {limit}.")

@@ -88,7 +88,8 @@ def read_frame(obs: Mapping[str, Any], frames: FrameSpec) -> dict[str, Array]:
     Raises:
         ProtocolError: something is no array.
     """
-    return {key: _array(key, value, frames.dtypes.get(key, "float32")) for key, value in obs.items()}
+    dtypes = {key: spec.dtype for key, spec in frames.specs.items()}
+    return {key: _array(key, value, dtypes.get(key, "float32")) for key, value in obs.items()}
 
 
 def _array(key: str, value: Any, dtype: str) -> Array:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any
 
+from ttscompile.core.given import integer
 from ttscompile.errors import ExecutorError, ProtocolError, RuntimeUnavailableError, TtscompileError
 
 from .executor import AsyncExecutor
@@ -51,6 +52,8 @@ class ServerLimits:
     action_timeout: float = 30.0
 
     def __post_init__(self) -> None:
+        for name in ("clients", "message_bytes"):
+            object.__setattr__(self, name, integer(getattr(self, name), f"the server's {name}", ExecutorError, 1))
         for name, value in vars(self).items():
             if not value > 0:
                 raise ExecutorError(f"the server's {name} must be positive; found {value}.")
@@ -85,8 +88,9 @@ class ExecutorServer:
 
         Raises:
             RuntimeUnavailableError: ``websockets`` is not installed.
-            ExecutorError: the address cannot be had.
+            ExecutorError: the address cannot be had, or the port is none.
         """
+        port = integer(port, "port", ExecutorError, 0, 65535)
         try:
             from websockets.asyncio.server import serve
         except ModuleNotFoundError as error:
@@ -199,7 +203,7 @@ class ExecutorServer:
         frames, (control_hz, policy_hz) = executor.frames, executor.rates
         return {
             "observation": {
-                key: {"shape": list(shape), "dtype": frames.dtypes[key]} for key, shape in frames.shapes.items()
+                key: {"shape": list(spec.shape), "dtype": spec.dtype} for key, spec in frames.specs.items()
             },
             "n_obs_steps": frames.steps,
             "control_hz": control_hz,

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Protocol
 
+from ttscompile.core.given import integer
 from ttscompile.errors import ExecutorError
 
 from .feasibility import Feasibility
@@ -18,6 +19,12 @@ if TYPE_CHECKING:
 
 INTERPOLATIONS = ("hold", "linear")
 SEAMS = ("replace", "blend", "prefix")
+
+_MAY_BE_ZERO = frozenset({"blend_steps", "max_hold", "margin_ticks", "warm_up", "trace_events", "reserve"})
+"""Of the whole numbers among the settings; the others are at least 1."""
+
+_MOST = 10**9
+"""Of any of them: a week of ticks at a kilohertz, and a queue that Python can have."""
 
 
 class Policy(Protocol):
@@ -94,15 +101,18 @@ class ExecutorSettings:
     trace_events: int = 65536
 
     def __post_init__(self) -> None:
-        positive = ("policy_hz", "n_obs_steps", "horizon", "max_age", "measured_calls", "latency_window", "down_after")
-        for name in (*positive, "up_after", "statistics_window"):
+        for one in fields(self):
+            value = getattr(self, one.name)
+            if one.type == "int" or (one.type == "int | None" and value is not None):
+                least = 0 if one.name in _MAY_BE_ZERO else 1
+                object.__setattr__(self, one.name, integer(value, one.name, ExecutorError, least, _MOST))
+        if self.cores is not None:
+            cores = tuple(integer(core, "a processor in cores", ExecutorError) for core in self.cores)
+            object.__setattr__(self, "cores", cores)
+        for name in ("policy_hz", "max_age"):
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ExecutorError(f"{name} must be positive; found {value}.")
-        for name in ("blend_steps", "max_hold", "margin_ticks", "warm_up", "trace_events", "reserve"):
-            value = getattr(self, name)
-            if value is not None and not value >= 0:
-                raise ExecutorError(f"{name} must not be negative; found {value}.")
         if not 0 < self.rate_tolerance < 0.5:
             raise ExecutorError(f"rate_tolerance must be between 0 and 0.5 periods; found {self.rate_tolerance}.")
         if self.interpolation not in INTERPOLATIONS:
@@ -115,15 +125,29 @@ class ExecutorSettings:
 
 @dataclass(frozen=True)
 class Resolved:
-    """Settings with everything that follows from the policy filled in; see ``ExecutorSettings``."""
+    """Settings with everything that follows from the policy filled in; see ``ExecutorSettings``.
+
+    Attributes:
+        control_hz: ticks a second.
+        policy_hz: frames and actions a second.
+        ticks_per_step: control ticks that an action lasts.
+        horizon: actions of a chunk that are played.
+        reserve: actions after these that may be.
+        first: index in ``action_pred`` of the first action that is played.
+        channels: Da.
+        frames: what one frame holds.
+        max_age: of the newest frame of a window when a call starts, seconds.
+        tiers: plans, slowest first.
+        margin_ticks: control ticks that a chunk shall be there before it is needed.
+    """
 
     control_hz: float
-    policy_hz: float  # of frames and actions
-    ticks_per_step: int  # that an action lasts
+    policy_hz: float
+    ticks_per_step: int
     horizon: int
     reserve: int
-    first: int  # index in ``action_pred`` of the first action that is played
-    channels: int  # Da
+    first: int
+    channels: int
     frames: FrameSpec
     max_age: float
     tiers: tuple[str, ...]

@@ -16,8 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ttscompile.core.spec import ObservationSpec
+from ttscompile.core.values import check_values
 from ttscompile.errors import ObservationError
-from ttscompile.runtimes.arrays import as_array, check_finite
+from ttscompile.runtimes.arrays import read_observation
 
 Array: TypeAlias = npt.NDArray[Any]
 Frame: TypeAlias = dict[str, Array]
@@ -31,14 +32,12 @@ class FrameSpec:
     """What one frame holds.
 
     Attributes:
-        shapes: shape of each key's array in one frame.
-        dtypes: numpy name of each key's dtype.
+        specs: by key, of one frame.
         history: keys of which the policy sees To frames; of the others it sees the newest.
         steps: To; 1 if there is no history.
     """
 
-    shapes: Mapping[str, tuple[int, ...]]
-    dtypes: Mapping[str, str]
+    specs: Mapping[str, ObservationSpec]
     history: frozenset[str]
     steps: int
 
@@ -49,42 +48,35 @@ class FrameSpec:
         A key is a history if its first axis is time, and of the length ``steps``.
         """
         history = frozenset(key for key, spec in specs.items() if spec.frames == steps)
-        return cls(
-            {key: spec.shape[1:] if key in history else spec.shape for key, spec in specs.items()},
-            {key: spec.dtype for key, spec in specs.items()},
-            history,
-            steps if history else 1,
-        )
+        frame = {key: spec.one_frame if key in history else spec for key, spec in specs.items()}
+        return cls(frame, history, steps if history else 1)
 
     def check(self, obs: Mapping[str, Any]) -> Frame:
         """One frame as numpy arrays of its own, which the caller may not change any more.
 
         Raises:
-            ObservationError: a key, a shape or a dtype is not the policy's, or a number is not finite.
+            ObservationError: a key, a shape, a dtype or a number is not such as the policy takes.
         """
-        if not isinstance(obs, Mapping) or obs.keys() != self.shapes.keys():
-            found = sorted(map(str, obs)) if isinstance(obs, Mapping) else type(obs).__name__
-            keys = sorted(self.shapes)
-            raise ObservationError(f"expected one frame, a dictionary with the keys {keys}; found {found}.")
-        return {key: self._one(key, obs[key]) for key in self.shapes}
+        arrays, _ = read_observation(obs, self.specs)
+        return {key: self._own(key, array, self.specs[key]) for key, array in arrays.items()}
 
-    def _one(self, key: str, given: Any) -> Array:
-        array, shape, dtype = as_array(given, f"observation {key!r}"), self.shapes[key], self.dtypes[key]
-        if array.shape != shape or array.dtype != dtype:
-            remedy = "Convert it with .astype." if array.shape == shape else ""
-            if array.shape[1:] == shape and key in self.history:
+    def _own(self, key: str, array: Array, spec: ObservationSpec) -> Array:
+        if array.shape != spec.shape or array.dtype != spec.dtype:
+            remedy = "Convert it with .astype." if array.shape == spec.shape else ""
+            if array.shape[1:] == spec.shape and key in self.history:
                 remedy = f"Give one frame at a time; the executor makes the window of {self.steps}."
-            what = f"one frame of observation {key!r} must be {dtype} {list(shape)}"
-            raise ObservationError(f"{what}; found {array.dtype} {list(array.shape)}. {remedy}".rstrip())
-        check_finite(array, f"observation {key!r}", "Look for the sensor, or the division, that made it.")
-        return array.copy()
+            what = f"one frame of observation {key!r} must be {spec.dtype} {list(spec.shape)}"
+            raise ObservationError(f"{what}; found {array.dtype!s:.80} {list(array.shape)}. {remedy}".rstrip())
+        own = array.copy()  # and then looked at: another thread may write into the caller's
+        check_values(own, spec, f"observation {key!r}", ObservationError)
+        return own
 
     def observation(self, frames: list[Frame]) -> dict[str, Array]:
         """What the policy is called with, ``[1, ...]`` a key, from a window's frames, oldest first."""
         newest = frames[-1]
         return {
             key: np.stack([frame[key] for frame in frames])[None] if key in self.history else newest[key][None]
-            for key in self.shapes
+            for key in self.specs
         }
 
 

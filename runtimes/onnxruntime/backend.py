@@ -41,7 +41,9 @@ class OnnxBackend:
     def __init__(self, artifact: Artifact, threads: int = 1) -> None:
         self._manifest = artifact.manifest
         self._artifact, self._threads = artifact, threads
-        self._schedules = tuple(self.lower(plan) for plan in artifact.schedules.values())
+        groups, plans = self._manifest.groups, artifact.schedules.values()
+        self._lowered = {plan.tobytes(): instructions_of(plan, groups) for plan in plans}
+        self._schedules = tuple(self._lowered.values())
         self._pruned = any(plan.pruned for plan in self._manifest.plans.values())
         self._blocks = self._pruned or any(one.partial for one in self._schedules)  # whether these have sessions
         self.sessions = open_sessions(artifact, threads, self._blocks)
@@ -60,7 +62,7 @@ class OnnxBackend:
 
     def lower(self, plan: PlanArray) -> Instructions:
         """See ``Backend.lower``."""
-        return instructions_of(plan, self._manifest.groups)
+        return self._lowered.get(plan.tobytes()) or instructions_of(plan, self._manifest.groups)
 
     def prepare(self, streams: int, plans: Sequence[Instructions] | None) -> None:
         """Make the workspace of a batch size, and the sessions of single blocks for the first plans that need them."""

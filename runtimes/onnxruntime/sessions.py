@@ -155,14 +155,23 @@ _TURNS = (np.array(False), np.array(True))
 
 @dataclass(frozen=True)
 class JointBlock:
-    """One block of the session that holds all blocks; takes and gives what the block's own session would."""
+    """One block of the session that holds all blocks; takes and gives what the block's own session would.
 
-    session: Any  # an ``InferenceSession`` of the piece ``blocks``
-    joint: Joint  # its interface
-    index: int  # of the block
-    piece: PieceRecord  # of the block
-    stream: TensorType  # the residual stream's
-    blanks: dict[int, dict[str, Array]]  # by number of streams, zeros for contexts that a block does not read
+    Attributes:
+        session: an ``InferenceSession`` of the piece ``blocks``.
+        joint: its interface.
+        index: number of the block.
+        piece: of the block.
+        stream: type of the residual stream.
+        blanks: by number of streams, zeros for contexts that a block does not read.
+    """
+
+    session: Any
+    joint: Joint
+    index: int
+    piece: PieceRecord
+    stream: TensorType
+    blanks: dict[int, dict[str, Array]]
 
     def feeds(self, inputs: Mapping[str, Array]) -> dict[str, Array]:
         """The inputs of the joint session for the inputs of the block; those that it does not read are zeros."""

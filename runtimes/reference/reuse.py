@@ -30,23 +30,38 @@ class RolloutCache:
 
 @dataclass
 class Caches:
-    """The three caches during a call, for all streams at once; when it starts there is what earlier calls left."""
+    """The three caches during a call, for all streams at once; when it starts there is what earlier calls left.
 
-    rollout: dict[tuple[int, int], Tensor]  # by step and block
-    forward: dict[int, Tensor] = field(default_factory=dict)  # by group
-    timestep: dict[int, Tensor] = field(default_factory=dict)  # by block
+    Attributes:
+        rollout: by step and block.
+        forward: by group; empty when the call starts.
+        timestep: by block; empty when the call starts.
+    """
+
+    rollout: dict[tuple[int, int], Tensor]
+    forward: dict[int, Tensor] = field(default_factory=dict)
+    timestep: dict[int, Tensor] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One cell for all streams: block b at step k."""
+    """One cell for all streams: block b at step k.
+
+    Attributes:
+        k: the step.
+        b: the block.
+        group: the block's FORWARD group.
+        plan: int8 ``[B]``, the source of each stream.
+        gates: float32 ``[B, 4]``, the same one-hot, with or without a gradient.
+        type: of the residual.
+    """
 
     k: int
     b: int
-    group: int  # the block's, of FORWARD
-    plan: npt.NDArray[np.int8]  # [B], the source of each stream
-    gates: Tensor  # float32 [B, 4], the same one-hot, with or without a gradient
-    type: TensorType  # of the residual
+    group: int
+    plan: npt.NDArray[np.int8]
+    gates: Tensor
+    type: TensorType
 
     @property
     def trains(self) -> bool:

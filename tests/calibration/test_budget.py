@@ -54,7 +54,7 @@ def test_nothing_asked_for_is_the_default_and_one_thing_is_itself() -> None:
         ({"latency_ms": 0}, "latency_ms: expected a number above 0; found 0"),
         ({"latency_ms": float("inf")}, "latency_ms: expected a number above 0; found inf"),
         ({"max_action_error": -1}, "max_action_error: expected a number above 0"),
-        ({"latency_ms": 5, "threads": 0}, "threads: expected an integer of at least 1; found 0"),
+        ({"latency_ms": 5, "threads": 0}, "threads must be an integer of at least 1; found 0"),
     ],
 )
 def test_what_nothing_can_satisfy_is_refused_before_any_work(

@@ -173,10 +173,16 @@ def test_a_baseline_that_diverges_is_worse_than_any_plan(
 
 
 def test_a_negative_seed_is_refused(artifact: Path, recording: Path) -> None:
-    with pytest.raises(CalibrationError, match="seed: expected an integer of at least 0; found -1"):
+    with pytest.raises(CalibrationError, match="seed must be an integer of at least 0; found -1"):
         calibrate(artifact, [recording], 0.7, seed=-1, progress=False)
     with pytest.raises(CalibrationError, match="found -1"):
         compare(artifact, [recording], [], [], seed=-1)
+    for name in ("seed", "threads", "max_intervals"):
+        with pytest.raises(CalibrationError, match=f"{name} must be an integer of at least .; found 0.5"):
+            calibrate(artifact, [recording], 0.7, **{name: 0.5}, progress=False)
+    for name in ("calls", "learned", "seed", "threads", "intervals"):
+        with pytest.raises(CalibrationError, match=f"{name} must be an integer of at least .; found True"):
+            compare(artifact, [recording], [], [], **{name: True})
 
 
 def test_a_state_that_cannot_be_removed_is_an_error(

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import random
+from typing import Any
 
 import numpy as np
 import pytest
 
+from ttscompile import Affine, ObservationSpec
+from ttscompile.core.values import check_values
 from ttscompile.errors import ObservationError, StaleObservationError
 from ttscompile.runtimes.executor import ExecutorSettings
+from ttscompile.runtimes.executor.window import FrameSpec
 
 from .simulation import TA, World
 
@@ -76,6 +80,9 @@ def test_wrong_frames_are_the_callers_error_and_change_nothing() -> None:
             {"obs": np.array([0.0, np.nan])},
             {"image": np.zeros(2)},
             {"obs": np.zeros(2, int)},
+            {"obs": np.ma.masked_array(np.zeros(2), mask=[True, False])},
+            {"obs": np.array([0.0, 1e30])},
+            {"obs": [0.0, 0.0]},
         ):
             with pytest.raises(ObservationError):
                 world.executor.observe(obs)
@@ -86,3 +93,31 @@ def test_wrong_frames_are_the_callers_error_and_change_nothing() -> None:
         for _ in range(20):
             assert world.tick() is not None
         assert world.executor.statistics().frames == 22
+
+
+def test_a_frame_is_held_against_what_the_policy_takes_before_it_is_kept() -> None:
+    """What a call would refuse ends the policy's thread, so it has to be refused here."""
+    image = ObservationSpec((2, 3, 4, 4), bounds=(0.0, 1.0))
+    tokens = ObservationSpec((4,), dtype="int64", window=False, bounds=(0.0, 9.0))
+    state = ObservationSpec((2, 1), Affine(np.array([2.0]), np.array([0.0])))
+    frames = FrameSpec.of({"image": image, "tokens": tokens, "state": state}, 2)
+    good = {"image": np.ones((3, 4, 4), np.float32), "tokens": np.arange(4), "state": np.ones(1, np.float32)}
+    assert frames.check(good).keys() == good.keys()
+    for key, values, message in (
+        ("image", good["image"] * 255, r"'image' is an image .* of 0 to 1; found 255 to 255\. Divide by 255"),
+        ("tokens", good["tokens"] + 7, "'tokens' must hold integers of 0 to 9; found 7 to 10"),
+        ("state", good["state"] * np.float32(6e5), r"1e\+06 when normalised; found 600000 at index \(0,\) \(1\.2e\+06"),
+    ):
+        with pytest.raises(ObservationError, match=message):
+            frames.check(good | {key: values})
+
+
+def test_a_frame_is_copied_before_it_is_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = np.array([1.0, 2.0], np.float32)
+
+    def spoiled(array: np.ndarray, *others: Any) -> None:
+        given[:] = np.nan
+        check_values(array, *others)
+
+    monkeypatch.setattr("ttscompile.runtimes.executor.window.check_values", spoiled)
+    assert FrameSpec.of({"obs": ObservationSpec((2,))}, 1).check({"obs": given})["obs"].tolist() == [1, 2]

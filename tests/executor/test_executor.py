@@ -176,7 +176,7 @@ def test_reset_starts_an_episode_and_passes_the_seed_on() -> None:
 def test_a_seed_that_is_none_is_told_to_who_gave_it_and_the_policy_lives() -> None:
     with World() as world:
         world.begin()
-        with pytest.raises(TtscompileError, match="seed: expected an integer of at least 0"):
+        with pytest.raises(TtscompileError, match="seed must be an integer of at least 0"):
             world.executor.reset(seed=-1)
         assert world.executor.statistics().resets == 0
         world.tick()

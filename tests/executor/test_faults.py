@@ -16,6 +16,7 @@ from ttscompile.errors import (
     DeadlineMissedError,
     ExecutorClosedError,
     ExecutorError,
+    NonFiniteActionsError,
     StaleObservationError,
     WorkerDeadError,
 )
@@ -197,6 +198,25 @@ def test_nan_is_not_executed() -> None:
         assert counted.chunks_refused == 3
         assert counted.last_refusal == f"1 of its {3 * TA} numbers are not finite"
         assert counted.starved == 0
+
+
+def test_a_call_without_actions_is_a_chunk_that_the_guard_refuses() -> None:
+    """A compiled policy raises where its arithmetic overflowed: the thread goes on, and so does the robot."""
+    policy = ScriptedPolicy(FakeClock())
+
+    def overflow(obs: np.ndarray) -> np.ndarray:
+        if len(policy.calls) in (2, 3, 4):
+            raise NonFiniteActionsError("scripted")
+        return np.zeros((policy.predicted, 3))
+
+    policy.actions = overflow
+    with World(policy=policy) as world:
+        world.begin()
+        for _ in range(30):
+            assert np.isfinite(world.tick()).all()
+        counted = world.executor.statistics()
+        assert (counted.chunks_refused, counted.starved) == (3, 0)
+        assert counted.last_refusal == f"{3 * TA} of its {3 * TA} numbers are not finite"
 
 
 def test_nothing_but_nan_ends_in_an_error_that_says_so() -> None:

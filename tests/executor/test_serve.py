@@ -312,13 +312,16 @@ def test_the_error_of_a_dead_worker_reaches_the_clients() -> None:
 
 
 def test_limits_are_checked_and_a_port_that_is_taken_is_told() -> None:
-    with pytest.raises(ExecutorError, match="clients must be positive"):
+    with pytest.raises(ExecutorError, match="clients must be an integer of at least 1; found 0"):
         ServerLimits(clients=0)
     executor = AsyncExecutor(Quick(FakeClock()), 20, latencies={"dense": 0.01})
     with executor, socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
+        for bad in (70000, -1, True, 8.5):
+            with pytest.raises(ExecutorError, match="port must be an integer of at least 0 and at most 65535; found"):
+                asyncio.run(ExecutorServer(executor).run("127.0.0.1", bad, asyncio.Event()))  # type: ignore[arg-type]
         with pytest.raises(ExecutorError, match=f"cannot listen on 127.0.0.1:{port}"):
             asyncio.run(ExecutorServer(executor).run("127.0.0.1", port, asyncio.Event()))
 

@@ -36,7 +36,7 @@ def values(made: ObservationWindow) -> list[float] | None:
 def test_the_first_axis_of_a_history_is_time() -> None:
     spec = FrameSpec.of(SPECS, 2)
     assert spec.history == {"obs", "image"}
-    assert spec.shapes == {"obs": (3,), "image": (4, 4), "goal": (5,)}
+    assert {key: one.shape for key, one in spec.specs.items()} == {"obs": (3,), "image": (4, 4), "goal": (5,)}
     assert spec.steps == 2
     alone = FrameSpec.of({"goal": SPECS["goal"]}, 2)
     assert (alone.steps, alone.history) == (1, frozenset())
@@ -69,9 +69,9 @@ def test_an_observation_is_stacked_and_has_a_batch_of_one() -> None:
         ({"obs": np.zeros(3)}, r"found float64 \[3\]. Convert it with .astype"),
         ({"obs": np.array([0, np.nan, 0], np.float32)}, r"'obs' must be finite; found nan at index \(1,\)"),
         ({"obs": [0.0, 0.0, 0.0]}, "is a list; expected a numpy array"),
-        ({}, r"with the keys \['obs'\]; found \[\]"),
+        ({}, r"expected the observation keys \['obs'\]; found \[\]"),
         ({"obs": np.zeros(3, np.float32), "more": 1}, r"found \['more', 'obs'\]"),
-        (np.zeros(3), "found ndarray"),
+        (np.zeros(3), "is a ndarray; expected a dictionary"),
     ],
 )
 def test_a_wrong_frame_is_refused(obs: object, message: str) -> None:

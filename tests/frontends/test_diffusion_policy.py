@@ -332,8 +332,8 @@ def test_sampler_override_keeps_the_betas(payload: Build, save: Save) -> None:
     [
         ({"sampler": "euler"}, r"'euler' is none of .* diffusion; expected one of ddpm, ddim, dpmsolver\+\+\."),
         ({"steps": 21}, "21 denoising steps are not possible"),
-        ({"steps": 0}, "0 denoising steps are not possible"),
-        ({"steps": -1}, "-1 denoising steps are not possible"),
+        ({"steps": 0}, "steps must be an integer of at least 1; found 0"),
+        ({"steps": -1}, "steps must be an integer of at least 1; found -1"),
         ({"spacing": "even"}, "'even' is not known; expected one of leading"),
     ],
 )

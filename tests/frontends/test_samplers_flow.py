@@ -114,9 +114,9 @@ def test_the_clipped_sample_is_where_the_velocity_leads() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"steps": 0}, "0 flow-matching steps"),
-        ({"steps": True}, "True flow-matching steps"),
-        ({"steps": 4.0}, "all rise or all fall"),
+        ({"steps": 0}, "steps must be an integer of at least 1; found 0"),
+        ({"steps": True}, "steps must be an integer of at least 1; found True"),
+        ({"steps": 4.0}, "integer of at least 1; found 4.0"),
         ({"steps": 4, "start": 1.0}, "all rise or all fall"),
         ({"steps": [0.0, 0.5, 0.5, 1.0]}, "all rise or all fall"),
         ({"steps": [0.0]}, "two or more"),

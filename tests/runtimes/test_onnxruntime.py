@@ -12,12 +12,15 @@ import pytest
 
 from tests.rounding import assert_equal_but_for_rounding, bound
 from ttscompile import Noise, Source
-from ttscompile.artifact import Artifact
-from ttscompile.core.lattice import dense_plan, legalize, uniform_plan
+from ttscompile.artifact import Artifact, load_artifact
+from ttscompile.artifact.write import update_calibration
+from ttscompile.core.lattice import PlanArray, dense_plan, legalize, uniform_plan
 from ttscompile.errors import ArtifactError, IllegalPlanError, ObservationError, RuntimeUnavailableError
 from ttscompile.ir.program import Binding
 from ttscompile.runtimes import Runtime, open_runtime
+from ttscompile.runtimes.onnxruntime.instructions import Instructions, instructions_of
 from ttscompile.runtimes.onnxruntime.workspace import Workspace
+from ttscompile.runtimes.policy import load
 
 from .agreement import call_terms, largest_difference, random_inputs
 from .conftest import MakeArtifact
@@ -49,6 +52,25 @@ def test_reuse_gives_41_and_compute_gives_44(pencil_artifact: Artifact, name: st
     with pytest.raises(IllegalPlanError, match="never computed"):
         call(33, [C, R])
     assert call(35, [C, C]) == 44
+
+
+def test_a_schedule_is_lowered_once_at_load_and_never_in_a_call(
+    own_artifact: Artifact, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    schedules = {"half": uniform_plan(5, 5, 2), "most": uniform_plan(5, 5, 4)}
+    update_calibration(own_artifact.path, None, schedules, "half", {"strategy": "uniform"})
+    lowered: list[bytes] = []
+
+    def counted(plan: PlanArray, groups: tuple[int, ...]) -> Instructions:
+        lowered.append(plan.tobytes())
+        return instructions_of(plan, groups)
+
+    monkeypatch.setattr("ttscompile.runtimes.onnxruntime.backend.instructions_of", counted)
+    policy = load(own_artifact.path)
+    assert sorted(lowered) == sorted(plan.tobytes() for plan in load_artifact(own_artifact.path).schedules.values())
+    for name in policy.info.plans:
+        policy.predict_action({"obs": np.zeros((1, 2), np.float32)}, plan=name)
+    assert len(lowered) == len(set(lowered)) >= 2
 
 
 def test_a_value_of_the_step_may_be_one_number(make_artifact: MakeArtifact) -> None:

@@ -13,7 +13,7 @@ from ttscompile import Noise
 from ttscompile.artifact import Artifact
 from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import IllegalPlanError, ObservationError
-from ttscompile.runtimes.arrays import check_observation
+from ttscompile.runtimes.arrays import check_observation, read_observation
 from ttscompile.runtimes.policy import CompiledPolicy, load
 from ttscompile.runtimes.queues import Queues, is_window
 
@@ -26,9 +26,14 @@ def frame(value: float, streams: int = 1) -> dict[str, Any]:
     return {"observation.state": state, "tokens": tokens, "task": ["push"]}
 
 
+def taken(batch: dict[str, Any]) -> dict[str, np.ndarray]:
+    """A batch as ``select_action`` hands it on."""
+    return read_observation(batch, SPECS, others=True)[0]
+
+
 def push(queues: Queues, batch: dict[str, Any]) -> dict[str, Any]:
     """Take a frame; the window after it."""
-    queues.keep(queues.after(batch))
+    queues.keep(queues.after(taken(batch)))
     return queues.observation(queues._frames)
 
 
@@ -87,13 +92,13 @@ def test_actions_come_one_by_one() -> None:
 def test_a_bad_frame_changes_nothing(change: dict[str, Any], message: str) -> None:
     queues = Queues(SPECS)
     push(queues, frame(1))
-    queues.after(frame(5))  # not kept
+    queues.after(taken(frame(5)))  # not kept
     bad = {key: value for key, value in (frame(2) | change).items() if value is not None}
     with pytest.raises(ObservationError, match=message):
-        queues.after(bad)
+        queues.after(taken(bad))
     assert window(queues) == [1, 1, 1]
     with pytest.raises(ObservationError, match="before"):
-        queues.after(frame(2, streams=3))
+        queues.after(taken(frame(2, streams=3)))
 
 
 IMAGE = ObservationSpec((2, 3, 8, 9), bounds=(0.0, 1.0))

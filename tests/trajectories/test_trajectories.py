@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.hostile.pickles import Runs
-from ttscompile import ObservationSpec
+from ttscompile import Affine, ObservationSpec
 from ttscompile.errors import TrajectoryError
 from ttscompile.trajectories import Episode, load_trajectories
 
@@ -197,6 +197,25 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         load(tmp_path)
     with pytest.raises(TrajectoryError, match="no trajectory files"):
         load_trajectories([], SPECS, 2)
+    for paths in ([np.zeros(3)], np.ma.zeros((2, 3)), [None], None, 5):
+        with pytest.raises(TrajectoryError, match=r"expected paths of recordings; found a \w+\. Use np.savez"):
+            load_trajectories(paths, SPECS, 2)  # type: ignore[arg-type]
+
+
+def test_numbers_that_a_call_would_refuse_are_refused_in_a_recording(file: Path) -> None:
+    content = arrays()
+    content["obs"][3, 1, 2] = -1e30
+    with pytest.raises(
+        TrajectoryError, match=r"npz: 'obs' must be between .* 1e\+06; found -1e\+30 at index \(3, 1, 2\)"
+    ):
+        load(saved(file, **content))
+    content["obs"][3, 1, 2] = 2e6
+    normalizer = Affine(np.array([1.0, 1.0, 0.4]), np.zeros(3))
+    specs = SPECS | {"obs": ObservationSpec((2, 3), normalizer)}
+    assert load(saved(file, **content), specs)[1].observations["obs"][1, 1, 2] == 2e6
+    specs |= {"goal": ObservationSpec((4,), dtype="int64", bounds=(0.0, 9.0))}
+    with pytest.raises(TrajectoryError, match="npz: 'goal' must hold integers of 0 to 9; found 0 to 19"):
+        load(saved(file, **content), specs)
 
 
 def test_integers_that_would_wrap_are_refused(tmp_path: Path) -> None:

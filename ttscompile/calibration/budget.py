@@ -15,6 +15,7 @@ import numpy as np
 from ..artifact.ceiling import TYPICAL_SPARSITY
 from ..artifact.load import Artifact
 from ..artifact.manifest import Manifest, PlanRecord
+from ..core.given import integer
 from ..core.lattice import dense_plan, sparsity, uniform_plan
 from ..core.spec import Noise
 from ..errors import CalibrationError
@@ -97,8 +98,7 @@ def goal_of(
     if len(given) > 1:
         raise CalibrationError(f"expected one budget; found {' and '.join(given)}. They exclude each other: give one.")
     kind, value = next(iter(given.items()), (SPARSITY, usual))
-    if not isinstance(threads, int) or isinstance(threads, bool) or threads < 1:
-        raise CalibrationError(f"threads: expected an integer of at least 1; found {threads!r}.")
+    threads = integer(threads, "threads", CalibrationError, 1)
     number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
     share = kind in (SPARSITY, FLOPS)
     if number and share and value == 0:

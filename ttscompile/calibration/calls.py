@@ -38,16 +38,6 @@ class Split:
     validation: tuple[int, ...]
 
 
-def require_seed(seed: int) -> None:
-    """Refuse what no random numbers begin with.
-
-    Raises:
-        CalibrationError: it is negative.
-    """
-    if seed < 0:
-        raise CalibrationError(f"seed: expected an integer of at least 0; found {seed}.")
-
-
 def split_episodes(count: int, fraction: float, seed: int) -> Split:
     """Divide episodes at random.
 

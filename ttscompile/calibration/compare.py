@@ -22,6 +22,7 @@ import torch
 from ..artifact.load import Artifact, load_artifact
 from ..artifact.manifest import DENSE
 from ..core.correction import FEATURES
+from ..core.given import integer
 from ..core.lattice import Source
 from ..core.spec import FP32, Noise
 from ..errors import CalibrationError
@@ -32,7 +33,7 @@ from ..runtimes.policy import CompiledPolicy
 from ..runtimes.random_calls import random_noise
 from ..trajectories.episodes import Episode
 from .budget import cells_of, goal_of, with_plans
-from .calls import LARGEST, Split, load_episodes, require_seed, sample_calls, split_episodes
+from .calls import LARGEST, Split, load_episodes, sample_calls, split_episodes
 from .execute import Executor
 from .search import plan_of
 from .strategies import strategy_of
@@ -110,9 +111,10 @@ def compare(
         TrajectoryError: the recordings do not fit the policy.
         ArtifactError: an artifact cannot be opened.
     """
-    if calls < 1 or learned < 2:
-        raise CalibrationError(f"expected at least 1 call and 2 to learn from; found {calls} and {learned}.")
-    require_seed(seed)
+    calls, learned = integer(calls, "calls", CalibrationError, 1), integer(learned, "learned", CalibrationError, 2)
+    threads, seed = integer(threads, "threads", CalibrationError, 1), integer(seed, "seed", CalibrationError)
+    if intervals is not None:
+        intervals = integer(intervals, "intervals", CalibrationError)
     artifact = load_artifact(path)
     spec = artifact.manifest.spec
     budgets = {one: cells_of(goal_of(target_sparsity=one), artifact.manifest, False) for one in sparsities}

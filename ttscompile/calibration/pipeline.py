@@ -17,13 +17,14 @@ from ..artifact.load import Artifact, load_artifact
 from ..artifact.manifest import UNIFORM
 from ..artifact.write import update_calibration
 from ..core.correction import FEATURES
+from ..core.given import integer
 from ..core.lattice import sparsity
 from ..errors import CalibrationError
 from ..ir.pieces import PRUNER
 from ..trajectories.episodes import Episode
 from ..verification.record_golden import record_plans
 from .budget import ERROR, LATENCY, Budget, Goal, cells_of, goal_of, measure_budget
-from .calls import Calls, load_episodes, require_seed, split_episodes
+from .calls import Calls, load_episodes, split_episodes
 from .crowded import SAFE, SHARE, CrowdedSchedules, budget_of_error, named_plans
 from .execute import Executor
 from .judge import SCHEDULE, default_of, judge, precision_record, require_success, uniform_of
@@ -109,6 +110,9 @@ def calibrate(
         ArtifactError: no artifact, or it cannot be written.
     """
     begun = time.monotonic()
+    seed = integer(seed, "seed", CalibrationError)
+    if max_intervals is not None:
+        max_intervals = integer(max_intervals, "max_intervals", CalibrationError)
     asked = (target_sparsity, target_flops, latency_ms, max_action_error, threads)
     goal_of(*asked)  # what cannot be is refused before anything is read
     artifact = load_artifact(Path(path))
@@ -118,7 +122,7 @@ def calibrate(
         raise CalibrationError(
             f"{path}: only a directory can be calibrated. Unzip the artifact and give the directory."
         )
-    budget = _known_budget(artifact, goal, chosen, validation_fraction, max_minutes, seed)
+    budget = _known_budget(artifact, goal, chosen, validation_fraction, max_minutes)
     episodes = load_episodes(spec, trajectories, observation)
     split = split_episodes(len(episodes), validation_fraction, seed)
     features = FEATURES * spec.sample[0] + 1
@@ -212,15 +216,12 @@ def _write(
     )
 
 
-def _known_budget(
-    artifact: Artifact, goal: Goal, strategy: Strategy, fraction: float, minutes: float, seed: int
-) -> Budget | None:
+def _known_budget(artifact: Artifact, goal: Goal, strategy: Strategy, fraction: float, minutes: float) -> Budget | None:
     """The budget where nothing has to be run for it; refuses what cannot be satisfied before any work."""
     if not 0 < fraction < 1 or not minutes > 0:
         raise CalibrationError(
             f"expected validation_fraction between 0 and 1 and max_minutes above 0; found {fraction} and {minutes}."
         )
-    require_seed(seed)
     if goal.kind == ERROR and not strategy.fits_correction:
         raise CalibrationError(
             f"max_action_error needs strategy {' or '.join(map(repr, FITTED))}; found {strategy.name!r}. Give this"

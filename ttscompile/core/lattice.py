@@ -9,11 +9,13 @@ from __future__ import annotations
 import enum
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ..errors import IllegalPlanError
+from .given import listed
 
 PlanArray = npt.NDArray[np.int8]
 BoolArray = npt.NDArray[np.bool_]
@@ -55,20 +57,30 @@ def check_plan(plan: npt.ArrayLike, steps: int, blocks: int, streams: int) -> Pl
     Raises:
         IllegalPlanError: wrong dtype, shape or values.
     """
-    array = np.asarray(plan)
-    if array.dtype.kind not in "iu":
-        raise IllegalPlanError(
-            f"plan has dtype {array.dtype}; expected an integer array of ttscompile.Source. Use plan.astype(np.int8)."
-        )
+    array = given = _sources(plan)
     if array.ndim == 2:
         array = np.broadcast_to(array, (streams, *array.shape))
     if array.shape != (streams, steps, blocks):
         expected = f"[K, blocks] = ({steps}, {blocks}) or [B, K, blocks] = ({streams}, {steps}, {blocks})"
-        raise IllegalPlanError(f"plan has shape {np.shape(plan)}; expected {expected}.")
+        raise IllegalPlanError(f"plan has shape {given.shape}; expected {expected}.")
+    return np.ascontiguousarray(array, dtype=np.int8)
+
+
+def _sources(plan: npt.ArrayLike) -> npt.NDArray[Any]:
+    """A copy of a plan of any shape and integer dtype, which holds nothing but sources.
+
+    Raises:
+        IllegalPlanError: it does not.
+    """
+    array = listed(plan, "plan", IllegalPlanError, "int8").copy()
+    if array.dtype.kind not in "iu":
+        raise IllegalPlanError(
+            f"plan has dtype {array.dtype}; expected an integer array of ttscompile.Source. Use plan.astype(np.int8)."
+        )
     if array.size and (array.min() < 0 or array.max() > 3):
         found = f"{int(array.min())}..{int(array.max())}"
         raise IllegalPlanError(f"plan holds values {found}; expected ttscompile.Source, 0..3.")
-    return np.ascontiguousarray(array, dtype=np.int8)
+    return array
 
 
 def origins(plan: PlanArray, groups: Sequence[int]) -> Origins:
@@ -154,16 +166,26 @@ def legalize(plan: PlanArray, groups: Sequence[int], written: BoolArray) -> tupl
 
     Returns:
         A legal plan of the same shape, and the number of cells that were replaced.
+
+    Raises:
+        IllegalPlanError: the plan holds something else than sources, or ``written`` is not of its shape.
     """
-    plan = np.asarray(plan, dtype=np.int8)
-    if plan.ndim == 3:
-        pairs = [legalize(one, groups, cells) for one, cells in zip(plan, written, strict=True)]
-        return np.stack([p for p, _ in pairs]), sum(n for _, n in pairs)
+    sources = _sources(plan).astype(np.int8)
+    known = listed(written, "written", IllegalPlanError, "bool").astype(np.bool_)
+    if sources.ndim not in (2, 3) or len(groups) != sources.shape[-1] or known.shape != sources.shape:
+        expected = "plan and written of the same shape, [K, blocks] or [B, K, blocks], and a group for each block"
+        raise IllegalPlanError(f"expected {expected}; found {sources.shape}, {known.shape} and {len(groups)} groups.")
+    legal = without_illegal_reads(sources, known)
+    return legal, int(np.count_nonzero(legal != sources))
+
+
+def without_illegal_reads(plan: PlanArray, written: BoolArray) -> PlanArray:
+    """What ``legalize`` makes of plans ``[..., K, blocks]`` that hold sources, and were checked to fit."""
     legal = plan.copy()
-    legal[0] = Source.COMPUTE
+    legal[..., 0, :] = Source.COMPUTE
     legal[(legal == Source.ROLLOUT) & ~written] = Source.TIMESTEP
     # With step 0 dense every TIMESTEP and FORWARD read after it is written, so one sweep is enough.
-    return legal, int(np.count_nonzero(legal != plan))
+    return legal
 
 
 def dense_plan(steps: int, blocks: int) -> PlanArray:

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ..errors import SpecError
+from .given import integer, listed, numbers
 from .rules import DType, Positive
 
 FloatArray = npt.NDArray[np.float32]
@@ -20,6 +22,11 @@ FloatArray = npt.NDArray[np.float32]
 FP32, INT8 = "fp32", "int8"
 PRECISIONS = (FP32, INT8)
 """Names of what the weights of residual blocks can be asked for in."""
+
+LARGEST = 1e6
+"""No number that goes into the network, normalised, is larger, either way; what is cannot be from training. A range
+maps to -1..1, and of N samples none is further than sqrt(N - 1) deviations from their mean. A network multiplies up to
+four of its numbers (a gated product of two, and a LayerNorm squares that): this leaves 1e14 for weights and sums."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +43,7 @@ class Affine:
 
     def __post_init__(self) -> None:
         for name in ("scale", "offset"):
-            array = np.asarray(getattr(self, name), dtype=np.float32)
+            array = numbers(getattr(self, name), f"normaliser {name}", SpecError)
             if array.ndim != 1 or not np.isfinite(array).all():
                 raise SpecError(f"normaliser {name} must be a finite vector; found shape {array.shape}, {array}.")
             object.__setattr__(self, name, array)
@@ -44,6 +51,11 @@ class Affine:
             raise SpecError(f"normaliser scale {self.scale.shape} and offset {self.offset.shape} differ in length.")
         if (self.scale == 0).any():
             raise SpecError(f"normaliser scale is zero at {np.flatnonzero(self.scale == 0).tolist()}: not invertible.")
+
+    @cached_property
+    def reach(self) -> float:
+        """Numbers up to this size, either way, are normalised to at most ``LARGEST`` in every entry."""
+        return float(((LARGEST - np.abs(self.offset, dtype=np.float64)) / np.abs(self.scale)).min())
 
     def normalize(self, x: npt.NDArray[np.float32]) -> FloatArray:
         """``x * scale + offset`` over the last axis."""
@@ -93,17 +105,17 @@ class SamplerTable:
     COLUMNS = ("sample_to_x0", "out_to_x0", "x0_to_next", "sample_to_next", "out_to_next", "noise_to_next")
 
     def __post_init__(self) -> None:
-        timesteps = np.asarray(self.timesteps)
-        kind = np.int64 if timesteps.dtype.kind in "iu" else np.float32
-        object.__setattr__(self, "timesteps", timesteps.astype(kind))
+        timesteps = listed(self.timesteps, "sampler timesteps", SpecError, "float32")
+        kind = "int64" if timesteps.dtype.kind in "iu" else "float32"
+        object.__setattr__(self, "timesteps", numbers(timesteps, "sampler timesteps", SpecError, kind))
         if timesteps.ndim != 1 or len(timesteps) == 0:
             raise SpecError(f"sampler timesteps must be a non-empty vector; found shape {timesteps.shape}.")
         for name in self.COLUMNS:
-            column = np.asarray(getattr(self, name), dtype=np.float32)
+            column = numbers(getattr(self, name), f"sampler column {name}", SpecError)
             if column.shape != timesteps.shape or not np.isfinite(column).all():
                 raise SpecError(f"sampler column {name} must hold {len(timesteps)} finite numbers; found {column}.")
             object.__setattr__(self, name, column)
-        memory_to_next, to_memory = (np.asarray(getattr(self, n), np.float32) for n in ("memory_to_next", "to_memory"))
+        memory_to_next, to_memory = (numbers(getattr(self, n), n, SpecError) for n in ("memory_to_next", "to_memory"))
         if not memory_to_next.size and not to_memory.size:
             memory_to_next, to_memory = (np.zeros((len(timesteps), 0, *rest), np.float32) for rest in ((), (3,)))
         count = memory_to_next.shape[-1]
@@ -156,9 +168,10 @@ class ObservationSpec:
     bounds: tuple[float | tuple[float, ...], float | tuple[float, ...]] | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "shape", tuple(int(n) for n in self.shape))
-        if not self.shape or min(self.shape) < 1:
-            raise SpecError(f"an observation needs a shape of positive sizes; found {self.shape}.")
+        sizes = tuple(integer(n, "a size in an observation's shape", SpecError, 1) for n in self.shape)
+        object.__setattr__(self, "shape", sizes)
+        if not sizes:
+            raise SpecError("an observation needs a shape of one size or more; found ().")
         if self.normalizer is not None and self.normalizer.scale.shape != self.shape[-1:]:
             found = len(self.normalizer.scale)
             raise SpecError(f"normaliser has {found} entries for an observation of shape {self.shape}.")
@@ -176,6 +189,11 @@ class ObservationSpec:
     def frames(self) -> int | None:
         """To, the number of frames that the first axis holds; None without such an axis."""
         return self.shape[0] if self.window and len(self.shape) > 1 else None
+
+    @property
+    def one_frame(self) -> ObservationSpec:
+        """The same of one frame, where there are several."""
+        return replace(self, shape=self.shape[1:], window=False)
 
     @property
     def image(self) -> bool:
@@ -230,7 +248,9 @@ class ChunkSpec:
     ranged: bool = True
 
     def __post_init__(self) -> None:
-        if not 0 <= self.start < self.stop or self.action_dim < 1:
+        for name in ("action_dim", "start", "stop"):
+            object.__setattr__(self, name, integer(getattr(self, name), f"a chunk's {name}", SpecError))
+        if not self.start < self.stop or self.action_dim < 1:
             raise SpecError(f"chunk [{self.start}:{self.stop}] of {self.action_dim} channels is empty.")
 
     def unnormalized(self, sample: FloatArray) -> FloatArray:
@@ -265,8 +285,10 @@ class PolicySpec:
     left_out: int = 0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "sample", tuple(int(n) for n in self.sample))
-        if len(self.sample) != 2 or min(self.sample) < 1:
+        sizes = tuple(integer(n, "a size in the sample's shape", SpecError, 1) for n in self.sample)
+        object.__setattr__(self, "sample", sizes)
+        object.__setattr__(self, "left_out", integer(self.left_out, "left_out", SpecError))
+        if len(sizes) != 2:
             raise SpecError(f"the sample's shape must be (T, D); found {self.sample}.")
         if not self.observations:
             raise SpecError("a policy needs at least one observation: a condition input of the denoiser.")
@@ -278,8 +300,6 @@ class PolicySpec:
                     f" argument {argument!r} none of {sorted(taken)}."
                 )
             taken.add(argument)
-        if self.left_out < 0:
-            raise SpecError(f"left_out is {self.left_out}; expected a number of steps, 0 for none.")
         horizon, channels = self.sample
         if self.chunk.stop > horizon or self.chunk.action_dim > channels:
             told = f"chunk [{self.chunk.start}:{self.chunk.stop}] of {self.chunk.action_dim} channels does not fit a"

@@ -13,8 +13,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from ..core.given import integer
 from ..core.spec import PolicySpec
-from ..errors import CheckpointError
+from ..errors import CheckpointError, SpecError
 from ..samplers.flow import METHODS
 from .refusals import refuse_directory
 from .settings import read_json
@@ -41,6 +42,10 @@ class LoadOptions:
     spacing: str | None = None
     task: str | None = None
     encoders: str | os.PathLike[str] | None = None
+
+    def __post_init__(self) -> None:
+        if self.steps is not None:
+            object.__setattr__(self, "steps", integer(self.steps, "steps", SpecError, 1))
 
 
 AS_SAVED = LoadOptions()

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from ..core.given import numbers
 from ..core.spec import SamplerTable
 from ..errors import SpecError
 from .flow import deterministic_table
@@ -58,7 +59,7 @@ def edm_table(sigmas: Sequence[float], sigma_data: float, *, clip: float | None 
     Raises:
         SpecError: no noise levels, or such that do not fall to 0 or above it; ``sigma_data`` is not positive.
     """
-    levels = np.asarray(sigmas, np.float64)
+    levels = numbers(sigmas, "sigmas", SpecError, "float64")
     if levels.ndim != 1 or len(levels) < 2 or not (np.isfinite(levels).all() and (np.diff(levels) < 0).all()):
         raise SpecError(f"EDM's noise levels must fall, and be two or more; found {levels.tolist()}.")
     if levels[-1] < 0 or not (np.isfinite(sigma_data) and sigma_data > 0):

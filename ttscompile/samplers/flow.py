@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from ..core.given import integer, numbers
 from ..core.spec import SamplerTable
 from ..errors import SpecError
 
@@ -69,12 +70,11 @@ def flow_matching_table(
 
 def _times(steps: int | Sequence[float], start: float, end: float) -> npt.NDArray[np.float64]:
     """The N + 1 times."""
-    if isinstance(steps, (int, np.integer)):
-        if isinstance(steps, bool) or steps < 1:
-            raise SpecError(f"{steps!r} flow-matching steps are not possible; expected a positive whole number.")
-        times = start + (end - start) * np.arange(steps + 1) / steps
+    if isinstance(steps, Sequence) or np.ndim(steps):
+        times = numbers(steps, "steps", SpecError, "float64")
     else:
-        times = np.asarray(steps, np.float64)
+        count = integer(steps, "steps", SpecError, 1)
+        times = start + (end - start) * np.arange(count + 1) / count
     lengths = np.diff(np.atleast_1d(times))
     if times.ndim != 1 or len(times) < 2 or not np.isfinite(times).all() or not (lengths * lengths[0] > 0).all():
         raise SpecError(f"flow-matching times must all rise or all fall, and be two or more; found {times.tolist()}.")

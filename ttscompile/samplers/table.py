@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from ..core.given import integer
 from ..core.spec import SamplerTable
 from ..errors import SpecError
 from .multistep import multistep_table, set_timesteps
@@ -167,6 +168,7 @@ def sampler_table(
     Raises:
         SpecError: the scheduler refuses the settings, or its step is not of the form of ``SamplerTable``.
     """
+    steps = integer(steps, "steps", SpecError, 1)
     probe = _Probe(scheduler, step_arguments or {})
     _refuse_known(scheduler)
     trained = scheduler.config.get("num_train_timesteps")

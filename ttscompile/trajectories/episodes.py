@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,8 +19,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..core.given import integer
 from ..core.spec import ObservationSpec
 from ..core.untrusted_json import parse_json
+from ..core.values import check_values
 from ..errors import TrajectoryError
 from .apart import frames_apart
 from .frames import Frames, few, observation_frames, one_error, require_proportion
@@ -72,8 +74,11 @@ def load_trajectories(
     Raises:
         TrajectoryError: names the file, what was expected, what it holds, and what to do.
     """
-    if isinstance(paths, str | os.PathLike):
+    action_steps = integer(action_steps, "action_steps", TrajectoryError, 1)
+    if isinstance(paths, str | os.PathLike) or not isinstance(paths, Iterable):
         paths = [paths]
+    if no_path := [type(path).__name__ for path in paths if not isinstance(path, str | os.PathLike)]:
+        raise TrajectoryError(f"expected paths of recordings; found a {no_path[0]}. {_SAVEZ}, and give the file.")
     if not paths:
         raise TrajectoryError("no trajectory files were given. Name at least one .npz with recorded episodes.")
     different: dict[bytes, Episode] = {}  # one that is there twice could be learned from and held out at once
@@ -227,6 +232,8 @@ def _checked(path: Path, key: str, array: Array, spec: ObservationSpec, frames: 
         bad = np.flatnonzero(~np.isfinite(cast.reshape(len(cast), -1)).all(1))
         told = f"{path}: {key!r} holds NaN or infinity in {len(bad)} rows, the first of them row {bad[0]}"
         raise TrajectoryError(f"{told}. Leave the episodes with broken sensors out.")
+    if cast.size:
+        check_values(cast, spec, f"{path}: {key!r}", TrajectoryError)
     return cast
 
 

@@ -15,9 +15,10 @@ from ..artifact.files import check_file
 from ..artifact.golden import load_golden, load_golden_plans
 from ..artifact.load import Artifact, load_artifact, read_manifest
 from ..artifact.manifest import MANIFEST
+from ..core.given import integer
 from ..core.spec import FP32
-from ..errors import ArtifactError, TtscompileError
-from ..runtimes.open import open_runtime
+from ..errors import ArtifactError, RuntimeUnavailableError, TtscompileError
+from ..runtimes.open import MOST_THREADS, open_runtime
 from ..runtimes.policy import CompiledPolicy
 from ..trajectories.episodes import load_trajectories
 from .calls import (
@@ -74,6 +75,8 @@ def verify(
         TrajectoryError: the recordings do not fit the policy.
         RuntimeUnavailableError: onnxruntime is missing.
     """
+    calls = integer(calls, "calls", TtscompileError, 1)
+    threads = integer(threads, "threads", RuntimeUnavailableError, 1, MOST_THREADS)
     begun = time.monotonic()
     progress(INTEGRITY)
     rung, artifact = check_integrity(Path(path))

@@ -146,7 +146,7 @@ def _episode(
     for order in (1, -1):
         contexts = model.prologue({key: torch.from_numpy(value[::order].copy()) for key, value in obs.items()})
         wanted = pruner_plan(model.logits(contexts).numpy()) if pruned else artifact.schedule(name)
-        plan, _ = repair_plan(wanted, model.groups, cache.written)
+        plan, _ = repair_plan(wanted, cache.written)
         draws = None if golden.draws is None else torch.from_numpy(golden.draws[:, ::order].copy())
         initial, correction = torch.from_numpy(golden.initial[::order].copy()), artifact.corrections.get(name)
         result = model.denoise(contexts, initial, draws, plan, cache, correction=correction)
