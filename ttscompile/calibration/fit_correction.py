@@ -33,8 +33,8 @@ ROWS = 512
 """Calls whose conditions give the directions of the components, at most."""
 
 SMALLEST = 1e-4
-"""A component is mostly rounding, and not read, if its deviation is below this share of the largest one or of a tenth of
-the mean."""
+"""A component is mostly rounding, and not read, if its deviation is below this share of the largest one, or of a tenth
+of the mean."""
 
 ANCHOR_SHARE = 0.5
 """Of the blocks that a step computes, from which on it is an anchor."""
