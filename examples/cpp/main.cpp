@@ -4,8 +4,8 @@
 //
 // runs CALLS calls of one episode. Call r reads its inputs from FOLDER/r/NAME.bin, raw numbers in the machine's byte
 // order: the observations, initial_noise, step_noise (if the sampler is stochastic), plan, rollout_keep; and, where there
-// are such files, the plan's correction_anchors, correction and correction_bias, without which nothing is corrected. The
-// rollout cache is handed from call to call here. Prints one line of actions a call; times go to standard error.
+// are such files, the plan's correction (correction.bin, correction_bias.bin and so on), without which nothing is
+// corrected. The rollout cache is handed from call to call here. Prints one line of actions a call; times go to standard error.
 #include <onnxruntime_c_api.h>
 
 #include <chrono>

@@ -54,12 +54,17 @@ class ContextValues:
         if piece.outputs:
             feed = {name: np.ascontiguousarray(obs[name]) for name in piece.inputs}
             for name, value in run_named(self._sessions[CONDITION], piece.outputs, feed).items():
-                if name in self.values:
-                    np.copyto(self.values[name], value)
-                else:
-                    self.values[name] = value  # a feature, which only the pruner reads
+                np.copyto(self.values[name], value)
         if STEP in self._manifest.pieces:
             self._run_step(self._manifest.pieces[STEP])
+
+    def condition(self) -> FloatArray:
+        """What a correction reads: the features, one row of numbers a stream, ``[B, N]``."""
+        rows = []
+        for name in self._manifest.features:
+            axis = self._manifest.contexts[name].type.batch_axis
+            rows.append(np.moveaxis(self.values[name], axis or 0, 0).reshape(self.streams, -1))
+        return np.concatenate(rows, axis=1)
 
     def at(self, name: str, k: int) -> Array:
         """The value of a context at step k."""

@@ -109,11 +109,13 @@ class Workspace:
             np.multiply(noise.steps.transpose(0, 3, 1, 2), column, out=self._offset)
         else:
             self._offset.fill(0)
+        self._contexts.fill(obs)
         if correction is not None:
             self._offset += correction.bias
+            if correction.reads:
+                self._offset += correction.from_condition(self._contexts.condition())
         if known is not None:
             self._offset[:, known.channels, :, known.positions] = known.values[1:].transpose(0, 3, 1, 2)
-        self._contexts.fill(obs)
 
     def begin(self) -> None:
         """The residual stream of step 0; fills ``fresh``."""

@@ -147,6 +147,12 @@ class ReferenceModel:
         rows = [self._step(self._contexts(self._pieces.step.inputs, k, contexts)) for k in range(self.steps)]
         return Contexts(streams, condition, tuple(dict(zip(names, row, strict=True)) for row in rows))
 
+    def condition(self, contexts: Contexts) -> Tensor:
+        """What a correction reads of the observation: the pruner's features, one row a stream, ``[B, N]``."""
+        types = self._pieces.condition.types()
+        rows = [contexts.condition[name].movedim(types[name].batch_axis or 0, 0) for name in self._pieces.features]
+        return torch.cat([torch.zeros(contexts.streams, 0), *(row.reshape(contexts.streams, -1) for row in rows)], 1)
+
     def logits(self, contexts: Contexts, weights: Mapping[str, Tensor] | None = None) -> Tensor:
         """The pruner: float32 ``[B, K, blocks, 4]``.
 
@@ -210,9 +216,11 @@ class ReferenceModel:
             known: what a prefix makes known of the samples; None for nothing.
         """
         carried = hold(self.sampler.begin(initial), known, 0)
+        condition = self.condition(contexts) if correction is not None and correction.reads else None
         for k in range(self.steps):
             prediction = self.predict(carried.sample, k, contexts, blocks)
-            carried = self.sampler.advance(carried, prediction, None if noise is None else noise[k], k, correction)
+            draw = None if noise is None else noise[k]
+            carried = self.sampler.advance(carried, prediction, draw, k, correction, condition)
             carried = hold(carried, known, k + 1)
             yield carried
 

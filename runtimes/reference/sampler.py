@@ -39,7 +39,13 @@ class TorchSampler:
         return Carried(initial, memory, initial.new_zeros(streams, HISTORY * horizon, channels))
 
     def advance(
-        self, carried: Carried, prediction: Tensor, noise: Tensor | None, k: int, correction: Correction | None = None
+        self,
+        carried: Carried,
+        prediction: Tensor,
+        noise: Tensor | None,
+        k: int,
+        correction: Correction | None = None,
+        condition: Tensor | None = None,
     ) -> Carried:
         """What is carried to step k + 1 (``core.spec.SamplerTable`` has the formula).
 
@@ -49,6 +55,7 @@ class TorchSampler:
             noise: the draw used at step k, ``[B, T, D]``; None if the sampler is deterministic.
             k: step.
             correction: of the sampler's steps; None for none.
+            condition: what the correction reads of the observation, ``[B, N]``; None if it reads nothing.
         """
         table, (sample, memory, history) = self._table, carried
         row = {name: float(getattr(table, name)[k]) for name in table.COLUMNS}
@@ -67,6 +74,9 @@ class TorchSampler:
         if correction is None:
             return uncorrected
         weights, bias = torch.tensor(correction.weights[k]), torch.tensor(correction.bias[k])
+        if condition is not None and correction.reads:
+            observed = torch.tensor(correction.observed[:, k])
+            bias = bias + torch.einsum("bn,nf,fdt->dbt", condition, torch.tensor(correction.reading), observed)
         return correct(carried, prediction, uncorrected, weights, bias, bool(correction.anchors[k]))
 
 
@@ -85,7 +95,7 @@ def correct(
         prediction: the network's output at step k, ``[B, T, D]``.
         following: what is carried to step k + 1 without a correction.
         weights: of the correction at step k, ``[G, 6 T, T]``.
-        bias: of the correction at step k, ``[G, 1, T]``.
+        bias: of the correction at step k, ``[D, 1, T]``, or ``[D, B, T]`` with what it reads of the observation.
         anchor: whether step k enters the history.
     """
     added = (features(carried, prediction) @ weights + bias).permute(1, 2, 0)

@@ -14,6 +14,7 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration import fit_correction as fitting
 from ttscompile.calibration.fit_correction import anchors_of, fit_correction
 from ttscompile.calibration.task import Task
+from ttscompile.calibration.whole_steps import _held_out
 from ttscompile.core.lattice import PlanArray, Source, dense_plan, uniform_plan
 
 from . import tasks
@@ -32,9 +33,9 @@ def test_anchors_are_steps_that_compute_half_their_blocks() -> None:
     assert anchors_of(plan).tolist() == [True, False, True, False]
 
 
-def fitted(task: Task, plan: PlanArray) -> Task:
+def fitted(task: Task, plan: PlanArray, reads: bool = True) -> Task:
     """The same with the correction of a plan, fitted on all of its calls."""
-    return replace(task, executor=task.executor.corrected(fit_correction(task.executor, plan, task.calls)))
+    return replace(task, executor=task.executor.corrected(fit_correction(task.executor, plan, task.calls, reads)))
 
 
 def test_it_helps_on_calls_of_other_episodes(make_task: MakeTask, plan: PlanArray) -> None:
@@ -75,6 +76,42 @@ def test_the_reference_runtime_does_the_same(make_task: MakeTask, plan: PlanArra
 
 def test_the_same_calls_give_the_same_bytes(make_task: MakeTask, plan: PlanArray) -> None:
     task = make_task(calls=150)
-    one, two = (fit_correction(task.executor, plan, task.calls) for _ in range(2))
+    one, two = (fit_correction(task.executor, plan, task.calls, True) for _ in range(2))
     assert one.weights.tobytes() == two.weights.tobytes()
     assert one.bias.tobytes() == two.bias.tobytes()
+    assert one.observed.tobytes() == two.observed.tobytes()
+
+
+def test_it_reads_the_observation_where_that_helps_on_other_episodes(make_task: MakeTask, plan: PlanArray) -> None:
+    task, held_out = make_task(calls=400, episodes=range(4)), make_task(calls=60, episodes=range(4, 6)).calls
+    blind, reading = fitted(task, plan, reads=False), fitted(task, plan)
+    assert task.whole.reads == (reading.error(plan, held_out) < blind.error(plan, held_out))
+    correction = task.whole.correction(range(0, task.executor.model.steps, 3))
+    assert correction is not None
+    assert (correction.reads > 0) == task.whole.reads
+
+
+def test_calls_of_one_episode_do_not_tell_whether_reading_helps(make_task: MakeTask) -> None:
+    assert make_task(calls=60, episodes=range(1)).whole.reads is False
+
+
+def test_schedules_are_compared_on_other_episodes_than_they_were_fitted_on() -> None:
+    episodes = np.array([3, 1, 1, 0, 3, 2, 0, 4])
+    assert _held_out(episodes).tolist() == (episodes == 3).tolist()
+    assert _held_out(np.array([5, 5, 5, 5])).tolist() == [True, False, False, False]
+    assert _held_out(np.array([5])).tolist() == [True]
+
+
+@pytest.mark.parametrize("groups", [1, 3])
+def test_the_regression_finds_what_made_the_numbers(monkeypatch: pytest.MonkeyPatch, groups: int) -> None:
+    monkeypatch.setattr(fitting, "RIDGE", 1e-12)
+    draw = torch.Generator().manual_seed(0)
+    read, seen, weight, observed, bias = (
+        torch.randn(*shape, generator=draw, dtype=torch.float64)
+        for shape in ((3, 200, 12), (200, 5), (groups, 12, 2), (3, 5, 2), (3, 1, 2))
+    )
+    seen = seen - seen.mean(0)
+    missing = read @ weight + seen @ observed + bias
+    found = fitting._solve(read, seen, missing, groups)
+    for ours, made in ((found.weight, weight), (found.observed, observed.transpose(0, 1)), (found.bias, bias)):
+        torch.testing.assert_close(ours, made.float(), rtol=0, atol=1e-4)

@@ -12,11 +12,11 @@ import onnxruntime
 import pytest
 
 from tests.lower.whole_call import Episode, groups, inputs, make
-from tests.runtimes.plans import random_plan
+from tests.runtimes.plans import random_plan, random_reading
 from tests.runtimes.toys import toy_program
-from ttscompile.core.correction import no_correction
+from ttscompile.artifact import load_artifact
+from ttscompile.core.correction import Correction, no_correction
 from ttscompile.core.lattice import Source
-from ttscompile.lower.single_file import ANCHORS, CORRECTION, CORRECTION_BIAS
 
 SOURCE = Path(__file__).resolve().parents[2] / "examples" / "cpp" / "main.cpp"
 CALLS = 5
@@ -54,8 +54,9 @@ def test_an_episode_is_what_python_computes(program: Path, tmp_path: Path, strea
     reads, feeds = np.zeros(4, int), {}
     if streams == 2:  # of a calibrated schedule
         empty = no_correction(8, toy.spec.sample)
-        numbers = [rng.normal(0, 0.01, each.shape).astype(np.float32) for each in (empty.weights, empty.bias)]
-        feeds = dict(zip((ANCHORS, CORRECTION, CORRECTION_BIAS), (np.arange(8) % 3 == 0, *numbers), strict=True))
+        own = [rng.normal(0, 0.01, each.shape).astype(np.float32) for each in (empty.weights, empty.bias)]
+        numbers = load_artifact(tmp_path / "artifact").manifest.condition_numbers
+        feeds = Correction(np.arange(8) % 3 == 0, *own, *random_reading(rng, numbers, empty)).inputs()
     for r in range(CALLS):
         plan = random_plan(rng, 8, groups(toy), written, 0.3)
         obs, drawn = inputs(policy, rng, streams)

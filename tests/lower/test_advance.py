@@ -62,7 +62,7 @@ def corrected(weights: torch.Tensor, bias: torch.Tensor, *parts: torch.Tensor) -
             features = torch.cat([part[s, :, d] for part in parts])
             group = min(d, len(weights) - 1)
             for t in range(horizon):
-                result[s, t, d] = features @ weights[group, :, t] + bias[group, 0, t]
+                result[s, t, d] = features @ weights[group, :, t] + bias[d, 0, t]
     return result
 
 
@@ -70,7 +70,7 @@ def random_correction(steps: int, scale: float) -> Correction:
     rng = np.random.default_rng(0)
     nothing = no_correction(steps, (TOKENS, WIDTH))
     weights, bias = (rng.standard_normal(a.shape).astype(np.float32) * scale for a in (nothing.weights, nothing.bias))
-    return Correction(nothing.anchors, weights, bias)
+    return replace(nothing, weights=weights, bias=bias)
 
 
 def turned(x: torch.Tensor) -> torch.Tensor:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import numpy.typing as npt
 
 from ttscompile import legalize
 from ttscompile.artifact import Artifact
@@ -33,4 +34,15 @@ def random_correction(artifact: Artifact, rng: np.random.Generator) -> Correctio
         rng.random(manifest.steps) < 0.5,
         (scale * rng.standard_normal(like.weights.shape)).astype(np.float32),
         (0.1 * rng.standard_normal(like.bias.shape)).astype(np.float32),
+        *random_reading(rng, manifest.condition_numbers, like),
     )
+
+
+def random_reading(
+    rng: np.random.Generator, numbers: int, like: Correction, read: int = 3
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """What a random correction reads of N numbers of the condition, and what that adds."""
+    read = min(read, numbers)
+    reading = rng.standard_normal((numbers, read)) / np.sqrt(max(numbers, 1))
+    observed = 0.1 * rng.standard_normal((read, *like.observed.shape[1:]))
+    return reading.astype(np.float32), observed.astype(np.float32)

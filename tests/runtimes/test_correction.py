@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,27 @@ def test_both_runtimes_agree_on_random_corrections(toy_artifact: Artifact, strea
         ours, theirs = (r.predict(obs, noise, plans, correction=correction)[0] for r in runtimes)
         assert_equal_but_for_rounding(ours, theirs, terms)
         written |= plans == Source.COMPUTE
+
+
+@pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
+def test_what_it_reads_of_the_observation_is_each_streams_own(toy_artifact: Artifact, runtime: str) -> None:
+    """Every step adds what the observation says; with another observation in one stream the others stay."""
+    rng, made = np.random.default_rng(0), open_runtime(toy_artifact, runtime)
+    correction = random_correction(toy_artifact, rng)
+    assert correction.reads > 0
+    plan = uniform_plan(toy_artifact.manifest.steps, len(toy_artifact.manifest.groups), 2)
+    obs, noise = random_inputs(toy_artifact, rng, 3)
+
+    def call(given: dict[str, np.ndarray], one: Correction) -> np.ndarray:
+        made.reset()
+        return made.predict(given, noise, plan, correction=one)[0]
+
+    blind = replace(correction, observed=np.zeros_like(correction.observed))
+    assert (np.abs(call(obs, correction) - call(obs, blind)).max(axis=(1, 2)) > 1e-2).all()
+    turned = {key: np.concatenate([-value[:1], value[1:]]) for key, value in obs.items()}
+    changed = np.abs(call(turned, correction) - call(obs, correction)).max(axis=(1, 2))
+    assert changed[0] > 1e-2
+    assert (changed[1:] < 1e-5).all()
 
 
 def test_a_correction_of_one_call_is_gone_in_the_next(toy_artifact: Artifact) -> None:
@@ -104,7 +126,7 @@ def test_the_first_call_binds_nothing(
     plans, correction = artifact.schedule("fast")[None], artifact.corrections["fast"]
     runtime.predict(obs, noise, plans, plan_name="fast", correction=correction)
     assert made == []
-    another = Correction(correction.anchors, correction.weights, correction.bias)
+    another = replace(correction)
     with pytest.raises(AttributeError):  # what stands in for a binding cannot run
         runtime.predict(obs, noise, plans, plan_name="fast", correction=another)
     assert len(made) == artifact.manifest.steps

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 import ttscompile
 from tests.calibration import policies
+from tests.runtimes.plans import random_reading
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import update_calibration
 from ttscompile.core.correction import no_correction
@@ -52,6 +54,8 @@ def sound(compiled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     corrected = no_correction(policy.STEPS, (policy.HORIZON, policy.CHANNELS))
     corrected.weights[2:] += np.random.default_rng(0).normal(0, 0.002, corrected.weights[2:].shape)
     corrected.anchors[[0, 4, 8]] = True
+    reading = random_reading(np.random.default_rng(1), load_artifact(directory).manifest.condition_numbers, corrected)
+    corrected = replace(corrected, reading=reading[0], observed=0.05 * reading[1])
     pruner = {name: np.array(value) for name, value in load_artifact(directory).pruner.items()}
     pruner["pruner.base"][...] = np.eye(4)[policy.sparse()] - 0.5 * np.eye(4)[Source.ROLLOUT]
     pruner["pruner.step"] *= 10

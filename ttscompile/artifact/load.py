@@ -272,7 +272,7 @@ def _plans(directory: Path, manifest: Manifest) -> tuple[Mapping[str, PlanArray]
             check_schedule(name, plan, manifest)
         for name in names:
             corrections[name] = Correction(**{field: parts[f"{name}/{field}"] for field in CORRECTION_FIELDS})
-            corrections[name].require_fit(manifest.steps, manifest.spec.sample)
+            corrections[name].require_fit(manifest.steps, manifest.spec.sample, manifest.condition_numbers)
     except IllegalPlanError as error:
         raise ArtifactError(f"{where}: {name}: {error} {REMEDY}") from error
     return MappingProxyType(schedules), MappingProxyType(corrections)

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
+from ..core.correction import numbers_of
 from ..core.lattice import PlanArray, plan_flops
 from ..core.rules import NotNegative, Positive, Rule, Sha256, Share
 from ..core.spec import FP32, PolicySpec
@@ -18,7 +19,7 @@ from ..ir.pieces import OF_ALL_BLOCKS, PRUNER
 from ..ir.program import Binding
 
 FORMAT = "ttscompile artifact"
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 MANIFEST = "manifest.json"
 DENSE = "dense"
 """The plan that computes every cell; every artifact has it without listing it."""
@@ -94,7 +95,7 @@ class FlopsRecord:
 
     Attributes:
         dense: one call of the captured denoiser as it was: K evaluations.
-        prologue: once a call: condition, and step values for all K steps.
+        prologue: once a call: condition, step values for all K steps, and what a correction reads of the condition.
         pruner: once a call.
         stem: one evaluation of sample to stream; there are K a call.
         tail: one evaluation of stream to prediction, and of a correction; there are K a call.
@@ -246,7 +247,7 @@ class Manifest:
         pieces: ONNX graphs: ``condition``, ``step``, ``pruner``, ``stem``, ``advance``, ``block_00``...; those that the
             policy has; and ``blocks``, all of its blocks in one (``ir.joint``).
         contexts: binding and type of every context.
-        features: condition values that the pruner reads.
+        features: condition values that the pruner reads, and corrections.
         flops: see ``FlopsRecord``.
         plans: beside ``dense``, by name.
         default_plan: ``dense`` or a name in ``plans``.
@@ -284,6 +285,11 @@ class Manifest:
     def steps(self) -> int:
         """K."""
         return self.spec.sampler.steps
+
+    @property
+    def condition_numbers(self) -> int:
+        """N: how many numbers of one stream's condition a correction may read; 0 where there are too many."""
+        return numbers_of(self.contexts[name].type.at(1) for name in self.features)
 
     @property
     def groups(self) -> tuple[int, ...]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from ..core.correction import condition_flops, numbers_of
 from ..core.lattice import plan_flops, sparsity
 from ..core.update import update_flops
 from ..errors import ArtifactError
@@ -70,14 +71,16 @@ def block_records(program: Program) -> tuple[BlockRecord, ...]:
 
 def flops_record(program: Program) -> FlopsRecord:
     """FLOPs of one call's parts for one stream."""
-    pieces = program.pieces
-    step = 0 if pieces.step is None else graph_flops(pieces.step) * program.spec.sampler.steps
+    pieces, types = program.pieces, program.pieces.condition.types()
+    steps, sample = program.spec.sampler.steps, program.spec.sample
+    step = 0 if pieces.step is None else graph_flops(pieces.step) * steps
+    read = condition_flops(steps, sample, numbers_of(types[name].at(1) for name in pieces.features))
     return FlopsRecord(
         dense=program.dense_flops,
-        prologue=graph_flops(pieces.condition) + step,
+        prologue=graph_flops(pieces.condition) + step + read,
         pruner=0 if pieces.pruner is None else graph_flops(pieces.pruner),
         stem=graph_flops(pieces.stem.graph),
-        tail=graph_flops(pieces.tail.graph) + update_flops(program.spec.sampler, program.spec.sample),
+        tail=graph_flops(pieces.tail.graph) + update_flops(program.spec.sampler, sample),
         blocks=tuple(graph_flops(piece.graph) for piece in pieces.blocks),
     )
 
@@ -94,6 +97,8 @@ def context_records(program: Program) -> dict[str, ContextRecord]:
     if pieces.step is not None:
         readers = {names.STEP: dict(pieces.step.inputs), **readers}
         computed[Binding.STEP] = set(pieces.step.outputs)
+    if pieces.pruner is not None:  # it reads the features, and so may corrections
+        readers[names.PRUNER] = dict(pieces.pruner.inputs)
     records: dict[str, ContextRecord] = {}
     for piece, contexts in readers.items():
         for name, kind in contexts.items():

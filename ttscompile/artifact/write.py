@@ -292,7 +292,7 @@ def _plan_arrays(
     for plan, correction in corrections.items():
         if plan not in manifest.plans:
             raise ArtifactError(f"correction of {plan!r}: expected a plan of the artifact, {sorted(manifest.plans)}.")
-        correction.require_fit(manifest.steps, manifest.spec.sample)
+        correction.require_fit(manifest.steps, manifest.spec.sample, manifest.condition_numbers)
         arrays |= {f"{CORRECTION_PREFIX}{plan}/{name}": getattr(correction, name) for name in CORRECTION_FIELDS}
     return arrays
 

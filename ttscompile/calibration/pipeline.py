@@ -37,10 +37,10 @@ from .strategies import DEFAULT, FITTED, Strategy, strategy_of
 from .targets import draw_calls, with_targets
 from .task import Clock, Found, Search, Task
 
-CALLS_A_MINUTE = 64
-"""Calls to learn from, for each minute of the time limit."""
+EVALUATIONS_A_MINUTE = 6400
+"""Of the network, to make the calls to learn from, for each minute of the time limit."""
 
-FEWEST_CALLS, MOST_CALLS = 64, 1024
+FEWEST_CALLS, MOST_CALLS = 64, 3072
 
 CALLS_A_FEATURE = 3
 """Calls to learn from at least, for each number that a correction reads. On Push-T (97 of them, 95 %) one that is
@@ -126,8 +126,8 @@ def calibrate(
     episodes = load_episodes(spec, trajectories, observation)
     split = split_episodes(len(episodes), validation_fraction, seed)
     features = FEATURES * spec.sample[0] + 1
-    fewest = min(CALLS_A_FEATURE * features, MOST_CALLS) if chosen.fits_correction else FEWEST_CALLS
-    limit = int(np.clip(CALLS_A_MINUTE * max_minutes, fewest, MOST_CALLS))
+    fewest = min(CALLS_A_FEATURE * features, 1024) if chosen.fits_correction else FEWEST_CALLS
+    limit = int(np.clip(EVALUATIONS_A_MINUTE / spec.sampler.steps * max_minutes, fewest, MOST_CALLS))
     state = StateFile(
         Path(path),
         {

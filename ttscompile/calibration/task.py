@@ -136,8 +136,13 @@ class Task:
         return float(self.actions.errors(self.executor.run(plan, calls), calls.targets, units=False).mean())
 
     def whole_steps(self, steps: Sequence[int], **notes: Any) -> Found:
-        """The schedule that computes these steps, with its correction; they are added to the notes."""
-        return Found(self.whole.plan(steps), {"steps": list(steps), **notes}, self.whole.correction(steps))
+        """The schedule that computes these steps, with its correction.
+
+        The notes get the steps, and how many numbers of the condition the correction reads.
+        """
+        correction = self.whole.correction(steps)
+        reads = 0 if correction is None else correction.reads
+        return Found(self.whole.plan(steps), {"steps": list(steps), "reads": reads, **notes}, correction)
 
 
 class Search(Protocol):

@@ -5,12 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from ..core.correction import Correction
-from ..core.lattice import PlanArray, whole_steps_plan
-from .calls import Actions, Calls
+from ..core.lattice import BoolArray, PlanArray, whole_steps_plan
+from .calls import Actions, Calls, IntArray
 from .execute import Executor
 from .fit_correction import fit_correction
 
@@ -39,7 +40,8 @@ class WholeSteps:
         executor: runs the policy.
         actions: which part of the sample counts.
         calls: with what the dense policy answers to them.
-        seed: decides which of the calls corrections are fitted on, and which schedules are compared on.
+        seed: decides which of the calls corrections are fitted on, and which, of other episodes, schedules are compared
+            on.
     """
 
     _pace = 0.0
@@ -48,10 +50,10 @@ class WholeSteps:
     def __init__(self, executor: Executor, actions: Actions, calls: Calls, seed: int) -> None:
         self._executor, self._actions, self._calls = executor, actions, calls
         order = np.random.default_rng((seed, 3, 0)).permutation(calls.count)
-        compared = max(1, min(COMPARED, calls.count // 4))
-        self._compared = self._fitted = executor.select(calls, order[:compared])
-        if calls.count > 1:
-            self._fitted = executor.select(calls, order[compared:][:FITTED])
+        held_out = _held_out(calls.episodes[order])
+        self._compared = self._fitted = executor.select(calls, order[held_out][:COMPARED])
+        if not held_out.all():
+            self._fitted = executor.select(calls, order[~held_out][:FITTED])
 
     @property
     def steps(self) -> int:
@@ -74,7 +76,20 @@ class WholeSteps:
         corrected, plain = self._with_and_without(steps)
         if plain.normalised <= corrected.normalised:
             return None
-        return fit_correction(self._executor, self.plan(steps), self._calls)
+        return fit_correction(self._executor, self.plan(steps), self._calls, self.reads)
+
+    @cached_property
+    def reads(self) -> bool:
+        """Whether corrections read the observation: if that is better on episodes that they were not fitted on.
+
+        Decided once, on a schedule whose steps halve what is left of the loop: 0, 50, 75, 88, 94, 97 of 100.
+        """
+        if len(np.unique(self._fitted.episodes)) < 2:
+            return False
+        steps = sorted({0, *(self.steps - (self.steps >> i) for i in range(1, 6) if self.steps >> i > 1)})
+        fitted = (fit_correction(self._executor, self.plan(steps), self._fitted, reads) for reads in (False, True))
+        without, reading = (self._errors(steps, correction).normalised for correction in fitted)
+        return reading < without
 
     def comparing(self, full_steps: int) -> float:
         """Seconds that ``errors`` of a schedule takes, by those so far; 0 before any."""
@@ -87,7 +102,7 @@ class WholeSteps:
 
     def _with_and_without(self, steps: Sequence[int]) -> tuple[Errors, Errors]:
         begun = time.monotonic()
-        fitted = fit_correction(self._executor, self.plan(steps), self._fitted)
+        fitted = fit_correction(self._executor, self.plan(steps), self._fitted, self.reads)
         errors = self._errors(steps, fitted), self._errors(steps, None)
         self._pace = max(self._pace, (time.monotonic() - begun) / len(steps))
         return errors
@@ -97,3 +112,15 @@ class WholeSteps:
         samples = self._executor.corrected(correction).run(self.plan(steps), calls)
         normalised, units = (self._actions.errors(samples, calls.targets, units=u).mean() for u in (False, True))
         return Errors(float(normalised), float(units))
+
+
+def _held_out(episodes: IntArray) -> BoolArray:
+    """Which calls, of the episodes ``[n]``, are compared on: all of a quarter of the episodes, the first ones.
+
+    A correction reads the observation, and those of one episode are nearly the same. If there is one episode alone, a
+    quarter of its calls.
+    """
+    known = episodes[np.sort(np.unique(episodes, return_index=True)[1])]
+    if len(known) > 1:
+        return np.isin(episodes, known[: max(1, len(known) // 4)])
+    return np.arange(len(episodes)) < len(episodes) // 4 if len(episodes) > 1 else np.ones(1, np.bool_)

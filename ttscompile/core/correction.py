@@ -6,16 +6,23 @@ them at the last two *anchors*, steps that compute much. So the sampler's scalar
 
     features_k  = [sample_k, prediction_k, history_k]                               [B, 6 T, D]
     sample_k+1 += weights[k, d]^T features_k[:, :, d] + bias[k, d]                  for each action dimension d
+               += (condition @ reading) @ observed[:, k, d]
     history     = [sample, prediction] of the last anchor, then of the one before   [B, 4 T, D], zeros at first
 
 It mixes time steps of the chunk, never action dimensions, and costs ``12 T^2 D`` FLOPs a step: nothing beside a block.
+The second line reads the observation, as the policy's own encoder gives it to the pruner: ``condition [B, N]``. It
+depends on nothing in the loop, so one product before the loop makes it for all steps.
+
 The idea is that of solvers fitted to one model (Bespoke solvers, arXiv 2310.19075; DPM-Solver-v3, arXiv 2310.13268),
 here fitted to one model *and* one schedule of reuse, by least squares, with the policy's own noise.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -29,8 +36,18 @@ FEATURES = 6
 HISTORY = 4
 """Those of the anchors."""
 
+CORRECTION, CORRECTION_BIAS, ANCHORS = "correction", "correction_bias", "correction_anchors"
+READING, OBSERVED = "correction_reading", "correction_observed"
+"""Inputs of a single ONNX file that carry a schedule's correction."""
+
 LARGEST = 4 << 20
-"""Numbers in the weights above which all action dimensions share them."""
+"""Numbers in the weights above which all action dimensions share them; and at most in what the observation adds."""
+
+COMPONENTS = 64
+"""Directions of the condition that the correction reads at most."""
+
+MOST_NUMBERS = 16384
+"""Of the condition, above which the correction does not read it: the keys of a prefix are millions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +57,9 @@ class Correction:
     Attributes:
         anchors: bool ``[K]``; after these steps sample and prediction enter the history.
         weights: float32 ``[K, G, 6 T, T]``; G is the number of action dimensions, or 1 where they share.
-        bias: float32 ``[K, G, 1, T]``.
+        bias: float32 ``[K, D, 1, T]``.
+        reading: float32 ``[N, F]``; from the condition's N numbers to the F that are read. F is 0 where none are.
+        observed: float32 ``[F, K, D, T]``; what each of these adds to the sample of every step.
 
     Raises:
         IllegalPlanError: shapes or dtypes that do not fit each other, or numbers that are not finite.
@@ -49,23 +68,37 @@ class Correction:
     anchors: npt.NDArray[np.bool_]
     weights: npt.NDArray[np.float32]
     bias: npt.NDArray[np.float32]
+    reading: npt.NDArray[np.float32]
+    observed: npt.NDArray[np.float32]
 
     def __post_init__(self) -> None:
         steps, groups, _, horizon = self.weights.shape if self.weights.ndim == 4 else (0, 0, 0, 0)
-        shapes = ((steps,), (steps, groups, FEATURES * horizon, horizon), (steps, groups, 1, horizon))
-        arrays = (self.anchors, self.weights, self.bias)
-        types = tuple(str(array.dtype) for array in arrays)
-        if tuple(array.shape for array in arrays) != shapes or types != ("bool", "float32", "float32"):
+        numbers, read = self.reading.shape if self.reading.ndim == 2 else (0, 0)
+        dimensions = self.observed.shape[2] if self.observed.ndim == 4 else 0
+        arrays = (self.anchors, self.weights, self.bias, self.reading, self.observed)
+        expected = (
+            ((steps,), "bool"),
+            ((steps, groups, FEATURES * horizon, horizon), "float32"),
+            ((steps, dimensions, 1, horizon), "float32"),
+            ((numbers, read), "float32"),
+            ((read, steps, dimensions, horizon), "float32"),
+        )
+        if tuple((array.shape, str(array.dtype)) for array in arrays) != expected:
             shown = ", ".join(f"{array.dtype}{list(array.shape)}" for array in arrays)
             raise IllegalPlanError(
-                "a correction has anchors bool[K], weights float32[K, G, 6 T, T] and a bias float32[K, G, 1, T]; found"
-                f" {shown}."
+                "a correction has anchors bool[K], and in float32 weights [K, G, 6 T, T], a bias [K, D, 1, T], a"
+                f" reading [N, F] and what is observed [F, K, D, T]; found {shown}."
             )
-        if not (np.isfinite(self.weights).all() and np.isfinite(self.bias).all()):
+        if not all(np.isfinite(array).all() for array in arrays[1:]):
             raise IllegalPlanError("a correction holds numbers that are not finite. Calibrate the artifact again.")
 
-    def require_fit(self, steps: int, sample: tuple[int, int]) -> None:
-        """Raise unless it is a correction for a policy of K steps and samples ``(T, D)``.
+    @property
+    def reads(self) -> int:
+        """F: how many numbers of the condition it reads; 0 if it does not read the observation."""
+        return self.reading.shape[1]
+
+    def require_fit(self, steps: int, sample: tuple[int, int], numbers: int) -> None:
+        """Raise unless it is a correction for a policy of K steps, samples ``(T, D)`` and a condition of N numbers.
 
         Raises:
             IllegalPlanError: it is not.
@@ -75,6 +108,27 @@ class Correction:
             raise IllegalPlanError(
                 f"the correction has weights {list(self.weights.shape)}; this policy needs {list(expected)}."
             )
+        found, wanted = (len(self.reading), self.observed.shape[2]), (numbers, sample[1])
+        if self.reads > components_of(steps, sample, numbers) or (self.reads and found != wanted):
+            raise IllegalPlanError(
+                f"the correction reads {self.reads} combinations of {found[0]} numbers of the condition for"
+                f" {found[1]} action dimensions; this policy has {numbers} such numbers and {sample[1]} dimensions."
+            )
+
+    def inputs(self) -> dict[str, npt.NDArray[Any]]:
+        """Its arrays by the names of the inputs of a single ONNX file (``lower.single_file``)."""
+        named = {ANCHORS: self.anchors, CORRECTION: self.weights, CORRECTION_BIAS: self.bias}
+        return named | ({READING: self.reading, OBSERVED: self.observed} if self.reads else {})
+
+    def from_condition(self, condition: FloatArray) -> FloatArray:
+        """What the observation adds to the sample of every step, float32 ``[K, D, B, T]``.
+
+        Args:
+            condition: float32 ``[B, N]``.
+        """
+        read, *shape = self.observed.shape
+        added = (condition @ self.reading) @ self.observed.reshape(read, -1)
+        return added.reshape(-1, *shape).transpose(1, 2, 0, 3)
 
 
 def remember(history: FloatArray, sample: FloatArray, prediction: FloatArray) -> None:
@@ -91,6 +145,26 @@ def correction_flops(sample: tuple[int, int]) -> int:
     return 2 * FEATURES * horizon * horizon * dimensions
 
 
+def numbers_of(features: Iterable[tuple[int, ...]]) -> int:
+    """N: how many numbers of the condition a correction may read; 0 where there are too many.
+
+    Args:
+        features: the shapes of its values for one stream.
+    """
+    numbers = sum(math.prod(shape) for shape in features)
+    return numbers if numbers <= MOST_NUMBERS else 0
+
+
+def components_of(steps: int, sample: tuple[int, int], numbers: int) -> int:
+    """How many numbers a correction reads at most of a condition of N numbers."""
+    return min(COMPONENTS, numbers, LARGEST // (steps * sample[0] * sample[1]))
+
+
+def condition_flops(steps: int, sample: tuple[int, int], numbers: int) -> int:
+    """FLOPs of reading a condition of N numbers, once a call, for one stream of samples ``(T, D)``."""
+    return 2 * components_of(steps, sample, numbers) * (numbers + steps * sample[0] * sample[1])
+
+
 def groups_of(steps: int, sample: tuple[int, int]) -> int:
     """Into how many groups the action dimensions of samples ``(T, D)`` fall: each for itself, or all in one."""
     horizon, dimensions = sample
@@ -99,9 +173,11 @@ def groups_of(steps: int, sample: tuple[int, int]) -> int:
 
 def no_correction(steps: int, sample: tuple[int, int]) -> Correction:
     """The correction of K steps and samples ``(T, D)`` that changes nothing."""
-    groups, horizon = groups_of(steps, sample), sample[0]
+    groups, (horizon, dimensions) = groups_of(steps, sample), sample
     return Correction(
         anchors=np.zeros(steps, np.bool_),
         weights=np.zeros((steps, groups, FEATURES * horizon, horizon), np.float32),
-        bias=np.zeros((steps, groups, 1, horizon), np.float32),
+        bias=np.zeros((steps, dimensions, 1, horizon), np.float32),
+        reading=np.zeros((0, 0), np.float32),
+        observed=np.zeros((0, steps, dimensions, horizon), np.float32),
     )

@@ -45,6 +45,15 @@ class Contexts:
         if pieces.step is not None:
             self._rows.update(self._step_values(models[STEP], weights))
 
+    def condition(self) -> str:
+        """What a correction reads: the pruner's features, one row of numbers a stream, ``[B, N]``."""
+        types, rows = self._pieces.condition.types(), []
+        for name in self._pieces.features:
+            axis, value = types[name].batch_axis or 0, self._conditions[name]
+            order = [axis, *(i for i in range(len(types[name].shape)) if i != axis)]
+            rows.append(self._main.op("Flatten", self._main.op("Transpose", value, perm=order), axis=1))
+        return rows[0] if len(rows) == 1 else self._main.op("Concat", *rows, axis=1)
+
     def value(self, w: GraphWriter, name: str, k: str, type_: TensorType) -> str:
         """A context at the step whose index is the value ``k``; ``w`` writes where it is read."""
         binding = self._pieces.bindings[name]

@@ -18,9 +18,10 @@ All B streams of a batch follow one plan. For K steps and N blocks the inputs ar
                                             ROLLOUT, and the cache stays empty
 ======================= =================== ==========================================================================
 
-For a schedule that has a correction (``ttscompile.core.correction``), its anchors, weights and bias may be given as
-``correction_anchors``, ``correction`` and ``correction_bias``; inputs that are left out correct nothing. onnxruntime
-warns, when it loads the file, that these three have values and can be overridden. The outputs are
+A schedule that has a correction wants it as further inputs, which ``Correction.inputs`` gives: ``correction``,
+``correction_bias`` and ``correction_anchors``, and if it reads the observation ``correction_reading`` and
+``correction_observed``. Inputs that are left out correct nothing. onnxruntime warns, when it loads the file, that these
+have values and can be overridden. The outputs are
 
 ======================= =================== ==========================================================================
 ``action``              float32 [B,Ta,Da]   what to execute
@@ -39,7 +40,17 @@ from collections.abc import Mapping
 import numpy as np
 from onnx import ModelProto, ValueInfoProto, helper
 
-from ..core.correction import FEATURES, HISTORY, no_correction
+from ..core.correction import (
+    ANCHORS,
+    CORRECTION,
+    CORRECTION_BIAS,
+    FEATURES,
+    HISTORY,
+    OBSERVED,
+    READING,
+    no_correction,
+    numbers_of,
+)
 from ..core.spec import PolicySpec
 from ..core.update import columns, diagonals, rows
 from ..errors import LoweringError
@@ -50,9 +61,6 @@ from .graph_writer import GraphWriter, Weights, tensor
 from .loop import GROUP, DenoisingLoop, LoopInputs
 from .onnx_model import opsets, own_model
 from .plan import LoweredPlan, lower_plan
-
-CORRECTION, CORRECTION_BIAS, ANCHORS = "correction", "correction_bias", "correction_anchors"
-"""Inputs of the whole call that carry a schedule's correction."""
 
 LARGEST = 2**31 - 1
 """Bytes of a file that protobuf reads."""
@@ -87,6 +95,9 @@ def lower_single_file(program: Program, models: Mapping[str, ModelProto], weight
         inputs.append(tensor(name, array.dtype, array.shape))
         main.default(name, array)
     update, offset = _update(main, spec, streams)
+    if numbers := numbers_of(program.pieces.condition.types()[name].at(1) for name in program.pieces.features):
+        inputs += _condition_inputs(main, spec, numbers)
+        offset = main.op("Add", offset, _observed(main, spec, contexts.condition()))
     history, memories = _zeros(main, spec, streams, HISTORY), spec.sampler.memories
     memory = _zeros(main, spec, streams, memories) if memories else None
     loop = DenoisingLoop(main, program, models, weights, contexts)
@@ -158,6 +169,26 @@ def _update(main: GraphWriter, spec: PolicySpec, streams: str) -> tuple[str, str
         scale = main.constant(sampler.noise_to_next[:, None, None, None], np.float32)
         offset = main.op("Add", main.op("Mul", noise, scale), offset)
     return update, offset
+
+
+def _condition_inputs(main: GraphWriter, spec: PolicySpec, numbers: int) -> list[ValueInfoProto]:
+    """The inputs of a correction that reads N numbers of the condition; they read one that adds nothing by default."""
+    (horizon, dimensions), steps = spec.sample, spec.sampler.steps
+    main.default(READING, np.zeros((numbers, 1), np.float32))
+    main.default(OBSERVED, np.zeros((1, steps, dimensions, horizon), np.float32))
+    return [
+        tensor(READING, np.float32, [numbers, "F"]),
+        tensor(OBSERVED, np.float32, ["F", steps, dimensions, horizon]),
+    ]
+
+
+def _observed(main: GraphWriter, spec: PolicySpec, condition: str) -> str:
+    """``Correction.from_condition`` in ONNX: ``[K, D, B, T]`` of the condition's numbers ``[B, N]``."""
+    (horizon, dimensions), steps = spec.sample, spec.sampler.steps
+    rows = main.op("Reshape", OBSERVED, main.constant([-1, steps * dimensions * horizon]))
+    added = main.op("MatMul", main.op("MatMul", condition, READING), rows)
+    split = main.op("Reshape", added, main.constant([-1, steps, dimensions, horizon]))
+    return main.op("Transpose", split, perm=[1, 2, 0, 3])
 
 
 def _zeros(main: GraphWriter, spec: PolicySpec, streams: str, count: int) -> str:

@@ -47,6 +47,9 @@ class Probe:
         named = {**obs, **{arguments[key]: value for key, value in obs.items()}}
         feed = {name: np.ascontiguousarray(named[name]) for name in piece.inputs}
         condition = run_named(self._sessions[CONDITION], piece.outputs, feed) if piece.outputs else {}
+        types = {name: artifact.manifest.contexts[name].type for name in artifact.manifest.features}
+        rows = [np.moveaxis(condition[name], kind.batch_axis or 0, 0) for name, kind in types.items()]
+        self._condition = [row.reshape(self.streams, -1) for row in rows]
         self._contexts = [self._step(k, tables, condition) for k in range(self._manifest.steps)]
         self._tail_blanks = {
             one.name: np.zeros([n if isinstance(n, int) else self.streams for n in one.shape], np.float32)
@@ -89,6 +92,7 @@ class Probe:
         spec, blocks, groups = self._manifest.spec, self._manifest.blocks, self._manifest.groups
         sampler, horizon = spec.sampler, spec.sample[0]
         correction = correction or no_correction(sampler.steps, spec.sample)
+        read = np.concatenate(self._condition, 1) @ correction.reading if correction.reads else None
         updates, own, shared = matrices(sampler, correction), dict[int, Array](), dict[int, Array]()
         sample = noise.initial.transpose(2, 0, 1)
         dimensions = sample.shape[0]
@@ -118,7 +122,8 @@ class Probe:
                 denoised = sampler.sample_to_x0[k] * sample + sampler.out_to_x0[k] * prediction
                 parts.append(np.clip(denoised, -sampler.clip, sampler.clip))
             product = np.concatenate([*parts, memory], 2) @ updates[k]
-            following, memory = product[..., :horizon] + correction.bias[k], product[..., horizon:]
+            seen = 0.0 if read is None else np.einsum("bf,fdt->dbt", read, correction.observed[:, k])
+            following, memory = product[..., :horizon] + correction.bias[k] + seen, product[..., horizon:]
             if noise.steps is not None:
                 following = following + sampler.noise_to_next[k] * noise.steps[k].transpose(2, 0, 1)
             if correction.anchors[k]:
