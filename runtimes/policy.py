@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import weakref
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import DENSE
 from ttscompile.core.spec import FP32, ChunkSpec, FloatArray, Noise, ObservationSpec
 from ttscompile.errors import IllegalPlanError, RuntimeUnavailableError, TtscompileError
+from ttscompile.measure.process import Process
 
 from .arrays import check_observation, check_seed, is_tensor, like
 from .inpainting import check_prefix, prefix_refusal
@@ -24,6 +26,9 @@ from .open import kind_of, open_runtime
 from .queues import Queues, is_window
 from .report import CallReport
 from .runtime import Runtime
+
+LONGEST_WAIT = 10.0
+"""Seconds that the end of the interpreter waits for a call under way."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +125,8 @@ def load(
 class CompiledPolicy:
     """A policy that takes the place of the original: ``reset`` at the start of an episode, then ``predict_action``.
 
-    One caller at a time; a second one gets an error rather than somebody else's residuals.
+    One caller at a time; a second one gets an error rather than somebody else's residuals. A forked process gets one,
+    too, where the call might hang: load the policy in the process that calls it.
 
     Args:
         artifact: loaded and checked.
@@ -144,7 +150,17 @@ class CompiledPolicy:
         self._rng = np.random.default_rng(check_seed(seed))
         self.last_report: CallReport | None = None
         self._queues = Queues(artifact.manifest.spec.observations)
-        self._lock = threading.Lock()
+        self._lock, self._process = threading.Lock(), Process()
+        self._exit = weakref.finalize(self, _end_calls, self._lock, self._process)
+
+    def __getstate__(self) -> None:
+        """Refuse to be copied, and to be sent to another process.
+
+        Raises:
+            TtscompileError: always.
+        """
+        remedy = "Load it again, where it is called: ttscompile.load(DIR)."
+        raise TtscompileError(f"a compiled policy cannot be copied, nor sent to another process. {remedy}")
 
     @property
     def info(self) -> PolicyInfo:
@@ -330,13 +346,30 @@ class CompiledPolicy:
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
+        if self._process.left:
+            what = f"the policy was loaded in {self._process}. Threads and locks that a call needs are missing here"
+            raise TtscompileError(f"{what}. Load the policy in the process that calls it, after the fork.")
         if not self._lock.acquire(blocking=False):
+            if not self._exit.alive:
+                if threading.current_thread() is not threading.main_thread():
+                    threading.Event().wait()  # for the end of the interpreter, which is the end of a daemon thread
+                remedy = "Register what shall call it then, with atexit, after the policy was loaded."
+                raise TtscompileError(f"the program is ending, and the policy makes no more calls. {remedy}")
             remedy = "It serves one caller at a time: load one policy a thread, or send all streams in one batch."
             raise TtscompileError(f"the policy is in the middle of a call on another thread. {remedy}")
         try:
             yield
         finally:
             self._lock.release()
+
+
+def _end_calls(lock: threading.Lock, process: Process) -> None:
+    """At the end of the interpreter: wait for the call under way, and let no other begin.
+
+    A daemon thread that comes back from onnxruntime when the interpreter is gone would abort the process.
+    """
+    if not process.left:
+        lock.acquire(timeout=LONGEST_WAIT)
 
 
 def _require_plan(artifact: Artifact, name: str) -> None:
