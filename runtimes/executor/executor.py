@@ -81,9 +81,9 @@ class AsyncExecutor:
         self.trace = Trace(settings.trace_events, self._identity)
         self._failure_told = self._closed = False
         self._worker = Worker(policy, settings, self._resolved, self._clock, self.trace)
-        self._worker.open(latencies, open_timeout)
         self._finalizer = weakref.finalize(self, self._worker.abandon)
         self._finalizer.atexit = False  # the worker sees to that itself
+        self._worker.open(latencies, open_timeout)
 
     # The control loop's side
 

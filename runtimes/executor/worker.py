@@ -63,6 +63,8 @@ class Worker:
         self._reset_due = True
         self._reset_seed: int | None = None
         self._ready = threading.Event()
+        self._latencies: Mapping[str, float] | None = None  # as they were given
+        self._thread = threading.Thread(target=self._run, name="ttscompile-executor", daemon=True)
 
     # Everybody else's side
 
@@ -77,11 +79,10 @@ class Worker:
             ExecutorError: it takes longer than that, or something does not fit.
             InfeasibleError: no tier is fast enough.
         """
-        arguments = (latencies,)
-        self._thread = threading.Thread(target=self._run, args=arguments, name="ttscompile-executor", daemon=True)
+        self._latencies = latencies
         atexit.register(self._end_at_exit)
-        self._thread.start()
         try:
+            self._thread.start()
             opened = self._ready.wait(timeout)
         except BaseException:  # an interrupt: nobody will have an executor to close
             self.end()
@@ -132,15 +133,15 @@ class Worker:
 
     def _end_at_exit(self) -> None:
         """A daemon thread that comes back from a library when the interpreter is gone may abort the process."""
-        if not self.process.left:
+        if not self.process.left and self._thread.is_alive():
             self.end()
             self.join(LONGEST_WAIT)
 
     # The thread's side
 
-    def _run(self, latencies: Mapping[str, float] | None) -> None:
+    def _run(self) -> None:
         try:
-            self._open(latencies)
+            self._open()
             while (due := self._next()) is not None:
                 if isinstance(due, Job):
                     self._call(due)
@@ -156,9 +157,9 @@ class Worker:
             atexit.unregister(self._end_at_exit)
             self._ready.set()
 
-    def _open(self, given: Mapping[str, float] | None) -> None:
+    def _open(self) -> None:
         """Pin the thread, measure the tiers, refuse what is infeasible."""
-        settings, resolved = self._settings, self._resolved
+        settings, resolved, given = self._settings, self._resolved, self._latencies
         if settings.cores is not None:
             _pin(settings.cores)
         if given is None:
