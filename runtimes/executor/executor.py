@@ -83,7 +83,7 @@ class AsyncExecutor:
         self._worker = Worker(policy, settings, self._resolved, self._clock, self.trace)
         self._finalizer = weakref.finalize(self, self._worker.abandon)
         self._finalizer.atexit = False  # the worker sees to that itself
-        self._worker.open(latencies, open_timeout)
+        self._state = self._worker.open(latencies, open_timeout)
 
     # The control loop's side
 
@@ -207,8 +207,7 @@ class AsyncExecutor:
     def statistics(self) -> ExecutorStatistics:
         """What happened so far; works after ``close`` too."""
         with self._here().lock:
-            state = self._worker.opened
-            plan, copied = state.plan, state.recorder.copy()
+            plan, copied = self._state.plan, self._state.recorder.copy()
         return statistics(plan, copied, self._identity)
 
     def feasibility(self) -> dict[str, Feasibility]:
@@ -242,7 +241,8 @@ class AsyncExecutor:
 
         Cheaper than ``statistics``, for a loop that looks at every tick.
         """
-        counts = self._here().opened.recorder.counts
+        self._here()
+        counts = self._state.recorder.counts
         return counts.reserve + counts.holds
 
     def now(self) -> float:
@@ -258,10 +258,11 @@ class AsyncExecutor:
         return worker
 
     def _checked(self) -> ExecutorState:
-        self._raise_failure()
+        if self._worker.failure is not None:
+            self._raise_failure()
         if self._closed:
             raise ExecutorClosedError("the executor was closed. Make another one.")
-        return self._worker.opened
+        return self._state
 
     def _raise_failure(self) -> None:
         """Raise if the worker has ended by an error."""

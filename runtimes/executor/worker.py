@@ -41,7 +41,6 @@ class Worker:
         lock: of everything here that several threads use; held for microseconds.
         news: notified when a call has ended; a condition on ``lock``.
         process: that the thread is in.
-        state: None until the policy was measured.
         feasibility: the arithmetic of each tier.
         failure: what ended the thread; None if nothing did.
     """
@@ -54,7 +53,7 @@ class Worker:
         self.lock = threading.Lock()
         self._work, self.news = threading.Condition(self.lock), threading.Condition(self.lock)
         self.process = Process()
-        self.state: ExecutorState | None = None
+        self._state: ExecutorState | None = None
         self.feasibility: dict[str, Feasibility] = {}
         self.failure: BaseException | None = None
         self._ending = False
@@ -68,12 +67,15 @@ class Worker:
 
     # Everybody else's side
 
-    def open(self, latencies: Mapping[str, float] | None, timeout: float) -> None:
+    def open(self, latencies: Mapping[str, float] | None, timeout: float) -> ExecutorState:
         """Start the thread, and wait until it has measured the policy.
 
         Args:
             latencies: seconds of the longest call of each tier, if they are known; None has them measured.
             timeout: seconds, of real time.
+
+        Returns:
+            The state, which belongs to whoever holds the lock.
 
         Raises:
             ExecutorError: it takes longer than that, or something does not fit.
@@ -94,14 +96,15 @@ class Worker:
         if self.failure is not None:
             self._thread.join()
             raise self.failure
+        return self._opened
 
     def look_again(self, now: float) -> None:
         """Have the thread see a new observation, if that starts a call sooner than it looks by itself.
 
         The caller holds the lock.
         """
-        if self._waiting and self.state is not None:
-            start = self.state.next_start(now)
+        if self._waiting and self._state is not None:
+            start = self._state.next_start(now)
             if start is not None and (start == now or not self._timed):
                 self._work.notify()
 
@@ -150,8 +153,8 @@ class Worker:
         except BaseException as error:
             with self.lock:
                 self.failure = error
-                if self.state is not None:
-                    self.state.fail()
+                if self._state is not None:
+                    self._state.fail()
                 self.news.notify_all()
         finally:
             atexit.unregister(self._end_at_exit)
@@ -176,13 +179,13 @@ class Worker:
         action = self._policy.info.action
         normalizer = action.normalizer if action.ranged else None
         with self.lock:
-            self.state = ExecutorState(settings, resolved, normalizer, tiers, latencies)
+            self._state = ExecutorState(settings, resolved, normalizer, tiers, latencies)
         self._ready.set()
 
     def _next(self) -> Job | tuple[int | None] | None:
         """Wait for what to do: a call, a reset of the policy with a seed, or (None) the end."""
         with self.lock:
-            state = self.opened
+            state = self._opened
             while not self._ending:
                 if self._reset_due:
                     seed, self._reset_due, self._reset_seed = self._reset_seed, False, None
@@ -209,7 +212,7 @@ class Worker:
         actions: npt.NDArray[np.float32] = predicted[0, resolved.first : last].astype(np.float32)
         with self.lock:
             now = self._clock.now()
-            outcome = self.opened.finish(job, actions, now)
+            outcome = self._opened.finish(job, actions, now)
             self.news.notify_all()
         if self._trace.on:
             args = {"plan": job.plan, "epoch": job.epoch, "chunk": outcome}
@@ -217,10 +220,9 @@ class Worker:
             self._trace.call(job.started, now, args, None if report is None else report.timings)
 
     @property
-    def opened(self) -> ExecutorState:
-        """The state; ``open`` waited for it."""
-        assert self.state is not None
-        return self.state
+    def _opened(self) -> ExecutorState:
+        assert self._state is not None  # ``_open`` made it
+        return self._state
 
 
 def _pin(cores: tuple[int, ...]) -> None:
