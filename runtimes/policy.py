@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import threading
 import weakref
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -197,7 +196,7 @@ class CompiledPolicy:
             TtscompileError: the seed is no whole number of at least 0; nothing was done.
         """
         check_seed(seed)
-        with self._alone():
+        with self._turn():
             self._runtime.reset()
             self._queues.reset()
             if seed is not None:
@@ -231,7 +230,7 @@ class CompiledPolicy:
                 ``info.prefix_refusal`` says that there can be none; nothing was executed.
             IllegalPlanError: a plan that is unknown, malformed or illegal; nothing was executed.
         """
-        with self._alone():
+        with self._turn():
             predicted = self._predict(obs_dict, noise, plan, prefix)
             example, chunk = self._example(obs_dict), self._manifest.spec.chunk
             executed = predicted[:, chunk.start : chunk.stop]
@@ -255,7 +254,7 @@ class CompiledPolicy:
             ObservationError: a frame or noise that does not fit; nothing was executed, and the frame was not kept.
             IllegalPlanError: as ``predict_action``.
         """
-        with self._alone():
+        with self._turn():
             frames = self._queues.after(batch)
             if self._queues.empty:
                 self._queues.extend(self._chunk(self._queues.observation(frames), noise, plan))
@@ -278,7 +277,7 @@ class CompiledPolicy:
             ObservationError: a window, a frame or noise that does not fit; nothing was executed or kept.
             IllegalPlanError: as ``predict_action``.
         """
-        with self._alone():
+        with self._turn():
             specs = self._manifest.spec.observations
             if isinstance(batch, Mapping) and is_window(batch, specs):
                 chunk = self._chunk({key: value for key, value in batch.items() if key in specs}, noise, plan)
@@ -344,12 +343,16 @@ class CompiledPolicy:
         """A tensor among the observations of a batch, if there is one; what else it holds is not ours."""
         return next((batch[key] for key in self._manifest.spec.observations if is_tensor(batch[key])), None)
 
-    @contextmanager
-    def _alone(self) -> Iterator[None]:
+    def _turn(self) -> threading.Lock:
+        """The lock, to hold during a call. Not a manager of contexts of our own: an interrupt might keep it locked.
+
+        Raises:
+            TtscompileError: a call is under way, the program is ending, or this is another process.
+        """
         if self._process.left:
             what = f"the policy was loaded in {self._process}. Threads and locks that a call needs are missing here"
             raise TtscompileError(f"{what}. Load the policy in the process that calls it, after the fork.")
-        if not self._lock.acquire(blocking=False):
+        if self._lock.locked():
             if not self._exit.alive:
                 if threading.current_thread() is not threading.main_thread():
                     threading.Event().wait()  # for the end of the interpreter, which is the end of a daemon thread
@@ -357,10 +360,7 @@ class CompiledPolicy:
                 raise TtscompileError(f"the program is ending, and the policy makes no more calls. {remedy}")
             remedy = "It serves one caller at a time: load one policy a thread, or send all streams in one batch."
             raise TtscompileError(f"the policy is in the middle of a call on another thread. {remedy}")
-        try:
-            yield
-        finally:
-            self._lock.release()
+        return self._lock
 
 
 def _end_calls(lock: threading.Lock, process: Process) -> None:

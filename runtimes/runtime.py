@@ -151,7 +151,7 @@ class Runtime:
             backend.first_step()
         sample = backend.other_steps(settled.lowered)
         stop = time.perf_counter()
-        computed = settled.plans == Source.COMPUTE
+        computed = settled.plans == Source.COMPUTE.value
         self._written, self._dropped = np.where(computed, keep, written), np.where(computed, ~keep, dropped)
         executed = settled.plans.copy()  # the caller's plan is the caller's
         executed.flags.writeable = False
@@ -192,7 +192,7 @@ class Runtime:
             plans, legalised = repair_plan(plan, self._groups, written)
         else:
             plans, legalised = check_plan(plan, steps, blocks, streams), (0,) * streams
-        rollout = plans == Source.ROLLOUT.value  # numpy takes five times as long to compare with the enum itself
+        rollout = plans == Source.ROLLOUT.value
         if (rollout & dropped).any():
             _, k, b = np.argwhere(rollout & dropped)[0].tolist()
             raise IllegalPlanError(

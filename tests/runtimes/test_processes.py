@@ -124,7 +124,7 @@ def test_workers_of_multiprocessing(pruned: Path) -> None:
 def test_a_fork_during_a_call_is_told_the_same(pruned: Path) -> None:
     code = """
     policy = load(sys.argv[1])
-    with policy._alone():
+    with policy._turn():
         def child():
             try:
                 policy.reset()
