@@ -130,12 +130,12 @@ class Worker:
         return not self._thread.is_alive()
 
     def abandon(self) -> None:
-        """The same for the garbage collector, which may run on any thread, even on this one while it holds the lock."""
+        """``end`` for the garbage collector, which may run on any thread, even on this one while it holds the lock."""
         if self._thread.is_alive():
             threading.Thread(target=self.end, name="ttscompile-abandoned", daemon=True).start()
 
     def _end_at_exit(self) -> None:
-        """A daemon thread that comes back from a library when the interpreter is gone may abort the process."""
+        """Wait for the call under way: a thread that comes back when the interpreter is gone may abort the process."""
         if not self.process.left and self._thread.is_alive():
             self.end()
             self.join(LONGEST_WAIT)
