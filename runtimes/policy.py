@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+import weakref
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import DENSE
 from ttscompile.core.spec import FP32, ChunkSpec, FloatArray, Noise, ObservationSpec
 from ttscompile.errors import IllegalPlanError, NonFiniteActionsError, RuntimeUnavailableError, TtscompileError
+from ttscompile.measure.process import Process
 
 from .arrays import Array, check_observation, check_seed, like, read_observation
 from .inpainting import check_prefix, prefix_refusal
@@ -24,6 +25,9 @@ from .open import kind_of, open_runtime
 from .queues import Queues, is_window
 from .report import CallReport
 from .runtime import Runtime
+
+LONGEST_WAIT = 10.0
+"""Seconds that the end of the interpreter waits for a call under way."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +124,8 @@ def load(
 class CompiledPolicy:
     """A policy that takes the place of the original: ``reset`` at the start of an episode, then ``predict_action``.
 
-    One caller at a time; a second one gets an error rather than somebody else's residuals.
+    One caller at a time; a second one gets an error rather than somebody else's residuals. A forked process gets one,
+    too, where the call might hang: load the policy in the process that calls it.
 
     Args:
         artifact: loaded and checked.
@@ -141,7 +146,17 @@ class CompiledPolicy:
         self._rng = np.random.default_rng(check_seed(seed))
         self._report: CallReport | None = None
         self._queues = Queues(artifact.manifest.spec.observations)
-        self._lock = threading.Lock()
+        self._lock, self._process = threading.Lock(), Process()
+        self._exit = weakref.finalize(self, _end_calls, self._lock, self._process)
+
+    def __getstate__(self) -> None:
+        """Refuse to be copied, and to be sent to another process.
+
+        Raises:
+            TtscompileError: always.
+        """
+        remedy = "Load it again, where it is called: ttscompile.load(DIR)."
+        raise TtscompileError(f"a compiled policy cannot be copied, nor sent to another process. {remedy}")
 
     @property
     def last_report(self) -> CallReport | None:
@@ -183,7 +198,7 @@ class CompiledPolicy:
             TtscompileError: the seed is no whole number of at least 0; nothing was done.
         """
         seed = check_seed(seed)
-        with self._alone():
+        with self._turn():
             self._runtime.reset()
             self._queues.reset()
             if seed is not None:
@@ -219,7 +234,7 @@ class CompiledPolicy:
             IllegalPlanError: a plan that is unknown, malformed or illegal; nothing was executed.
             NonFiniteActionsError: the arithmetic overflowed, and the episode has ended.
         """
-        with self._alone():
+        with self._turn():
             spec = self._manifest.spec
             obs, example = read_observation(obs_dict, spec.observations)
             predicted, chunk = self._predict(obs, noise, plan, prefix), spec.chunk
@@ -245,7 +260,7 @@ class CompiledPolicy:
             IllegalPlanError: as ``predict_action``.
             NonFiniteActionsError: as ``predict_action``.
         """
-        with self._alone():
+        with self._turn():
             obs, example = read_observation(batch, self._manifest.spec.observations, others=True)
             frames = self._queues.after(obs)
             if self._queues.empty:
@@ -270,7 +285,7 @@ class CompiledPolicy:
             IllegalPlanError: as ``predict_action``.
             NonFiniteActionsError: as ``predict_action``.
         """
-        with self._alone():
+        with self._turn():
             specs = self._manifest.spec.observations
             obs, example = read_observation(batch, specs, others=True)
             if is_window(obs, specs):
@@ -339,15 +354,33 @@ class CompiledPolicy:
         _require_plan(self._artifact, plan)
         return (None if self._manifest.plans[plan].pruned else self._artifact.schedule(plan)), plan, True
 
-    @contextmanager
-    def _alone(self) -> Iterator[None]:
-        if not self._lock.acquire(blocking=False):
+    def _turn(self) -> threading.Lock:
+        """The lock, to hold during a call. Not a manager of contexts of our own: an interrupt might keep it locked.
+
+        Raises:
+            TtscompileError: a call is under way, the program is ending, or this is another process.
+        """
+        if self._process.left:
+            what = f"the policy was loaded in {self._process}. Threads and locks that a call needs are missing here"
+            raise TtscompileError(f"{what}. Load the policy in the process that calls it, after the fork.")
+        if self._lock.locked():
+            if not self._exit.alive:
+                if threading.current_thread() is not threading.main_thread():
+                    threading.Event().wait()  # for the end of the interpreter, which is the end of a daemon thread
+                remedy = "Register what shall call it then, with atexit, after the policy was loaded."
+                raise TtscompileError(f"the program is ending, and the policy makes no more calls. {remedy}")
             remedy = "It serves one caller at a time: load one policy a thread, or send all streams in one batch."
             raise TtscompileError(f"the policy is in the middle of a call on another thread. {remedy}")
-        try:
-            yield
-        finally:
-            self._lock.release()
+        return self._lock
+
+
+def _end_calls(lock: threading.Lock, process: Process) -> None:
+    """At the end of the interpreter: wait for the call under way, and let no other begin.
+
+    A daemon thread that comes back from onnxruntime when the interpreter is gone would abort the process.
+    """
+    if not process.left:
+        lock.acquire(timeout=LONGEST_WAIT)
 
 
 def _require_plan(artifact: Artifact, name: str) -> None:

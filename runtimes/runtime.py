@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import wait
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -29,9 +29,13 @@ from ttscompile.ir.pieces import PRUNER
 
 from .arrays import check_noise
 from .backend import Backend, Call
+from .helper import Helper
 from .inpainting import known_samples
 from .report import GIVEN, CallReport, Timings
 from .settle import LoweringCache, pruner_plan, repair_plan
+
+HELPER = "ttscompile-pruner"
+"""Name of the helper's thread."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +51,7 @@ class _Settled:
 class Runtime:
     """One episode at a time on a fixed number of streams.
 
-    Nothing here locks: a runtime belongs to one thread (``CompiledPolicy`` sees to that).
+    Nothing here locks: a runtime belongs to one process and one thread (``CompiledPolicy`` sees to that).
 
     Which entries of the rollout cache are kept: of a call with a plan of the artifact, those that the backend says. A
     dense call, and one whose plan is a matrix of the caller's, keeps all that it computes; and from the first such
@@ -64,9 +68,8 @@ class Runtime:
         self._lowering = LoweringCache(backend.lower)
         for schedule in artifact.schedules.values():
             self._lowering.lower(schedule)
-        self._helper = ThreadPoolExecutor(1, "ttscompile-pruner") if PRUNER in self._manifest.pieces else None
-        if self._helper is not None and any(plan.pruned for plan in self._manifest.plans.values()):
-            self._helper.submit(lambda: None).result()  # the thread is there before the first call
+        pruned = any(plan.pruned for plan in self._manifest.plans.values())
+        self._helper = Helper(HELPER) if pruned else None  # its thread is there before the first call
         self._matrices = False  # whether one was ever given
         self._written: BoolArray | None = None
         self._dropped: BoolArray | None = None  # computed in this episode, and not kept
@@ -128,7 +131,7 @@ class Runtime:
         cells = (streams, self._manifest.steps, len(self._groups))
         written = np.zeros(cells, dtype=np.bool_) if self._written is None else self._written
         dropped = np.zeros(cells, dtype=np.bool_) if self._dropped is None else self._dropped
-        if plan is None and self._helper is None:
+        if plan is None and PRUNER not in self._manifest.pieces:
             remedy = "Give plan='dense', the name of a plan, or a matrix; or calibrate with strategy='tts'."
             raise IllegalPlanError(f"no plan was given and the artifact has no pruner to make one. {remedy}")
         settled = None if plan is None else self._settle(plan, written, dropped, repair)
@@ -148,7 +151,7 @@ class Runtime:
             backend.first_step()
         sample = backend.other_steps(settled.lowered)
         stop = time.perf_counter()
-        computed = settled.plans == Source.COMPUTE
+        computed = settled.plans == Source.COMPUTE.value
         self._written, self._dropped = np.where(computed, keep, written), np.where(computed, ~keep, dropped)
         executed = settled.plans.copy()  # the caller's plan is the caller's
         executed.flags.writeable = False
@@ -170,8 +173,8 @@ class Runtime:
 
     def _prune_beside_first_step(self, written: BoolArray) -> tuple[_Settled, float]:
         """Step 0, and meanwhile the plan of the steps after it; ms that the loop stood still for it."""
-        assert self._helper is not None
-        pruning: Future[_Settled] = self._helper.submit(_prune, self.backend, self._lowering, written)
+        self._helper = self._helper or Helper(HELPER)
+        pruning = self._helper.submit(partial(_prune, self.backend, self._lowering, written))
         try:
             self.backend.first_step()
             ready = time.perf_counter()
@@ -189,7 +192,7 @@ class Runtime:
             plans, legalised = repair_plan(plan, written)
         else:
             plans, legalised = check_plan(plan, steps, blocks, streams), (0,) * streams
-        rollout = plans == Source.ROLLOUT.value  # numpy takes five times as long to compare with the enum itself
+        rollout = plans == Source.ROLLOUT.value
         if (rollout & dropped).any():
             _, k, b = np.argwhere(rollout & dropped)[0].tolist()
             raise IllegalPlanError(

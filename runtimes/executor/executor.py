@@ -2,39 +2,37 @@
 
 Who owns what:
 
-- The *policy*, with its runtime, its caches and its random numbers, belongs to the worker thread, from the constructor
-  to the end of ``close``. Nobody else calls it: a reset is a note to the worker.
-- The *state* (``state.ExecutorState``) belongs to whoever holds ``_lock``, for microseconds at a time: never during a
-  call of the policy, never while frames are copied.
-- ``_work`` wakes the worker, ``_news`` those who wait for an action. Both are conditions on ``_lock``; nothing polls.
+- The *policy*, with its runtime, its caches and its random numbers, belongs to the worker's thread, from the
+  constructor to the end of ``close``. Nobody else calls it: a reset is a note to the worker.
+- The *worker* (``worker.Worker``) belongs to the process that made it.
+- The *state* (``state.ExecutorState``) belongs to whoever holds the worker's lock, for microseconds at a time: never
+  during a call of the policy, never while frames are copied.
+- Two conditions on that lock wake the worker, and those who wait for an action; nothing polls.
 - The *trace* takes events from any thread.
-- What the worker raises ends it, is kept in ``_failure``, and is raised at the next call of anybody.
+- What the worker raises ends it, is kept, and is raised at the next call of anybody.
 - A reset counts the *epoch* up. A call carries the epoch that it was started in, and what it computes is thrown away if
   that is over.
 """
 
 from __future__ import annotations
 
-import os
-import threading
+import weakref
 from collections.abc import Mapping
 from types import TracebackType
 from typing import Any, Self
 
-import numpy as np
-import numpy.typing as npt
-
 from ttscompile.core.spec import FloatArray
-from ttscompile.errors import ExecutorClosedError, ExecutorError, NonFiniteActionsError, WorkerDeadError
+from ttscompile.errors import ExecutorClosedError, ExecutorError, WorkerDeadError
 from ttscompile.runtimes.arrays import check_seed
 
-from .feasibility import Feasibility, LatencyWindow, fast_enough
-from .measure import Clock, MonotonicClock, measure_latencies, require_prefix
+from .feasibility import Feasibility
+from .measure import Clock, MonotonicClock, require_prefix
 from .settings import ExecutorSettings, Policy, resolve
-from .state import ExecutorState, Job
+from .state import ExecutorState
 from .statistics import ExecutorStatistics, statistics
 from .trace import CONTROL, Trace
 from .window import FrameSpec
+from .worker import Worker
 
 
 class AsyncExecutor:
@@ -73,38 +71,19 @@ class AsyncExecutor:
         latencies: Mapping[str, float] | None = None,
         open_timeout: float = 120.0,
     ) -> None:
-        self._settings = settings = settings or ExecutorSettings()
+        settings = settings or ExecutorSettings()
         info = policy.info
         self._resolved = resolve(settings, info, control_hz)
         if settings.seam == "prefix":
             require_prefix(policy)
-        self._policy = policy
-        self._normalizer = info.action.normalizer if info.action.ranged else None
-        self._given_latencies = latencies
         self._clock = clock or MonotonicClock()
         self._identity = str(getattr(info, "identity", ""))  # anything that predicts may be driven
         self.trace = Trace(settings.trace_events, self._identity)
-        self._lock = threading.Lock()
-        self._work, self._news = threading.Condition(self._lock), threading.Condition(self._lock)
-        self._state: ExecutorState | None = None
-        self._failure: BaseException | None = None
-        self._failure_told = False
-        self._closing = False
-        self._waiting = False  # the worker has nothing to do
-        self._timed = False  # and looks again by itself
-        self._reset_due = True
-        self._reset_seed: int | None = None
-        self._feasibility: dict[str, Feasibility] = {}
-        self._ready = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="ttscompile-executor", daemon=True)
-        self._thread.start()
-        if not self._ready.wait(open_timeout):
-            self._closing = True
-            what = f"the policy was not measured within {open_timeout:g} s: a call of it hangs, or is very slow."
-            raise ExecutorError(f"{what} Look at 'ttscompile realtime DIR'.")
-        if self._failure is not None:
-            self._thread.join()
-            raise self._failure
+        self._failure_told = self._closed = False
+        self._worker = Worker(policy, settings, self._resolved, self._clock, self.trace)
+        self._finalizer = weakref.finalize(self, self._worker.abandon)
+        self._finalizer.atexit = False  # the worker sees to that itself
+        self._state = self._worker.open(latencies, open_timeout)
 
     # The control loop's side
 
@@ -120,13 +99,13 @@ class AsyncExecutor:
             WorkerDeadError: the policy's thread has ended; ``__cause__`` says why.
             ExecutorClosedError: after ``close``.
         """
+        worker = self._here()
         frame = self._resolved.frames.check(obs)
-        with self._lock:
+        with worker.lock:
             state = self._checked()
             now = self._clock.now()
             state.observe(frame, now if t is None else t, now)
-            if self._waiting and (start := state.next_start(now)) is not None and (start == now or not self._timed):
-                self._work.notify()
+            worker.look_again(now)
 
     def action(self, t: float | None = None, timeout: float | None = None) -> FloatArray:
         """The action for a time.
@@ -145,13 +124,14 @@ class AsyncExecutor:
             WorkerDeadError: the policy's thread has ended; ``__cause__`` says why.
             ExecutorClosedError: after ``close``.
         """
-        with self._lock:
+        worker = self._here()
+        with worker.lock:
             state = self._checked()
             start = now = self._clock.now()
             until = now if timeout is None else now + timeout
             reserve = state.recorder.counts.reserve
             while (action := state.play(now if t is None else t, now)) is None and now < until:
-                self._clock.wait(self._news, until - now)
+                self._clock.wait(worker.news, until - now)
                 state, now = self._checked(), self._clock.now()
             name = "tick" if state.recorder.counts.reserve == reserve else "reserve"
             if action is None:
@@ -176,19 +156,20 @@ class AsyncExecutor:
             ExecutorClosedError: after ``close``.
             TtscompileError: the seed is no whole number of at least 0; the episode goes on.
         """
+        worker = self._here()
         seed = check_seed(seed)
-        with self._lock:
+        with worker.lock:
             state = self._checked()
             state.reset()
-            self._reset_due = True
-            if seed is not None:
-                self._reset_seed = seed
-            self._work.notify()
+            worker.reset(seed)
             if self.trace.on:
                 self.trace.instant(CONTROL, "reset", self._clock.now(), {"epoch": state.epoch})
 
     def close(self, timeout: float = 10.0) -> None:
         """End the thread, after the call that it is in. The policy may be used again after this.
+
+        Closing twice is closing once. Called by the policy itself, this waits for nothing: the thread ends with the
+        call. A forked process, where there is no thread to end, does nothing.
 
         Args:
             timeout: seconds, of real time, to wait for it.
@@ -198,12 +179,13 @@ class AsyncExecutor:
                 or the process.
             WorkerDeadError: the thread had ended because of an error that nobody was told.
         """
-        with self._lock:
-            self._closing = True
-            self._work.notify_all()
-            self._news.notify_all()
-        self._thread.join(timeout)
-        if self._thread.is_alive():
+        worker = self._worker
+        if worker.process.left:
+            return
+        self._closed = True
+        self._finalizer.detach()
+        worker.end()
+        if not worker.join(timeout):
             what = f"the policy is still in a call, {timeout:g} s after close(): it hangs, or is slower than that"
             raise ExecutorError(f"{what}. Its thread is left behind; do not use the policy again.")
         if not self._failure_told:
@@ -224,14 +206,13 @@ class AsyncExecutor:
 
     def statistics(self) -> ExecutorStatistics:
         """What happened so far; works after ``close`` too."""
-        with self._lock:
-            state = self._opened()
-            plan, copied = state.plan, state.recorder.copy()
+        with self._here().lock:
+            plan, copied = self._state.plan, self._state.recorder.copy()
         return statistics(plan, copied, self._identity)
 
     def feasibility(self) -> dict[str, Feasibility]:
         """The arithmetic of each tier, as measured when the executor was made."""
-        return self._feasibility
+        return dict(self._worker.feasibility)
 
     @property
     def ready(self) -> bool:
@@ -241,7 +222,7 @@ class AsyncExecutor:
             WorkerDeadError: the policy's thread has ended; ``__cause__`` says why.
             ExecutorClosedError: after ``close``.
         """
-        with self._lock:
+        with self._here().lock:
             return self._checked().ready
 
     @property
@@ -260,119 +241,34 @@ class AsyncExecutor:
 
         Cheaper than ``statistics``, for a loop that looks at every tick.
         """
-        counts = self._opened().recorder.counts
+        self._here()
+        counts = self._state.recorder.counts
         return counts.reserve + counts.holds
 
     def now(self) -> float:
         """Seconds on the executor's clock: what times of observations and actions are compared with."""
         return self._clock.now()
 
-    def _opened(self) -> ExecutorState:
-        assert self._state is not None  # the constructor waited for it
-        return self._state
+    def _here(self) -> Worker:
+        """The worker, unless it is in another process: not even its lock may be waited for then."""
+        worker = self._worker
+        if worker.process.left:
+            what = f"the executor was made in {worker.process}. The thread that calls the policy is not here"
+            raise ExecutorError(f"{what}. Load the policy and make an executor in the process that uses them.")
+        return worker
 
     def _checked(self) -> ExecutorState:
-        self._raise_failure()
-        if self._closing:
+        if self._worker.failure is not None:
+            self._raise_failure()
+        if self._closed:
             raise ExecutorClosedError("the executor was closed. Make another one.")
-        return self._opened()
+        return self._state
 
     def _raise_failure(self) -> None:
         """Raise if the worker has ended by an error."""
-        failure = self._failure
+        failure = self._worker.failure
         if failure is not None:
             self._failure_told = True
             raised = f"a call raised {type(failure).__name__}: {failure}"
             remedy = "Stop the robot safely; close this executor, and make another one when the cause is gone."
             raise WorkerDeadError(f"the thread that owns the policy has ended, because {raised}. {remedy}") from failure
-
-    # The worker's side
-
-    def _run(self) -> None:
-        try:
-            self._open()
-            while (due := self._next()) is not None:
-                if isinstance(due, Job):
-                    self._call(due)
-                else:
-                    self._policy.reset(*due)
-        except BaseException as error:
-            with self._lock:
-                self._failure = error
-                if self._state is not None:
-                    self._state.fail()
-                self._news.notify_all()
-        finally:
-            self._ready.set()
-
-    def _open(self) -> None:
-        """Pin the thread, measure the tiers, refuse what is infeasible."""
-        settings, resolved, given = self._settings, self._resolved, self._given_latencies
-        if settings.cores is not None:
-            _pin(settings.cores)
-        if given is None:
-            self._policy.reset()
-            times = measure_latencies(self._policy, self._clock, settings, resolved.tiers)
-            measured = {name: [ms / 1e3 for ms in each.ms] for name, each in times.items()}
-        elif missing := [name for name in resolved.tiers if name not in given]:
-            raise ExecutorError(f"latencies lacks the tier {missing[0]!r}; give one for each of {resolved.tiers}.")
-        else:
-            measured = {name: [given[name]] for name in resolved.tiers}
-        latencies = {name: LatencyWindow(settings.latency_window, values) for name, values in measured.items()}
-        self._feasibility = {name: resolved.feasibility(max(values)) for name, values in measured.items()}
-        tiers = fast_enough(self._feasibility, settings.refuse_infeasible)
-        with self._lock:
-            self._state = ExecutorState(settings, resolved, self._normalizer, tiers, latencies)
-        self._ready.set()
-
-    def _next(self) -> Job | tuple[int | None] | None:
-        """Wait for what to do: a call, a reset of the policy with a seed, or (None) the end."""
-        with self._lock:
-            state = self._opened()
-            while not self._closing:
-                if self._reset_due:
-                    seed, self._reset_due, self._reset_seed = self._reset_seed, False, None
-                    return (seed,)
-                now = self._clock.now()
-                start = state.next_start(now)
-                if start is not None and start <= now:
-                    return state.begin(now)
-                self._waiting, self._timed = True, start is not None
-                self._clock.wait(self._work, None if start is None else start - now)
-                self._waiting = False
-        return None
-
-    def _call(self, job: Job) -> None:
-        resolved = self._resolved
-        obs = resolved.frames.observation(job.frames)
-        prefix = {} if job.prefix is None else {"prefix": job.prefix[None]}
-        last = resolved.first + resolved.horizon + resolved.reserve
-        try:
-            predicted = np.asarray(self._policy.predict_action(obs, plan=job.plan, **prefix)["action_pred"])
-        except NonFiniteActionsError:  # the guard refuses them, as it does those of a policy that gives them out
-            predicted = np.full((1, last, resolved.channels), np.nan, np.float32)
-        streams, steps, channels = predicted.shape if predicted.ndim == 3 else (0, 0, 0)
-        if streams != 1 or steps < last or channels != resolved.channels:
-            expected = f"[1, T, Da] with T of at least {last} and Da = {resolved.channels}"
-            raise ExecutorError(f"the policy's action_pred has shape {list(predicted.shape)}; expected {expected}.")
-        actions: npt.NDArray[np.float32] = predicted[0, resolved.first : last].astype(np.float32)
-        with self._lock:
-            now = self._clock.now()
-            outcome = self._opened().finish(job, actions, now)
-            self._news.notify_all()
-        if self.trace.on:
-            args = {"plan": job.plan, "epoch": job.epoch, "chunk": outcome}
-            report = getattr(self._policy, "last_report", None)
-            self.trace.call(job.started, now, args, None if report is None else report.timings)
-
-
-def _pin(cores: tuple[int, ...]) -> None:
-    """Keep the calling thread on these processors."""
-    if not hasattr(os, "sched_setaffinity"):
-        raise ExecutorError("cores cannot be set on this system. Leave ExecutorSettings.cores at None.")
-    try:
-        os.sched_setaffinity(0, cores)
-    except OSError as error:
-        usable = sorted(os.sched_getaffinity(os.getpid()))
-        problem = f"the policy's thread cannot be pinned to {cores}: {error}"
-        raise ExecutorError(f"{problem}. This process may use {usable}.") from error

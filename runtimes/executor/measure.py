@@ -21,7 +21,10 @@ from .settings import ExecutorSettings, Policy
 
 
 class Clock(Protocol):
-    """A clock that never goes back, and the only way in which the executor waits."""
+    """A clock that never goes back, and the only way in which the executor waits.
+
+    Both methods are called with the executor's lock held: they must not call the executor.
+    """
 
     def now(self) -> float:
         """Seconds since some fixed moment."""

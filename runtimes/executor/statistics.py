@@ -65,7 +65,7 @@ def summary(kept: npt.NDArray[np.float64], count: int, low: float, high: float) 
 
 @dataclass
 class Counts:
-    """What happened, in numbers; see ``ExecutorStatistics``. Changed under the executor's lock only."""
+    """What happened so far, in numbers; ``ExecutorStatistics`` has the same fields, and says what they are."""
 
     ticks: int = 0
     reserve: int = 0
@@ -85,8 +85,8 @@ class Counts:
     resets: int = 0
 
 
-@dataclass(kw_only=True)
-class ExecutorStatistics(Counts):
+@dataclass(frozen=True, kw_only=True)
+class ExecutorStatistics:
     """What an executor did so far.
 
     Attributes:
@@ -121,6 +121,22 @@ class ExecutorStatistics(Counts):
 
     plan: str
     identity: str
+    ticks: int
+    reserve: int
+    holds: int
+    starved: int
+    frames: int
+    frames_late: int
+    frames_replaced: int
+    calls: int
+    chunks: int
+    chunks_refused: int
+    chunks_overdue: int
+    chunks_discarded: int
+    deadlines_missed: int
+    switches_down: int
+    switches_up: int
+    resets: int
     last_refusal: str | None
     latency_ms: Summary | None
     observation_age_ms: Summary | None

@@ -24,7 +24,8 @@ Array: TypeAlias = npt.NDArray[Any]
 Frame: TypeAlias = dict[str, Array]
 
 MOST_FRAMES = 1024
-"""Frames that are kept at most, whatever their rate; they are thrown away by age long before."""
+"""Frames that are kept at most. At usual rates they are thrown away by age long before; at several kilohertz some are
+left out, so that those which are kept go back far enough for a window."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +105,7 @@ class ObservationWindow:
     def __init__(self, steps: int, period: float, tolerance: float, max_age: float) -> None:
         self._steps, self._period, self._slack = steps, period, tolerance * period
         self._keep = max_age + (steps - 1) * period + self._slack  # older ones are part of windows that are too old
+        self._apart = 2 * steps * period / MOST_FRAMES  # of frames in a row, from one to the next but one
         self._times: list[float] = []
         self._frames: list[Frame] = []
         self.complete: Window | None = None
@@ -131,7 +133,7 @@ class ObservationWindow:
         place = bisect_left(times, time)
         if place < len(times) and times[place] == time:
             frames[place] = frame
-            self.complete = self._find()
+            self.complete = self._newest(place)
             return "replaced"
         if time < now - self._keep:
             return "late"
@@ -139,10 +141,16 @@ class ObservationWindow:
             self.delay = max(now - time, 0.0)
         times.insert(place, time)
         frames.insert(place, frame)
-        keep = max(bisect_left(times, times[-1] - self._keep), len(times) - MOST_FRAMES)
-        if keep:
-            del times[:keep], frames[:keep]
-        self.complete = self._find()
+        middle = min(place, len(times) - 2)  # the newest frame is never left out
+        if middle > 0 and times[middle + 1] - times[middle - 1] < self._apart:
+            del times[middle], frames[middle]
+            place = middle
+        gone = max(bisect_left(times, times[-1] - self._keep), len(times) - MOST_FRAMES, 0)
+        if gone:
+            del times[:gone], frames[:gone]
+        if place < gone:
+            return "late"
+        self.complete = self._newest(place - gone)
         return "added"
 
     def why_incomplete(self) -> str:
@@ -156,18 +164,23 @@ class ObservationWindow:
             f" newest came {', '.join(f'{gap:.4g}' for gap in gaps)} s apart"
         )
 
-    def _find(self) -> Window | None:
-        times, frames = self._times, self._frames
-        for newest in range(len(times) - 1, self._steps - 2, -1):
-            chosen, before = [newest], newest
-            for back in range(1, self._steps):
-                before = self._nearest(times[newest] - back * self._period, before)
-                if before < 0:
-                    break
-                chosen.append(before)
-            else:
-                return Window(times[newest], [frames[i] for i in reversed(chosen)])
-        return None
+    def _newest(self, changed: int) -> Window | None:
+        """The newest complete window after the frame of this index has changed: older ones are what they were."""
+        for newest in range(len(self._times) - 1, max(changed, self._steps - 1) - 1, -1):
+            found = self._window(newest)
+            if found is not None:
+                return found
+        return self.complete
+
+    def _window(self, newest: int) -> Window | None:
+        """The window whose newest frame has this index; None if it is not complete."""
+        times, chosen, before = self._times, [newest], newest
+        for back in range(1, self._steps):
+            before = self._nearest(times[newest] - back * self._period, before)
+            if before < 0:
+                return None
+            chosen.append(before)
+        return Window(times[newest], [self._frames[i] for i in reversed(chosen)])
 
     def _nearest(self, time: float, before: int) -> int:
         """Index under ``before`` of the frame nearest to ``time``; -1 if none is within the tolerance."""

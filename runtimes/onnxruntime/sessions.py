@@ -15,10 +15,13 @@ need, are opened when some plan does.
 
 from __future__ import annotations
 
+import ctypes
+import os
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
+from weakref import WeakSet
 
 import numpy as np
 import numpy.typing as npt
@@ -49,6 +52,10 @@ EXACT_INTEGERS = "session.x64quantprecision"
 saturate. It takes processors with VNNI for such that saturate, and costs them their speed; so it is only set where it
 is needed."""
 
+CONFIG_FROM_MODEL = "ORT_LOAD_CONFIG_FROM_MODEL"
+"""Environment variable of onnxruntime. With it a session has the options that its model has; if that has none, then
+those of onnxruntime, with a thread a core. No argument turns it off."""
+
 
 def open_sessions(artifact: Artifact, threads: int, blocks: bool = True) -> dict[str, Any]:
     """What runs each ONNX piece of the artifact, by name: an ``InferenceSession``, or a ``JointBlock``.
@@ -61,7 +68,8 @@ def open_sessions(artifact: Artifact, threads: int, blocks: bool = True) -> dict
         blocks: single blocks, too; else ``open_blocks`` may open them later.
 
     Raises:
-        RuntimeUnavailableError: onnxruntime is missing, or other code has made its global thread pool.
+        RuntimeUnavailableError: onnxruntime is missing, other code has made its global thread pool, or the environment
+            has it ignore options.
         ArtifactError: onnxruntime refuses a graph.
     """
     single = {block_name(b) for b in range(len(artifact.manifest.blocks))}
@@ -100,6 +108,9 @@ def _open(artifact: Artifact, pieces: Iterable[str], threads: int) -> dict[str, 
     except ImportError as error:
         problem = f"runtime 'onnxruntime' needs the package onnxruntime, which cannot be imported ({error})."
         raise RuntimeUnavailableError(f"{problem} Run: pip install onnxruntime.") from error
+    if os.environ.get(CONFIG_FROM_MODEL) not in (None, "", "0"):
+        problem = f"the environment variable {CONFIG_FROM_MODEL} has onnxruntime ignore the threads and options that"
+        raise RuntimeUnavailableError(f"{problem} a policy is loaded with. Unset it.")
     sessions: dict[str, Any] = {}
     careful = needs_care(artifact.manifest.precision_name)
     for piece in sorted(pieces):
@@ -117,6 +128,8 @@ def _open(artifact: Artifact, pieces: Iterable[str], threads: int) -> dict[str, 
                 f"{path}: onnxruntime {ort.__version__} cannot load this graph: {error} Install the version that the"
                 f" artifact asks for (>= {artifact.manifest.requires.onnxruntime}), or convert the checkpoint again."
             ) from error
+        if options.intra_op_num_threads > 1:
+            _threaded.add(sessions[piece])
     return sessions
 
 
@@ -149,6 +162,22 @@ def needs_care(precision: str) -> bool:
     )
     return True
 
+
+_threaded: WeakSet[Any] = WeakSet()
+"""The sessions with threads of their own."""
+
+
+def _keep_for_ever() -> None:
+    """In a forked child: keep what was inherited, whoever lets go of it.
+
+    A session ends by waiting for its threads, which are not in the child: it would wait for ever, or crash.
+    """
+    for session in _threaded:
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(session))
+
+
+if hasattr(os, "register_at_fork"):  # Windows has no fork
+    os.register_at_fork(after_in_child=_keep_for_ever)
 
 _TURNS = (np.array(False), np.array(True))
 

@@ -173,7 +173,7 @@ class Schedule(RuleBasedStateMachine):
     @property
     def counts(self) -> Counts:
         """Without the percentiles of ``statistics()``, which would be half of the time that this takes."""
-        return self.world.executor._opened().recorder.counts
+        return self.world.executor._state.recorder.counts
 
     def missed(self) -> int:
         return self.counts.deadlines_missed

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import fields
+from dataclasses import FrozenInstanceError, fields
 from pathlib import Path
 
 import numpy as np
@@ -45,6 +45,17 @@ def test_every_count_has_its_place_in_the_statistics() -> None:
     assert json.loads(json.dumps(made.to_json(), allow_nan=False))["plan"] == "plan"
     for name in names:
         assert f"        {name}: " in str(ExecutorStatistics.__doc__)
+
+
+def test_what_a_user_gets_cannot_be_changed() -> None:
+    with World() as world:
+        world.begin()
+        made = world.executor.statistics()
+        world.executor.feasibility().clear()
+        for record in (made, made.latency_ms, world.executor.feasibility()["dense"], world.executor.frames):
+            for field in fields(record):
+                with pytest.raises(FrozenInstanceError):
+                    setattr(record, field.name, 0)
 
 
 def test_the_control_rate_is_measured() -> None:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from ttscompile import ObservationSpec
 from ttscompile.errors import ObservationError
-from ttscompile.runtimes.executor.window import FrameSpec, ObservationWindow
+from ttscompile.runtimes.executor.window import MOST_FRAMES, FrameSpec, ObservationWindow
 
 SPECS = {
     "obs": ObservationSpec((2, 3)),
@@ -130,13 +130,25 @@ def test_the_tolerance(time: float, complete: bool) -> None:
     assert (window(times=[0.0, time]).complete is not None) is complete
 
 
-def test_old_frames_are_thrown_away(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(f"{ObservationWindow.__module__}.MOST_FRAMES", 30)
-    made = window(times=[i * 1e-6 for i in range(90)])
-    assert len(made._times) == len(made._frames) == 30
+def test_old_frames_are_thrown_away() -> None:
+    made = window(times=[i * 0.01 for i in range(90)])
+    assert len(made._times) == len(made._frames) == 44  # of 0.3 s, a period and the tolerance
     made.add(10.0, frame(10), 10.0)
     assert made._times == [10.0]
     assert window(times=[]).complete is None  # of the next episode, which has a window of its own
+
+
+@pytest.mark.parametrize("hz", [1000, 3000, 10_000, 40_000])
+@pytest.mark.parametrize("jitter", [0.0, 3.0])
+def test_frames_at_any_rate_make_windows_in_a_bounded_memory(hz: int, jitter: float) -> None:
+    """Jitter is of the times on their way, in frames: they come out of order, as from several threads."""
+    made, chance = window(3), np.random.default_rng(0)
+    times: list[float] = [(i + chance.uniform(0, jitter)) / hz for i in range(2 * hz // 5)]
+    for time in times:
+        made.add(time, frame(time), time)
+        assert len(made._times) == len(made._frames) <= MOST_FRAMES
+    assert values(made) == pytest.approx([max(times) - 0.2, max(times) - 0.1, max(times)], abs=0.001)
+    assert made._times == sorted(made._times)
 
 
 def test_the_next_frame_is_expected_when_the_last_ones_say() -> None:

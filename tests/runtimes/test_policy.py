@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -311,6 +312,40 @@ def test_a_second_caller_gets_an_error(quick: CompiledPolicy, monkeypatch: pytes
     first.join(30)
     assert results[0]["action"].shape == (2, 2, 2)
     quick.reset()
+
+
+def test_an_interrupt_at_any_line_of_a_call_comes_through_and_the_next_call_is_made(quick: CompiledPolicy) -> None:
+    """Ctrl-C arrives between two lines of Python: of ours, and of what numpy calls, which may swallow it."""
+    noise, own = some_noise(), sys.gettrace()
+
+    def call(lines: int) -> int:
+        """A call that is interrupted after so many lines; how many it had."""
+        count = 0
+
+        def trace(*event: Any) -> Any:
+            nonlocal count
+            count += event[1] == "line"
+            if count == lines:
+                sys.settrace(own)
+                raise KeyboardInterrupt
+            return trace
+
+        sys.settrace(trace)
+        try:
+            quick.predict_action({"obs": OBS}, noise=noise)
+        finally:
+            sys.settrace(own)
+        return count
+
+    quick.reset()
+    expected = quick.predict_action({"obs": OBS}, noise=noise)["action"]
+    total = call(-1)
+    assert total > 200
+    for lines in (*range(1, 40), *range(40, total - 40, 11), *range(total - 40, total)):
+        with pytest.raises(KeyboardInterrupt):
+            call(lines)
+        quick.reset()
+    np.testing.assert_array_equal(quick.predict_action({"obs": OBS}, noise=noise)["action"], expected)
 
 
 def test_a_call_that_was_refused_does_not_keep_the_lock(quick: CompiledPolicy) -> None:

@@ -11,6 +11,7 @@ import zlib
 from pathlib import Path, PurePosixPath
 
 from ..errors import ArtifactError
+from ..measure.process import Process
 from .codec import MAX_MANIFEST_BYTES, decode
 from .manifest import MANIFEST
 
@@ -28,7 +29,7 @@ _AGAIN = "Zip the artifact's directory again, or give the directory itself."
 
 
 class Unpacked:
-    """A temporary folder that goes when this object does.
+    """A temporary folder that goes when this object does, but for a copy of this object in a forked process.
 
     Attributes:
         path: the folder.
@@ -36,11 +37,16 @@ class Unpacked:
 
     def __init__(self) -> None:
         self.path = Path(tempfile.mkdtemp(prefix="ttscompile-"))
-        self._finalizer = weakref.finalize(self, shutil.rmtree, self.path, True)
+        self._finalizer = weakref.finalize(self, _remove, self.path, Process())
 
     def remove(self) -> None:
         """Remove the folder now."""
         self._finalizer()
+
+
+def _remove(folder: Path, process: Process) -> None:
+    if not process.left:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def unpack(path: Path) -> Unpacked:

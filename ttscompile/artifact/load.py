@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -300,6 +301,8 @@ def check_schedule(name: str, plan: npt.NDArray[Any], manifest: Manifest) -> Non
 def _check_runtime(requires: Requires, directory: Path) -> None:
     if importlib.util.find_spec("onnxruntime") is None:
         return  # the reference runtime does without; the onnxruntime runtime says that it is missing
+    # From 1.31 on it reports its use to its makers, on threads of its own, for which the end of a forked child waits.
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
     import onnxruntime
 
     found = str(onnxruntime.__version__)

@@ -95,7 +95,7 @@ class Correction:
     @property
     def reads(self) -> int:
         """F: how many numbers of the condition it reads; 0 if it does not read the observation."""
-        return self.reading.shape[1]
+        return int(self.reading.shape[1])
 
     def require_fit(self, steps: int, sample: tuple[int, int], numbers: int) -> None:
         """Raise unless it is a correction for a policy of K steps, samples ``(T, D)`` and a condition of N numbers.
@@ -128,7 +128,7 @@ class Correction:
         """
         read, *shape = self.observed.shape
         added = (condition @ self.reading) @ self.observed.reshape(read, -1)
-        return added.reshape(-1, *shape).transpose(1, 2, 0, 3)
+        return np.asarray(added, np.float32).reshape(-1, *shape).transpose(1, 2, 0, 3)
 
 
 def remember(history: FloatArray, sample: FloatArray, prediction: FloatArray) -> None:

@@ -22,7 +22,11 @@ BoolArray = npt.NDArray[np.bool_]
 
 
 class Source(enum.IntEnum):
-    """Where the residual of one cell comes from."""
+    """Where the residual of one cell comes from.
+
+    What runs in every call gives numpy the ``value``: a member makes numpy look for attributes, in Python, which takes
+    five times as long and loses an interrupt (Ctrl-C) that comes meanwhile.
+    """
 
     COMPUTE = 0
     FORWARD = 1
@@ -126,7 +130,7 @@ def illegal_cells(plan: PlanArray, groups: Sequence[int], written: BoolArray) ->
     """
     resolved = origins(plan, groups)
     illegal: BoolArray = np.where(resolved.rollout, ~written, resolved.cell == UNWRITTEN)
-    illegal[0] |= plan[0] != Source.COMPUTE
+    illegal[0] |= plan[0] != Source.COMPUTE.value
     return illegal
 
 
@@ -182,15 +186,15 @@ def legalize(plan: PlanArray, groups: Sequence[int], written: BoolArray) -> tupl
 def without_illegal_reads(plan: PlanArray, written: BoolArray) -> PlanArray:
     """What ``legalize`` makes of plans ``[..., K, blocks]`` that hold sources, and were checked to fit."""
     legal = plan.copy()
-    legal[..., 0, :] = Source.COMPUTE
-    legal[(legal == Source.ROLLOUT) & ~written] = Source.TIMESTEP
+    legal[..., 0, :] = Source.COMPUTE.value
+    legal[(legal == Source.ROLLOUT.value) & ~written] = Source.TIMESTEP.value
     # With step 0 dense every TIMESTEP and FORWARD read after it is written, so one sweep is enough.
     return legal
 
 
 def dense_plan(steps: int, blocks: int) -> PlanArray:
     """The plan that computes everything, int8 ``[K, blocks]``."""
-    return np.full((steps, blocks), Source.COMPUTE, dtype=np.int8)
+    return np.full((steps, blocks), Source.COMPUTE.value, dtype=np.int8)
 
 
 def whole_steps_plan(steps: int, blocks: int, chosen: Iterable[int]) -> PlanArray:
@@ -212,4 +216,4 @@ def sparsity(plan: PlanArray) -> float:
 
 def plan_flops(plan: PlanArray, block_flops: npt.ArrayLike) -> float:
     """FLOPs of the computed cells of one plan ``[K, blocks]``, given FLOPs of one evaluation of each block."""
-    return float(((plan == Source.COMPUTE) * np.asarray(block_flops, dtype=np.float64)).sum())
+    return float(((plan == Source.COMPUTE.value) * np.asarray(block_flops, dtype=np.float64)).sum())

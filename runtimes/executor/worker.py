@@ -1,0 +1,240 @@
+"""The executor's thread, and what it shares with those who observe and act.
+
+It knows nothing of the ``AsyncExecutor`` around it, so that an executor which nobody holds any more is collected, and
+ends it.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import threading
+from collections.abc import Mapping
+
+import numpy as np
+import numpy.typing as npt
+
+from ttscompile.errors import ExecutorError, NonFiniteActionsError
+from ttscompile.measure.process import Process
+
+from .feasibility import Feasibility, LatencyWindow, fast_enough
+from .measure import Clock, measure_latencies
+from .settings import ExecutorSettings, Policy, Resolved
+from .state import ExecutorState, Job
+from .trace import Trace
+
+LONGEST_WAIT = 10.0
+"""Seconds that the end of the interpreter waits for a call under way."""
+
+
+class Worker:
+    """Owns a policy, and calls it when it is time.
+
+    Args:
+        policy: nobody else's until the thread has ended.
+        settings: as given.
+        resolved: what follows from them and the policy.
+        clock: what time it is.
+        trace: of the executor.
+
+    Attributes:
+        lock: of everything here that several threads use; held for microseconds.
+        news: notified when a call has ended; a condition on ``lock``.
+        process: that the thread is in.
+        feasibility: the arithmetic of each tier.
+        failure: what ended the thread; None if nothing did.
+    """
+
+    def __init__(
+        self, policy: Policy, settings: ExecutorSettings, resolved: Resolved, clock: Clock, trace: Trace
+    ) -> None:
+        self._policy, self._settings, self._resolved = policy, settings, resolved
+        self._clock, self._trace = clock, trace
+        self.lock = threading.Lock()
+        self._work, self.news = threading.Condition(self.lock), threading.Condition(self.lock)
+        self.process = Process()
+        self._state: ExecutorState | None = None
+        self.feasibility: dict[str, Feasibility] = {}
+        self.failure: BaseException | None = None
+        self._ending = False
+        self._waiting = False  # there is nothing to do
+        self._timed = False  # and the thread looks again by itself
+        self._reset_due = True
+        self._reset_seed: int | None = None
+        self._ready = threading.Event()
+        self._latencies: Mapping[str, float] | None = None  # as they were given
+        self._thread = threading.Thread(target=self._run, name="ttscompile-executor", daemon=True)
+
+    # Everybody else's side
+
+    def open(self, latencies: Mapping[str, float] | None, timeout: float) -> ExecutorState:
+        """Start the thread, and wait until it has measured the policy.
+
+        Args:
+            latencies: seconds of the longest call of each tier, if they are known; None has them measured.
+            timeout: seconds, of real time.
+
+        Returns:
+            The state, which belongs to whoever holds the lock.
+
+        Raises:
+            ExecutorError: it takes longer than that, or something does not fit.
+            InfeasibleError: no tier is fast enough.
+        """
+        self._latencies = latencies
+        atexit.register(self._end_at_exit)
+        try:
+            self._thread.start()
+            opened = self._ready.wait(timeout)
+        except BaseException:  # an interrupt: nobody will have an executor to close
+            self.end()
+            raise
+        if not opened:
+            self.end()
+            what = f"the policy was not measured within {timeout:g} s: a call of it hangs, or is very slow."
+            raise ExecutorError(f"{what} Look at 'ttscompile realtime DIR'.")
+        if self.failure is not None:
+            self._thread.join()
+            raise self.failure
+        return self._opened
+
+    def look_again(self, now: float) -> None:
+        """Have the thread see a new observation, if that starts a call sooner than it looks by itself.
+
+        The caller holds the lock.
+        """
+        if self._waiting and self._state is not None:
+            start = self._state.next_start(now)
+            if start is not None and (start == now or not self._timed):
+                self._work.notify()
+
+    def reset(self, seed: int | None) -> None:
+        """Have the policy reset before its next call; a seed of None changes nothing. The caller holds the lock."""
+        self._reset_due = True
+        if seed is not None:
+            self._reset_seed = seed
+        self._work.notify()
+
+    def end(self) -> None:
+        """Have the thread end, after the call that it is in, and wake whoever waits for an action."""
+        with self.lock:
+            self._ending = True
+            self._work.notify_all()
+            self.news.notify_all()
+
+    def join(self, timeout: float) -> bool:
+        """Whether the thread has ended, some seconds from now at most. The thread itself does not wait for its end."""
+        if threading.current_thread() is self._thread:
+            return True
+        self._thread.join(timeout)
+        return not self._thread.is_alive()
+
+    def abandon(self) -> None:
+        """``end`` for the garbage collector, which may run on any thread, even on this one while it holds the lock."""
+        if self._thread.is_alive():
+            threading.Thread(target=self.end, name="ttscompile-abandoned", daemon=True).start()
+
+    def _end_at_exit(self) -> None:
+        """Wait for the call under way: a thread that comes back when the interpreter is gone may abort the process."""
+        if not self.process.left and self._thread.is_alive():
+            self.end()
+            self.join(LONGEST_WAIT)
+
+    # The thread's side
+
+    def _run(self) -> None:
+        try:
+            self._open()
+            while (due := self._next()) is not None:
+                if isinstance(due, Job):
+                    self._call(due)
+                else:
+                    self._policy.reset(*due)
+        except BaseException as error:
+            with self.lock:
+                self.failure = error
+                if self._state is not None:
+                    self._state.fail()
+                self.news.notify_all()
+        finally:
+            atexit.unregister(self._end_at_exit)
+            self._ready.set()
+
+    def _open(self) -> None:
+        """Pin the thread, measure the tiers, refuse what is infeasible."""
+        settings, resolved, given = self._settings, self._resolved, self._latencies
+        if settings.cores is not None:
+            _pin(settings.cores)
+        if given is None:
+            self._policy.reset()
+            times = measure_latencies(self._policy, self._clock, settings, resolved.tiers)
+            measured = {name: [ms / 1e3 for ms in each.ms] for name, each in times.items()}
+        elif missing := [name for name in resolved.tiers if name not in given]:
+            raise ExecutorError(f"latencies lacks the tier {missing[0]!r}; give one for each of {resolved.tiers}.")
+        else:
+            measured = {name: [given[name]] for name in resolved.tiers}
+        latencies = {name: LatencyWindow(settings.latency_window, values) for name, values in measured.items()}
+        self.feasibility = {name: resolved.feasibility(max(values)) for name, values in measured.items()}
+        tiers = fast_enough(self.feasibility, settings.refuse_infeasible)
+        action = self._policy.info.action
+        normalizer = action.normalizer if action.ranged else None
+        with self.lock:
+            self._state = ExecutorState(settings, resolved, normalizer, tiers, latencies)
+        self._ready.set()
+
+    def _next(self) -> Job | tuple[int | None] | None:
+        """Wait for what to do: a call, a reset of the policy with a seed, or (None) the end."""
+        with self.lock:
+            state = self._opened
+            while not self._ending:
+                if self._reset_due:
+                    seed, self._reset_due, self._reset_seed = self._reset_seed, False, None
+                    return (seed,)
+                now = self._clock.now()
+                start = state.next_start(now)
+                if start is not None and start <= now:
+                    return state.begin(now)
+                self._waiting, self._timed = True, start is not None
+                self._clock.wait(self._work, None if start is None else start - now)
+                self._waiting = False
+        return None
+
+    def _call(self, job: Job) -> None:
+        resolved = self._resolved
+        obs = resolved.frames.observation(job.frames)
+        prefix = {} if job.prefix is None else {"prefix": job.prefix[None]}
+        last = resolved.first + resolved.horizon + resolved.reserve
+        try:
+            predicted = np.asarray(self._policy.predict_action(obs, plan=job.plan, **prefix)["action_pred"])
+        except NonFiniteActionsError:  # the guard refuses them, as it does those of a policy that gives them out
+            predicted = np.full((1, last, resolved.channels), np.nan, np.float32)
+        streams, steps, channels = predicted.shape if predicted.ndim == 3 else (0, 0, 0)
+        if streams != 1 or steps < last or channels != resolved.channels:
+            expected = f"[1, T, Da] with T of at least {last} and Da = {resolved.channels}"
+            raise ExecutorError(f"the policy's action_pred has shape {list(predicted.shape)}; expected {expected}.")
+        actions: npt.NDArray[np.float32] = predicted[0, resolved.first : last].astype(np.float32)
+        with self.lock:
+            now = self._clock.now()
+            outcome = self._opened.finish(job, actions, now)
+            self.news.notify_all()
+        if self._trace.on:
+            args = {"plan": job.plan, "epoch": job.epoch, "chunk": outcome}
+            report = getattr(self._policy, "last_report", None)
+            self._trace.call(job.started, now, args, None if report is None else report.timings)
+
+    @property
+    def _opened(self) -> ExecutorState:
+        assert self._state is not None  # ``_open`` made it
+        return self._state
+
+
+def _pin(cores: tuple[int, ...]) -> None:
+    """Keep the calling thread on these processors."""
+    if not hasattr(os, "sched_setaffinity"):
+        raise ExecutorError("cores cannot be set on this system. Leave ExecutorSettings.cores at None.")
+    try:
+        os.sched_setaffinity(0, cores)
+    except OSError as error:
+        usable = sorted(os.sched_getaffinity(os.getpid()))
+        problem = f"the policy's thread cannot be pinned to {cores}: {error}"
+        raise ExecutorError(f"{problem}. This process may use {usable}.") from error

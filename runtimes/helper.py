@@ -1,0 +1,45 @@
+"""One thread that works beside the caller's."""
+
+from __future__ import annotations
+
+import threading
+import weakref
+from collections.abc import Callable
+from concurrent.futures import Future
+from queue import SimpleQueue
+from typing import Any, TypeAlias, TypeVar
+
+Result = TypeVar("Result")
+_Todo: TypeAlias = "SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None]"
+
+
+class Helper:
+    """A thread that sleeps on a queue, and lives as long as this does.
+
+    ``ThreadPoolExecutor`` takes no more work once the program's main thread has ended, although a control loop on
+    another thread may go on for hours.
+
+    Args:
+        name: of the thread.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._todo: _Todo = SimpleQueue()
+        threading.Thread(target=_work, args=(self._todo,), name=name, daemon=True).start()
+        weakref.finalize(self, self._todo.put, None).atexit = False
+
+    def submit(self, work: Callable[[], Result]) -> Future[Result]:
+        """Have something done, after what was submitted before."""
+        future: Future[Result] = Future()
+        self._todo.put((future, work))
+        return future
+
+
+def _work(todo: _Todo) -> None:
+    while (item := todo.get()) is not None:
+        future, work = item
+        try:
+            future.set_result(work())
+        except BaseException as error:
+            future.set_exception(error)
+        del item, future, work  # while it sleeps, the thread keeps nothing of a call
