@@ -77,7 +77,7 @@ def open_runtime(artifact: Artifact, runtime: str = "onnxruntime", threads: int 
         raise RuntimeUnavailableError(f"threads must be {expected}; found {threads!r}.")
     kind = kind_of(runtime)
     try:
-        with fitting(artifact):
+        with artifact.reading(), fitting(artifact):  # a backend reads arrays that are mapped from the files
             return Runtime(artifact, kind.make(artifact, threads))
     except ModuleNotFoundError as error:
         problem = f"runtime {runtime!r} needs {error.name!r}, which is not installed"

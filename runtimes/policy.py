@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ import numpy.typing as npt
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import DENSE
 from ttscompile.core.spec import FP32, ChunkSpec, FloatArray, Noise, ObservationSpec
-from ttscompile.errors import IllegalPlanError, RuntimeUnavailableError, TtscompileError
+from ttscompile.errors import ArtifactChangedError, IllegalPlanError, RuntimeUnavailableError, TtscompileError
 
 from .arrays import check_observation, check_seed, is_tensor, like
 from .inpainting import check_prefix, prefix_refusal
@@ -24,6 +24,9 @@ from .open import kind_of, open_runtime
 from .queues import Queues, is_window
 from .report import CallReport
 from .runtime import Runtime
+
+TRIES = 3
+"""Times that ``load`` begins before it gives up on an artifact that is replaced while it is loaded."""
 
 
 @dataclass(frozen=True)
@@ -99,11 +102,21 @@ def load(
 
     Raises:
         IllegalPlanError: the artifact has no plan of this name.
+        ArtifactChangedError: the artifact was replaced while it was loaded, and again whenever it was tried again.
         ArtifactError: the artifact is missing, damaged, of another version, or without blocks of this precision.
         RuntimeUnavailableError: the runtime cannot be had on this machine.
         TtscompileError: the seed is no whole number of at least 0.
     """
     check_seed(seed)
+    for _ in range(TRIES - 1):
+        with suppress(ArtifactChangedError):
+            return _load(path, runtime, threads, seed, precision, plan)
+    return _load(path, runtime, threads, seed, precision, plan)
+
+
+def _load(
+    path: str | Path, runtime: str, threads: int, seed: int | None, precision: str | None, plan: str | None
+) -> CompiledPolicy:
     artifact = load_artifact(path)
     if kind_of(runtime).fp32_only:
         if precision not in (None, FP32):
