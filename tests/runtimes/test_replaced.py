@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -25,6 +26,7 @@ from ttscompile.runtimes import policy
 
 from .replaced import CHANGES, answer, load_often, prepared, reuse
 from .toys import toy_program, written_artifact
+from .unloaded import left
 
 
 @pytest.fixture(scope="module")
@@ -244,3 +246,14 @@ def test_loads_while_another_process_changes_the_artifact(way: str, tmp_path: Pa
 def test_ten_thousand_loads(tmp_path: Path) -> None:
     made = load_often(*prepared(tmp_path), loads=10_000, ways=CHANGES, longest=0.05)
     assert made["mixed"] == 0, made
+
+
+def test_a_policy_that_is_let_go_leaves_no_descriptor(places: tuple[Path, Path]) -> None:
+    """A short version of ``unloaded.py``, where 5,000 loads leave as much as 500."""
+    ttscompile.load(places[0])
+    gc.collect()
+    before = left()["descriptors"]
+    for _ in range(3):
+        ttscompile.load(places[0])
+    gc.collect()
+    assert left()["descriptors"] == before
