@@ -76,7 +76,7 @@ def open_runtime(artifact: Artifact, runtime: str = "onnxruntime", threads: int 
     threads = integer(threads, "threads", RuntimeUnavailableError, 1, MOST_THREADS)
     kind = kind_of(runtime)
     try:
-        with fitting(artifact):
+        with artifact.reading(), fitting(artifact):  # a backend reads arrays that are mapped from the files
             return Runtime(artifact, kind.make(artifact, threads))
     except ModuleNotFoundError as error:
         problem = f"runtime {runtime!r} needs {error.name!r}, which is not installed"

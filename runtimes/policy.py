@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import weakref
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,13 @@ import numpy.typing as npt
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import DENSE
 from ttscompile.core.spec import FP32, ChunkSpec, FloatArray, Noise, ObservationSpec
-from ttscompile.errors import IllegalPlanError, NonFiniteActionsError, RuntimeUnavailableError, TtscompileError
+from ttscompile.errors import (
+    ArtifactChangedError,
+    IllegalPlanError,
+    NonFiniteActionsError,
+    RuntimeUnavailableError,
+    TtscompileError,
+)
 from ttscompile.measure.process import Process
 
 from .arrays import Array, check_observation, check_seed, like, read_observation
@@ -28,6 +35,8 @@ from .runtime import Runtime
 
 LONGEST_WAIT = 10.0
 """Seconds that the end of the interpreter waits for a call under way."""
+TRIES = 3
+"""Times that ``load`` begins before it gives up on an artifact that is replaced while it is loaded."""
 
 
 @dataclass(frozen=True)
@@ -103,11 +112,21 @@ def load(
 
     Raises:
         IllegalPlanError: the artifact has no plan of this name.
+        ArtifactChangedError: the artifact was replaced while it was loaded, and again whenever it was tried again.
         ArtifactError: the artifact is missing, damaged, of another version, or without blocks of this precision.
         RuntimeUnavailableError: the runtime cannot be had on this machine.
         TtscompileError: the seed is no whole number of at least 0.
     """
     seed = check_seed(seed)
+    for _ in range(TRIES - 1):
+        with suppress(ArtifactChangedError):
+            return _load(path, runtime, threads, seed, precision, plan)
+    return _load(path, runtime, threads, seed, precision, plan)
+
+
+def _load(
+    path: str | Path, runtime: str, threads: int, seed: int | None, precision: str | None, plan: str | None
+) -> CompiledPolicy:
     artifact = load_artifact(path)
     if kind_of(runtime).fp32_only:
         if precision not in (None, FP32):

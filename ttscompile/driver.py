@@ -18,6 +18,7 @@ from .artifact.write import require_replaceable, write_artifact
 from .capture.export import capture
 from .capture.narrow import narrow, unneeded
 from .core.given import integer
+from .core.paths import require_free_or_path
 from .core.spec import FP32, PolicySpec
 from .errors import ArtifactError, PassError, SpecError
 from .frontends import load_checkpoint_policy
@@ -151,6 +152,8 @@ def compile_denoiser(
         require_precision(precision)
     if prediction_horizon is not None:
         prediction_horizon = integer(prediction_horizon, "prediction_horizon", SpecError, 1)
+    if single_file is not None:
+        require_free_or_path(single_file, ArtifactError, "Give another path for the single file.")
     if prediction_horizon is not None or spec.left_out:
         kept = spec.sample[0] if prediction_horizon is None else prediction_horizon
         spec, changed = narrow(module, spec.original, kept)

@@ -39,6 +39,10 @@ class ArtifactError(TtscompileError):
     """An artifact that is missing, truncated, changed since it was written, or of another schema version."""
 
 
+class ArtifactChangedError(ArtifactError):
+    """An artifact that was replaced or changed while it was being read; reading it again finds what is there now."""
+
+
 class ObservationError(TtscompileError):
     """An observation, noise, or a prefix of actions that does not fit the specification of the policy."""
 

@@ -26,7 +26,6 @@ from weakref import WeakSet
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.artifact.files import check_file
 from ttscompile.artifact.load import Artifact
 from ttscompile.artifact.manifest import PieceRecord
 from ttscompile.core.spec import FP32
@@ -63,7 +62,7 @@ def open_sessions(artifact: Artifact, threads: int, blocks: bool = True) -> dict
     With one thread all run on the caller's thread and make none.
 
     Args:
-        artifact: loaded and checked.
+        artifact: loaded and checked; within its ``reading``.
         threads: of arithmetic.
         blocks: single blocks, too; else ``open_blocks`` may open them later.
 
@@ -83,9 +82,8 @@ def open_blocks(artifact: Artifact, threads: int) -> dict[str, Any]:
     Raises:
         ArtifactError: the artifact on disk is no longer the one that was loaded, or onnxruntime refuses a graph.
     """
-    for name, record in artifact.manifest.files.items():
-        check_file(artifact.path / name, record)
-    return _open_blocks(artifact, threads)
+    with artifact.reading():
+        return _open_blocks(artifact, threads)
 
 
 def _open_blocks(artifact: Artifact, threads: int) -> dict[str, Any]:
@@ -114,7 +112,7 @@ def _open(artifact: Artifact, pieces: Iterable[str], threads: int) -> dict[str, 
     sessions: dict[str, Any] = {}
     careful = needs_care(artifact.manifest.precision_name)
     for piece in sorted(pieces):
-        path = artifact.onnx_path(piece)
+        path = artifact.files / artifact.onnx_file(piece)
         options = _options(ort, 1 if piece in SINGLE_THREADED else threads, piece in OF_ALL_BLOCKS, careful)
         try:
             sessions[piece] = ort.InferenceSession(str(path), options, ["CPUExecutionProvider"], enable_fallback=0)

@@ -1,7 +1,13 @@
 from __future__ import annotations
 
+import errno
 import gc
+import os
+import shutil
 import stat
+import subprocess
+import sys
+import tempfile
 import zipfile
 from pathlib import Path
 
@@ -9,7 +15,9 @@ import pytest
 
 from tests.artifact.folders import Edit, flip, packed
 from ttscompile.artifact import archive, load_artifact
-from ttscompile.errors import ArtifactError
+from ttscompile.errors import ArtifactChangedError, ArtifactError
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.parametrize("prefix", ["", "compiled/", "./"])
@@ -175,3 +183,66 @@ def test_too_many_entries(written: Path) -> None:
 
     with pytest.raises(ArtifactError, match="at most 4096 entries"):
         load_artifact(packed(written, edit=edit))
+
+
+def test_a_forked_child_leaves_its_parents_folder_alone(written: Path) -> None:
+    """However the child ends, and whether or not it lets go of the artifact."""
+    path = packed(written)
+    script = f"""
+import gc, os, sys
+from ttscompile.artifact import load_artifact
+artifact = load_artifact({str(path)!r})
+folder = artifact.path
+for ending in (sys.exit, os._exit):
+    child = os.fork()
+    if child == 0:
+        del artifact
+        gc.collect()
+        ending(0)
+    os.waitpid(child, 0)
+    print(folder.is_dir(), len(artifact.graphs) > 0)
+del artifact
+gc.collect()
+print(folder.exists())
+"""
+    environment = {**os.environ, "ORT_DISABLE_TELEMETRY": "1"}  # the end of a child would wait for its threads
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=ROOT,
+        env=environment,
+        timeout=60,
+    )
+    assert done.stdout.split() == ["True", "True", "True", "True", "False"]
+
+
+def test_an_unpacked_folder_that_was_removed_is_told_by_the_name_of_the_archive(written: Path) -> None:
+    path = packed(written)
+    artifact = load_artifact(path)
+    shutil.rmtree(artifact.path)
+    with pytest.raises(ArtifactChangedError, match=rf"^{path}: what it was unpacked to, .* was changed or removed"):
+        _ = artifact.graphs
+
+
+def test_without_a_place_for_temporary_files(written: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = packed(written)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "none"))
+    with pytest.raises(ArtifactError, match=r"artifact\.zip: cannot be unpacked .*none.* Set TMPDIR"):
+        load_artifact(path)
+
+
+def test_a_full_disk_is_not_told_as_a_bad_archive(
+    written: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, folders = packed(written), watch(monkeypatch)
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(shutil, "copyfileobj", full)
+    with pytest.raises(ArtifactError, match=r"artifact\.zip: cannot be unpacked .*No space left.* Set TMPDIR"):
+        load_artifact(path)
+    assert folders
+    assert not any(folder.exists() for folder in folders)

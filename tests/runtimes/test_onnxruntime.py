@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from tests.rounding import assert_equal_but_for_rounding, bound
+from tests.verification.broken import edit_manifest
 from ttscompile import Noise, Source
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.write import update_calibration
@@ -303,9 +304,11 @@ except RuntimeUnavailableError as error:
 def test_a_graph_that_onnxruntime_refuses_is_an_artifact_error(
     own_artifact: Artifact, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    own_artifact.onnx_path("dense_step").write_bytes(b"no graph")
-    with pytest.raises(ArtifactError, match=r"dense_step\.onnx.*cannot load"):
-        open_runtime(own_artifact)
+    path = own_artifact.onnx_path("dense_step")
+    path.write_bytes(b"")
+    edit_manifest(path.parent)
+    with pytest.raises(ArtifactError, match=rf"^{path}: onnxruntime .* cannot load"):
+        open_runtime(load_artifact(path.parent))
     assert capfd.readouterr().out == ""
 
 

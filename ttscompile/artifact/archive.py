@@ -13,6 +13,7 @@ from pathlib import Path, PurePosixPath
 from ..errors import ArtifactError
 from ..measure.process import Process
 from .codec import MAX_MANIFEST_BYTES, decode
+from .files import opened
 from .manifest import MANIFEST
 
 MAX_ENTRIES = 4096
@@ -33,6 +34,9 @@ class Unpacked:
 
     Attributes:
         path: the folder.
+
+    Raises:
+        OSError: there is no place for temporary files.
     """
 
     def __init__(self) -> None:
@@ -64,9 +68,12 @@ def unpack(path: Path) -> Unpacked:
         ArtifactError: no zip file, no artifact in it, an entry with a name or of a kind that an artifact cannot have,
             or sizes that contradict the manifest or are out of proportion.
     """
-    unpacked = Unpacked()
     try:
-        with zipfile.ZipFile(path) as archive:
+        unpacked = Unpacked()
+    except OSError as error:
+        raise _no_room(path, error) from error
+    try:
+        with opened(path) as file, zipfile.ZipFile(file) as archive:
             _extract(archive, path, unpacked.path)
     except _UNREADABLE as error:
         unpacked.remove()
@@ -75,6 +82,13 @@ def unpack(path: Path) -> Unpacked:
         unpacked.remove()
         raise
     return unpacked
+
+
+def _no_room(path: Path, error: OSError) -> ArtifactError:
+    return ArtifactError(
+        f"{path}: cannot be unpacked into a temporary folder: {error}. Set TMPDIR to a folder with room, or unzip the"
+        " artifact yourself and give its directory."
+    )
 
 
 def is_checkpoint(path: Path) -> bool:
@@ -144,7 +158,11 @@ def _copy(archive: zipfile.ZipFile, info: zipfile.ZipInfo, size: int, path: Path
     """Write the content of an entry, which has to be of exactly this size, to a new file."""
     if info.file_size != size:
         raise ArtifactError(f"{path}: {info.filename}: expected {size} bytes; found {info.file_size}. {_AGAIN}")
-    with archive.open(info) as source, target.open("xb") as file:
-        shutil.copyfileobj(source, file, CHUNK)  # never more than the directory says, which was compared above
+    with archive.open(info) as source:
+        try:
+            with target.open("xb") as file:
+                shutil.copyfileobj(source, file, CHUNK)  # never more than the directory says, which was compared above
+        except OSError as error:  # of the disk; damage to the archive has errors of its own
+            raise _no_room(path, error) from error
     if (found := target.stat().st_size) != size:
         raise ArtifactError(f"{path}: {info.filename}: expected {size} bytes; found {found}. {_AGAIN}")

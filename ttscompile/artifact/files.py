@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import ctypes
+import errno
 import fcntl
 import hashlib
 import os
 import re
 import secrets
 import shutil
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from io import BufferedReader
 from pathlib import Path
 
 from ..errors import ArtifactError
@@ -35,29 +38,55 @@ def content_hash(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()[:16]
 
 
+_AGAIN = "Copy the artifact again, or convert the checkpoint again."
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[BufferedReader]:
+    """A file to read from. Anything else is refused unread: a pipe or a device may never end.
+
+    Raises:
+        ArtifactError: missing, something else than a file, or it cannot be read, now or within the block.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # else a pipe waits for somebody who writes into it
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            os.close(descriptor)
+            raise ArtifactError(f"{path}: cannot be read: expected a file; found something else. {_AGAIN}")
+        with os.fdopen(descriptor, "rb") as file:
+            yield file
+    except FileNotFoundError:
+        raise ArtifactError(f"{path}: cannot be read: the file is missing; manifest.json lists it. {_AGAIN}") from None
+    except OSError as error:
+        raise ArtifactError(f"{path}: cannot be read: {error}. {_AGAIN}") from error
+
+
+def read_file(path: Path, limit: int) -> bytes:
+    """The content of a file of at most so many bytes; of a larger one no more is read, and the last byte is too many.
+
+    Raises:
+        ArtifactError: see ``opened``.
+    """
+    with opened(path) as file:
+        return file.read(limit + 1)
+
+
 def check_file(path: Path, record: FileRecord) -> None:
     """Raise unless the file is what its record says.
 
     Raises:
         ArtifactError: missing, unreadable, of another size, or of other content.
     """
-    again = "Copy the artifact again, or convert the checkpoint again."
-    try:
-        size = path.stat().st_size
-        if not path.is_file():
-            raise ArtifactError(f"{path}: expected a file; found something else. {again}")
+    with opened(path) as file:
+        size = os.fstat(file.fileno()).st_size
         if size != record.bytes:
             kind = "truncated" if size < record.bytes else "longer than it was"
-            raise ArtifactError(f"{path}: expected {record.bytes} bytes; found {size}: the file is {kind}. {again}")
-        found = describe(path).sha256
-    except FileNotFoundError:
-        raise ArtifactError(f"{path}: the file is missing; manifest.json lists it. {again}") from None
-    except OSError as error:
-        raise ArtifactError(f"{path}: cannot be read: {error}. {again}") from error
+            raise ArtifactError(f"{path}: expected {record.bytes} bytes; found {size}: the file is {kind}. {_AGAIN}")
+        found = hashlib.file_digest(file, "sha256").hexdigest()
     if found != record.sha256:
         raise ArtifactError(
             f"{path}: expected sha256 {record.sha256[:12]}...; found {found[:12]}...: the file was changed since it was"
-            f" written. {again}"
+            f" written. {_AGAIN}"
         )
 
 
@@ -70,7 +99,13 @@ def write_synced(path: Path, content: bytes) -> None:
 
 
 def replace_file(path: Path, content: bytes) -> None:
-    """Put a file in place at once: other processes see the old content or the new one, and so does a crash."""
+    """Put a file in place at once: other processes see the old content or the new one, and so does a crash.
+
+    Raises:
+        OSError: it cannot be written; or something else than a file is there, such as ``/dev/null``.
+    """
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EEXIST, "something else than a file is there", str(path))
     partial = beside(path)
     try:
         write_synced(partial, content)
@@ -135,12 +170,14 @@ def lock_folder(path: Path) -> Iterator[None]:
     """Keep other processes that ask from working in a folder; a crash releases it.
 
     Raises:
-        BlockingIOError: another process has it.
+        BlockingIOError: another process has it, or has put another folder in its place.
         OSError: no permission, or a file system without locks.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if not os.path.samestat(os.fstat(descriptor), path.stat()):  # it was replaced before it could be locked
+            raise BlockingIOError
         yield
     finally:
         os.close(descriptor)

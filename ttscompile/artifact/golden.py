@@ -140,7 +140,8 @@ def load_golden(artifact: Artifact) -> Golden:
             f"{artifact.path}: expected a golden record of the original network; found none: it was written by"
             " 'write_artifact' alone. Convert the checkpoint with 'ttscompile convert', or use compile_denoiser."
         )
-    arrays, where = tensors.read(artifact.path / manifest.stores.golden), f"{artifact.path}: golden record"
+    with artifact.reading(manifest.stores.golden):
+        arrays, where = tensors.read(artifact.files / manifest.stores.golden), f"{artifact.path}: golden record"
     kept = {name: arrays.get(name, np.zeros(0)) for name in ("initial", "steps", "evaluated")}
     streams, anchors, evaluated = (len(array) if array.ndim else 0 for array in kept.values())
     sample, projected = (streams, *spec.sample), (steps, streams, DIGITS)
@@ -182,7 +183,8 @@ def load_golden_plans(artifact: Artifact, streams: int) -> dict[str, GoldenPlan]
     manifest = artifact.manifest
     if manifest.stores.golden_plans is None:
         return {}
-    arrays = tensors.read(artifact.path / manifest.stores.golden_plans)
+    with artifact.reading(manifest.stores.golden_plans):
+        arrays = tensors.read(artifact.files / manifest.stores.golden_plans)
     kinds: dict[str, tuple[str, tuple[int, ...]]] = {
         "plan": ("int8", (2, streams, manifest.steps, len(manifest.blocks))),
         "path": ("float32", (2, manifest.steps, streams, DIGITS)),

@@ -6,6 +6,7 @@ import importlib.util
 import math
 import os
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +18,7 @@ import numpy.typing as npt
 
 from ..core.correction import Correction
 from ..core.lattice import PlanArray, Source, check_plan, dense_plan
+from ..core.paths import require_path
 from ..core.spec import FP32
 from ..errors import ArtifactError, IllegalPlanError
 from ..ir.graph import Graph, TensorType
@@ -25,8 +27,9 @@ from ..ir.program import Binding, Pieces
 from ..measure.versions import release
 from . import tensors
 from .archive import Unpacked, is_checkpoint, unpack
-from .codec import decode, identities
-from .files import check_file
+from .codec import MAX_MANIFEST_BYTES, decode, identities
+from .files import check_file, read_file
+from .folder import Folder, Stamp
 from .graph_json import graph_from_json
 from .manifest import DENSE, MANIFEST, Manifest, Requires, abbreviated
 from .onnx_files import check_model
@@ -65,13 +68,45 @@ class Artifact:
     pruner: Mapping[str, npt.NDArray[Any]]
     schedules: Mapping[str, PlanArray]
     corrections: Mapping[str, Correction]
+    _folder: Folder = field(repr=False)
+    _stamps: Mapping[str, Stamp] = field(repr=False)
     _unpacked: Unpacked | None = field(default=None, repr=False)
 
-    def onnx_path(self, piece: str) -> Path:
-        """The ONNX file of a piece, whose weights onnxruntime finds beside it; of a block the one in its precision."""
+    @property
+    def files(self) -> Path:
+        """The folder to read from, within ``reading``: still the one that was checked when another is at ``path``."""
+        return self._folder.files
+
+    @contextmanager
+    def reading(self, *names: str) -> Iterator[None]:
+        """Within the block these files, in ``files``, are those that were checked.
+
+        Args:
+            names: none means all.
+
+        Raises:
+            ArtifactChangedError: a file was changed or replaced since it was checked.
+        """
+        names = names or tuple(self.manifest.files)
+        with self._folder.unchanged(names) as now:
+            for name in names:
+                if now[name] == self._stamps.get(name):
+                    continue
+                try:
+                    check_file(self.files / name, self.manifest.files[name])
+                except (ArtifactError, KeyError) as error:  # the manifest itself has no record
+                    raise self._folder.changed([name]) from error
+            yield
+
+    def onnx_file(self, piece: str) -> str:
+        """Name of the ONNX file of a piece, whose weights are beside it; of a block the one in its precision."""
         record = self.manifest.precision
         models = {} if record is None else record.models
-        return self.path / models.get(piece, self.manifest.pieces[piece].file)
+        return models.get(piece, self.manifest.pieces[piece].file)
+
+    def onnx_path(self, piece: str) -> Path:
+        """Where ``onnx_file`` is, for other programs; what is there by then was not checked."""
+        return self.path / self.onnx_file(piece)
 
     def at_precision(self, name: str) -> Artifact:
         """The same artifact with its residual blocks in a precision: its own, or ``fp32``, which all artifacts hold.
@@ -105,12 +140,9 @@ class Artifact:
 
     @cached_property
     def _document(self) -> Value:
-        path = self.path / self.manifest.stores.program
-        try:
-            content = path.read_bytes()
-        except OSError as error:
-            raise ArtifactError(f"{path}: cannot be read: {error}. {REMEDY}") from error
-        return parse(content, path.name)
+        name = self.manifest.stores.program
+        with self.reading(name):
+            return parse(read_file(self.files / name, self.manifest.files[name].bytes), name)
 
     @cached_property
     def graphs(self) -> Mapping[str, Graph]:
@@ -175,20 +207,29 @@ def load_artifact(path: str | Path) -> Artifact:
         The artifact; arrays are mapped, not read.
 
     Raises:
+        ArtifactChangedError: it was replaced or changed meanwhile.
         ArtifactError: says what is wrong, where, and what to do.
     """
     place = Path(path)
+    require_artifact_path(place)
     if place.is_dir():
-        return _load_directory(place)
-    if not place.exists():
-        raise ArtifactError(f"{place}: does not exist. Give the directory that 'ttscompile convert' wrote.")
+        return _load_directory(place, place)
     _refuse_checkpoint(place)
     unpacked = unpack(place)
     try:
-        return replace(_load_directory(unpacked.path), _unpacked=unpacked)
-    except ArtifactError as error:
+        return replace(_load_directory(unpacked.path, place), _unpacked=unpacked)
+    except BaseException:
         unpacked.remove()
-        raise ArtifactError(str(error).replace(str(unpacked.path), str(place))) from error
+        raise
+
+
+def require_artifact_path(path: Path) -> None:
+    """Raise unless there is something that may be an artifact.
+
+    Raises:
+        ArtifactError: there is nothing, or something that is never read.
+    """
+    require_path(path, ArtifactError, "Give the directory that 'ttscompile convert' wrote.")
 
 
 def read_manifest(directory: Path) -> Manifest:
@@ -198,16 +239,13 @@ def read_manifest(directory: Path) -> Manifest:
         ArtifactError: not an artifact, or a manifest that is damaged or of another schema version.
     """
     path = directory / MANIFEST
-    try:
-        content = path.read_bytes()
-    except FileNotFoundError:
+    require_artifact_path(directory)
+    if not os.path.lexists(path):
         _refuse_checkpoint(directory)
         raise ArtifactError(
             f"{directory}: not an artifact: it has no {MANIFEST}. Give the directory that 'ttscompile convert' wrote."
-        ) from None
-    except OSError as error:
-        raise ArtifactError(f"{path}: cannot be read: {error}. {REMEDY}") from error
-    return decode(content, str(path))
+        )
+    return decode(read_file(path, MAX_MANIFEST_BYTES), str(path))
 
 
 def _refuse_checkpoint(path: Path) -> None:
@@ -217,11 +255,22 @@ def _refuse_checkpoint(path: Path) -> None:
         )
 
 
-def _load_directory(directory: Path) -> Artifact:
-    manifest = read_manifest(directory)
-    _check_runtime(manifest.requires, directory)
-    for name, record in manifest.files.items():
-        check_file(directory / name, record)
+def _load_directory(path: Path, shown: Path) -> Artifact:
+    try:
+        folder = Folder(path, shown)
+    except OSError as error:
+        raise ArtifactError(f"{shown}: cannot be opened: {error}. {REMEDY}") from error
+    with folder.unchanged([MANIFEST]) as first:
+        manifest = read_manifest(folder.files)
+        _check_runtime(manifest.requires, folder.files)
+        with folder.unchanged(manifest.files) as stamps:
+            for name, record in manifest.files.items():
+                check_file(folder.files / name, record)
+            return _open(path, folder, {**first, **stamps}, manifest)
+
+
+def _open(path: Path, folder: Folder, stamps: Mapping[str, Stamp], manifest: Manifest) -> Artifact:
+    directory = folder.files
     if identities(manifest) != (manifest.identity, manifest.model_identity):
         raise ArtifactError(
             f"{directory}: expected the identity {manifest.short_identity}; its content has"
@@ -238,13 +287,15 @@ def _load_directory(directory: Path) -> Artifact:
     tensors.check_arrays("table", tables, wanted, directory / manifest.stores.weights)
     schedules, corrections = _plans(directory, manifest)
     return Artifact(
-        path=directory,
+        path=path,
         manifest=manifest,
         weights=MappingProxyType({n: a for n, a in stored.items() if not n.startswith(TABLE_PREFIX)}),
         tables=MappingProxyType(tables),
         pruner=_optional(directory, manifest.stores.pruner),
         schedules=schedules,
         corrections=corrections,
+        _folder=folder,
+        _stamps=stamps,
     )
 
 

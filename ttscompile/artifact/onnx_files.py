@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from ..errors import ArtifactError
+from .files import read_file
 from .manifest import FileRecord
 from .strict_json import REMEDY
 
@@ -37,12 +38,9 @@ def check_model(path: Path, files: Mapping[str, FileRecord]) -> None:
     Raises:
         ArtifactError: unreadable, no such model, or weights elsewhere.
     """
-    try:
-        if path.suffix != ".onnx" or path.stat().st_size > MAX_BYTES:
-            raise ArtifactError(f"{path}: expected a file NAME.onnx of at most {MAX_BYTES} bytes. {REMEDY}")
-        content = path.read_bytes()
-    except OSError as error:
-        raise ArtifactError(f"{path}: cannot be read: {error}. {REMEDY}") from error
+    content = read_file(path, MAX_BYTES) if path.suffix == ".onnx" else None
+    if content is None or len(content) > MAX_BYTES:
+        raise ArtifactError(f"{path}: expected a file NAME.onnx of at most {MAX_BYTES} bytes. {REMEDY}")
     try:
         places = [_entries(tensor) for tensor in _tensors(memoryview(content), "model", 0)]
     except (ValueError, IndexError) as error:

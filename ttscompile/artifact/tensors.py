@@ -8,8 +8,10 @@ Source: the format's description, https://github.com/huggingface/safetensors#for
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from io import BufferedReader
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -18,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ArtifactError
+from .files import opened
 from .strict_json import REMEDY, Value, parse
 
 Array = npt.NDArray[Any]
@@ -68,16 +71,17 @@ def read_header(path: Path) -> dict[str, Entry]:
         ArtifactError: unreadable or truncated; a dtype that numpy lacks; sizes that contradict each other; data that
             overlap, have gaps, are not aligned or lie outside of the file.
     """
-    try:
-        size = path.stat().st_size
-        with path.open("rb") as file:
-            prefix = file.read(_PREFIX)
-            length = int.from_bytes(prefix, "little")
-            if len(prefix) < _PREFIX or length > min(MAX_HEADER_BYTES, size - _PREFIX):
-                raise _error(path, f"a header of at most {MAX_HEADER_BYTES} bytes inside the file", f"{size} bytes")
-            content = file.read(length)
-    except OSError as error:
-        raise ArtifactError(f"{path.name}: cannot be read: {error}. {REMEDY}") from error
+    with opened(path) as file:
+        return _header(file, path)
+
+
+def _header(file: BufferedReader, path: Path) -> dict[str, Entry]:
+    size = os.fstat(file.fileno()).st_size
+    prefix = file.read(_PREFIX)
+    length = int.from_bytes(prefix, "little")
+    if len(prefix) < _PREFIX or length > min(MAX_HEADER_BYTES, size - _PREFIX):
+        raise _error(path, f"a header of at most {MAX_HEADER_BYTES} bytes inside the file", f"{size} bytes")
+    content = file.read(length)
     root = parse(content, path.name, MAX_HEADER_BYTES)
     members = root.members()
     if "__metadata__" in members:
@@ -116,8 +120,9 @@ def read(path: Path) -> Mapping[str, Array]:
     Raises:
         ArtifactError: see ``read_header``.
     """
-    entries = read_header(path)
-    data: Array = np.memmap(path, dtype=np.uint8, mode="r").view(np.ndarray)
+    with opened(path) as file:
+        entries = _header(file, path)
+        data: Array = np.memmap(file, dtype=np.uint8, mode="r").view(np.ndarray)
     return MappingProxyType(
         {
             name: data[entry.offset : entry.offset + entry.length].view(entry.dtype).reshape(entry.shape)

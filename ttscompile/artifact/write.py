@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.correction import Correction
+from ..core.paths import require_free_or_path
 from ..errors import ArtifactError
 from ..ir.pieces import PRUNER
 from ..ir.program import Binding, Program
@@ -42,6 +43,7 @@ from .load import (
     Artifact,
     load_artifact,
     read_manifest,
+    require_artifact_path,
 )
 from .manifest import DENSE, FORMAT, MANIFEST, SCHEMA_VERSION, Manifest, Stores, abbreviated
 from .strict_json import dump_compact
@@ -89,7 +91,7 @@ def write_artifact(
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         recover(target)
-        with _locked(target) if target.is_dir() else nullcontext(), new_folder(target) as partial:
+        with locked(target) if target.is_dir() else nullcontext(), new_folder(target) as partial:
             manifest = _fill(partial, program, models, blocks, golden)
             sync_directory(partial)
             replace_folder(partial, target)
@@ -110,6 +112,7 @@ def update_calibration(
     corrections: Mapping[str, Correction] | None = None,
     model_identity: str | None = None,
     golden: Callable[[Artifact], Mapping[str, GoldenPlan]] | None = None,
+    held: bool = False,
 ) -> Manifest:
     """Replace the plans of an artifact, and its pruner's weights: at once, or not at all.
 
@@ -128,6 +131,7 @@ def update_calibration(
         model_identity: of the artifact that was calibrated; refuses another one.
         golden: records what the reference runtime makes of the plans (``record_golden.record_plans``), given the
             artifact as it will be; None leaves the artifact without, and its plans cannot be verified.
+        held: whether the caller has the artifact ``locked``.
 
     Returns:
         The new manifest.
@@ -137,11 +141,10 @@ def update_calibration(
         IllegalPlanError: a schedule or a correction that does not fit the policy.
     """
     directory = Path(path)
-    if directory.is_file():
-        raise ArtifactError(f"{directory}: expected a directory; found a file. Unzip it and give the directory.")
+    require_artifact_path(directory)
     if not directory.is_dir():
-        raise ArtifactError(f"{directory}: does not exist. Give the directory that 'ttscompile convert' wrote.")
-    with _locked(directory):
+        raise ArtifactError(f"{directory}: expected a directory; found a file. Unzip it and give the directory.")
+    with nullcontext() if held else locked(directory):
         artifact = load_artifact(directory)
         if model_identity not in (None, artifact.manifest.model_identity):
             raise ArtifactError(
@@ -254,6 +257,7 @@ def require_replaceable(directory: str | os.PathLike[str]) -> None:
     Raises:
         ArtifactError: it is something else.
     """
+    require_free_or_path(directory, ArtifactError, "Give another output directory.")
     target = Path(os.path.realpath(directory))
     if not target.exists():
         return
@@ -268,17 +272,24 @@ def require_replaceable(directory: str | os.PathLike[str]) -> None:
             f"{target}: expected an empty directory or a ttscompile artifact; found one that holds"
             f" {', '.join((foreign or entries)[:5])}. Give another output directory, or remove this one yourself."
         )
+    with locked(target):  # told now, not after minutes of work
+        pass
 
 
 @contextmanager
-def _locked(directory: Path) -> Iterator[None]:
-    """Keep other processes from changing the artifact."""
+def locked(directory: Path) -> Iterator[None]:
+    """Keep all others from calibrating, converting to, or updating an artifact; a kill ends this, too.
+
+    Raises:
+        ArtifactError: somebody else is at it; or it cannot be locked.
+    """
     with ExitStack() as held:
         try:
             held.enter_context(lock_folder(directory))
         except BlockingIOError:
             raise ArtifactError(
-                f"{directory}: another process is changing the artifact. Try again when it is done."
+                f"{directory}: another process is changing the artifact: it calibrates it, or converts a checkpoint to"
+                " this directory. Try again when it is done."
             ) from None
         except OSError as error:  # no permission; a file system without locks
             raise ArtifactError(f"{directory}: cannot be locked, and was not changed: {error}.") from error

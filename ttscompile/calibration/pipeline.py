@@ -15,7 +15,7 @@ import numpy as np
 from ..artifact.ceiling import few_steps, usual_sparsity
 from ..artifact.load import Artifact, load_artifact
 from ..artifact.manifest import UNIFORM
-from ..artifact.write import update_calibration
+from ..artifact.write import locked, update_calibration
 from ..core.correction import FEATURES
 from ..core.given import integer
 from ..core.lattice import sparsity
@@ -107,7 +107,7 @@ def calibrate(
             computes as much. The artifact is as it was.
         CalibrationError: the arguments cannot be satisfied, or there is nothing to resume with these.
         TrajectoryError: the recordings do not fit the policy.
-        ArtifactError: no artifact, or it cannot be written.
+        ArtifactError: no artifact, one that another process is changing, or it cannot be written.
     """
     begun = time.monotonic()
     seed = integer(seed, "seed", CalibrationError)
@@ -115,84 +115,87 @@ def calibrate(
         max_intervals = integer(max_intervals, "max_intervals", CalibrationError)
     asked = (target_sparsity, target_flops, latency_ms, max_action_error, threads)
     goal_of(*asked)  # what cannot be is refused before anything is read
-    artifact = load_artifact(Path(path))
-    goal = goal_of(*asked, usual=usual_sparsity(artifact.manifest.steps))
-    spec, chosen = artifact.manifest.spec, strategy_of(strategy)
     if not Path(path).is_dir():
+        load_artifact(Path(path))  # says what is wrong, if it is no zipped artifact
         raise CalibrationError(
             f"{path}: only a directory can be calibrated. Unzip the artifact and give the directory."
         )
-    budget = _known_budget(artifact, goal, chosen, validation_fraction, max_minutes)
-    episodes = load_episodes(spec, trajectories, observation)
-    split = split_episodes(len(episodes), validation_fraction, seed)
-    features = FEATURES * spec.sample[0] + 1
-    fewest = min(CALLS_A_FEATURE * features, 1024) if chosen.fits_correction else FEWEST_CALLS
-    limit = int(np.clip(EVALUATIONS_A_MINUTE / spec.sampler.steps * max_minutes, fewest, MOST_CALLS))
-    state = StateFile(
-        Path(path),
-        {
-            "model": artifact.manifest.model_identity[:16],
-            "trajectories": _digest(episodes),
-            "budget": goal.record(),
-            "strategy": strategy,
-            "seed": seed,
-            "validation_fraction": validation_fraction,
-            "max_intervals": max_intervals,
-        },
-    )
-    if not (resume and state.load()):
+    with locked(Path(path)):  # all the while: a second calibration would undo the first
+        artifact = load_artifact(Path(path))
+        goal = goal_of(*asked, usual=usual_sparsity(artifact.manifest.steps))
+        spec, chosen = artifact.manifest.spec, strategy_of(strategy)
+        budget = _known_budget(artifact, goal, chosen, validation_fraction, max_minutes)
+        episodes = load_episodes(spec, trajectories, observation)
+        split = split_episodes(len(episodes), validation_fraction, seed)
+        features = FEATURES * spec.sample[0] + 1
+        fewest = min(CALLS_A_FEATURE * features, 1024) if chosen.fits_correction else FEWEST_CALLS
+        limit = int(np.clip(EVALUATIONS_A_MINUTE / spec.sampler.steps * max_minutes, fewest, MOST_CALLS))
+        state = StateFile(
+            Path(path),
+            {
+                "model": artifact.manifest.model_identity[:16],
+                "trajectories": _digest(episodes),
+                "budget": goal.record(),
+                "strategy": strategy,
+                "seed": seed,
+                "validation_fraction": validation_fraction,
+                "max_intervals": max_intervals,
+            },
+        )
+        if not (resume and state.load()):
+            state.remove()
+        limit = state.progress.setdefault("calls", limit)  # whatever time there is to go on
+        clock = Clock(60 * max_minutes, float(state.progress.get("seconds", 0.0)), begun)
+        if goal.kind == LATENCY:
+            budget = _timed_budget(artifact, goal, chosen, state, clock)
+        executor = Executor(artifact)
+        sets = draw_calls(executor, spec, episodes, split, limit, min(JUDGED, limit // 2), seed)
+        with Bar(progress) as bar:
+            if (warning := few_steps(artifact.manifest)) is not None:
+                bar.warn(warning)
+            least = {"calibration": fewest, "validation": limit}
+            sets = {
+                name: with_targets(executor, name, calls, least[name], state, clock, bar)
+                for name, calls in sets.items()
+            }
+            if clock.left() < 0:
+                bar.warn(
+                    f"{max_minutes:g} minutes were over when the dense policy had answered the calls to learn from:"
+                    f" strategy {strategy!r} needs {fewest}. Its search is the shortest there is; allow more time."
+                )
+            task = Task.of(artifact, executor, sets["calibration"], 0, seed)
+            crowded = CrowdedSchedules(task.whole, state, clock, bar)
+            if budget is None:
+                budget = budget_of_error(crowded, goal, artifact.manifest.steps, len(artifact.manifest.blocks))
+            task = replace(task, budget=budget.cells, clock=clock.until(1 - SHARE) if chosen.fits_correction else clock)
+            found, intervals, stopped = _search(open_search(strategy, task), state, task.clock, bar, max_intervals)
+            if goal.kind == ERROR:
+                found, budget = _relax(artifact, crowded, task, found, budget, sets["validation"])
+            named, skipped = named_plans(crowded, task, chosen, budget.cells)
+        plans = {SCHEDULE: found, UNIFORM: uniform_of(artifact.manifest, budget.cells), **named}
+        scores = judge(artifact, executor, plans, sets["validation"])
+        if SAFE in scores and not scores[SAFE].error < scores[SCHEDULE].error:
+            del plans[SAFE]
+            skipped[SAFE] = f"{scores.pop(SAFE).error:.4g} off, no safer than {SCHEDULE}: its search was cut short"
+        result = CalibrationResult(
+            strategy=strategy,
+            seed=seed,
+            target_sparsity=goal.sparsity(budget.cells, artifact.manifest),
+            budget=budget.record(),
+            default_plan=default_of(scores, goal, budget.cells, artifact.manifest),
+            plans=scores,
+            skipped=skipped,
+            episodes={"calibration": split.calibration, "validation": split.validation},
+            calls={name: calls.count for name, calls in sets.items()},
+            intervals=intervals,
+            stopped=stopped,
+            seconds=clock.elapsed(),
+        )
+        require_success(result, goal)
+        precision = precision_record(artifact, episodes, split.validation, found, seed)
+        _write(Path(path), artifact, result, plans, precision)
         state.remove()
-    limit = state.progress.setdefault("calls", limit)  # whatever time there is to go on
-    clock = Clock(60 * max_minutes, float(state.progress.get("seconds", 0.0)), begun)
-    if goal.kind == LATENCY:
-        budget = _timed_budget(artifact, goal, chosen, state, clock)
-    executor = Executor(artifact)
-    sets = draw_calls(executor, spec, episodes, split, limit, min(JUDGED, limit // 2), seed)
-    with Bar(progress) as bar:
-        if (warning := few_steps(artifact.manifest)) is not None:
-            bar.warn(warning)
-        least = {"calibration": fewest, "validation": limit}
-        sets = {
-            name: with_targets(executor, name, calls, least[name], state, clock, bar) for name, calls in sets.items()
-        }
-        if clock.left() < 0:
-            bar.warn(
-                f"{max_minutes:g} minutes were over when the dense policy had answered the calls to learn from:"
-                f" strategy {strategy!r} needs {fewest}. Its search is the shortest there is; allow more time."
-            )
-        task = Task.of(artifact, executor, sets["calibration"], 0, seed)
-        crowded = CrowdedSchedules(task.whole, state, clock, bar)
-        if budget is None:
-            budget = budget_of_error(crowded, goal, artifact.manifest.steps, len(artifact.manifest.blocks))
-        task = replace(task, budget=budget.cells, clock=clock.until(1 - SHARE) if chosen.fits_correction else clock)
-        found, intervals, stopped = _search(open_search(strategy, task), state, task.clock, bar, max_intervals)
-        if goal.kind == ERROR:
-            found, budget = _relax(artifact, crowded, task, found, budget, sets["validation"])
-        named, skipped = named_plans(crowded, task, chosen, budget.cells)
-    plans = {SCHEDULE: found, UNIFORM: uniform_of(artifact.manifest, budget.cells), **named}
-    scores = judge(artifact, executor, plans, sets["validation"])
-    if SAFE in scores and not scores[SAFE].error < scores[SCHEDULE].error:
-        del plans[SAFE]
-        skipped[SAFE] = f"{scores.pop(SAFE).error:.4g} off, no safer than {SCHEDULE}: its search was cut short"
-    result = CalibrationResult(
-        strategy=strategy,
-        seed=seed,
-        target_sparsity=goal.sparsity(budget.cells, artifact.manifest),
-        budget=budget.record(),
-        default_plan=default_of(scores, goal, budget.cells, artifact.manifest),
-        plans=scores,
-        skipped=skipped,
-        episodes={"calibration": split.calibration, "validation": split.validation},
-        calls={name: calls.count for name, calls in sets.items()},
-        intervals=intervals,
-        stopped=stopped,
-        seconds=clock.elapsed(),
-    )
-    require_success(result, goal)
-    precision = precision_record(artifact, episodes, split.validation, found, seed)
-    _write(Path(path), artifact, result, plans, precision)
-    state.remove()
-    return result
+        return result
 
 
 def _write(
@@ -213,6 +216,7 @@ def _write(
         corrections=corrections,
         model_identity=artifact.manifest.model_identity,
         golden=record_plans,
+        held=True,
     )
 
 

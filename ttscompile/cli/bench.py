@@ -6,8 +6,9 @@ from pathlib import Path
 
 import click
 
+from ttscompile.artifact.load import load_artifact
 from ttscompile.cli.options import PATH, artifact_argument, count_option, json_option, names_option
-from ttscompile.cli.output import identity_of, print_identity, print_json, progress, results, say, table
+from ttscompile.cli.output import print_identity, print_json, progress, results, say, table
 from ttscompile.cli.timing import Measurement, contestants, measure
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.units import ms, share
@@ -51,9 +52,10 @@ def bench(
     """
     if {"eager", "original"}.intersection(against) and checkpoint is None:
         raise click.UsageError("--against eager or original runs the original network: give --checkpoint FILE too.")
-    console, identity = progress(), identity_of(directory)
+    console, artifact = progress(), load_artifact(directory)
+    identity = artifact.manifest.identity
     with console.status("loading"):
-        entered = contestants(directory, threads, plan, against, checkpoint)
+        entered = contestants(artifact, threads, plan, against, checkpoint)
     if entered[0].plan == "dense":
         say(console, f"warning: {directory} runs dense: it is not calibrated, or --plan dense was given.")
     with console.status("timing") as status:

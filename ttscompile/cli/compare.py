@@ -12,7 +12,7 @@ from ttscompile.calibration.strategies import NAMES
 from ttscompile.cli.options import PATH, artifact_argument, count_option, json_option, names_option
 from ttscompile.cli.output import manifest_of, only_results_on_stdout, print_json, progress, results, say, table
 from ttscompile.cli.recordings import FilesCommand, Sources, require_recordings, trajectories_options
-from ttscompile.errors import RuntimeUnavailableError
+from ttscompile.errors import ArtifactChangedError, RuntimeUnavailableError
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.units import ms, share
 from ttscompile.plots.frontier import plot_frontier
@@ -127,6 +127,8 @@ def compare(
             progress=tell,
             **search,
         )
+    if any(manifest_of(path).identity != manifest.identity for path, manifest in manifests.items()):
+        raise ArtifactChangedError(f"{directory}: it, or another that was compared, was replaced meanwhile. Try again.")
     say(told, *(f"warning: {warning}" for warning in found.warnings))
     machine, threads = fingerprint(), f"{found.threads} thread{'s' * (found.threads > 1)}"
     if as_json:

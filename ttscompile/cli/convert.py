@@ -14,6 +14,7 @@ from ttscompile.artifact.write import require_replaceable
 from ttscompile.cli.options import PATH, count_option, json_option
 from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results, say
 from ttscompile.cli.summary import print_summary
+from ttscompile.core.paths import require_path
 from ttscompile.core.spec import FP32, PRECISIONS
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends.families import FAMILIES, FORMATS, SAMPLERS, SPACINGS
@@ -89,9 +90,8 @@ def convert(
 
     The artifact computes everything until 'ttscompile calibrate' gives it a plan.
     """
-    if not checkpoint.exists():  # told now: importing the compiler, and with it torch, takes seconds
-        expected = " or ".join(each.reads for each in FAMILIES)
-        raise CheckpointError(f"{checkpoint}: does not exist. Give {expected}.")
+    # Told now: importing the compiler, and with it torch, takes seconds.
+    require_path(checkpoint, CheckpointError, f"Give {' or '.join(each.reads for each in FAMILIES)}.")
     require_replaceable(directory)
     stages: list[dict[str, Any]] = []
     console = progress()

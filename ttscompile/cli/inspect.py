@@ -8,7 +8,6 @@ import click
 import numpy as np
 import numpy.typing as npt
 
-import ttscompile
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import DENSE
 from ttscompile.cli.options import PATH, artifact_argument, json_option
@@ -18,6 +17,8 @@ from ttscompile.core.lattice import PlanArray
 from ttscompile.errors import ArtifactError, ObservationError
 from ttscompile.plots.maps import plot_plan
 from ttscompile.report.summary import document
+from ttscompile.runtimes.open import open_runtime
+from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.trajectories import read_npz
 
 SCHEDULE = "schedule"
@@ -78,7 +79,7 @@ def _plan(artifact: Artifact, name: str, observation: Path | None) -> PlanArray:
             f"{artifact.path}: plan {name!r} is made for each observation, and none was given. Add --observation"
             f" FILE.npz, or draw a schedule with --plan: {', '.join(others)}."
         )
-    policy = ttscompile.load(artifact.path, seed=0)
+    policy = CompiledPolicy(artifact, open_runtime(artifact), seed=0)  # of this artifact, whatever is there by now
     for call in _calls(observation, artifact):
         policy.predict_action(call, plan=name)
     report = policy.last_report

@@ -15,7 +15,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from ttscompile.artifact.load import load_artifact, read_manifest
+from ttscompile.artifact.load import load_artifact, read_manifest, require_artifact_path
 from ttscompile.artifact.manifest import Manifest, abbreviated
 from ttscompile.errors import TtscompileError
 
@@ -90,6 +90,7 @@ def manifest_of(path: Path) -> Manifest:
     Raises:
         ArtifactError: there is no artifact.
     """
+    require_artifact_path(path)
     return read_manifest(path) if path.is_dir() else load_artifact(path).manifest
 
 

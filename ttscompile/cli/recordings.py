@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from ttscompile.cli.options import PATH, Decorator, together
+from ttscompile.core.paths import require_path
 from ttscompile.errors import TrajectoryError
 
 Sources = dict[str, tuple[str, ...]]
@@ -52,8 +53,7 @@ def require_recordings(paths: Iterable[Path]) -> None:
         TrajectoryError: names the first that does not.
     """
     for path in paths:
-        if not path.exists():
-            raise TrajectoryError(f"{path}: does not exist. Give the file or the directory of a recording.")
+        require_path(path, TrajectoryError, "Give the file or the directory of a recording.")
 
 
 def trajectories_options(required: bool = True) -> Decorator:

@@ -12,11 +12,13 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.cli.options import PATH, artifact_argument, count_option
 from ttscompile.cli.output import only_results_on_stdout, progress, results, say
 from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
-from ttscompile.errors import ArtifactError, OutputError
+from ttscompile.errors import ArtifactChangedError, ArtifactError, OutputError
 from ttscompile.report import Given, Section, build, render, verified
 from ttscompile.report.comparison import read_comparison
 from ttscompile.report.page import require_packages
 from ttscompile.report.verified import NOT_RUN
+from ttscompile.runtimes.open import open_runtime
+from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.trajectories import load_trajectories
 
 
@@ -81,11 +83,15 @@ def report(
                     threads=threads,
                     progress=lambda what: status.update(f"verifying: {what}"),
                 )
+                if found.identity not in (None, manifest.identity):
+                    raise ArtifactChangedError(f"{directory}: was replaced meanwhile. Report on it again.")
                 passed, section = found.passed, verified(found)
+            except ArtifactChangedError:
+                raise
             except ArtifactError as error:  # it has nothing to check against, and so fails nothing
                 section = Section("Verification", (f"Could not be run: {error}",))
         given = Given(chosen, compared, section, threads, runs)
-        policy = ttscompile.load(directory, threads=threads, seed=0)
+        policy = CompiledPolicy(artifact, open_runtime(artifact, threads=threads), seed=0)
         page = render(build(artifact, policy, given, status.update))
     try:
         replace_file(output, page.encode())

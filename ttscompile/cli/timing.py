@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-import ttscompile
-from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.load import Artifact
 from ttscompile.core.lattice import Source
 from ttscompile.core.spec import FP32, Affine, Noise, PolicySpec
 from ttscompile.errors import RuntimeUnavailableError, SpecError
 from ttscompile.measure.timer import Timer, Times
+from ttscompile.runtimes.open import open_runtime
+from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.runtimes.random_calls import Observation, normalized, random_calls
 
 if TYPE_CHECKING:
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
 
     from ttscompile.artifact.manifest import Manifest
     from ttscompile.frontends.eager import EagerPolicy
-    from ttscompile.runtimes.policy import CompiledPolicy
 
 WARM_UP = 3
 """Calls of each that are not counted: allocations, and the first call of an episode, which cannot use ROLLOUT."""
@@ -90,27 +90,28 @@ class Measurement:
 
 
 def contestants(
-    directory: Path, threads: int, plan: str | None, against: Sequence[str], checkpoint: Path | None
+    artifact: Artifact, threads: int, plan: str | None, against: Sequence[str], checkpoint: Path | None
 ) -> list[Contestant]:
     """The compiled policy first, then its rivals, in fp32; each with a policy, and caches, of its own.
 
     Args:
-        directory: the artifact.
+        artifact: of all that run it.
         threads: threads that each computes with.
         plan: of the compiled policy; None for the artifact's default.
         against: ``original``, ``eager``, ``onnxruntime-dense``.
         checkpoint: for ``original`` and ``eager``.
 
     Raises:
-        ArtifactError: it cannot be opened.
+        ArtifactError: it cannot be run.
         RuntimeUnavailableError: ``eager`` without torch.
         SpecError: the checkpoint is of another policy.
     """
-    manifest = load_artifact(directory).manifest
+    manifest = artifact.manifest
     own = manifest.precision_name
 
     def compiled(label: str, plan: str, precision: str) -> Contestant:
-        policy = ttscompile.load(directory, threads=threads, precision=precision)
+        chosen = artifact.at_precision(precision)
+        policy = CompiledPolicy(chosen, open_runtime(chosen, threads=threads))
         policy.reset()
         return plan_contestant(label, policy, plan, manifest.spec)
 

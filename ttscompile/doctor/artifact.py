@@ -37,7 +37,7 @@ def artifact_findings(directory: Path) -> list[Finding]:
         artifact = load_artifact(directory)
     except TtscompileError as error:
         return [Finding(PART, "load", str(error), Level.PROBLEM, "As the message says; nothing else was tried.")]
-    return [*_needs(artifact), *_call(directory, artifact)]
+    return [*_needs(artifact), *_call(artifact)]
 
 
 def _needs(artifact: Artifact) -> list[Finding]:
@@ -71,13 +71,14 @@ def _needs(artifact: Artifact) -> list[Finding]:
     return found
 
 
-def _call(directory: Path, artifact: Artifact) -> list[Finding]:
+def _call(artifact: Artifact) -> list[Finding]:
     """Calls on an observation that the normaliser maps to 0."""
     from ..runtimes.executor.measure import neutral_observation
-    from ..runtimes.policy import load
+    from ..runtimes.open import open_runtime
+    from ..runtimes.policy import CompiledPolicy
 
     try:
-        policy = load(directory, threads=1, seed=0)
+        policy = CompiledPolicy(artifact, open_runtime(artifact), seed=0)
         obs: dict[str, Any] = neutral_observation(dict(policy.info.observation))
         times = []
         for _ in range(CALLS):

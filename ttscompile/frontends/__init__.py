@@ -6,7 +6,9 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..core.paths import require_free_or_path
 from ..core.spec import PolicySpec
+from ..errors import CheckpointError
 from .families import AS_SAVED, LoadOptions, find_family
 
 if TYPE_CHECKING:
@@ -32,4 +34,5 @@ def load_checkpoint_policy(
         CheckpointError: unreadable, unsafe, not a supported policy, or given an option of another family.
         SpecError: the sampler asked for is not possible.
     """
+    require_free_or_path(path, CheckpointError, "Give a file or a directory that was trained.")
     return find_family(Path(path), format).load(Path(path), options)

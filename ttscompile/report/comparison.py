@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+from ..core.paths import require_path
 from ..core.untrusted_json import parse_json
 from ..errors import ReportError
 from ..measure.points import Point
@@ -23,8 +24,10 @@ def read_comparison(path: Path) -> Compared:
     Raises:
         ReportError: the file is not what ``ttscompile compare --json`` prints.
     """
+    require_path(path, ReportError, _REMEDY)
     try:
-        document: Any = parse_json(path.read_bytes(), MAX_BYTES)
+        with path.open("rb") as file:
+            document: Any = parse_json(file.read(MAX_BYTES + 1), MAX_BYTES)
     except (OSError, ValueError) as error:
         raise ReportError(f"{path}: no JSON document: {error}. {_REMEDY}") from error
     document = document if isinstance(document, dict) else {}

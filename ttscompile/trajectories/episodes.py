@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.given import integer
+from ..core.paths import require_path
 from ..core.spec import ObservationSpec
 from ..core.untrusted_json import parse_json
 from ..core.values import check_values
@@ -99,6 +100,7 @@ def _read(
     path: Path, observations: Mapping[str, ObservationSpec], action_steps: int, sources: Mapping[str, Sequence[str]]
 ) -> list[Episode]:
     """Episodes of one file."""
+    require_path(path, TrajectoryError, "Give the file or the directory of a recording.")
     other = _other_format(path)
     used = {part.partition(":")[0] for key in observations for part in sources.get(key, (key,))}
     held, frames = _npz(path) if other is None else (frames_apart(path, other, sorted(used)), True)
@@ -152,8 +154,7 @@ def read_npz(path: Path) -> dict[str, Array]:
     Raises:
         TrajectoryError: it is missing, truncated, of another format, or holds Python objects.
     """
-    if not path.exists():
-        raise TrajectoryError(f"{path}: does not exist. Give the .npz file of a recording.")
+    require_path(path, TrajectoryError, "Give the .npz file of a recording.")
     if not path.is_file():
         raise TrajectoryError(
             f"{path}: expected an .npz, a zarr replay buffer of Diffusion Policy, an HDF5 file of robomimic or a"

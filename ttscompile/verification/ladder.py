@@ -13,11 +13,11 @@ from ..artifact.archive import is_checkpoint
 from ..artifact.codec import encode
 from ..artifact.files import check_file
 from ..artifact.golden import load_golden, load_golden_plans
-from ..artifact.load import Artifact, load_artifact, read_manifest
+from ..artifact.load import Artifact, load_artifact, read_manifest, require_artifact_path
 from ..artifact.manifest import MANIFEST
 from ..core.given import integer
 from ..core.spec import FP32
-from ..errors import ArtifactError, RuntimeUnavailableError, TtscompileError
+from ..errors import ArtifactChangedError, ArtifactError, RuntimeUnavailableError, TtscompileError
 from ..runtimes.open import MOST_THREADS, open_runtime
 from ..runtimes.policy import CompiledPolicy
 from ..trajectories.episodes import load_trajectories
@@ -97,16 +97,21 @@ def check_integrity(path: Path) -> tuple[Rung, Artifact | None]:
     Raises:
         ArtifactError: there is nothing at this path that could be an artifact.
     """
-    if not path.exists() or (path.is_dir() and not (path / MANIFEST).is_file()) or is_checkpoint(path):
+    require_artifact_path(path)
+    if (path.is_dir() and not (path / MANIFEST).is_file()) or is_checkpoint(path):
         load_artifact(path)  # says what is wrong
-    wrong = _wrong_files(path) if path.is_dir() else []
-    artifact = None
-    if not wrong:
-        try:
-            artifact = load_artifact(path)
-        except ArtifactError as error:
-            wrong = [str(error)]
-    if artifact is None:
+    artifact, wrong = None, list[str]()
+    try:
+        artifact = load_artifact(path)
+        # Two spellings of one document have one checksum.
+        with artifact.reading(MANIFEST):
+            if encode(artifact.manifest) != (artifact.files / MANIFEST).read_bytes():
+                wrong = [f"{path / MANIFEST}: is written otherwise than ttscompile writes it; the file was changed."]
+    except ArtifactChangedError:
+        raise  # nothing is wrong with it
+    except ArtifactError as error:
+        wrong = (_wrong_files(path) if path.is_dir() else []) or [str(error)]
+    if artifact is None or wrong:
         remedy = "Copy the artifact again, or convert the checkpoint again."
         told = f"{len(wrong)} of its files are not as written: " * (len(wrong) > 1) + " ".join(wrong)
         return Rung(INTEGRITY, FAILED, told, len(wrong), 0, "files", remedy, details={"wrong": wrong}), None
@@ -131,9 +136,6 @@ def _wrong_files(directory: Path) -> list[str]:
             check_file(directory / name, record)
         except ArtifactError as error:
             wrong.append(str(error))
-    # Two spellings of one document have one checksum.
-    if not wrong and encode(manifest) != (directory / MANIFEST).read_bytes():
-        wrong = [f"{directory / MANIFEST}: is written otherwise than ttscompile writes it; the file was changed."]
     return wrong
 
 
