@@ -1,11 +1,11 @@
 """What a policy is evaluated in: what an environment has to offer, and which there are.
 
 A new one is one file in this folder, named as ``--environment`` calls it (``_`` for ``-``): a class that satisfies
-``Environment``, and the line ``ENVIRONMENT = TheClass``. ``fetch.py`` is a short one to start from, and the tests hold every
-file here against the protocol.
+``Environment``, and the line ``ENVIRONMENT = TheClass``. ``fetch.py`` is a short one to start from. The tests hold
+every file here against the protocol.
 
-An environment gives single frames and takes single actions. Windows of To frames, chunks of actions, batches, noise, the
-cache and the tables are the harness's, and are cut as the specification of the policy says.
+An environment gives single frames and takes single actions. Windows of To frames, chunks of actions, batches, noise,
+the cache and the tables are the harness's; the specification of the policy says how windows are cut.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Environment(Protocol):
         title: for tables and pictures, such as ``Push-T``.
         hz: actions a second.
         max_steps: actions after which an episode ends.
-        task: what has to be done, where there are several tasks: the seed decides; else empty. Tables have a row for each.
+        task: what has to be done, where there are several tasks: the seed decides; else empty.
         done: the task is solved, or ``max_steps`` actions were taken.
         success: the task is solved. It stays solved.
         score: 0 to 1, what the episode is worth so far: 1 if it is solved. It never falls.
@@ -86,6 +86,8 @@ def environment_class(name: str) -> type[Environment]:
     try:
         module = import_module(f"{__name__}.{name.replace('-', '_')}")
     except ModuleNotFoundError as error:
+        if (error.name or __name__).startswith(__name__):
+            raise
         lacking = f"the environment {name!r} needs the package {error.name!r}, which is not installed"
         raise TtscompileError(f"{lacking}. Run: pip install 'ttscompile[examples]'.") from error
     found: type[Environment] = module.ENVIRONMENT

@@ -1,13 +1,14 @@
 """Gymnasium-Robotics' Fetch: an arm reaches, pushes, or picks and places, as the seed says. Written to be copied.
 
-A frame has ``state`` ``[25]`` (gripper and object; of the object zeros where there is none), ``goal`` ``[3]`` and ``task``
-``[3]``, a one-hot vector in the order of ``TASKS``. Actions are ``[4]``: the gripper's displacement and its opening, -1..1.
+A frame has ``state`` ``[25]`` (gripper and object; of the object zeros where there is none), ``goal`` ``[3]`` and
+``task`` ``[3]``, a one-hot vector in the order of ``TASKS``. Actions are ``[4]``: the gripper's displacement and its
+opening, -1..1.
 """
 
 from __future__ import annotations
 
 import gymnasium
-import gymnasium_robotics  # type: ignore[import-untyped]
+import gymnasium_robotics
 import numpy as np
 import numpy.typing as npt
 
