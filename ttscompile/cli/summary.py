@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from rich.console import Console
+from rich.padding import Padding
 
 from ttscompile.artifact.load import Artifact
 from ttscompile.cli.output import table
@@ -51,7 +52,7 @@ def print_summary(artifact: Artifact, console: Console) -> None:
         return
     _print_facts(console, facts.score_table(record))
     for line in (*facts.other_noise(record), *facts.left_out(record)):
-        console.print(f"  {line}")  # as a row it would squeeze the figures
+        console.print(Padding(line, (0, 0, 0, 2)))  # as a row it would squeeze the figures
     _print_facts(console, facts.record_table(record, most=90))
 
 
