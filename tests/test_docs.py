@@ -179,6 +179,7 @@ def elsewhere(command: Any) -> bool:
 def test_a_page_can_be_followed(page: Path, request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: Any) -> None:
     if page == TUTORIAL:  # makes everything itself, from the policy of the example
         (tmp_path / "examples" / "pusht").mkdir(parents=True)
+        (tmp_path / "examples" / "evaluation").symlink_to(ROOT / "examples" / "evaluation")
         for file in (ROOT / "examples" / "pusht").iterdir():
             one_layer = request.getfixturevalue("one_layer_checkpoint")
             (tmp_path / "examples" / "pusht" / file.name).symlink_to(one_layer if file.suffix == ".ckpt" else file)

@@ -11,6 +11,7 @@ small operation, and where they have to share cores an eager call can take ten t
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -20,13 +21,10 @@ from typing import Any
 import click
 import numpy as np
 import numpy.typing as npt
-from environment import FloatArray, PushT
 from original import EagerPolicy
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
-from rollout import NoiseShape, Plan, Policy, seeded_noise
-from variants import noise_shape, results_console, run
 
 import ttscompile
 from ttscompile import Source
@@ -35,6 +33,10 @@ from ttscompile.cli.output import print_identity
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.timer import Timer, Times
 from ttscompile.runtimes.policy import PolicyInfo
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "evaluation"))
+from environments.pusht import FloatArray, PushT
+from variants import NoiseShape, Plan, Policy, noise_shape, results_console, run, seeded_noise
 
 CHECKPOINT = Path(__file__).with_name("pusht_dpt_ema_fp16.ckpt")
 WARM_UP = 3
@@ -116,13 +118,12 @@ def random_plan(steps: int, blocks: int, computed: float, seed: int) -> npt.NDAr
 def scripted_windows(count: int) -> list[FloatArray]:
     """Observations of consecutive calls while the agent goes round in a circle, ``[1, 2, 20]`` each."""
     environment = PushT()
-    current = environment.reset(seed=0)
-    windows = []
-    for call in range(count):
-        windows.append(current[None])
-        angle = 0.1 * (8 * call + np.arange(8))
-        current = environment.execute(256 + 120 * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
-    return windows
+    environment.reset(seed=0)
+    frames = [environment.observe()["obs"]] * 2
+    for angle in 0.1 * np.arange(8 * count):
+        environment.step(256 + 120 * np.array([np.cos(angle), np.sin(angle)]))
+        frames.append(environment.observe()["obs"])
+    return [np.stack(frames[8 * call : 8 * call + 2])[None] for call in range(count)]
 
 
 def measure(

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -23,18 +24,21 @@ from typing import Any, TypeVar
 
 import click
 import numpy as np
-from delays_plot import plot_delays
-from delays_world import Driven, Setup, drive
-from episodes import Episodes
-from evaluate import Evaluation, summarise
-from jobs import fill_cache
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
-from rollout import Rollout, run_episodes
-from variants import cache_option, first_seed_option, open_variant, results_console, run, runtime_option
 
 from ttscompile.cli.output import identity_of, print_identity
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "evaluation"))
+from delays_plot import plot_delays
+from delays_world import Driven, Setup, drive
+from environments.pusht import PushT
+from episodes import Episodes
+from evaluate import Evaluation, summarise
+from jobs import fill_cache
+from rollout import Rollout, run_episodes
+from variants import cache_option, first_seed_option, open_variant, results_console, run, runtime_option
 
 T = TypeVar("T")
 SEEDS_A_JOB = 4
@@ -109,11 +113,11 @@ def figures(setup: Setup, driven: Sequence[Driven], baseline: Rollout) -> Figure
         baseline: of the same seeds.
     """
     rollout = Rollout(tuple(each.episode for each in driven), ())
-    steps = sum(len(each.episode.targets) for each in driven)
+    steps = sum(len(each.episode.actions) for each in driven)
     ages = [each.age for each in driven if each.age is not None]
     return Figures(
         evaluation=summarise(setup.label, rollout, baseline),
-        calls=float(np.mean([len(each.episode.windows) for each in driven])),
+        calls=float(np.mean([each.episode.calls for each in driven])),
         age=float(np.mean(ages)) if ages else None,
         bridged=sum(each.bridged for each in driven) / steps,
         still=sum(each.still for each in driven) / steps,
@@ -130,7 +134,7 @@ def delays_table(found: dict[Setup, Figures], baseline: Evaluation) -> Table:
     table.add_column("setup")
     for column in ("score", "success", "score, difference", "calls", "age, ticks", "bridged", "standing still"):
         table.add_column(column, justify="right")
-    calls = np.mean([len(each.windows) for each in episodes])
+    calls = np.mean([each.calls for each in episodes])
     table.add_row("", "the world waits", str(baseline.score), f"{baseline.success.mean:.3f}", "", f"{calls:.1f}")
     for setup, each in found.items():
         evaluation = each.evaluation
@@ -194,12 +198,12 @@ def main(
     first_seed: int,
     runtime: str,
     jobs: int,
-    cache: Path,
+    cache: Path | None,
     picture: Path | None,
     as_json: bool,
 ) -> None:
     """Drive the policy of DIR through the executor with latencies that are given, and compare with waiting for it."""
-    opened = open_variant(variant, runtime, 1)
+    opened, cache = open_variant(variant, runtime, 1), cache or Path("build", "pusht", "episodes")
     seeds = range(first_seed, first_seed + episodes)
     setups = [
         Setup(latency, seam, margin, horizon or None, hz)
@@ -210,12 +214,13 @@ def main(
     with Progress(console=Console(stderr=True)) as progress:
         waiting = progress.add_task("the world waits", total=episodes)
         going = progress.add_task("the world goes on", total=episodes * len(setups))
-        fill_cache(
-            [variant], seeds, SEEDS_A_JOB, runtime, cache, jobs, lambda _, n: progress.update(waiting, completed=n)
-        )
-        rollout = run_episodes(
-            opened.policy, seeds, opened.noise, SEEDS_A_JOB, opened.plan, cache=Episodes(cache, opened, runtime)
-        )
+
+        def waited(_: str, count: int) -> None:
+            progress.update(waiting, completed=count)
+
+        fill_cache("pusht", [variant], seeds, SEEDS_A_JOB, runtime, cache, jobs, waited)
+        kept = Episodes(cache, "pusht", opened, runtime)
+        rollout = run_episodes(PushT, opened, seeds, SEEDS_A_JOB, cache=kept)
         driven = drive_all(variant, runtime, setups, seeds, jobs, lambda n: progress.update(going, completed=n))
     baseline = summarise("the world waits", rollout, rollout)
     found = {setup: figures(setup, each, rollout) for setup, each in driven.items()}

@@ -11,10 +11,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from environment import FloatArray, PushT, observation
-from rollout import Episode, seeded_noise
-from variants import Variant
+from environments import Array
+from environments.pusht import PushT
+from rollout import Episode, Recorder
+from variants import Variant, seeded_noise
 
 from ttscompile import AsyncExecutor, ExecutorSettings
 from ttscompile.errors import DeadlineMissedError
@@ -101,14 +101,14 @@ class DelayedPolicy:
     """A policy whose calls take a given time, with noise that depends on a seed and the number of the call only.
 
     Attributes:
-        windows: ``[2, 20]``, the observation of each call since the last reset.
+        windows: by key ``[To, ...]``, the observation of each call since the last reset.
     """
 
     def __init__(self, variant: Variant, clock: LockStepClock, latency: float) -> None:
         self._variant, self._clock, self._latency = variant, clock, latency
         self.info = variant.policy.info
         self._seed = 0
-        self.windows: list[FloatArray] = []
+        self.windows: list[Mapping[str, Array]] = []
 
     def reset(self, seed: int | None = None) -> None:
         """A new episode."""
@@ -118,7 +118,7 @@ class DelayedPolicy:
     def predict_action(self, obs_dict: Mapping[str, Any], *, plan: str, prefix: Any = None) -> Mapping[str, Any]:
         """One call, with the next noise."""
         noise = seeded_noise(self._variant.noise, [self._seed], len(self.windows))
-        self.windows.append(obs_dict["obs"][0])
+        self.windows.append({key: array[0] for key, array in obs_dict.items()})
         given = {} if prefix is None else {"prefix": prefix}
         predicted: Mapping[str, Any] = self._variant.policy.predict_action(obs_dict, noise=noise, plan=plan, **given)
         self._clock.take(self._latency)
@@ -193,8 +193,7 @@ def drive(variant: Variant, setup: Setup, seed: int) -> Driven:
         seed: of the initial state and of the noise.
     """
     plan = variant.plan or variant.policy.info.default_plan
-    clock, world = LockStepClock(), PushT()
-    world.reset(seed)
+    clock, world = LockStepClock(), Recorder(PushT(), seed)
     latency = setup.latency_ms / 1e3
     policy = DelayedPolicy(variant, clock, latency)
     executor = AsyncExecutor(policy, setup.hz, setup.settings(plan), clock=clock, latencies={plan: latency})
@@ -203,27 +202,21 @@ def drive(variant: Variant, setup: Setup, seed: int) -> Driven:
         clock.join()
         executor.reset(seed)
         clock.settle()
-        while not world.done:
-            clock.advance(len(world.targets) / setup.hz)
-            executor.observe({"obs": observation(world.states[-1])})
+        while not world.environment.done:
+            clock.advance(world.steps / setup.hz)
+            executor.observe({key: world.look()[key] for key in policy.info.observation})
             clock.settle()
             try:
-                target = executor.action()
+                action = executor.action()
             except DeadlineMissedError:
                 still += 1
-                target = world.states[-1][:2].astype(np.float32)
-            world.execute(target[None])
+                action = world.environment.rest()
+            world.step(action)
         statistics = executor.statistics()
     finally:
         clock.free()
         executor.close(timeout=120)
     age = statistics.action_age_ms
-    episode = Episode(
-        seed=seed,
-        windows=np.array(policy.windows),
-        states=np.stack(world.states),
-        targets=np.stack(world.targets),
-        coverages=np.array(world.coverages),
-    )
+    world.windows = policy.windows
     bridged = statistics.reserve + statistics.holds
-    return Driven(episode, still, bridged, None if age is None else age.p50 * setup.hz / 1e3)
+    return Driven(world.episode(), still, bridged, None if age is None else age.p50 * setup.hz / 1e3)

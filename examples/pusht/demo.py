@@ -9,29 +9,33 @@ episodes that it has not seen. That takes about ten minutes on 2 cores; everythi
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 
 import click
-from animate import save_animation
 from benchmark import CHECKPOINT, Measurement, speed_table, time_calls
-from bootstrap import Estimate, paired_difference
-from episodes import Episodes
-from evaluate import Evaluation, evaluate, evaluation_table
-from jobs import fill_cache
-from record import save_trajectories
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
-from rollout import run_episodes
-from variants import Variant, first_seed_option, open_variant, results_console, run, threads_option
 
 import ttscompile
 from ttscompile.calibration.result import CalibrationResult
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.plots.maps import plot_plan
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "evaluation"))
+from animate import save_animation
+from bootstrap import Estimate, paired_difference
+from environments.pusht import PushT
+from episodes import Episodes
+from evaluate import Evaluation, evaluate, evaluation_table
+from jobs import fill_cache
+from record import save_trajectories
+from rollout import run_episodes
+from variants import Variant, first_seed_option, open_variant, results_console, run, threads_option
 
 BUILD = Path(__file__).resolve().parents[2] / "build" / "pusht"
 SAMPLER, STEPS, HORIZON = "dpmsolver++", 16, 12
@@ -53,11 +57,9 @@ def record_calls(artifact: Path, output: Path, episodes: int, batch: int, thread
     dense = open_variant(f"{artifact}:dense", "onnxruntime", threads)
     with progress_bar() as progress:
         task = progress.add_task("recording episodes", total=episodes)
-        rollout = run_episodes(
-            dense.policy, range(episodes), dense.noise, batch, dense.plan, lambda n: progress.update(task, completed=n)
-        )
+        rollout = run_episodes(PushT, dense, range(episodes), batch, lambda n: progress.update(task, completed=n))
     save_trajectories(output, rollout.episodes)
-    return f"{sum(len(episode.windows) for episode in rollout.episodes)} calls in {episodes} episodes"
+    return f"{sum(episode.calls for episode in rollout.episodes)} calls in {episodes} episodes"
 
 
 def compare(original: Path, artifact: Path, seeds: Sequence[int], batch: int, jobs: int) -> list[Evaluation]:
@@ -66,17 +68,19 @@ def compare(original: Path, artifact: Path, seeds: Sequence[int], batch: int, jo
     The original is run by onnxruntime, which gives the actions of the checkpoint's own code and takes less time.
     Episodes are kept beside the artifact, so that a second demo or ``evaluate.py`` need not run them again.
     """
-    runtime, cache = "onnxruntime", artifact.parent / "episodes"
+    name, runtime, cache = "pusht", "onnxruntime", artifact.parent / "episodes"
     texts = {f"{original}:dense": ORIGINAL, f"{artifact}:dense": DENSE, str(artifact): COMPILED}
     with progress_bar() as progress:
         tasks = {text: progress.add_task(f"evaluating: {label}", total=len(seeds)) for text, label in texts.items()}
-        fill_cache(
-            list(texts), seeds, batch, runtime, cache, jobs, lambda text, n: progress.update(tasks[text], completed=n)
-        )
+
+        def finished(text: str, count: int) -> None:
+            progress.update(tasks[text], completed=count)
+
+        fill_cache(name, list(texts), seeds, batch, runtime, cache, jobs, finished)
     opened = [open_variant(text, runtime, 1) for text in texts]
-    caches = [Episodes(cache, variant, runtime) for variant in opened]
+    caches = [Episodes(cache, name, variant, runtime) for variant in opened]
     variants = [Variant(texts[v.label], v.policy, v.plan, v.noise) for v in opened]
-    return evaluate(variants, seeds, batch, caches=caches)
+    return evaluate(PushT, variants, seeds, batch, caches=caches)
 
 
 def time_alone(artifact: Path, checkpoint: Path, runs: int) -> list[Measurement]:
@@ -225,7 +229,7 @@ def main(
     console.rule("4 of 5: drive the robot with each")
     seeds = range(first_seed, first_seed + episodes)
     evaluations = compare(original, artifact, seeds, batch, jobs or machine["cores"])
-    console.print(evaluation_table(evaluations, seeds))
+    console.print(evaluation_table(PushT.title, evaluations, seeds))
 
     console.rule("5 of 5: time one call")
     speeds = time_alone(artifact, checkpoint, runs)
@@ -241,7 +245,7 @@ def main(
         plot_plan(plan, kinds, picture)
         console.print(f"which blocks one call computes: {picture}")
     pair = [evaluations[0].rollout.episodes[0], evaluations[-1].rollout.episodes[0]]
-    save_animation(animation, pair, [ORIGINAL, COMPILED])
+    save_animation(animation, PushT, pair, [ORIGINAL, COMPILED])
     console.print(f"the episode of seed {first_seed}, original and compiled: {animation}")
     console.print(f"everything on one page: .venv/bin/ttscompile report {artifact} -o report.html", soft_wrap=True)
     console.print("what to do with a policy of your own: docs/tutorial.md", soft_wrap=True)

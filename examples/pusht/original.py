@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from rollout import NoiseShape, Plan
 
 import ttscompile
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "evaluation"))
+from variants import NoiseShape, Plan
 
 
 class EagerPolicy:

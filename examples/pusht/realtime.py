@@ -24,12 +24,9 @@ from typing import Any
 import click
 import numpy as np
 from benchmark import CHECKPOINT
-from environment import WINDOW, PushT, observation
 from realtime_plot import plot_traces
 from rich.console import Console
 from rich.table import Table
-from rollout import NoiseShape, seeded_noise
-from variants import noise_shape, results_console, run
 
 import ttscompile
 from ttscompile import AsyncExecutor, ExecutorSettings
@@ -37,6 +34,10 @@ from ttscompile.cli.output import identity_of, print_identity
 from ttscompile.errors import DeadlineMissedError
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.runtimes.policy import PolicyInfo
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "evaluation"))
+from environments.pusht import PushT
+from variants import NoiseShape, noise_shape, results_console, run, seeded_noise
 
 EAGER, COMPILED = "eager PyTorch", "compiled"
 OUTPUT = Path(__file__).resolve().parents[2] / "build" / "pusht" / "realtime"
@@ -118,8 +119,8 @@ class World:
 
     def next_episode(self) -> int:
         """Start it; its seed."""
-        if self.episode >= 0 and self._environment.coverages:
-            self.best.append(max(self._environment.coverages))
+        if self.episode >= 0:
+            self.best.append(self._environment.coverage)
         self.episode += 1
         seed = self._first_seed + self.episode
         self._environment.reset(seed)
@@ -132,12 +133,11 @@ class World:
 
     def frame(self) -> dict[str, Any]:
         """What the policy observes now."""
-        return {"obs": observation(self._environment.states[-1])}
+        return {"obs": self._environment.observe()["obs"]}
 
     def step(self, target: Any) -> None:
         """Let the world go on for one step; without an action the agent is told to stay where it is."""
-        position = self._environment.states[-1][:2] if target is None else target
-        self._environment.execute(np.asarray(position)[None])
+        self._environment.step(self._environment.rest() if target is None else target)
 
 
 def drive(
@@ -162,7 +162,8 @@ def drive(
     executor = AsyncExecutor(policy, hz, settings)
     try:
         (each,) = executor.feasibility().values()
-        patience = WINDOW / hz + max(each.max_latency, 0.0)
+        window = max(spec.frames or 1 for spec in policy.info.observation.values())
+        patience = window / hz + max(each.max_latency, 0.0)
         start = time.monotonic()
         while time.monotonic() - start < seconds:
             executor.reset(world.next_episode())

@@ -85,6 +85,10 @@ def test_what_it_measured_is_what_the_artifact_does(
     for plan in ("schedule", "uniform"):
         error = np.abs(actions[plan] - actions["dense"]).mean()
         assert error == pytest.approx(result.plans[plan].error, rel=0.35)
+    policy.reset()
+    other = ttscompile.Noise(noise.initial[::-1].copy(), noise.steps[:, ::-1].copy())
+    apart = np.abs(policy.predict_action(obs, noise=other, plan="dense")["action"] - actions["dense"]).mean()
+    assert apart == pytest.approx(result.other_noise, rel=0.35)
 
 
 def test_the_record_is_in_the_artifact(calibrated: tuple[Path, CalibrationResult]) -> None:
@@ -94,6 +98,8 @@ def test_the_record_is_in_the_artifact(calibrated: tuple[Path, CalibrationResult
     record = json.loads(json.dumps(dict(manifest.calibration)))
     assert record["plans"]["schedule"]["error"] == pytest.approx(result.plans["schedule"].error)
     assert record["sparsity"] == pytest.approx(result.sparsity)
+    for plan in record["plans"].values():
+        assert plan["of_other_noise"] == pytest.approx(plan["error"] / result.other_noise)
     assert record["stopped"] == result.stopped == "converged"
     assert set(manifest.plans) == set(result.plans)
     assert record["budget"] == {"target_sparsity": TARGET, "cells": 18}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from benchmark import WARM_UP, Contestant, Measurement, measure, random_plan, scripted_windows, speed_table, to_json
 from rich.console import Console
-from rollout import NoiseShape
+from variants import NoiseShape
 
 from ttscompile import Source
 from ttscompile.core.lattice import illegal_cells

@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from benchmark import contestants_for, fixed_shares, measure, random_plan
-from environment import PushT
+from environments.pusht import PushT
 from original import EagerPolicy
-from rollout import seeded_noise
-from variants import open_variant
+from variants import open_variant, seeded_noise
 
 from tests.rounding import PROMISED
 
-SCRIPTS = Path(__file__).parents[2] / "examples" / "pusht"
+SCRIPTS = Path(__file__).parents[2] / "examples" / "evaluation"
 
 
 def run(script: str, *arguments: object) -> str:
@@ -28,7 +27,11 @@ def run(script: str, *arguments: object) -> str:
 
 @pytest.fixture(scope="module")
 def windows() -> np.ndarray:
-    return np.stack([PushT().reset(seed) for seed in range(2)])
+    environment, frames = PushT(), []
+    for seed in range(2):
+        environment.reset(seed)
+        frames.append(environment.observe()["obs"])
+    return np.stack([frames, frames], axis=1)
 
 
 def test_dense_compiled_is_the_eager_policy(compiled_pusht, pusht_checkpoint, windows):

@@ -8,7 +8,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import environment
 import numpy as np
 import pytest
 from bootstrap import Estimate
@@ -16,11 +15,11 @@ from click.testing import CliRunner
 from delays import delays_table, figures, main
 from delays_plot import plot_delays
 from delays_world import Driven, Setup, drive
-from environment import PushT
+from environments.pusht import PushT
 from evaluate import summarise
 from rich.console import Console
-from rollout import Episode, NoiseShape, Rollout
-from variants import Variant
+from rollout import Episode, Recorder, Rollout
+from variants import NoiseShape, Variant
 
 from ttscompile import ChunkSpec, ObservationSpec
 from ttscompile.errors import WorkerDeadError
@@ -60,11 +59,11 @@ def played(setup: Setup, ticks: int, seed: int = 3) -> tuple[list[tuple[int, int
     """Number of the call and index in its chunk of the first actions; None where the agent stood still."""
     policy = Telling()
     driven = drive(Variant("telling", policy, None, SHAPE), setup, seed)  # type: ignore[arg-type]
-    targets, states = driven.episode.targets[:ticks], driven.episode.states[:ticks, :2]
-    told = [
-        None if np.array_equal(target.astype(np.float32), state.astype(np.float32)) else tuple((target - 100) // 10)
-        for target, state in zip(targets, states, strict=True)
-    ]
+    world, told = Recorder(PushT(), seed), []
+    for action in driven.episode.actions[:ticks]:
+        still = np.array_equal(action, world.environment.rest())
+        told.append(None if still else tuple((action - 100) // 10))
+        world.step(action)
     return told, driven, policy
 
 
@@ -78,7 +77,7 @@ def setup(ticks: float, margin: int = 0, horizon: int | None = None, seam: str =
 
 @pytest.fixture(autouse=True)
 def _short_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(environment, "MAX_STEPS", STEPS)
+    monkeypatch.setattr(PushT, "max_steps", STEPS)
 
 
 def test_without_latency_chunks_are_executed_as_if_the_world_waited() -> None:
@@ -87,10 +86,11 @@ def test_without_latency_chunks_are_executed_as_if_the_world_waited() -> None:
     assert told == [None, *chunk(0, 0, 7), *chunk(1, 0, 7)]
     world = PushT()
     world.reset(3)
-    world.execute(driven.episode.targets[:1])
-    np.testing.assert_array_equal(driven.episode.windows[0], world.window())
-    world.execute(driven.episode.targets[1:9])
-    np.testing.assert_array_equal(driven.episode.windows[1], world.window())
+    frames = [world.observe()["obs"]]
+    for action in driven.episode.actions[:9]:
+        world.step(action)
+        frames.append(world.observe()["obs"])
+    np.testing.assert_array_equal(driven.episode.windows["obs"][:2], [frames[0:2], frames[8:10]])
     assert policy.noises[:2] == [np.random.default_rng([3, call]).standard_normal(dtype=np.float32) for call in (0, 1)]
     assert (driven.still, driven.bridged, driven.age) == (1, 0, pytest.approx(3.5, abs=0.5))
 
@@ -127,7 +127,7 @@ def test_what_is_too_slow_is_bridged_and_then_the_agent_stands_still() -> None:
 def test_a_run_can_be_repeated() -> None:
     (first, one, _), (again, other, _) = (played(setup(3.3, 1, seam="blend"), STEPS) for _ in range(2))
     assert first == again
-    np.testing.assert_array_equal(one.episode.states, other.episode.states)
+    np.testing.assert_array_equal(one.episode.actions, other.episode.actions)
 
 
 def test_a_policy_that_fails_is_an_error_at_once() -> None:
@@ -136,14 +136,14 @@ def test_a_policy_that_fails_is_an_error_at_once() -> None:
 
 
 def episode(seed: int, best: float, calls: int) -> Episode:
-    windows, coverages = np.zeros((calls, 2, 20), np.float32), np.array([0.0, best])
-    return Episode(seed, windows, np.zeros((3, 5)), np.zeros((2, 2)), coverages)
+    windows = {"obs": np.zeros((calls, 2, 20), np.float32)}
+    return Episode(seed, "", windows, np.zeros((2, 2)), np.array([0.0, best]), False, {})
 
 
 def test_the_table_and_the_picture(tmp_path: Path) -> None:
-    waiting = Rollout((episode(7, 0.95, 2), episode(8, 0.95, 2)), ())
+    waiting = Rollout((episode(7, 1.0, 2), episode(8, 1.0, 2)), ())
     one, two = setup(1), setup(2, horizon=8, seam="prefix")
-    driven = [Driven(episode(7, 0.95, 5), 1, 0, 3.0), Driven(episode(8, 0.475, 7), 0, 2, None)]
+    driven = [Driven(episode(7, 1.0, 5), 1, 0, 3.0), Driven(episode(8, 0.5, 7), 0, 2, None)]
     found = {each: figures(each, driven, waiting) for each in (one, two)}
     made = found[one]
     assert made.evaluation.score.mean == pytest.approx(0.75)

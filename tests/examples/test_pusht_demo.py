@@ -25,10 +25,12 @@ def printed(table):
 def rollout(coverage):
     one = Episode(
         0,
-        np.zeros((1, 2, 20), np.float32),
-        np.zeros((2, 5)),
+        "",
+        {"obs": np.zeros((1, 2, 20), np.float32)},
         np.zeros((1, 2)),
-        np.array([coverage]),
+        np.array([min(coverage / 0.95, 1.0)]),
+        coverage > 0.95,
+        {"best coverage": coverage},
         (0.95,),
         (1e9,),
         (0,),

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from environment import KEYPOINTS, MAX_STEPS, PushT, keypoints, observation, place
+from environments.pusht import KEYPOINTS, PushT, keypoints, observation, place
+from environments.pusht_pixels import SIZE, PushTPixels
 
 
 @pytest.fixture(scope="session")
@@ -78,12 +79,11 @@ def replay_error(states: np.ndarray, actions: np.ndarray) -> tuple[float, float,
     """Worst differences of agent (px), block (px) and angle over one replayed demonstration."""
     environment = PushT()
     environment.reset(seed=0, state=states[0])
-    for start in range(0, len(actions), 8):
-        window = environment.execute(actions[start : start + 8])
-    np.testing.assert_array_equal(window, observation(environment.states[-2:]))
-    reached = np.stack(environment.states)
-    assert len(reached) == len(states) + 1
-    error = np.abs(reached[:-1] - states)
+    reached = [environment.state]
+    for action in actions[:-1]:
+        environment.step(action)
+        reached.append(environment.state)
+    error = np.abs(np.stack(reached) - states)
     error[:, 4] = np.minimum(error[:, 4], 2 * np.pi - error[:, 4])
     return error[:, :2].max(), error[:, 2:4].max(), error[:, 4].max()
 
@@ -104,46 +104,61 @@ def test_demonstrated_actions_lead_to_the_demonstrated_states(demonstrations):
     assert angle.max() < 0.01
 
 
-def test_first_window_is_the_first_frame_twice():
-    environment = PushT()
-    window = environment.reset(seed=5)
-    assert window.shape == (2, 20)
-    np.testing.assert_array_equal(window[0], window[1])
-    np.testing.assert_array_equal(window[1], observation(environment.states[0]))
-
-
-def test_a_seed_is_an_initial_state():
-    first, second = PushT(), PushT()
-    np.testing.assert_array_equal(first.reset(seed=7), second.reset(seed=7))
-    assert (first.reset(seed=7) != second.reset(seed=8)).any()
-
-
 def test_an_episode_ends_after_the_original_number_of_steps():
-    environment = PushT()
+    environment, steps = PushT(), 0
     environment.reset(seed=0)
-    agent = environment.states[0][:2]
-    calls = 0
     while not environment.done:
-        environment.execute(np.repeat([agent], 8, axis=0))
-        calls += 1
-    assert calls == 38  # 37 chunks of 8, and 4 actions of the last
-    assert len(environment.targets) == len(environment.coverages) == MAX_STEPS == 300
-    assert len(environment.states) == MAX_STEPS + 1
+        environment.step(environment.rest())
+        steps += 1
+    assert steps == environment.max_steps == 300
 
 
-def test_an_episode_ends_at_success_within_a_chunk():
+def test_the_score_is_the_best_coverage_as_a_share_of_what_counts_as_success():
     environment = PushT()
     environment.reset(seed=0, state=[60.0, 60.0, 256.0, 256.0, np.pi / 4])
-    environment.execute(np.full((8, 2), 60.0))
+    environment.step([60.0, 60.0])
     assert environment.done
-    assert len(environment.targets) == 1
-    assert environment.coverages[0] == pytest.approx(1.0)
+    assert environment.success
+    assert environment.measures["best coverage"] == pytest.approx(1.0)
+    assert environment.score == 1.0
+    environment.reset(seed=0, state=[60.0, 60.0, 256.0, 306.0, np.pi / 4])
+    environment.step([60.0, 60.0])
+    first = environment.measures["best coverage"]
+    assert environment.score == pytest.approx(first / 0.95)
+    assert 0.1 < environment.score < 1
+    assert not environment.done
+    for number in range(10):  # pushed away
+        environment.step([256.0, 200.0 + 30 * number])
+    assert environment.measures["best coverage"] >= first
 
 
-def test_reset_forgets_the_episode_before():
+def test_picture_shows_agent_block_and_target_where_they_are():
     environment = PushT()
-    environment.reset(seed=1)
-    environment.execute([[100.0, 100.0]] * 3)
-    environment.reset(seed=2)
-    assert len(environment.states) == 1
-    assert environment.targets == environment.coverages == []
+    environment.reset(seed=0, state=[100.0, 400.0, 300.0, 200.0, 0.0])
+    assert environment.picture().shape == (512, 512, 3)
+    environment.step([450.0, 60.0])
+    picture = environment.picture().astype(int)
+    x, y = environment.rest().round().astype(int)
+    agent, block, target, nothing = picture[y, x], picture[215, 300], picture[60, 450], picture[450, 450]
+    assert agent[2] > agent[0] + 80  # royal blue
+    np.testing.assert_allclose(block, [119, 136, 153], atol=40)  # light slate grey
+    assert target[0] > target[1] + 100  # red
+    assert nothing.min() > 240
+
+
+def test_pixels_are_what_gym_pusht_observes():
+    import gymnasium
+
+    environment = PushTPixels()
+    environment.reset(seed=4)
+    size = {"observation_width": SIZE, "observation_height": SIZE}
+    theirs = gymnasium.make("gym_pusht/PushT-v0", obs_type="pixels_agent_pos", disable_env_checker=True, **size)
+    theirs.reset(seed=4)
+    for _ in range(3):
+        environment.step(np.array([100.0, 200.0]))
+        seen = theirs.step(np.array([100.0, 200.0]))[0]
+    frame = environment.observe()
+    assert frame["observation.image"].shape == (3, 64, 64)
+    np.testing.assert_array_equal(np.round(frame["observation.image"] * 255), np.moveaxis(seen["pixels"], -1, 0))
+    np.testing.assert_allclose(frame["observation.state"], seen["agent_pos"], rtol=1e-6)
+    assert environment.title != PushT.title

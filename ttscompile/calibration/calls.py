@@ -134,16 +134,21 @@ def prepare_calls(
 
     ``chosen`` has the number of the episode, and the row in it, of each call.
     """
-    draw = np.random.default_rng(seed)
-    shape = (len(chosen), *spec.sample)
-    initial = torch.from_numpy(draw.standard_normal(shape, dtype=np.float32))
-    noise = None
-    if spec.sampler.stochastic:
-        noise = torch.from_numpy(draw.standard_normal((spec.sampler.steps, *shape), dtype=np.float32))
+    initial, noise = draw_noise(spec, len(chosen), seed)
     observed = {key: np.stack([episodes[n].observations[key][row] for n, row in chosen]) for key in spec.observations}
     with torch.no_grad():
         contexts = model.prologue({key: torch.from_numpy(one) for key, one in normalized(spec, observed).items()})
     return Calls(contexts, initial, noise, np.array([n for n, _ in chosen], np.int64))
+
+
+def draw_noise(spec: PolicySpec, count: int, seed: tuple[int, ...]) -> tuple[Tensor, Tensor | None]:
+    """``initial`` and ``noise`` of so many ``Calls``."""
+    draw = np.random.default_rng(seed)
+    shape = (count, *spec.sample)
+    initial = torch.from_numpy(draw.standard_normal(shape, dtype=np.float32))
+    if not spec.sampler.stochastic:
+        return initial, None
+    return initial, torch.from_numpy(draw.standard_normal((spec.sampler.steps, *shape), dtype=np.float32))
 
 
 class Actions:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import torch
 
 from ..artifact.load import Artifact
 from ..artifact.manifest import DENSE, UNIFORM, Manifest
@@ -17,10 +19,11 @@ from ..runtimes.settle import pruner_plan
 from ..trajectories.episodes import Episode
 from ..verification.against_fp32 import action_errors, compare
 from .budget import ERROR, FLOPS, Goal
-from .calls import LARGEST, Actions, Calls, FloatArray, sample_calls
+from .calls import LARGEST, Actions, Calls, FloatArray, draw_noise, sample_calls
 from .execute import Executor
 from .result import CalibrationResult, PlanScore
 from .strategies import FITTED, strategy_of
+from .targets import dense_rounds
 from .task import Found
 
 SCHEDULE = "schedule"
@@ -28,6 +31,9 @@ SCHEDULE = "schedule"
 
 BETTER = 0.9
 """A plan has to bring the error below this share of the uniform schedule's."""
+
+WITH_OTHER_NOISE = 32
+"""Held-out calls at most that the dense policy answers a second time."""
 
 IN_PRECISION = 8
 """Calls in the artifact's precision; on Push-T at K = 100 about one second each, the dense ones for the most part."""
@@ -58,6 +64,24 @@ def judge(artifact: Artifact, executor: Executor, plans: Mapping[str, Found], ca
         made = pruner_plan(executor.logits(calls, found.pruner))
         scores[PRUNER] = PlanScore.of(errors(found, made), made, flops, pruned=True)
     return scores
+
+
+def dense_with_other_noise(artifact: Artifact, executor: Executor, calls: Calls, seed: int) -> float:
+    """How far two answers of the dense policy to one observation are apart, in the units of the actions.
+
+    The yardstick for the errors of plans: what is far below it changes less than the policy's own noise does.
+
+    Args:
+        artifact: the artifact of the policy.
+        executor: of the artifact.
+        calls: with targets; some of them get another noise.
+        seed: of that noise.
+    """
+    spec = artifact.manifest.spec
+    some = executor.select(calls, np.arange(min(WITH_OTHER_NOISE, calls.count)))
+    initial, noise = draw_noise(spec, some.count, (seed, 5))
+    paths = torch.cat(list(dense_rounds(executor, replace(some, initial=initial, noise=noise, path=None))))
+    return float(Actions(spec).errors(paths[:, -1], some.targets, units=True).mean())
 
 
 def default_of(scores: Mapping[str, PlanScore], goal: Goal, cells: int, manifest: Manifest) -> str:

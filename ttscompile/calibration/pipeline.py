@@ -27,7 +27,15 @@ from .budget import ERROR, LATENCY, Budget, Goal, cells_of, goal_of, measure_bud
 from .calls import Calls, load_episodes, split_episodes
 from .crowded import SAFE, SHARE, CrowdedSchedules, budget_of_error, named_plans
 from .execute import Executor
-from .judge import SCHEDULE, default_of, judge, precision_record, require_success, uniform_of
+from .judge import (
+    SCHEDULE,
+    default_of,
+    dense_with_other_noise,
+    judge,
+    precision_record,
+    require_success,
+    uniform_of,
+)
 from .progress import Bar
 from .pruner.switches import has_head
 from .result import CalibrationResult
@@ -184,6 +192,7 @@ def calibrate(
             budget=budget.record(),
             default_plan=default_of(scores, goal, budget.cells, artifact.manifest),
             plans=scores,
+            other_noise=dense_with_other_noise(artifact, executor, sets["validation"], seed),
             skipped=skipped,
             episodes={"calibration": split.calibration, "validation": split.validation},
             calls={name: calls.count for name, calls in sets.items()},

@@ -68,6 +68,8 @@ class CalibrationResult:
         intervals: how many intervals the search took.
         stopped: why it ended: ``converged``, ``finished`` or ``time limit``.
         seconds: of work, the parts before an interruption included.
+        other_noise: mean absolute difference of the executed actions of two dense calls on one observation with
+            different noise, in the units of the actions; None if it was not measured.
         budget: what was asked for, the cells that it comes to, and what was measured for it; JSON.
         skipped: why there is no plan of a name that there might be.
     """
@@ -82,6 +84,7 @@ class CalibrationResult:
     intervals: int
     stopped: str
     seconds: float
+    other_noise: float | None = None
     budget: Mapping[str, Any] = field(default_factory=dict)
     skipped: Mapping[str, str] = field(default_factory=dict)
 
@@ -104,5 +107,8 @@ class CalibrationResult:
         """As JSON, for the artifact. Without the time it took: the same calibration gives the same bytes."""
         record = asdict(self)
         del record["seconds"]
+        if self.other_noise:
+            for score in record["plans"].values():
+                score["of_other_noise"] = score["error"] / self.other_noise
         record["episodes"] = {name: list(numbers) for name, numbers in self.episodes.items()}
         return {**record, "sparsity": self.sparsity, "flops_sparsity": self.flops_sparsity}

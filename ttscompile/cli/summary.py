@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from rich.console import Console
+from rich.padding import Padding
 
 from ttscompile.artifact.load import Artifact
 from ttscompile.cli.output import table
@@ -50,8 +51,8 @@ def print_summary(artifact: Artifact, console: Console) -> None:
         console.print("Not calibrated: every call is dense. Run 'ttscompile calibrate' to give it a plan.")
         return
     _print_facts(console, facts.score_table(record))
-    for line in facts.left_out(record):
-        console.print(f"  {line}")  # as a row it would squeeze the figures
+    for line in (*facts.other_noise(record), *facts.left_out(record)):
+        console.print(Padding(line, (0, 0, 0, 2)))  # as a row it would squeeze the figures
     _print_facts(console, facts.record_table(record, most=90))
 
 

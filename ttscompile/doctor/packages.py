@@ -21,6 +21,7 @@ ENABLES = {
     "recordings": "recordings in zarr, HDF5 and LeRobot's format",
     "serve": "serve",
     "pusht": "examples/pusht",
+    "examples": "Meta-World and Fetch in examples/evaluation",
     "ray": "examples/ray_serve",
 }
 """What each extra of ttscompile is for. Those for its own development are not looked at."""
@@ -52,7 +53,7 @@ def requirements() -> list[Requirement]:
     except PackageNotFoundError:
         return []
     found = (_REQUIREMENT.match(line) for line in told)
-    return [Requirement(m["name"], m["least"] or "", m["extra"] or "") for m in found if m is not None]
+    return [Requirement(m["name"], m["least"] or "", m["extra"] or "") for m in found if m and m["name"] != PROJECT]
 
 
 def _python() -> list[Finding]:

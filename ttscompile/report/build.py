@@ -205,4 +205,9 @@ def _calibration(record: Mapping[str, Any] | None) -> Section:
         drawn = (Picture(pictures.plans_picture(scores), caption, alt),)
     tables = (facts.score_table(record), facts.record_table(record)) if scores else (facts.record_table(record),)
     text = "Errors on episodes that nothing was learned from, against the dense policy with the same noise."
-    return Section("Calibration", (*((text,) if scores else ()), *facts.left_out(record)), tables, drawn)
+    return Section(
+        "Calibration",
+        (*((text,) if scores else ()), *facts.other_noise(record), *facts.left_out(record)),
+        tables,
+        drawn,
+    )

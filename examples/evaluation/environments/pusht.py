@@ -1,15 +1,14 @@
-"""gym-pusht as the policy saw it in training: windows of keypoints in, chunks of target positions out.
+"""gym-pusht as the policy saw it in training: keypoints in, target positions out.
 
 The policy observes 20 numbers: the block's nine keypoints (x, y each) and the agent's x, y, in pixels of the 512 x 512
-world; a window is the last two frames at 10 Hz. gym-pusht's conventions are those of the demonstrations: the block's
-position is the origin of its frame (the middle of the bar's outer edge), not its centre of gravity, and y points down.
-Replaying a demonstration's actions in gym-pusht reproduces its states (``tests/examples``).
+world; an action is a position that the agent is to move to, for 0.1 s. gym-pusht's conventions are those of the
+demonstrations: the block's position is the origin of its frame (the middle of the bar's outer edge), not its centre of
+gravity, and y points down. Replaying a demonstration's actions reproduces its states (``tests/examples``).
 """
 
 from __future__ import annotations
 
 import os
-from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,6 +20,8 @@ import gym_pusht  # type: ignore[import-untyped]  # noqa: F401  (registers the e
 import gymnasium
 import numpy as np
 import numpy.typing as npt
+
+from . import Array, Frame
 
 FloatArray = npt.NDArray[np.float32]
 Float64Array = npt.NDArray[np.float64]
@@ -40,12 +41,10 @@ KEYPOINTS: Float64Array = np.array(
 )
 """``[9, 2]``: the keypoints in the block's frame, in pixels, as the published demonstrations have them."""
 
-WINDOW = 2
-"""To: frames in an observation."""
-MAX_STEPS = 300
-"""Steps of 0.1 s after which an episode ends, as in the original evaluation."""
 SUCCESS_COVERAGE = 0.95
 """Share of the goal that the block must cover; the episode ends there."""
+PICTURE = 512
+"""Pixels of gym-pusht's own drawing: one a unit of the world."""
 
 
 def keypoints(position: npt.ArrayLike, angle: npt.ArrayLike) -> Float64Array:
@@ -97,63 +96,79 @@ def place(body_world: Any, state: npt.ArrayLike) -> None:
 
 
 class PushT:
-    """One episode after another of Push-T, with the history that the observation window needs.
+    """See ``Environment``. The score is the original's reward: best coverage of the goal / ``SUCCESS_COVERAGE``.
 
     Attributes:
-        states: states so far, the first after reset: ``[5]`` each.
-        targets: executed actions: target position of the agent, ``[2]`` pixels each.
-        coverages: share of the goal covered after each executed action.
-        done: the goal was covered to ``SUCCESS_COVERAGE``, or ``MAX_STEPS`` actions were executed.
+        state: ``[5]`` now, as in ``observation``.
+        coverage: share of the goal that was covered at best.
     """
+
+    title, hz, max_steps, task = "Push-T", 10.0, 300, ""
 
     def __init__(self) -> None:
         self._gym = gymnasium.make(
-            "gym_pusht/PushT-v0", obs_type="state", max_episode_steps=MAX_STEPS, disable_env_checker=True
+            "gym_pusht/PushT-v0",
+            obs_type="state",
+            render_mode="rgb_array",
+            visualization_width=PICTURE,
+            visualization_height=PICTURE,
+            max_episode_steps=self.max_steps,
+            disable_env_checker=True,
         )
-        self._frames: deque[FloatArray] = deque(maxlen=WINDOW)
-        self.states: list[Float64Array] = []
-        self.targets: list[Float64Array] = []
-        self.coverages: list[float] = []
-        self.done = True
+        self.state: Float64Array = np.zeros(5)
+        self.coverage, self.done = 0.0, True
 
-    def reset(self, seed: int, state: Sequence[float] | None = None) -> FloatArray:
+    def reset(self, seed: int, state: Sequence[float] | None = None) -> None:
         """Start the episode of this seed.
 
         Args:
             seed: gym-pusht draws the initial state from it.
             state: start in this state instead.
-
-        Returns:
-            The first window, float32 ``[2, 20]``: the first frame twice, as the original's runner gives it.
         """
-        first, _ = self._gym.reset(seed=seed)
+        self.state, _ = self._gym.reset(seed=seed)
+        self._gym.unwrapped._last_action = None  # gym-pusht would go on drawing that of the episode before
         if state is not None:
             place(self._gym.unwrapped, state)
-            first = np.asarray(state, dtype=np.float64)
-        self.states, self.targets, self.coverages, self.done = [first], [], [], False
-        self._frames.extend([observation(first)] * WINDOW)
-        return self.window()
+            self.state = np.asarray(state, dtype=np.float64)
+        self.coverage, self.done = 0.0, False
 
-    def window(self) -> FloatArray:
-        """The current observation, float32 ``[2, 20]``."""
-        return np.stack(self._frames)
+    @property
+    def success(self) -> bool:
+        """Whether the goal was covered to more than ``SUCCESS_COVERAGE``."""
+        return self.coverage > SUCCESS_COVERAGE
 
-    def execute(self, chunk: npt.ArrayLike) -> FloatArray:
-        """Execute a chunk of actions, one each 0.1 s, until it ends or the episode is done.
+    @property
+    def score(self) -> float:
+        """Best coverage as a share of what counts as success, at most 1."""
+        return min(self.coverage / SUCCESS_COVERAGE, 1.0)
 
-        Args:
-            chunk: ``[Ta, 2]`` target positions of the agent, pixels.
+    @property
+    def measures(self) -> dict[str, float]:
+        """The coverage as it is."""
+        return {"best coverage": self.coverage}
 
-        Returns:
-            The window after it, float32 ``[2, 20]``.
-        """
-        for target in np.asarray(chunk, dtype=np.float64):
-            if self.done:
-                break
-            state, _, terminated, truncated, info = self._gym.step(target)
-            self.states.append(state)
-            self.targets.append(target)
-            self.coverages.append(float(info["coverage"]))
-            self._frames.append(observation(state))
-            self.done = terminated or truncated
-        return self.window()
+    def observe(self) -> Frame:
+        """``obs`` or ``observation.state``, as LeRobot calls it: float32 ``[20]``."""
+        seen = observation(self.state)
+        return {"obs": seen, "observation.state": seen}
+
+    def step(self, action: Array) -> None:
+        """Send the agent towards a position ``[2]``, pixels, for 0.1 s."""
+        self.state, _, terminated, truncated, info = self._gym.step(np.asarray(action, dtype=np.float64))
+        self.coverage = max(self.coverage, float(info["coverage"]))
+        self.done = terminated or truncated
+
+    def rest(self) -> Array:
+        """Where the agent is."""
+        return self.state[:2].astype(np.float32)
+
+    def picture(self) -> npt.NDArray[np.uint8]:
+        """``[512, 512, 3]``; a red cross is where the agent was last sent."""
+        return np.asarray(self._gym.render())
+
+    def close(self) -> None:
+        """Nothing more is asked."""
+        self._gym.close()
+
+
+ENVIRONMENT = PushT

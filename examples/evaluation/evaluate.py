@@ -1,16 +1,16 @@
-"""Evaluate policies on numbered seeds of Push-T, all on the same initial states and with the same noise.
+"""Evaluate policies on numbered seeds of an environment, all on the same initial states and with the same noise.
 
-    python examples/pusht/evaluate.py build/pusht/compiled:dense build/pusht/compiled --episodes 48 --jobs 4
+    python examples/evaluation/evaluate.py build/pusht/compiled:dense build/pusht/compiled --episodes 48 --jobs 4
 
-The score of an episode is the original's reward: the best coverage of the goal, divided by the 0.95 that counts as
-success, at most 1. Differences are taken episode by episode, against the first variant.
+What the score of an episode is, 0 to 1, its environment says. Differences are taken episode by episode, against the
+first variant.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
@@ -19,6 +19,7 @@ from typing import Any
 import click
 import numpy as np
 from bootstrap import Estimate, estimate, paired_difference
+from environments import Environment, environment_class, environment_option
 from episodes import Episodes
 from jobs import fill_cache
 from rich.console import Console
@@ -50,40 +51,48 @@ class Evaluation:
 
     Attributes:
         label: of the variant.
-        score: best coverage / 0.95, at most 1.
-        coverage: best coverage as it is.
-        success: share of the episodes that covered more than 0.95.
+        score: of an episode.
+        success: share of the episodes that solved their task.
+        measures: the environment's further figures.
         score_difference: against the first variant; None for the first itself.
         success_difference: likewise.
         sparsity: share of the cells that were reused, mean of all calls; None when the policy makes no reports.
         flops: mean of all calls; likewise.
         legalised: cells that had to be replaced, in all calls together.
+        tasks: the same of the episodes of each task, where there are several.
         rollout: the episodes.
     """
 
     label: str
     score: Estimate
-    coverage: Estimate
     success: Estimate
+    measures: Mapping[str, Estimate]
     score_difference: Estimate | None
     success_difference: Estimate | None
     sparsity: float | None
     flops: float | None
     legalised: int
+    tasks: Mapping[str, Evaluation]
     rollout: Rollout
 
     def to_json(self) -> dict[str, Any]:
         """The figures, and the score of every seed."""
-        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "rollout"}
-        figures = {k: dataclasses.asdict(v) if isinstance(v, Estimate) else v for k, v in fields.items()}
         episodes = [
-            {"seed": e.seed, "score": e.score, "best_coverage": e.best_coverage, "calls": len(e.windows)}
+            {"seed": e.seed, "task": e.task, "score": e.score, "success": e.success, **e.measures, "calls": e.calls}
             for e in self.rollout.episodes
         ]
-        return figures | {"episodes": episodes}
+        tasks = {task: {"episodes": len(e.rollout.episodes), **e._figures()} for task, e in self.tasks.items()}
+        return self._figures() | {"tasks": tasks, "episodes": episodes}
+
+    def _figures(self) -> dict[str, Any]:
+        plain = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in ("tasks", "rollout")}
+        return {k: dataclasses.asdict(v) if isinstance(v, Estimate) else v for k, v in plain.items()} | {
+            "measures": {name: dataclasses.asdict(each) for name, each in self.measures.items()}
+        }
 
 
 def evaluate(
+    make: Callable[[], Environment],
     variants: Sequence[Variant],
     seeds: Sequence[int],
     batch: int,
@@ -93,6 +102,7 @@ def evaluate(
     """Run every variant on every seed.
 
     Args:
+        make: an environment of its own for each episode.
         variants: the first is the baseline.
         seeds: one an episode.
         batch: episodes in lockstep.
@@ -109,7 +119,7 @@ def evaluate(
             if on_done is not None:
                 on_done(label, episodes)
 
-        rollouts.append(run_episodes(variant.policy, seeds, variant.noise, batch, variant.plan, finished, cache))
+        rollouts.append(run_episodes(make, variant, seeds, batch, finished, cache))
     return [summarise(variant.label, rollout, rollouts[0]) for variant, rollout in zip(variants, rollouts, strict=True)]
 
 
@@ -117,33 +127,45 @@ def summarise(label: str, rollout: Rollout, baseline: Rollout) -> Evaluation:
     """Figures of one variant's episodes, and their differences from the baseline's on the same seeds."""
     if [e.seed for e in rollout.episodes] != [e.seed for e in baseline.episodes]:
         raise ValueError(f"{label} ran other seeds than the baseline: their episodes are not paired.")
-    score, coverage, success = _columns(rollout)
-    base_score, _, base_success = _columns(baseline)
-    first = rollout is baseline
+    score, success = _columns(rollout)
+    base_score, base_success = _columns(baseline)
+    first, episodes = rollout is baseline, rollout.episodes
     return Evaluation(
         label=label,
         score=estimate(score),
-        coverage=estimate(coverage),
         success=estimate(success),
+        measures={name: estimate([e.measures[name] for e in episodes]) for name in episodes[0].measures},
         score_difference=None if first else paired_difference(score, base_score),
         success_difference=None if first else paired_difference(success, base_success),
         sparsity=float(np.mean(rollout.sparsity)) if rollout.sparsity else None,
         flops=float(np.mean(rollout.flops)) if rollout.flops else None,
         legalised=sum(rollout.legalised),
+        tasks=_by_task(label, rollout, baseline),
         rollout=rollout,
     )
 
 
-def _columns(rollout: Rollout) -> tuple[list[float], list[float], list[float]]:
-    episodes = rollout.episodes
-    return [e.score for e in episodes], [e.best_coverage for e in episodes], [float(e.success) for e in episodes]
+def _columns(rollout: Rollout) -> tuple[list[float], list[float]]:
+    return [e.score for e in rollout.episodes], [float(e.success) for e in rollout.episodes]
 
 
-def evaluation_table(evaluations: Sequence[Evaluation], seeds: Sequence[int], timed: Sequence[Timed] = ()) -> Table:
+def _by_task(label: str, rollout: Rollout, baseline: Rollout) -> dict[str, Evaluation]:
+    tasks = sorted({e.task for e in rollout.episodes})
+    found = {}
+    for task in tasks if len(tasks) > 1 else ():
+        own, base = (Rollout(tuple(e for e in r.episodes if e.task == task), ()) for r in (rollout, baseline))
+        found[task] = summarise(label, own, own if rollout is baseline else base)
+    return found
+
+
+def evaluation_table(
+    title: str, evaluations: Sequence[Evaluation], seeds: Sequence[int], timed: Sequence[Timed] = ()
+) -> Table:
     """The figures as a table, with 95 % intervals; and times, if any were taken."""
-    table = Table(title=f"Push-T, {len(seeds)} episodes, seeds {seeds[0]}..{seeds[-1]}, mean and 95 % interval")
+    table = Table(title=f"{title}, {len(seeds)} episodes, seeds {seeds[0]}..{seeds[-1]}, mean and 95 % interval")
     table.add_column("variant", overflow="fold")  # paths that differ at the end only
-    for column in ("score", "best coverage", "success", "score, difference", "success, difference", "sparsity"):
+    measures = list(evaluations[0].measures)
+    for column in ("score", *measures, "success", "score, difference", "success, difference", "sparsity"):
         table.add_column(column, justify="right")
     if timed:
         table.add_column("ms a call", justify="right")
@@ -151,7 +173,7 @@ def evaluation_table(evaluations: Sequence[Evaluation], seeds: Sequence[int], ti
         table.add_row(
             e.label,
             str(e.score),
-            f"{e.coverage.mean:.3f}",
+            *(f"{e.measures[name].mean:.3f}" for name in measures),
             str(e.success),
             "" if e.score_difference is None else str(e.score_difference),
             "" if e.success_difference is None else str(e.success_difference),
@@ -161,8 +183,25 @@ def evaluation_table(evaluations: Sequence[Evaluation], seeds: Sequence[int], ti
     return table
 
 
+def task_table(evaluations: Sequence[Evaluation]) -> Table:
+    """Success task by task; below the baseline's the others' differences from it."""
+    table = Table(title="success of each task; in brackets 95 % intervals of the difference")
+    table.add_column("task", overflow="fold")
+    table.add_column("episodes", justify="right")
+    for e in evaluations:
+        table.add_column(e.label, justify="right", overflow="fold")
+    for task, first in evaluations[0].tasks.items():
+        cells = []
+        for own in (e.tasks[task] for e in evaluations):
+            change = own.success_difference
+            cells.append(f"{own.success.mean:.3f}" + ("" if change is None else f", {change}"))
+        table.add_row(task, str(len(first.rollout.episodes)), *cells)
+    return table
+
+
 @click.command()
 @click.argument("variants", nargs=-1, required=True, metavar="DIR[:PLAN]...")
+@environment_option
 @click.option("--episodes", default=48, show_default=True, type=click.IntRange(1))
 @first_seed_option
 @click.option("--batch", default=16, show_default=True, type=click.IntRange(1), help="Episodes in lockstep.")
@@ -180,12 +219,13 @@ def evaluation_table(evaluations: Sequence[Evaluation], seeds: Sequence[int], ti
 @click.option("--json", "as_json", is_flag=True, help="One JSON document instead of a table.")
 def main(
     variants: tuple[str, ...],
+    environment: str,
     episodes: int,
     first_seed: int,
     batch: int,
     runtime: str,
     threads: int,
-    cache: Path,
+    cache: Path | None,
     no_cache: bool,
     jobs: int,
     picture: Path | None,
@@ -194,9 +234,11 @@ def main(
     """Compare artifacts and plans: DIR takes the artifact's own plan, DIR:dense computes everything."""
     if jobs > 1 and no_cache:
         raise click.UsageError("--jobs hands episodes over through the cache: leave out --no-cache.")
+    make = environment_class(environment)
+    cache = cache or Path("build", environment, "episodes")
     opened = [open_variant(text, runtime, threads) for text in variants]
     seeds = range(first_seed, first_seed + episodes)
-    caches = [None if no_cache else Episodes(cache, v, runtime) for v in opened]
+    caches = [None if no_cache else Episodes(cache, environment, v, runtime) for v in opened]
     with Progress(console=Console(stderr=True)) as progress:
         tasks = {v.label: progress.add_task(v.label, total=episodes) for v in opened}
 
@@ -204,22 +246,26 @@ def main(
             progress.update(tasks[label], completed=count)
 
         if jobs > 1:
-            fill_cache(variants, seeds, batch, runtime, cache, jobs, finished)
-        evaluations = evaluate(opened, seeds, batch, finished, caches)
-    timed = [] if picture is None else time_calls(opened, evaluations[0].rollout.episodes[0].windows[0], TIMED_CALLS)
+            fill_cache(environment, variants, seeds, batch, runtime, cache, jobs, finished)
+        evaluations = evaluate(make, opened, seeds, batch, finished, caches)
+    timed = [] if picture is None else time_calls(opened, evaluations[0].rollout.episodes[0].windows, TIMED_CALLS)
     machine = fingerprint()
     identities = [identity_of(Path(text.partition(":")[0])) for text in variants]
     if picture is not None:
         plural = "s" * (threads > 1)
-        title = f"Push-T, {len(seeds)} paired episodes; {threads} thread{plural} a call\n{one_line(machine)}"
+        title = f"{make.title}, {len(seeds)} paired episodes; {threads} thread{plural} a call\n{one_line(machine)}"
         plot_scores(variants, [e.score for e in evaluations], timed, picture, title)
     if as_json:
         figures = [{"identity": one, **e.to_json()} for one, e in zip(identities, evaluations, strict=True)]
         for each, time in zip(figures, timed, strict=False):
             each["latency_ms"] = dataclasses.asdict(time)
-        click.echo(json.dumps({"machine": machine, "threads": threads, "variants": figures}, indent=2))
+        document = {"environment": environment, "machine": machine, "threads": threads, "variants": figures}
+        click.echo(json.dumps(document, indent=2))
     else:
-        results_console().print(evaluation_table(evaluations, seeds, timed))
+        console = results_console()
+        console.print(evaluation_table(make.title, evaluations, seeds, timed))
+        if evaluations[0].tasks:
+            console.print(task_table(evaluations))
         for text, identity in zip(variants, identities, strict=True):
             click.echo(f"{text}: identity {abbreviated(identity)}")
     for e in evaluations:

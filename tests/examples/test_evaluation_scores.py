@@ -5,9 +5,8 @@ import pytest
 from bootstrap import Estimate
 from episodes import Episodes
 from jobs import fill_cache
-from rollout import NoiseShape
 from score_plot import Timed, plot_scores, time_calls
-from variants import Variant, open_variant
+from variants import NoiseShape, Variant, open_variant
 
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import update_calibration
@@ -24,6 +23,7 @@ class Sleeper:
         self.log.append((self.name, "reset"))
 
     def predict_action(self, obs_dict, *, noise, plan="default"):
+        assert obs_dict["obs"].shape == (1, 2, 20)
         self.log.append((self.name, plan, float(noise.initial[0, 0, 0])))
 
 
@@ -31,7 +31,7 @@ def test_calls_are_timed_in_turn_with_equal_noise():
     log = []
     shape = NoiseShape(3, (4, 2), True)
     variants = [Variant("a", Sleeper(log, "a"), None, shape), Variant("b", Sleeper(log, "b"), "dense", shape)]
-    found = time_calls(variants, np.zeros((2, 20), np.float32), calls=3)
+    found = time_calls(variants, {"obs": np.zeros((7, 2, 20), np.float32)}, calls=3)
     assert [one.label for one in found] == ["a", "b"]
     assert all(0 < one.median <= one.p90 for one in found)
     assert log[:2] == [("a", "reset"), ("b", "reset")]
@@ -65,13 +65,27 @@ def test_processes_fill_the_cache_with_the_episodes_of_one(compiled_pusht, tmp_p
     update_calibration(artifact, None, {"one": plan}, "one", {"strategy": "interval"})
     text, told = f"{artifact}:one", []
     fill_cache(
-        [text], [7, 8], 1, "onnxruntime", tmp_path / "cache", 2, lambda label, count: told.append((label, count))
+        "pusht",
+        [text],
+        [7, 8],
+        1,
+        "onnxruntime",
+        tmp_path / "cache",
+        2,
+        lambda label, count: told.append((label, count)),
     )
     assert told == [(text, 0), (text, 1), (text, 2)]
-    cache = Episodes(tmp_path / "cache", open_variant(text, "onnxruntime", 1), "onnxruntime")
+    cache = Episodes(tmp_path / "cache", "pusht", open_variant(text, "onnxruntime", 1), "onnxruntime")
     assert [cache.read(seed).seed for seed in (7, 8)] == [7, 8]
     told.clear()
     fill_cache(
-        [text], [7, 8], 1, "onnxruntime", tmp_path / "cache", 2, lambda label, count: told.append((label, count))
+        "pusht",
+        [text],
+        [7, 8],
+        1,
+        "onnxruntime",
+        tmp_path / "cache",
+        2,
+        lambda label, count: told.append((label, count)),
     )
     assert told == [(text, 2)]

@@ -6,19 +6,21 @@ import json
 import numpy as np
 import pytest
 from bootstrap import estimate, paired_difference
-from evaluate import evaluation_table, summarise
+from evaluate import evaluation_table, summarise, task_table
 from rich.console import Console
 from rollout import Episode, Rollout
 
 
-def rollout(best, first_seed=100):
+def rollout(best, first_seed=100, tasks=("",)):
     episodes = tuple(
         Episode(
             seed=first_seed + i,
-            windows=np.zeros((3, 2, 20), np.float32),
-            states=np.zeros((2, 5)),
-            targets=np.zeros((1, 2)),
-            coverages=np.array([coverage]),
+            task=tasks[i % len(tasks)],
+            windows={"obs": np.zeros((3, 2, 20), np.float32)},
+            actions=np.zeros((1, 2)),
+            scores=np.array([min(coverage / 0.95, 1.0)]),
+            success=coverage > 0.95,
+            measures={"best coverage": coverage},
             sparsity=(0.5, 0.7),
             flops=(1e9, 3e9),
             legalised=(0, int(i == 0)),
@@ -62,7 +64,7 @@ def test_figures_of_a_variant():
     other = summarise("sparse", sparse, dense)
     assert base.score.mean == pytest.approx(2 / 3)
     assert base.success.mean == pytest.approx(1 / 3)
-    assert base.coverage.mean == pytest.approx(0.64)
+    assert base.measures["best coverage"].mean == pytest.approx(0.64)
     assert base.score_difference is None
     assert other.score_difference.mean == pytest.approx(-0.4 / 3)
     assert other.score_difference.high == pytest.approx(0.0)
@@ -76,7 +78,7 @@ def test_variants_whose_paths_differ_at_the_end_are_told_apart_in_a_narrow_table
     dense = rollout([0.97, 0.76])
     names = ("build/pusht/compiled:dense", "build/pusht/compiled:safe")
     console = Console(file=io.StringIO(), width=100)
-    console.print(evaluation_table([summarise(name, dense, dense) for name in names], range(100, 102)))
+    console.print(evaluation_table("Push-T", [summarise(name, dense, dense) for name in names], range(100, 102)))
     rows = "".join(line.split("│")[1].strip() for line in console.file.getvalue().splitlines() if line[:1] == "│")
     assert rows == "".join(names)
 
@@ -90,7 +92,7 @@ def test_table_and_json_say_the_same():
     dense, sparse = rollout([0.97, 0.76]), rollout([0.96, 0.38])
     evaluations = [summarise("dense", dense, dense), summarise("sparse", sparse, dense)]
     console = Console(file=io.StringIO(), width=200)
-    console.print(evaluation_table(evaluations, range(100, 102)))
+    console.print(evaluation_table("Push-T", evaluations, range(100, 102)))
     text = console.file.getvalue()
     assert "seeds 100..101" in text
     assert "0.700" in text
@@ -100,3 +102,30 @@ def test_table_and_json_say_the_same():
     assert document[1]["score_difference"]["mean"] == pytest.approx(-0.2)
     assert [e["seed"] for e in document[1]["episodes"]] == [100, 101]
     assert document[0]["score_difference"] is None
+
+
+def test_many_tasks_have_a_row_each():
+    tasks = ("reach", "push")
+    dense, sparse = rollout([0.97, 0.97, 0.97, 0.2], tasks=tasks), rollout([0.97, 0.2, 0.97, 0.97], tasks=tasks)
+    one, other = summarise("dense", dense, dense), summarise("sparse", sparse, dense)
+    assert list(one.tasks) == ["push", "reach"]
+    assert one.tasks["reach"].success.mean == 1.0
+    assert one.tasks["push"].success_difference is None
+    assert other.tasks["push"].success_difference.mean == 0.0
+    assert (other.tasks["push"].success_difference.low, other.tasks["push"].success_difference.high) == (-1.0, 1.0)
+    assert other.tasks["reach"].score_difference.mean == 0.0
+    console = Console(file=io.StringIO(), width=150)
+    console.print(task_table([one, other]))
+    rows = [[c.strip() for c in line.split("│")[1:-1]] for line in console.file.getvalue().splitlines()]
+    assert ["push", "2", "0.500", "0.500, 0.000 [-1.000, 1.000]"] in rows
+    assert ["reach", "2", "1.000", "1.000, 0.000 [0.000, 0.000]"] in rows
+    document = json.loads(json.dumps(other.to_json()))
+    assert document["tasks"]["push"]["episodes"] == 2
+    assert document["tasks"]["push"]["success"]["mean"] == 0.5
+    assert [e["task"] for e in document["episodes"]] == ["reach", "push", "reach", "push"]
+    assert document["measures"]["best coverage"]["mean"] == pytest.approx(0.7775)
+
+
+def test_one_task_has_no_table_of_its_own():
+    dense = rollout([0.97, 0.76])
+    assert summarise("dense", dense, dense).tasks == {}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -10,8 +10,7 @@ from textwrap import fill
 
 import numpy as np
 from bootstrap import Estimate
-from rollout import seeded_noise
-from variants import Variant
+from variants import Variant, seeded_noise
 
 from ttscompile.measure.timer import Timer
 from ttscompile.measure.units import ms
@@ -31,14 +30,15 @@ class Timed:
     p90: float
 
 
-def time_calls(variants: Sequence[Variant], window: np.ndarray, calls: int) -> list[Timed]:
+def time_calls(variants: Sequence[Variant], windows: Mapping[str, np.ndarray], calls: int) -> list[Timed]:
     """Time calls of all variants in turn, call by call, so that whatever else the machine does hits all of them.
 
     Args:
         variants: to time.
-        window: an observation ``[To, Do]``.
+        windows: of an episode, by key ``[N, To, ...]``; the first of them is observed.
         calls: of each, warm-up apart.
     """
+    first = {key: array[:1] for key, array in windows.items()}
     for variant in variants:
         variant.policy.reset()
     timer = Timer(len(variants), WARM_UP)
@@ -47,7 +47,7 @@ def time_calls(variants: Sequence[Variant], window: np.ndarray, calls: int) -> l
             variant = variants[i]
             noise = seeded_noise(variant.noise, [0], number)
             given = {} if variant.plan is None else {"plan": variant.plan}
-            timer.time(i, partial(variant.policy.predict_action, {"obs": window[None]}, noise=noise, **given))
+            timer.time(i, partial(variant.policy.predict_action, first, noise=noise, **given))
     return [
         Timed(variant.label, times.median, float(np.quantile(times.ms, 0.9)))
         for variant, times in zip(variants, timer.times, strict=True)

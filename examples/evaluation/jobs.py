@@ -8,6 +8,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import lru_cache
 from pathlib import Path
 
+from environments import environment_class
 from episodes import Episodes
 from rollout import run_episodes
 from variants import Variant, open_variant
@@ -16,6 +17,7 @@ _opened = lru_cache(open_variant)  # one for each process
 
 
 def fill_cache(
+    environment: str,
     texts: Sequence[str],
     seeds: Sequence[int],
     batch: int,
@@ -27,6 +29,7 @@ def fill_cache(
     """Run the episodes of all variants that are not in the cache yet.
 
     Args:
+        environment: its name.
         texts: variants, as ``open_variant`` takes them.
         seeds: of the episodes.
         batch: episodes in lockstep, at most; fewer where that keeps all processes busy.
@@ -38,7 +41,7 @@ def fill_cache(
     parts: list[tuple[str, list[int]]] = []
     done = {}
     for text in texts:
-        cache = Episodes(root, open_variant(text, runtime, 1), runtime)
+        cache = Episodes(root, environment, open_variant(text, runtime, 1), runtime)
         missing = [seed for seed in seeds if cache.read(seed) is None]
         done[text] = len(seeds) - len(missing)
         on_done(text, done[text])
@@ -48,7 +51,7 @@ def fill_cache(
         return
     # A fork of a process that has threads of onnxruntime would wait for them for ever.
     with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
-        running = {pool.submit(_run, text, some, runtime, root): (text, len(some)) for text, some in parts}
+        running = {pool.submit(_run, environment, text, some, runtime, root): (text, len(some)) for text, some in parts}
         for future in as_completed(running):
             future.result()
             text, count = running[future]
@@ -56,8 +59,8 @@ def fill_cache(
             on_done(text, done[text])
 
 
-def _run(text: str, seeds: Sequence[int], runtime: str, root: Path) -> None:
+def _run(environment: str, text: str, seeds: Sequence[int], runtime: str, root: Path) -> None:
     """One batch of episodes of one variant."""
     variant: Variant = _opened(text, runtime, 1)
-    cache = Episodes(root, variant, runtime)
-    run_episodes(variant.policy, seeds, variant.noise, len(seeds), variant.plan, cache=cache)
+    cache = Episodes(root, environment, variant, runtime)
+    run_episodes(environment_class(environment), variant, seeds, len(seeds), cache=cache)

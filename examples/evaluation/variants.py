@@ -1,0 +1,123 @@
+"""Policies as the command line names them, ``DIR`` or ``DIR:PLAN``, and the noise that they are given."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, TypeAlias
+
+import click
+import numpy as np
+import numpy.typing as npt
+
+import ttscompile
+from ttscompile.cli.output import results_console as results_console
+from ttscompile.cli.output import run as run
+from ttscompile.runtimes.policy import PolicyInfo
+
+Plan: TypeAlias = str | npt.NDArray[np.int8]
+"""``dense``, the name of a plan in the artifact, or a matrix ``[K, blocks]``."""
+
+
+class Policy(Protocol):
+    """What ``ttscompile.load`` returns, as far as an episode needs it."""
+
+    @property
+    def info(self) -> PolicyInfo:
+        """What it observes, and the shape of its actions."""
+
+    def reset(self) -> None:
+        """A new episode."""
+
+    def predict_action(
+        self, obs_dict: Mapping[str, Any], noise: ttscompile.Noise | None = None, plan: Plan | None = None
+    ) -> Mapping[str, Any]:
+        """Windows ``{key: [N, To, ...]}`` in, ``{"action": [N, Ta, Da]}`` out; without a plan the policy's default."""
+
+
+@dataclass(frozen=True)
+class NoiseShape:
+    """Sizes of the random numbers of one call of one stream.
+
+    Attributes:
+        steps: K.
+        sample: ``(T, D)``.
+        stochastic: whether the sampler draws noise at its steps.
+    """
+
+    steps: int
+    sample: tuple[int, int]
+    stochastic: bool
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way to drive the robot.
+
+    Attributes:
+        label: for tables.
+        policy: a policy of its own; its caches are shared with no other variant.
+        plan: as in ``predict_action``; None for the policy's default.
+        noise: sizes of the policy's noise.
+    """
+
+    label: str
+    policy: Policy
+    plan: str | None
+    noise: NoiseShape
+
+
+def noise_shape(info: PolicyInfo) -> NoiseShape:
+    """Sizes of the noise that a compiled policy takes."""
+    return NoiseShape(info.K, info.original_sample, info.stochastic)
+
+
+def open_variant(text: str, runtime: str, threads: int) -> Variant:
+    """Load what one argument names.
+
+    Args:
+        text: ``DIR`` for the artifact's default plan, ``DIR:dense``, or ``DIR:NAME`` for a plan that it holds.
+        runtime: of ``ttscompile.load``.
+        threads: of ``ttscompile.load``.
+
+    Returns:
+        The variant, its label being the text.
+    """
+    directory, colon, plan = text.partition(":")
+    policy = ttscompile.load(Path(directory), runtime=runtime, threads=threads)
+    return Variant(text, policy, plan if colon else None, noise_shape(policy.info))
+
+
+def seeded_noise(shape: NoiseShape, seeds: Sequence[int], call: int) -> ttscompile.Noise:
+    """The noise of the ``call``-th call of each episode.
+
+    A function of seed and call only: any two policies see the same numbers, in whatever batches they run. Policies
+    with another number of steps share the initial noise.
+
+    Args:
+        shape: sizes.
+        seeds: one a stream, not negative.
+        call: number of the call in the episode.
+
+    Returns:
+        ``initial [N, T, D]`` and ``steps [K, N, T, D]`` (None for a deterministic sampler), float32.
+    """
+    generators = [np.random.default_rng([seed, call]) for seed in seeds]
+    initial = np.stack([g.standard_normal(shape.sample, dtype=np.float32) for g in generators])
+    if not shape.stochastic:
+        return ttscompile.Noise(initial, None)
+    sizes = (shape.steps, *shape.sample)
+    return ttscompile.Noise(initial, np.stack([g.standard_normal(sizes, dtype=np.float32) for g in generators], axis=1))
+
+
+runtime_option = click.option("--runtime", default="onnxruntime", show_default=True, help="onnxruntime or reference.")
+threads_option = click.option("--threads", default=2, show_default=True, type=click.IntRange(1))
+first_seed_option = click.option(
+    "--first-seed", default=100_000, show_default=True, type=click.IntRange(0), help="Seeds count up from here."
+)
+cache_option = click.option(
+    "--cache",
+    type=click.Path(file_okay=False, path_type=Path),
+    help="Where episodes are kept, by what was computed, and taken from; otherwise build/ENVIRONMENT/episodes.",
+)
