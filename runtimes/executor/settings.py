@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from math import inf, isfinite
 from typing import TYPE_CHECKING, Any, Protocol
 
 from ttscompile.errors import ExecutorError
@@ -97,8 +98,8 @@ class ExecutorSettings:
         positive = ("policy_hz", "n_obs_steps", "horizon", "max_age", "measured_calls", "latency_window", "down_after")
         for name in (*positive, "up_after", "statistics_window"):
             value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise ExecutorError(f"{name} must be positive; found {value}.")
+            if value is not None and not 0 < value < inf:
+                raise ExecutorError(f"{name} must be positive and finite; found {value}.")
         for name in ("blend_steps", "max_hold", "margin_ticks", "warm_up", "trace_events", "reserve"):
             value = getattr(self, name)
             if value is not None and not value >= 0:
@@ -140,10 +141,11 @@ def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> 
     Raises:
         ExecutorError: they do not fit.
     """
-    if not control_hz > 0:
-        raise ExecutorError(f"control_hz must be positive; found {control_hz}.")
+    if not 0 < control_hz < inf:
+        raise ExecutorError(f"control_hz must be positive and finite; found {control_hz}.")
     policy_hz = settings.policy_hz or control_hz
-    ticks_per_step = round(control_hz / policy_hz)
+    ticks = control_hz / policy_hz
+    ticks_per_step = round(ticks) if isfinite(ticks) else 0
     if ticks_per_step < 1 or abs(ticks_per_step * policy_hz - control_hz) > 1e-6 * control_hz:
         what = f"control_hz = {control_hz:g} is no multiple of policy_hz = {policy_hz:g}"
         lasts = f"an action would last {control_hz / policy_hz:.4g} ticks"

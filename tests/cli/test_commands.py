@@ -52,7 +52,7 @@ def test_help_has_a_whole_line_for_each_command_in_the_order_of_use(
         runpy.run_module("ttscompile", run_name="__main__")
     told = capsys.readouterr().out
     assert "Usage: python -m ttscompile" in told
-    listed = [line.split(maxsplit=1) for line in told.partition("Commands:\n")[2].splitlines()]
+    listed = [line.split(maxsplit=1) for line in told.partition("Commands:\n")[2].partition("\n\n")[0].splitlines()]
     assert {name for name, _ in listed} == set(main.commands)
     assert all(what.endswith((".", "?")) and not what.endswith("...") for _, what in listed), "cut off"
     assert [name for name, _ in listed][:4] == ["doctor", "convert", "calibrate", "inspect"]

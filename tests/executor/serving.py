@@ -54,7 +54,7 @@ def serving(policy: type[ScriptedPolicy] = Quick, limits: ServerLimits = LIMITS)
     async def run(executor: AsyncExecutor) -> None:
         stop = asyncio.Event()
 
-        def on_start(port: int) -> None:
+        def on_start(_: str, port: int) -> None:
             ready.extend([asyncio.get_running_loop(), stop, port])
             started.set()
 
