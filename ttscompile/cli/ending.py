@@ -108,8 +108,9 @@ def _told_at_the_end(words: Sequence[str]) -> Iterator[None]:
         told, status = _judged(error, words)
     else:
         return
-    if told:
-        click.echo(told, err=True)
+    with suppress(OSError):  # standard error may be full, or nobody's
+        if told:
+            click.echo(told, err=True)
     raise click.exceptions.Exit(status)
 
 
