@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import builtins
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,6 +16,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from ttscompile.__main__ import main as start
 from ttscompile.cli import main
 from ttscompile.cli.ending import Status
 from ttscompile.errors import CalibrationFailedError, TtscompileError
@@ -71,6 +74,18 @@ def test_a_defect_is_no_failed_check(error: Exception, failing: Callable[[BaseEx
     assert shown.exit_code == Status.DEFECT
     assert shown.stderr.startswith("Traceback (most recent call last)")
     assert shown.stderr.splitlines()[-1].endswith("report it with the traceback above.")
+
+
+def test_an_interruption_of_the_imports_is_one_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(name: str, *more: object) -> object:
+        if name == "ttscompile.cli":
+            raise KeyboardInterrupt
+        return imported(name, *more)  # type: ignore[arg-type]
+
+    imported = builtins.__import__
+    monkeypatch.setattr(builtins, "__import__", interrupted)
+    with pytest.raises(SystemExit, match="130"):
+        start()
 
 
 def test_every_status_is_documented() -> None:
@@ -138,8 +153,6 @@ def test_a_signal_ends_a_command_and_leaves_nothing(
     sent: int, status: int, told: str, toy_compiled: Path, tmp_path: Path
 ) -> None:
     """Of a zipped artifact there is a folder in the temporary one as long as the command runs."""
-    import shutil
-
     archive = shutil.make_archive(str(tmp_path / "zipped"), "zip", toy_compiled)
     temporary = tmp_path / "temporary"
     temporary.mkdir()

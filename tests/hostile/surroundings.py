@@ -52,7 +52,7 @@ MOUNTED: Mapping[str, str] = {
     "results on a full disk": 'mount -t tmpfs -o size=4k tmpfs "$OUT"; head -c 4096 /dev/zero >"$OUT/zeros"',
     "results on a disk of 24 KiB": 'mount -t tmpfs -o size=24k tmpfs "$OUT"',
     "read-only artifact": 'mount --bind "$TOP/A" "$TOP/A"; mount -o remount,ro,bind "$TOP/A"',
-    "temporary files on a full disk": 'export TMPDIR="$TOP/t"; mkdir "$TMPDIR"; mount -t tmpfs -o size=4k tmpfs "$TMPDIR"',
+    "temporary files on a full disk": 'export TMPDIR="$TOP/t"; mkdir $TMPDIR; mount -t tmpfs -o size=4k tmpfs $TMPDIR',
 }
 """What the shell does before a command; those below in a name space of mounts of their own."""
 
