@@ -118,6 +118,22 @@ def test_pictures_that_cannot_be_drawn(toy_compiled: Path, tmp_path: Path) -> No
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_picture_takes_the_place_of_files_alone(toy_compiled: Path, tmp_path: Path) -> None:
+    """And has it only when it is whole."""
+    folder, null, picture = tmp_path / "folder.png", tmp_path / "null.png", tmp_path / ("p" * 251 + ".png")
+    folder.mkdir()
+    null.symlink_to("/dev/null")
+    for path in (folder, null):
+        result = CliRunner().invoke(main, ["inspect", str(toy_compiled), "--plot", str(path)])
+        assert result.exit_code == 2
+    assert null.is_symlink()
+    picture.write_text("the old one")
+    result = CliRunner().invoke(main, ["inspect", str(toy_compiled), "--plot", str(picture)])
+    assert result.exit_code == 0, result.stderr
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert sorted(tmp_path.iterdir()) == sorted([folder, null, picture])
+
+
 def test_arrays_that_cannot_be_read(tmp_path: Path) -> None:
     corrupt, single = tmp_path / "corrupt.npz", tmp_path / "single.npy"
     corrupt.write_bytes(b"PK\x03\x04 and nothing else")

@@ -90,6 +90,8 @@ def require_picture_name(path: Path) -> None:
         raise _refused(path, f"its name ends in {path.suffix!r}, which is no format of pictures here")
     if not path.parent.is_dir():
         raise _refused(path, "there is no such folder")
+    if path.exists() and not path.is_file():
+        raise _refused(path, "something else than a file is there")
 
 
 def write_picture(figure: Figure, path: str | Path) -> None:
