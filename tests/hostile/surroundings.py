@@ -62,7 +62,7 @@ COMMANDS: Mapping[str, Sequence[str]] = {
     "inspect": ("inspect", "A"),
     "inspect a zip": ("inspect", "A.zip", "--json"),
     "inspect --plot": ("inspect", "A", "--plot", "OUT/plan.png"),
-    "verify": ("verify", "A", "--json"),
+    "verify": ("verify", "V", "--json"),
     "bench": ("bench", "A", "--runs", "1"),
     "realtime": ("realtime", "A", "--control-hz", "1", "--margin-ticks", "0", "--runs", "1"),
     "report": ("report", "A", "-o", "OUT/page.html", "--runs", "1"),
@@ -70,6 +70,7 @@ COMMANDS: Mapping[str, Sequence[str]] = {
     "calibrate": ("calibrate", "OUT/B", "--trajectories", "calls.npz", "--max-minutes", "0.01"),
     "convert": ("convert", "policy.ckpt", "-o", "OUT/C", "--sampler", "ddim", "--steps", "2"),
 }
+NEED_CHECKPOINT = ("convert", "verify")
 STATUSES = {0, 2, 141}
 """All checks of the toy hold."""
 LEFT = (".partial", ".replaced")
@@ -81,15 +82,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     known = {**SETTINGS, **MOUNTED}
     parser.add_argument("--surrounding", choices=known, action="append")
     parser.add_argument("--command", choices=COMMANDS, action="append")
-    parser.add_argument("--checkpoint", type=Path, help="for convert, which is left out without it")
+    parser.add_argument(
+        "--checkpoint", type=Path, help="of Push-T, for convert and verify; without it they are left out"
+    )
     options = parser.parse_args(arguments)
-    failures = 0
+    failures, commands = 0, options.command or [c for c in COMMANDS if options.checkpoint or c not in NEED_CHECKPOINT]
     with tempfile.TemporaryDirectory() as folder:
         top = Path(folder)
         prepare(top, options.checkpoint)
         for name in options.surrounding or known:
             began, counted, wrong = time.monotonic(), Counter[int](), list[Any]()
-            for command in options.command or [c for c in COMMANDS if c != "convert" or options.checkpoint]:
+            for command in options.command or [
+                c for c in COMMANDS if options.checkpoint or c not in ("convert", "verify")
+            ]:
                 status, told = run(top, name, COMMANDS[command])
                 counted[status] += 1
                 if told:
@@ -111,7 +116,10 @@ def prepare(top: Path, checkpoint: Path | None) -> None:
     obs = np.random.default_rng(0).standard_normal((8, 2), np.float32)
     np.savez(top / "calls.npz", obs=obs, episode_ends=[4, 8])
     if checkpoint is not None:
+        import ttscompile
+
         shutil.copy(checkpoint, top / "policy.ckpt")
+        ttscompile.convert(checkpoint, top / "V", sampler="ddim", steps=2)
 
 
 def run(top: Path, surrounding: str, words: Sequence[str]) -> tuple[int, str]:
@@ -125,7 +133,7 @@ def run(top: Path, surrounding: str, words: Sequence[str]) -> tuple[int, str]:
     setup = (SETTINGS | MOUNTED)[surrounding]
     if words[0] == "calibrate" and mounts:  # on the disk itself; where it does not fit there is none
         setup += '; cp -r "$TOP/A" "$OUT/B" 2>/dev/null'
-    here = {"A": top / "A", "A.zip": top / "A.zip", "calls.npz": top / "calls.npz", "policy.ckpt": top / "policy.ckpt"}
+    here = {name: top / name for name in ("A", "V", "A.zip", "calls.npz", "policy.ckpt")}
     given = [str(here.get(word, word.replace("OUT", str(out)) if word.startswith("OUT/") else word)) for word in words]
     shell = ["bash", "-c", f'{setup}; exec "$@"', "bash", sys.executable, "-P", "-m", "ttscompile", *given]
     shell = ["unshare", "-m", *shell] if mounts else shell
