@@ -135,7 +135,7 @@ def run(top: Path, surrounding: str, words: Sequence[str]) -> tuple[int, str]:
     shell = ["unshare", "-m", *shell] if mounts else shell
     env = {**os.environ, "OUT": str(out), "TOP": str(top), "OMP_NUM_THREADS": "1"}
     with errors.open("wb") as file:
-        status = subprocess.run(shell, cwd=top, env=env, stdout=subprocess.DEVNULL, stderr=file, timeout=300).returncode
+        status = subprocess.run(shell, cwd=top, env=env, stdout=subprocess.DEVNULL, stderr=file, timeout=900).returncode
     return status, judged(status, errors.read_text(errors="replace"), out)
 
 

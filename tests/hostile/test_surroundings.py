@@ -23,7 +23,7 @@ TRIED = {
     "COLUMNS=1": ("inspect", 0),
     "all three closed": ("report", 0),
     "standard error full": ("inspect --plot", 2),
-    "in a folder that is gone": ("inspect a zip", 0),
+    "in a folder that is gone": ("inspect a zip", 2),
     "in a folder whose name is no text": ("inspect", 0),
     "files of 8 KiB": ("inspect --plot", 2),
 }

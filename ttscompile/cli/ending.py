@@ -83,6 +83,7 @@ class Commands(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command."""
         with _told_at_the_end(ctx.meta[_WORDS]), _ended_by_sigterm():
+            _require_folder()
             return super().invoke(ctx)
 
 
@@ -143,6 +144,14 @@ def _defect(error: Exception, words: Sequence[str]) -> str:
     if TRACEBACK in words[1:2]:
         return "".join(traceback.format_exception(error)) + f"{told}\n{asked} the traceback above."
     return f"{told}\n{asked} the traceback: {shlex.join((words[0], TRACEBACK, *words[1:]))[:300]}"
+
+
+def _require_folder() -> None:
+    """MKL ends the process in a folder that is gone, with a message about another file."""
+    try:
+        Path.cwd()
+    except FileNotFoundError as error:
+        raise TtscompileError("the folder that this is run in is gone. Run it in another.") from error
 
 
 def _resumes(words: Sequence[str]) -> str:
