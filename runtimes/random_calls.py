@@ -20,12 +20,14 @@ def random_calls(spec: PolicySpec, count: int, seed: int) -> list[tuple[Observat
         count: how many calls.
         seed: the same calls come of the same seed; more of them begin with the same ones.
     """
-    calls = []
-    for number in range(count):
-        rng = np.random.default_rng((number, seed))
-        obs: Observation = {key: observation.draw(rng) for key, observation in spec.observations.items()}
-        calls.append((obs, random_noise(spec, rng)))
-    return calls
+    return [random_call(spec, number, seed) for number in range(count)]
+
+
+def random_call(spec: PolicySpec, number: int, seed: int) -> tuple[Observation, Noise]:
+    """The call of this number among ``random_calls``."""
+    rng = np.random.default_rng((number, seed))
+    obs: Observation = {key: observation.draw(rng) for key, observation in spec.observations.items()}
+    return obs, random_noise(spec, rng)
 
 
 def random_noise(spec: PolicySpec, rng: np.random.Generator) -> Noise:

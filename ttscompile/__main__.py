@@ -1,6 +1,16 @@
-"""``python -m ttscompile``: the command line, where its script is not on the path."""
+"""The script ``ttscompile``, and ``python -m ttscompile`` where that is not on the path."""
 
-from ttscompile.cli import main
+import sys
+
+
+def main(prog_name: str | None = None) -> None:
+    """Run the command line; interrupted while it is being imported, which takes a moment, it ends as it would later."""
+    try:
+        from ttscompile.cli import main as commands
+    except KeyboardInterrupt:
+        sys.exit(130)
+    commands(prog_name=prog_name)
+
 
 if __name__ == "__main__":
-    main(prog_name="python -m ttscompile")
+    main("python -m ttscompile")

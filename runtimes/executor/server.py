@@ -76,7 +76,11 @@ class ExecutorServer:
         self._log = logging.getLogger("ttscompile.serve")
 
     async def run(
-        self, host: str, port: int, stop: asyncio.Event, on_start: Callable[[int], None] = lambda port: None
+        self,
+        host: str,
+        port: int,
+        stop: asyncio.Event,
+        on_start: Callable[[str, int], None] = lambda address, port: None,
     ) -> None:
         """Serve until ``stop`` is set.
 
@@ -84,12 +88,14 @@ class ExecutorServer:
             host: address to listen on; ``127.0.0.1`` cannot be reached from another machine.
             port: 0 for any that is free.
             stop: set it, in this event loop, to end.
-            on_start: told the port.
+            on_start: told address and port, as the socket has them.
 
         Raises:
             RuntimeUnavailableError: ``websockets`` is not installed.
-            ExecutorError: the address cannot be had, or the port is none.
+            ExecutorError: the address cannot be had or is none, or the port is none.
         """
+        if not host:  # asyncio would listen on every address of the machine
+            raise ExecutorError("cannot listen: host is empty. Give 127.0.0.1, or 0.0.0.0 for every address.")
         port = integer(port, "port", ExecutorError, 0, 65535)
         try:
             from websockets.asyncio.server import serve
@@ -114,11 +120,13 @@ class ExecutorServer:
                 max_queue=1,
                 logger=quiet,
             )
-        except OSError as error:
+        except (OSError, OverflowError, UnicodeError) as error:  # also a port above 65535, a name that cannot be one
             remedy = "Choose another port (0 takes any that is free), or an address of this machine."
-            raise ExecutorError(f"cannot listen on {host}:{port}: {error.strerror}. {remedy}") from error
+            why = getattr(error, "strerror", None) or error
+            shown = ascii(host[:100])[1:-1]
+            raise ExecutorError(f"cannot listen on {shown}:{port}: {why}. {remedy}") from error
         try:
-            on_start(next(iter(server.sockets)).getsockname()[1])
+            on_start(*next(iter(server.sockets)).getsockname()[:2])
             await stop.wait()
         finally:
             server.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
+from math import inf, isfinite
 from typing import TYPE_CHECKING, Any, Protocol
 
 from ttscompile.core.given import integer
@@ -111,8 +112,8 @@ class ExecutorSettings:
             object.__setattr__(self, "cores", cores)
         for name in ("policy_hz", "max_age"):
             value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise ExecutorError(f"{name} must be positive; found {value}.")
+            if value is not None and not 0 < value < inf:
+                raise ExecutorError(f"{name} must be positive and finite; found {value}.")
         if not 0 < self.rate_tolerance < 0.5:
             raise ExecutorError(f"rate_tolerance must be between 0 and 0.5 periods; found {self.rate_tolerance}.")
         if self.interpolation not in INTERPOLATIONS:
@@ -164,10 +165,11 @@ def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> 
     Raises:
         ExecutorError: they do not fit.
     """
-    if not control_hz > 0:
-        raise ExecutorError(f"control_hz must be positive; found {control_hz}.")
+    if not 0 < control_hz < inf:
+        raise ExecutorError(f"control_hz must be positive and finite; found {control_hz}.")
     policy_hz = settings.policy_hz or control_hz
-    ticks_per_step = round(control_hz / policy_hz)
+    ticks = control_hz / policy_hz
+    ticks_per_step = round(ticks) if isfinite(ticks) else 0
     if ticks_per_step < 1 or abs(ticks_per_step * policy_hz - control_hz) > 1e-6 * control_hz:
         what = f"control_hz = {control_hz:g} is no multiple of policy_hz = {policy_hz:g}"
         lasts = f"an action would last {control_hz / policy_hz:.4g} ticks"

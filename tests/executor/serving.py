@@ -33,6 +33,8 @@ LIMITS = ServerLimits(
     clients=4, message_bytes=4096, handshake_timeout=0.3, idle_timeout=0.6, send_timeout=0.3, action_timeout=2.0
 )
 
+SETTINGS = ExecutorSettings(max_hold=1000)
+
 
 class Quick(ScriptedPolicy):
     def predict_action(self, obs_dict, *, plan):  # type: ignore[no-untyped-def, override]
@@ -46,7 +48,9 @@ class Broken(Quick):
 
 
 @contextmanager
-def serving(policy: type[ScriptedPolicy] = Quick, limits: ServerLimits = LIMITS) -> Iterator[str]:
+def serving(
+    policy: type[ScriptedPolicy] = Quick, limits: ServerLimits = LIMITS, settings: ExecutorSettings = SETTINGS
+) -> Iterator[str]:
     """A server in this process; its url."""
     ready: list[Any] = []
     started = threading.Event()
@@ -54,13 +58,12 @@ def serving(policy: type[ScriptedPolicy] = Quick, limits: ServerLimits = LIMITS)
     async def run(executor: AsyncExecutor) -> None:
         stop = asyncio.Event()
 
-        def on_start(port: int) -> None:
+        def on_start(_: str, port: int) -> None:
             ready.extend([asyncio.get_running_loop(), stop, port])
             started.set()
 
         await ExecutorServer(executor, limits).run("127.0.0.1", 0, stop, on_start)
 
-    settings = ExecutorSettings(max_hold=1000)
     executor = AsyncExecutor(policy(FakeClock()), 20, settings, latencies={"dense": 0.01})
     thread = threading.Thread(target=lambda: asyncio.run(run(executor)))
     thread.start()

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from itertools import pairwise
+from math import inf
 from pathlib import Path
 
 import numpy as np
@@ -273,6 +274,7 @@ def test_the_guard_refuses_and_the_loop_goes_on_with_what_it_has() -> None:
     ("made", "message"),
     [
         ({"policy_hz": -1}, "policy_hz must be positive"),
+        ({"max_age": inf}, "max_age must be positive and finite"),
         ({"max_hold": -1}, "max_hold must not be negative"),
         ({"rate_tolerance": 0.5}, "rate_tolerance must be between"),
         ({"seam": "glue"}, "seam must be one of"),
@@ -290,6 +292,8 @@ def test_settings_are_checked(made: dict[str, object], message: str) -> None:
     ("made", "hz", "message"),
     [
         ({}, 0, "control_hz must be positive"),
+        ({}, inf, "control_hz must be positive and finite"),
+        ({"policy_hz": 1e-320}, 10, "no multiple of policy_hz"),
         ({"policy_hz": 20}, 50, "no multiple of policy_hz = 20: an action would last 2.5 ticks"),
         ({"policy_hz": 20}, 10, "no multiple"),
         ({"horizon": 16}, 10, "Give at most 15"),

@@ -326,6 +326,21 @@ def test_limits_are_checked_and_a_port_that_is_taken_is_told() -> None:
             asyncio.run(ExecutorServer(executor).run("127.0.0.1", port, asyncio.Event()))
 
 
+@pytest.mark.parametrize(
+    ("host", "port", "why"),
+    [
+        ("", 0, "host is empty"),
+        ("a" * 300, 0, "on a+:0: .*label"),
+        ("\udcff", 0, r"on \\udcff:0: "),
+        ("127.0.0.1", 2**40, "on 127.0.0.1:10995"),
+    ],
+)
+def test_what_is_no_address_is_an_error(host: str, port: int, why: str) -> None:
+    executor = AsyncExecutor(Quick(FakeClock()), 20, latencies={"dense": 0.01})
+    with executor, pytest.raises(ExecutorError, match=f"cannot listen.*{why}"):
+        asyncio.run(ExecutorServer(executor).run(host, port, asyncio.Event()))
+
+
 def test_the_server_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "websockets.asyncio.server", None)
     with (

@@ -73,6 +73,26 @@ def test_a_rename_that_fails_puts_the_old_one_back(tmp_path: Path, monkeypatch: 
     assert contents(target) == {"file": b"old"}
 
 
+@pytest.mark.parametrize("letter", ["l", "\N{EURO SIGN}"])  # of one byte and of three
+def test_names_as_long_as_names_may_be(letter: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is unfinished, or was replaced, has a longer one, which has to fit and to be its own."""
+    long = letter * (255 // len(letter.encode()))
+    for name in (long, long[:-1]):
+        files.replace_file(tmp_path / f"{name}", b"content")
+        (tmp_path / name).unlink()
+    target, other = folder(tmp_path / long, "old"), folder(tmp_path / long[:-1], "other")
+    abandoned = folder(files.beside(target), "x")
+    monkeypatch.setattr(files, "exchange", lambda one, other: False)
+    with new_folder(other) as partial:
+        assert abandoned.exists(), "it is another one's"
+    with new_folder(target) as partial:
+        assert not abandoned.exists()
+        (partial / "file").write_text("new")
+        replace_folder(partial, target)
+    assert (contents(target), contents(other)) == ({"file": b"new"}, {"file": b"other"})
+    assert sorted(tmp_path.iterdir()) == sorted([target, other])
+
+
 def test_abandoned_folders_go_and_those_of_the_living_stay(tmp_path: Path) -> None:
     target = tmp_path / "compiled"
     abandoned, stranger = folder(tmp_path / ".compiled.0123abcd.partial", "x"), folder(tmp_path / ".other.partial", "x")

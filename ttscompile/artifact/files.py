@@ -118,7 +118,13 @@ def replace_file(path: Path, content: bytes) -> None:
 
 def beside(path: Path) -> Path:
     """A name in the same folder that nothing has, for what is not finished."""
-    return path.with_name(f".{path.name}.{secrets.token_hex(4)}{PARTIAL}")
+    return path.with_name(f".{_short(path.name)}.{secrets.token_hex(4)}{PARTIAL}")
+
+
+def _short(name: str) -> str:
+    """The name, or of one so long that nothing more fits into 255 bytes its beginning and a hash of it."""
+    content = os.fsencode(name)
+    return name if len(content) <= 200 else f"{os.fsdecode(content[:160])}-{content_hash(content)}"
 
 
 def sync_directory(path: Path) -> None:
@@ -189,7 +195,7 @@ def new_folder(target: Path) -> Iterator[Path]:
 
     Folders that killed processes left there are removed first. A live process holds a lock on its folder.
     """
-    name = re.compile(rf"\.{re.escape(target.name)}\.[0-9a-f]{{8}}{re.escape(PARTIAL)}")
+    name = re.compile(rf"\.{re.escape(_short(target.name))}\.[0-9a-f]{{8}}{re.escape(PARTIAL)}")
     for path in [path for path in target.parent.iterdir() if name.fullmatch(path.name)]:
         with suppress(OSError), lock_folder(path):  # or somebody works in it, or removed it
             shutil.rmtree(path, ignore_errors=True)
@@ -211,4 +217,4 @@ def recover(target: Path) -> None:
 
 
 def _replaced(target: Path) -> Path:
-    return target.with_name(f".{target.name}.replaced")
+    return target.with_name(f".{_short(target.name)}.replaced")

@@ -26,6 +26,7 @@ from ..errors import CaptureError
 from ..ir.evaluate import Evaluator, without_stack_traces
 from ..ir.graph import GETITEM, Argument, Batch, Enum, Graph, Node, Ref, Size, TensorType
 from .batch import BATCHES, REMEDY, unify_batch
+from .stacks import AS_CAT
 
 EXAMPLE_STREAMS = 3
 """Batch size of the example inputs; neither 0 nor 1, which torch.export would specialise on."""
@@ -128,7 +129,7 @@ def _traced(
             warnings.filterwarnings("ignore", message=".*_flat_weights.*", category=UserWarning)
             exported = _export(module, given, symbolic)
             with without_stack_traces():  # each operation keeps the one that it was captured with
-                return exported.run_decompositions({}), examples
+                return exported.run_decompositions(dict(AS_CAT)), examples
     except Exception as error:  # torch.export raises whatever the user's code or its own machinery raises
         place = _innermost("".join(traceback.format_tb(error.__traceback__)))
         called = ", ".join(f"{name} {tuple(value.shape)} {value.dtype}" for name, value in examples.items())

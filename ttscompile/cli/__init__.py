@@ -1,13 +1,10 @@
 """The command ``ttscompile``: one file a command.
 
-Exit status: 0 done; 1 a check failed; 2 bad usage or bad input; 130 interrupted. Results go to standard output, as a
-table or with ``--json`` as one JSON document and nothing else; progress and warnings go to standard error.
+Results go to standard output, as a table or with ``--json`` as one JSON document and nothing else; progress and
+warnings go to standard error. ``ending`` has the exit statuses.
 """
 
 from __future__ import annotations
-
-import errno
-from typing import Any
 
 import click
 
@@ -17,40 +14,22 @@ from ttscompile.cli.calibrate import calibrate
 from ttscompile.cli.compare import compare
 from ttscompile.cli.convert import convert
 from ttscompile.cli.doctor import doctor
+from ttscompile.cli.ending import TRACEBACK, Commands
 from ttscompile.cli.inspect import inspect
 from ttscompile.cli.realtime import realtime
 from ttscompile.cli.report import report
 from ttscompile.cli.serve import serve
 from ttscompile.cli.verify import verify
-from ttscompile.errors import CalibrationFailedError, TtscompileError
 
 
-class _Commands(click.Group):
-    """Lists its commands as they follow each other; tells every error in one message, without a traceback."""
-
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(self.commands)
-
-    def invoke(self, ctx: click.Context) -> Any:
-        try:
-            return super().invoke(ctx)
-        except TtscompileError as error:
-            failed_check = isinstance(error, CalibrationFailedError)
-            click.echo(f"{'failed' if failed_check else 'error'}: {error}", err=True)
-            ctx.exit(1 if failed_check else 2)
-        except OSError as error:  # a full disk, a file that may not be read
-            if error.errno == errno.EPIPE:
-                raise  # nobody reads on: click ends without a word
-            click.echo(f"error: {error}", err=True)
-            ctx.exit(2)
-        except KeyboardInterrupt:
-            resumes = ctx.invoked_subcommand == "calibrate"
-            click.echo("interrupted" + "; the same command with --resume goes on" * resumes, err=True)
-            ctx.exit(130)
-
-
-@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(
+    cls=Commands,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog="Exit status: 0 done; 1 a check failed; 2 bad usage or bad input; 70 a defect of ttscompile;"
+    " 130 interrupted; 141 nobody reads the output; 143 ended by SIGTERM.",
+)
 @click.version_option(__version__, prog_name="ttscompile")
+@click.option(TRACEBACK, is_flag=True, expose_value=False, help="Show where a defect of ttscompile is.")
 def main() -> None:
     """Compile diffusion-transformer robot policies into artifacts that run in real time without PyTorch."""
 

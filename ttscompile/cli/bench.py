@@ -7,9 +7,17 @@ from pathlib import Path
 import click
 
 from ttscompile.artifact.load import load_artifact
-from ttscompile.cli.options import PATH, artifact_argument, count_option, json_option, names_option
+from ttscompile.cli.options import (
+    artifact_argument,
+    json_option,
+    names_option,
+    runs_option,
+    seed_option,
+    threads_option,
+)
 from ttscompile.cli.output import print_identity, print_json, progress, results, say, table
 from ttscompile.cli.timing import Measurement, contestants, measure
+from ttscompile.cli.types import PATH, TEXT
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.units import ms, share
 
@@ -19,9 +27,9 @@ RIVALS = ("original", "eager", "onnxruntime-dense")
 
 @click.command()
 @artifact_argument
-@count_option("--threads", "Threads that each contestant computes with.")
-@count_option("--runs", "Calls of each contestant that are counted.", default=20)
-@click.option("--plan", help="Plan of the compiled policy. Without this option its default plan runs.")
+@threads_option("Threads that each contestant computes with.")
+@runs_option("Calls of each contestant that are counted.")
+@click.option("--plan", type=TEXT, help="Plan of the compiled policy. Without this option its default plan runs.")
 @names_option(
     "--against",
     RIVALS,
@@ -34,7 +42,7 @@ RIVALS = ("original", "eager", "onnxruntime-dense")
     type=PATH,
     help="The checkpoint that DIRECTORY was made from. The rivals 'original' and 'eager' need it.",
 )
-@count_option("--seed", "Seed of the observations and the noise.", default=0, least=0)
+@seed_option("Seed of the observations and the noise.")
 @json_option
 def bench(
     directory: Path,

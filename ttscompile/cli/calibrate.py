@@ -10,10 +10,11 @@ import click
 import ttscompile
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.strategies import DEFAULT, NAMES, STRATEGIES
-from ttscompile.cli.options import ABOVE_0, artifact_argument, count_option, json_option
+from ttscompile.cli.options import artifact_argument, json_option, seed_option, threads_option
 from ttscompile.cli.output import manifest_of, only_results_on_stdout, print_json, results
 from ttscompile.cli.recordings import FilesCommand, Sources, require_recordings, trajectories_options
 from ttscompile.cli.summary import print_summary
+from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE
 from ttscompile.report.summary import document
 
 
@@ -22,26 +23,26 @@ from ttscompile.report.summary import document
 @trajectories_options()
 @click.option(
     "--target-sparsity",
-    type=float,
+    type=SHARE,
     help="Share of the cells to reuse; 0.95 if no budget is given, or what leaves five steps.",
 )
 @click.option(
     "--target-flops",
-    type=float,
+    type=SHARE,
     help="In its place: share of the FLOPs of a dense call to save, prologue and pruner counted.",
 )
 @click.option(
     "--latency-ms",
-    type=float,
+    type=MILLISECONDS,
     help="In its place: what a call with onnxruntime may take on this machine; measured at the start.",
 )
 @click.option(
     "--max-action-error",
-    type=float,
+    type=ERROR,
     help="In its place: the sparsest plan whose mean action error on held-out episodes, in the units of the actions, is"
     " not above this.",
 )
-@count_option("--threads", "Of calls for --latency-ms.")
+@threads_option("Of calls for --latency-ms.")
 @click.option(
     "--strategy",
     type=click.Choice(NAMES),
@@ -49,10 +50,10 @@ from ttscompile.report.summary import document
     show_default=True,
     help=f"How the plan is found. {'; '.join(f'{one.name}: {one.source}' for one in STRATEGIES)}.",
 )
-@count_option("--seed", "Of the split, the noise and the training.", default=0, least=0)
+@seed_option("Of the split, the noise and the training.")
 @click.option(
     "--max-minutes",
-    type=ABOVE_0,
+    type=MINUTES,
     default=15.0,
     show_default=True,
     help="All in all, about: the best plan found by then is taken. Also decides how many calls are used.",

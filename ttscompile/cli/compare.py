@@ -9,9 +9,17 @@ import click
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from ttscompile.calibration.strategies import NAMES
-from ttscompile.cli.options import PATH, artifact_argument, count_option, json_option, names_option
+from ttscompile.cli.options import (
+    artifact_argument,
+    count_option,
+    json_option,
+    names_option,
+    seed_option,
+    threads_option,
+)
 from ttscompile.cli.output import manifest_of, only_results_on_stdout, print_json, progress, results, say, table
 from ttscompile.cli.recordings import FilesCommand, Sources, require_recordings, trajectories_options
+from ttscompile.cli.types import PATH, PICTURE, TEXT, Number
 from ttscompile.errors import ArtifactChangedError, RuntimeUnavailableError
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.units import ms, share
@@ -54,6 +62,7 @@ def _sparsities(_: click.Context, __: click.Parameter, value: str | None) -> tup
 )
 @click.option(
     "--sparsities",
+    type=TEXT,
     callback=_sparsities,
     help="For strategies; 0.9,0.95,0.98 if not given, or, of less than 50 steps, what leaves five, three and two.",
 )
@@ -67,17 +76,17 @@ def _sparsities(_: click.Context, __: click.Parameter, value: str | None) -> tup
 )
 @count_option("--calls", "Held-out calls, at most.", default=32)
 @count_option("--learned-calls", "To learn from, at most.", default=256, least=2)
-@count_option("--threads", "Of onnxruntime.")
+@threads_option("Of onnxruntime.")
 @click.option(
     "--max-minutes",
-    type=click.FloatRange(min=0),
+    type=Number(0, 1e6),
     default=3.0,
     show_default=True,
     help="Limit of each search, about; there is one for each strategy and sparsity.",
 )
 @count_option("--intervals", "Of each search, at most; for a quick look.", default=None)
-@count_option("--seed", "Of the split, the noise and the searches.", default=0, least=0)
-@click.option("--plot", "picture", type=PATH, help="Draw into this file (.png, .svg, .pdf).")
+@seed_option("Of the split, the noise and the searches.")
+@click.option("--plot", "picture", type=PICTURE, help="Draw into this file (.png, .svg, .pdf).")
 @json_option
 def compare(
     directory: Path,

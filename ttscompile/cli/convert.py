@@ -11,9 +11,10 @@ import ttscompile
 from ttscompile.artifact.ceiling import few_steps, many_steps
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import require_replaceable
-from ttscompile.cli.options import PATH, count_option, json_option
+from ttscompile.cli.options import count_option, json_option
 from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results, say
 from ttscompile.cli.summary import print_summary
+from ttscompile.cli.types import ANY_TEXT, FOLDER, NEW_FILE, PATH
 from ttscompile.core.paths import require_path
 from ttscompile.core.spec import FP32, PRECISIONS
 from ttscompile.errors import CheckpointError
@@ -50,10 +51,12 @@ from ttscompile.report.summary import document
     " pure noise is not what the network expects; trailing and linspace start at it, which needs a bound on the sample."
     " Left out, dpmsolver++ in place of another sampler takes trailing; ddim takes leading.",
 )
-@click.option("--task", help="LeRobot: compile this instruction in; without it, its tokens are an observation.")
+@click.option(
+    "--task", type=ANY_TEXT, help="LeRobot: compile this instruction in; without it, its tokens are an observation."
+)
 @click.option(
     "--encoders",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=FOLDER,
     help="LeRobot: folder with the CLIP encoders' config.json, if not in or beside CHECKPOINT. Nothing is downloaded.",
 )
 @count_option(
@@ -71,7 +74,7 @@ from ttscompile.report.summary import document
 )
 @click.option(
     "--single-file",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=NEW_FILE,
     help="Write one ONNX file of the whole call too, for programs that have onnxruntime and no ttscompile.",
 )
 @click.option("--explain", is_flag=True, help="Say on standard error what each pass did.")

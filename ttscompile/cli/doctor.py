@@ -8,11 +8,12 @@ import click
 
 from ttscompile.cli.options import json_option
 from ttscompile.cli.output import identity_of, print_json
+from ttscompile.cli.types import PathName
 from ttscompile.doctor import diagnosis as examination
 
 
 @click.command()
-@click.argument("directory", required=False, type=click.Path(exists=True, path_type=Path))
+@click.argument("directory", required=False, type=PathName(exists=True))
 @json_option
 @click.pass_context
 def doctor(context: click.Context, directory: Path | None, as_json: bool) -> None:

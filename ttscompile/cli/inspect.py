@@ -10,9 +10,10 @@ import numpy.typing as npt
 
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import DENSE
-from ttscompile.cli.options import PATH, artifact_argument, json_option
+from ttscompile.cli.options import artifact_argument, json_option
 from ttscompile.cli.output import print_json, progress, results, say
 from ttscompile.cli.summary import print_summary
+from ttscompile.cli.types import FILE, PICTURE, TEXT
 from ttscompile.core.lattice import PlanArray
 from ttscompile.errors import ArtifactError, ObservationError
 from ttscompile.plots.maps import plot_plan
@@ -27,11 +28,13 @@ SCHEDULE = "schedule"
 
 @click.command()
 @artifact_argument
-@click.option("--plot", "picture", type=PATH, help="Draw a plan into this file (.png, .svg or .pdf).")
-@click.option("--plan", "name", help="The plan to draw. Without this option it is the artifact's default plan.")
+@click.option("--plot", "picture", type=PICTURE, help="Draw a plan into this file (.png, .svg or .pdf).")
+@click.option(
+    "--plan", "name", type=TEXT, help="The plan to draw. Without this option it is the artifact's default plan."
+)
 @click.option(
     "--observation",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    type=FILE,
     help="An .npz file with an array for each key of the observation, of one call or of the calls of one episode. It is"
     " needed for plans that depend on the observation; the plan of its last call is drawn.",
 )

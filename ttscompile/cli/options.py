@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import click
 
+from ttscompile.cli.types import ANY_TEXT, PATH, RATE
+
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
-PATH = click.Path(path_type=Path)
-ABOVE_0 = click.FloatRange(min=0, min_open=True)
+MOST = 1_000_000
+"""Of whatever is counted: none of it is of use beyond, and all of it fits a machine."""
+
+MOST_RUNS = 10_000
+MOST_THREADS = 1024
+"""onnxruntime makes as many as it is told."""
+MOST_SEED = 2**63 - 1
+"""torch takes no larger one."""
 
 artifact_argument = click.argument("directory", type=PATH)
 json_option = click.option(
@@ -19,10 +26,25 @@ json_option = click.option(
 )
 
 
-def count_option(name: str, help: str, *, default: int | None = 1, least: int = 1) -> Decorator:
-    """An option that takes a whole number of at least ``least``."""
-    kind = click.IntRange(min=least)
+def count_option(name: str, help: str, *, default: int | None = 1, least: int = 1, most: int = MOST) -> Decorator:
+    """An option that takes a whole number from ``least`` to ``most``."""
+    kind = click.IntRange(least, most)
     return click.option(name, type=kind, default=default, show_default=default is not None, help=help)
+
+
+def threads_option(help: str) -> Decorator:
+    """``--threads``."""
+    return count_option("--threads", help, most=MOST_THREADS)
+
+
+def runs_option(help: str, default: int = 20) -> Decorator:
+    """``--runs``."""
+    return count_option("--runs", help, default=default, most=MOST_RUNS)
+
+
+def seed_option(help: str, default: int | None = 0) -> Decorator:
+    """``--seed``."""
+    return count_option("--seed", help, default=default, least=0, most=MOST_SEED)
 
 
 def names_option(name: str, known: Sequence[str], *, default: str, help: str) -> Decorator:
@@ -34,7 +56,7 @@ def names_option(name: str, known: Sequence[str], *, default: str, help: str) ->
             raise click.BadParameter(f"{unknown[0]!r} is not one of {', '.join(known)}.")
         return names
 
-    return click.option(name, default=default, show_default=True, callback=parsed, help=help)
+    return click.option(name, type=ANY_TEXT, default=default, show_default=True, callback=parsed, help=help)
 
 
 def together(*options: Decorator) -> Decorator:
@@ -49,10 +71,10 @@ def together(*options: Decorator) -> Decorator:
 
 
 loop_options = together(
-    click.option("--control-hz", type=ABOVE_0, required=True, help="Rate of the control loop in Hz."),
+    click.option("--control-hz", type=RATE, required=True, help="Rate of the control loop in Hz."),
     click.option(
         "--policy-hz",
-        type=ABOVE_0,
+        type=RATE,
         help="Rate in Hz of the frames and actions that the policy was trained with. Without this option it is the"
         " control rate.",
     ),
@@ -70,6 +92,6 @@ loop_options = together(
         least=0,
     ),
     count_option("--margin-ticks", "Control ticks by which a chunk has to come before it is needed.", least=0),
-    count_option("--threads", "Threads that the policy computes with."),
+    threads_option("Threads that the policy computes with."),
 )
 """Of commands that run an artifact in a control loop; their meanings are those of ``ExecutorSettings``."""

@@ -23,10 +23,18 @@ _WIDTH = 110
 """Columns of a table that goes to a file or a pipe; a terminal's own width is used where there is one."""
 
 
+class _Console(Console):
+    """Does not end the process, as a check that failed, where nobody reads on."""
+
+    def on_broken_pipe(self) -> None:
+        """Called in the handler of the ``BrokenPipeError``."""
+        raise
+
+
 def results(width: int = _WIDTH) -> Console:
     """Console for results, on standard output; names and paths are shown as they are, whatever brackets they have."""
-    console = Console(highlight=False, markup=False, emoji=False)
-    return console if console.is_terminal else Console(highlight=False, markup=False, emoji=False, width=width)
+    console = _Console(highlight=False, markup=False, emoji=False)
+    return console if console.is_terminal else _Console(highlight=False, markup=False, emoji=False, width=width)
 
 
 def results_console() -> Console:
@@ -45,7 +53,7 @@ def run(command: click.Command) -> None:
 
 def progress() -> Console:
     """Console for progress and warnings, on standard error."""
-    return Console(stderr=True, highlight=False, markup=False, emoji=False)
+    return _Console(stderr=True, highlight=False, markup=False, emoji=False)
 
 
 @contextmanager

@@ -11,8 +11,9 @@ import numpy as np
 
 import ttscompile
 from ttscompile.artifact.manifest import UNIFORM, marked
-from ttscompile.cli.options import ABOVE_0, artifact_argument, count_option, json_option, loop_options
+from ttscompile.cli.options import artifact_argument, json_option, loop_options, runs_option
 from ttscompile.cli.output import print_identity, print_json, progress, results, say, table
+from ttscompile.cli.types import SECONDS, TEXT
 from ttscompile.errors import DeadlineMissedError
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.timer import Times
@@ -31,14 +32,15 @@ JITTER_HZ = 200
 @click.option(
     "--plan",
     "names",
+    type=TEXT,
     multiple=True,
     help="A plan to measure; may be repeated. Without this option all plans are measured.",
 )
-@count_option("--runs", "Calls of each plan that are counted.", default=20)
+@runs_option("Calls of each plan that are counted.")
 @click.option(
     "--jitter",
     "jitter_seconds",
-    type=ABOVE_0,
+    type=SECONDS,
     help=f"Also run a loop of {JITTER_HZ} Hz for this many seconds, first alone and then beside the default plan, and"
     " say how late it wakes.",
 )

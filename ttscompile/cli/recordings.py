@@ -7,7 +7,8 @@ from pathlib import Path
 
 import click
 
-from ttscompile.cli.options import PATH, Decorator, together
+from ttscompile.cli.options import Decorator, together
+from ttscompile.cli.types import PATH, TEXT
 from ttscompile.core.paths import require_path
 from ttscompile.errors import TrajectoryError
 
@@ -71,6 +72,7 @@ def trajectories_options(required: bool = True) -> Decorator:
         click.option(
             "--observation",
             "sources",
+            type=TEXT,
             multiple=True,
             callback=_sources,
             metavar="KEY=NAME,NAME:N",

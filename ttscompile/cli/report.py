@@ -9,9 +9,10 @@ import click
 import ttscompile
 from ttscompile.artifact.files import replace_file
 from ttscompile.artifact.load import load_artifact
-from ttscompile.cli.options import PATH, artifact_argument, count_option
+from ttscompile.cli.options import artifact_argument, count_option, runs_option, threads_option
 from ttscompile.cli.output import only_results_on_stdout, progress, results, say
 from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
+from ttscompile.cli.types import FILE, NEW_FILE
 from ttscompile.errors import ArtifactChangedError, ArtifactError, OutputError
 from ttscompile.report import Given, Section, build, render, verified
 from ttscompile.report.comparison import read_comparison
@@ -24,19 +25,19 @@ from ttscompile.trajectories import load_trajectories
 
 @click.command(cls=FilesCommand)
 @artifact_argument
-@click.option("-o", "--output", type=PATH, required=True, help="The page to write; its name ends in .html.")
+@click.option("-o", "--output", type=NEW_FILE, required=True, help="The page to write; its name ends in .html.")
 @trajectories_options(required=False)
 @count_option("--episode", "Number of the recorded episode that is run, from 0.", default=0, least=0)
 @click.option(
     "--comparison",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    type=FILE,
     help="A file with the output of 'ttscompile compare --json', whose points are drawn.",
 )
 @click.option(
     "--verify", "verifies", is_flag=True, help="Also run the checks of 'ttscompile verify', which take minutes."
 )
-@count_option("--threads", "Threads that the timed calls compute with.")
-@count_option("--runs", "Calls of each plan that are counted.", default=10)
+@threads_option("Threads that the timed calls compute with.")
+@runs_option("Calls of each plan that are counted.", default=10)
 @click.pass_context
 def report(
     context: click.Context,

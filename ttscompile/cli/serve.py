@@ -5,24 +5,33 @@ from __future__ import annotations
 import asyncio
 import json
 import signal
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
 import click
 
 import ttscompile
-from ttscompile.cli.options import artifact_argument, count_option, loop_options
+from ttscompile.cli.options import artifact_argument, count_option, loop_options, seed_option
 from ttscompile.cli.output import progress, say
+from ttscompile.cli.types import ADDRESS, TEXT
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
 from ttscompile.runtimes.executor.server import ExecutorServer, ServerLimits
 from ttscompile.runtimes.executor.settings import INTERPOLATIONS, SEAMS
+
+MOST_CLIENTS = 128
+"""A socket each, and threads that wait for actions; a process may have 1024 files open where nothing else is said."""
 
 
 @click.command()
 @artifact_argument
 @loop_options
 @click.option(
-    "--host", default="127.0.0.1", show_default=True, help="Address to listen on. There is no authentication."
+    "--host",
+    type=ADDRESS,
+    default="127.0.0.1",
+    show_default=True,
+    help="Address to listen on: an IP address of this machine, or localhost. There is no authentication.",
 )
 @click.option(
     "--port",
@@ -34,6 +43,7 @@ from ttscompile.runtimes.executor.settings import INTERPOLATIONS, SEAMS
 @click.option(
     "--tier",
     "tiers",
+    type=TEXT,
     multiple=True,
     help="A plan to run; may be repeated, from the slowest to the fastest, which are fallen back to when calls are"
     " late. Without this option it is the default plan.",
@@ -55,11 +65,9 @@ from ttscompile.runtimes.executor.settings import INTERPOLATIONS, SEAMS
 @count_option(
     "--max-hold", "Control ticks for which the last action is repeated when there is no other.", default=3, least=0
 )
-@count_option("--max-clients", "Clients that may be connected.", default=8)
-@count_option("--max-message-bytes", "Size of a message that is still read.", default=1 << 20, least=128)
-@count_option(
-    "--seed", "Seed of the policy's noise. Without this option each run draws other noise.", default=None, least=0
-)
+@count_option("--max-clients", "Clients that may be connected.", default=8, most=MOST_CLIENTS)
+@count_option("--max-message-bytes", "Size of a message that is still read.", default=1 << 20, least=128, most=1 << 30)
+@seed_option("Seed of the policy's noise. Without this option each run draws other noise.", default=None)
 def serve(
     directory: Path,
     control_hz: float,
@@ -82,7 +90,7 @@ def serve(
         policy = ttscompile.load(directory, threads=threads, seed=seed)
         executor = AsyncExecutor(policy, control_hz, ExecutorSettings(tiers=tiers or None, **settings))
     limits = ServerLimits(clients=max_clients, message_bytes=max_message_bytes)
-    if host not in ("127.0.0.1", "::1", "localhost"):
+    if host != "localhost" and not ip_address(host).is_loopback:
         say(console, f"warning: {host} may be reached from other machines, and whoever reaches it can drive the robot.")
     with executor:
         asyncio.run(_run(ExecutorServer(executor, limits), host, port, policy.info.identity))
@@ -94,9 +102,9 @@ async def _run(server: ExecutorServer, host: str, port: int, identity: str) -> N
     loop = asyncio.get_running_loop()
     for each in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(each, stop.set)
-    shown = f"[{host}]" if ":" in host else host
 
-    def bound(number: int) -> None:
+    def bound(address: str, number: int) -> None:
+        shown = f"[{address}]" if ":" in address else address
         click.echo(json.dumps({"url": f"ws://{shown}:{number}/", "identity": identity}))
 
     await server.run(host, port, stop, bound)

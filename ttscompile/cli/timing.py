@@ -17,7 +17,7 @@ from ttscompile.errors import RuntimeUnavailableError, SpecError
 from ttscompile.measure.timer import Timer, Times
 from ttscompile.runtimes.open import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy
-from ttscompile.runtimes.random_calls import Observation, normalized, random_calls
+from ttscompile.runtimes.random_calls import Observation, normalized, random_call
 
 if TYPE_CHECKING:
     from torch import nn
@@ -146,11 +146,11 @@ def measure(
     timer = Timer(len(entered), warm_up)
     reports: list[list[Any]] = [[] for _ in entered]
     specs = {id(one.spec): one.spec for one in entered}
-    calls = {name: random_calls(spec, warm_up + runs, seed) for name, spec in specs.items()}
     for number in range(warm_up + runs):
+        calls = {name: random_call(spec, number, seed) for name, spec in specs.items()}
         for i in timer.round():
             one = entered[i]
-            timer.time(i, partial(one.call, *calls[id(one.spec)][number]))
+            timer.time(i, partial(one.call, *calls[id(one.spec)]))
             if timer.counted:
                 reports[i].append(one.report())
         on_round(number + 1, warm_up + runs)

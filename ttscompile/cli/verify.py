@@ -9,9 +9,10 @@ from rich.console import Console
 
 import ttscompile
 from ttscompile.artifact.manifest import abbreviated
-from ttscompile.cli.options import PATH, artifact_argument, count_option, json_option
+from ttscompile.cli.options import artifact_argument, count_option, json_option, threads_option
 from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results, say, table
 from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
+from ttscompile.cli.types import PICTURE
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.plots.maps import plot_errors
 from ttscompile.report.verified import figure
@@ -21,11 +22,11 @@ from ttscompile.report.verified import figure
 @artifact_argument
 @trajectories_options(required=False)
 @count_option("--calls", "Recorded calls to check at least; whole episodes are taken.", default=24)
-@count_option("--threads", "Threads that onnxruntime computes with.")
+@threads_option("Threads that onnxruntime computes with.")
 @click.option(
     "--plot",
     "picture",
-    type=PATH,
+    type=PICTURE,
     help="Draw the error of every block at every step into this file (.png, .svg or .pdf).",
 )
 @json_option

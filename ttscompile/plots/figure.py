@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import secrets
+from contextlib import suppress
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +17,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 STEPS_AXIS = "denoising step k, in order of execution (0 is the noisiest)"
+
+FORMATS = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
+"""Suffixes of pictures; and of the metadata that matplotlib would write, what has to stay out."""
 
 _CHARACTER = 0.012
 """Share of the axes' width, about, that a character of a point's name takes."""
@@ -74,6 +80,20 @@ def beside(place: float, name: str, shift: float = 0.0) -> dict[str, Any]:
     return {"xytext": (-5 if left else 5, shift), "textcoords": "offset points", "ha": "right" if left else "left"}
 
 
+def require_picture_name(path: Path) -> None:
+    """Raise unless a picture may have this name: to be told before there is something to draw.
+
+    Raises:
+        OutputError: no suffix that says the format, or no such folder.
+    """
+    if path.suffix.lower() not in FORMATS:
+        raise _refused(path, f"its name ends in {path.suffix!r}, which is no format of pictures here")
+    if not path.parent.is_dir():
+        raise _refused(path, "there is no such folder")
+    if path.exists() and not path.is_file():
+        raise _refused(path, "something else than a file is there")
+
+
 def write_picture(figure: Figure, path: str | Path) -> None:
     """Write a picture; of the same figures the same bytes: matplotlib would put its version or the date into them.
 
@@ -82,12 +102,23 @@ def write_picture(figure: Figure, path: str | Path) -> None:
         path: of the picture; its suffix (``.png``, ``.svg``, ``.pdf``) is the format.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: it cannot be written; a file that was there is as it was.
     """
-    metadata = {".png": {"Software": None}, ".svg": {"Date": None}}.get(Path(path).suffix)
+    place, content = Path(path), BytesIO()
+    require_picture_name(place)
+    suffix = place.suffix.lower()
+    figure.savefig(content, format=suffix[1:], dpi=150, metadata=FORMATS[suffix])
+    partial = place.with_name(f".{secrets.token_hex(8)}.partial")  # a name as long as the picture's might be too long
     try:
-        figure.savefig(path, dpi=150, metadata=metadata)
-    except (OSError, ValueError) as error:  # no such folder; no such format
-        raise OutputError(
-            f"{path}: the picture cannot be written: {error}. Give a .png, .svg or .pdf in a folder that exists."
-        ) from error
+        partial.write_bytes(content.getvalue())
+        partial.replace(place)
+    except OSError as error:
+        raise _refused(place, str(error.strerror)) from error
+    finally:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
+
+
+def _refused(path: Path, why: str) -> OutputError:
+    remedy = "Give a name that ends in .png, .svg or .pdf, in a folder that exists and may be written to."
+    return OutputError(f"{path}: the picture cannot be written: {why}. {remedy}")

@@ -1,0 +1,156 @@
+"""Every option of every command takes what it is for, and refuses the rest: one message, and status 2."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from ttscompile.cli import main
+from ttscompile.runtimes.executor import server
+
+NO_TEXT = os.fsdecode(b"\xff\xfe.html")
+UNKIND = (
+    "-1",
+    "0",
+    "1e-320",
+    "1e300",
+    "inf",
+    "-inf",
+    "nan",
+    "",
+    "9" * 300,
+    "l" * 300,
+    NO_TEXT,
+    "\x1b[31m",
+    "a\nb",
+    "0x1",
+)
+
+NEEDED = {
+    "bench": ("A", "--runs", "1"),
+    "calibrate": ("A", "--trajectories", "calls.npz", "--max-minutes", "0.001"),
+    "compare": ("A", "--trajectories", "calls.npz", "--strategies", "", "--calls", "1"),
+    "convert": ("policy.ckpt", "-o", "out"),
+    "doctor": ("A",),
+    "inspect": ("A",),
+    "realtime": ("A", "--control-hz", "1", "--runs", "1"),
+    "report": ("A", "-o", "out.html", "--runs", "1"),
+    "serve": ("A", "--control-hz", "1", "--port", "0", "--margin-ticks", "0"),
+    "verify": ("A", "--calls", "1"),
+}
+"""A command line of each command that can be run, and ends soon."""
+
+
+def parameters() -> Iterator[tuple[str, click.Parameter]]:
+    for name, command in main.commands.items():
+        for parameter in command.params:
+            if isinstance(parameter, click.Argument) or not (parameter.is_flag or parameter.is_eager):  # type: ignore[attr-defined]
+                yield name, parameter
+
+
+ALL = [pytest.param(name, one, id=f"{name} {one.opts[-1]}") for name, one in parameters()]
+
+
+@pytest.fixture(autouse=True)
+def there(toy_compiled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the command lines above name."""
+    shutil.copytree(toy_compiled, tmp_path / "A")  # which is calibrated here
+    (tmp_path / "policy.ckpt").touch()
+    obs = np.random.default_rng(0).standard_normal((8, 2), np.float32)
+    np.savez(tmp_path / "calls.npz", obs=obs, episode_ends=[4, 8])
+    monkeypatch.chdir(tmp_path)
+
+
+def with_word(command: str, parameter: click.Parameter, word: str) -> list[str]:
+    """The command line with this word for the parameter."""
+    words = list(NEEDED[command])
+    if isinstance(parameter, click.Argument):
+        return [command, *words[1:], "--", word]
+    name = max(parameter.opts, key=len)
+    for given in parameter.opts:
+        if given in words:
+            del words[words.index(given) : words.index(given) + 2]
+    return [command, *words, f"{name}={word}"]
+
+
+def judged(result: Result, words: list[str]) -> None:
+    told = f"{words}: {result.exit_code} {result.stderr!r:.2000} {result.exception!r}"
+    assert result.exit_code in (0, 1, 2), told
+    assert "Traceback" not in result.output and "defect" not in result.stderr, told
+    if result.exit_code == 2:
+        message = result.stderr.split("\n\n")[-1]
+        assert message.startswith(("Error: ", "error: ")) and 0 < message.count("\n") <= 3, told
+        assert len(message) < 1500, told
+
+
+@pytest.fixture
+def stops_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A server ends as soon as it listens."""
+    run = server.ExecutorServer.run
+
+    async def brief(self: Any, host: str, port: int, stop: Any, on_start: Any) -> None:
+        stop.set()
+        await run(self, host, port, stop, on_start)
+
+    monkeypatch.setattr(server.ExecutorServer, "run", brief)
+
+
+@pytest.mark.usefixtures("stops_at_once")
+@pytest.mark.parametrize(("command", "parameter"), ALL)
+def test_unkind_words_are_refused_or_taken(command: str, parameter: click.Parameter) -> None:
+    """What its type takes is a number, a name or a path; and with that the command itself ends as it should."""
+    for word in UNKIND:
+        words, taken = with_word(command, parameter, word), list[Any]()
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(main.commands[command], "callback", lambda taken=taken, **given: taken.append(given))
+            result = CliRunner().invoke(main, words)
+        judged(result, words)
+        assert (result.exit_code == 0) == bool(taken), words
+        for given in taken:
+            assert_of_use(given[parameter.name], words)
+            judged(CliRunner().invoke(main, words), words)
+
+
+def assert_of_use(value: object, words: list[str]) -> None:
+    """A finite number of moderate size, or text; a path that can be looked up."""
+    match value:
+        case tuple() | dict():
+            for one in value:
+                assert_of_use(one, words)
+        case float():
+            assert np.isfinite(value) and abs(value) < 1e31, words
+        case int():
+            assert abs(value) < 2**63, words
+        case str():
+            value.encode()
+        case Path():
+            assert value.name and len(value.name) < 256, words
+            str(value).encode()
+
+
+@pytest.mark.parametrize(
+    ("word", "url"),
+    [("0.0.0.0", "ws://0.0.0.0:"), ("127.1.2.3", "ws://127.1.2.3:"), ("::1", "ws://[::1]:"), ("localhost", "ws://")],
+)
+@pytest.mark.usefixtures("stops_at_once")
+def test_the_url_is_where_the_server_listens(word: str, url: str) -> None:
+    result = CliRunner().invoke(main, ["serve", *NEEDED["serve"], "--host", word])
+    assert result.exit_code == 0, result.stderr
+    assert json.loads(result.stdout.splitlines()[0])["url"].startswith(url)
+    assert ("may be reached from other machines" in result.stderr) == (word == "0.0.0.0")
+
+
+@pytest.mark.parametrize("word", ["", "l" * 300, NO_TEXT, "example.org", "0", "nan"])
+def test_a_host_that_is_no_address_is_refused(word: str) -> None:
+    result = CliRunner().invoke(main, ["serve", *NEEDED["serve"], f"--host={word}"])
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert "expected an IP address of this machine" in result.stderr
