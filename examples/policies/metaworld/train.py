@@ -23,8 +23,10 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-HORIZON, WINDOW, EXECUTED = 8, 2, 6
+HORIZON, WINDOW, EXECUTED = 8, 2, 4
 """T, To and Ta."""
+UNDISTURBED = 6
+"""Actions of an example that no push may fall into."""
 TOLD_EVERY = 100
 """Steps between lines of progress."""
 
@@ -56,7 +58,7 @@ def windows(pushed: npt.NDArray[Any], ends: npt.NDArray[np.int64]) -> npt.NDArra
     """Numbers of the frames of each training example.
 
     As the original cuts them, an episode's first and last frame are repeated. Examples are left out where a push falls
-    into the actions that would be executed.
+    into the first ``UNDISTURBED`` actions from the observation on.
 
     Args:
         pushed: ``[F]``, not zero at steps at which the hand was pushed.
@@ -67,11 +69,11 @@ def windows(pushed: npt.NDArray[Any], ends: npt.NDArray[np.int64]) -> npt.NDArra
     """
     rows = []
     for first, end in zip([0, *ends[:-1]], ends, strict=True):
-        starts = np.arange(first - (WINDOW - 1), end - HORIZON + EXECUTED)
+        starts = np.arange(first - (WINDOW - 1), end - HORIZON + UNDISTURBED)
         rows.append(np.clip(starts[:, None] + np.arange(HORIZON), first, end - 1))
     frames = np.concatenate(rows)
-    executed = frames[:, WINDOW - 1 : WINDOW - 1 + EXECUTED]
-    return np.asarray(frames[(pushed[executed] == 0).all(axis=1)])
+    undisturbed = frames[:, WINDOW - 1 : WINDOW - 1 + UNDISTURBED]
+    return np.asarray(frames[(pushed[undisturbed] == 0).all(axis=1)])
 
 
 def in_bfloat16(policy: Any) -> Any:
@@ -100,7 +102,7 @@ def save(workspace: Any, folder: Path) -> None:
 @click.argument("original", type=click.Path(exists=True, file_okay=False, path_type=Path))
 @click.option("--demonstrations", type=click.Path(exists=True, dir_okay=False, path_type=Path), required=True)
 @click.option("-o", "--output", type=click.Path(file_okay=False, path_type=Path), required=True)
-@click.option("--steps", default=9000, show_default=True, type=click.IntRange(1))
+@click.option("--steps", default=8000, show_default=True, type=click.IntRange(1))
 @click.option("--save-every", default=1000, show_default=True, type=click.IntRange(1), help="Steps.")
 @click.option("--seed", default=0, show_default=True)
 @click.option("--resume", is_flag=True, help="Go on from the last checkpoint in the folder.")
