@@ -62,6 +62,7 @@ def _pictures(environment: Environment, episode: Episode, label: str, size: int)
         if step % every == 0 or step == len(episode.actions):
             told = f"{label}\n{step / environment.hz:.1f} s   score {environment.score:.2f}"
             found.append(_picture(environment, told, size))
+    environment.close()
     return found
 
 

@@ -204,7 +204,7 @@ def drive(variant: Variant, setup: Setup, seed: int) -> Driven:
         clock.settle()
         while not world.environment.done:
             clock.advance(world.steps / setup.hz)
-            executor.observe(world.look())
+            executor.observe({key: world.look()[key] for key in policy.info.observation})
             clock.settle()
             try:
                 action = executor.action()

@@ -133,7 +133,7 @@ class World:
 
     def frame(self) -> dict[str, Any]:
         """What the policy observes now."""
-        return self._environment.observe()
+        return {"obs": self._environment.observe()["obs"]}
 
     def step(self, target: Any) -> None:
         """Let the world go on for one step; without an action the agent is told to stay where it is."""

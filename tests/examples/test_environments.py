@@ -3,14 +3,29 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
+import click
+import evaluate
 import numpy as np
 import pytest
+import record
+import torch
+from click.testing import CliRunner
 from environments import Environment, environment_class, environment_names
+from torch import nn
+
+import ttscompile
+from ttscompile import ChunkSpec, ObservationSpec, PolicySpec
+from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.write import update_calibration
+from ttscompile.core.lattice import uniform_plan
+from ttscompile.samplers.flow import flow_matching_table
 
 os.environ.setdefault("MUJOCO_GL", "egl")  # read when MuJoCo is imported; there is no display
 
@@ -27,12 +42,14 @@ def missing(name: str) -> str | None:
 
 
 @pytest.fixture(scope="module", params=environment_names())
-def environment(request: pytest.FixtureRequest) -> Environment:
+def environment(request: pytest.FixtureRequest) -> Iterator[Environment]:
     if (package := missing(request.param)) is not None:
         pytest.skip(
             f"NO TESTS OF {request.param.upper()}: {package} is not installed; pip install 'ttscompile[examples]'"
         )
-    return environment_class(request.param)()
+    made = environment_class(request.param)()
+    yield made
+    made.close()
 
 
 def played(environment: Environment, seed: int, steps: int = STEPS) -> list[np.ndarray]:
@@ -125,3 +142,69 @@ def test_a_mistake_in_an_environment_is_no_missing_package(monkeypatch: pytest.M
     monkeypatch.setattr("environments.import_module", fail)
     with pytest.raises(ModuleNotFoundError):
         environment_class("fetch")
+
+
+class Arm(nn.Module):
+    """A denoiser for Fetch, of random weights: window of states, goal and task as three conditions."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.embed, self.observe, self.head = nn.Linear(4, 8), nn.Linear(2 * 25 + 3 + 3, 8), nn.Linear(8, 4)
+        self.layers = nn.ModuleList(nn.Linear(8, 8) for _ in range(2))
+
+    def forward(
+        self, sample: torch.Tensor, timestep: torch.Tensor, state: torch.Tensor, goal: torch.Tensor, task: torch.Tensor
+    ) -> torch.Tensor:
+        condition = self.observe(torch.cat([state.flatten(1), goal, task], -1))[:, None] + timestep[:, None, None]
+        x = self.embed(sample)
+        for layer in self.layers:
+            x = x + torch.tanh(layer(x + condition))
+        return self.head(x)
+
+
+@pytest.mark.skipif(missing("fetch") is not None, reason="NO TESTS OF FETCH: gymnasium_robotics is not installed")
+def test_a_policy_of_several_tasks_is_recorded_calibrated_and_evaluated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec = PolicySpec(
+        sample=(8, 4),
+        observations={
+            "state": ObservationSpec((2, 25)),
+            "goal": ObservationSpec((3,), window=False),
+            "task": ObservationSpec((3,), window=False),
+        },
+        sampler=flow_matching_table(4),
+        chunk=ChunkSpec(4, 1, 6),
+    )
+    monkeypatch.chdir(tmp_path)
+    ttscompile.compile_denoiser(Arm().eval(), spec, "arm")
+
+    def run(script: click.Command, *words: str) -> str:
+        given = ["--episodes", "3", "--threads", "1", "--environment", "fetch"]
+        result = CliRunner().invoke(script, [*words, *given], catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+        return result.stdout
+
+    assert "calls in 3 episodes" in run(record.main, "arm", "-o", "calls.npz")
+    with np.load("calls.npz") as file:
+        rows = int(file["episode_ends"][-1])
+        assert {key: file[key].shape for key in spec.observations} == {
+            "state": (rows, 2, 25),
+            "goal": (rows, 3),
+            "task": (rows, 3),
+        }
+        assert file["task"].sum(0).min() > 0
+    schedule = uniform_plan(4, len(load_artifact("arm").manifest.blocks), 2)
+    update_calibration(Path("arm"), None, {"schedule": schedule}, "schedule", {"strategy": "interval"})
+    document = json.loads(run(evaluate.main, "arm:dense", "arm", "--json", "--first-seed", "0"))
+    assert document["environment"] == "fetch"
+    dense, sparse = document["variants"]
+    assert (dense["sparsity"], sparse["sparsity"]) == (0.0, 0.5)
+    assert list(dense["tasks"]) == ["pick-and-place", "push", "reach"]
+    assert [each["calls"] for each in dense["episodes"]] == [10] * 3
+    assert sparse["tasks"]["push"]["score_difference"] is not None
+    assert sorted(Path("build/fetch/episodes").glob("*/*.npz")), "they are kept by environment"
+    table = run(evaluate.main, "arm:dense", "arm", "--first-seed", "0", "--jobs", "2")
+    assert "Fetch, 3 episodes" in table
+    assert "success of each task" in table

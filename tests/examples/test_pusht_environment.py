@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from environments.pusht import KEYPOINTS, PushT, keypoints, observation, place
+from environments.pusht_pixels import SIZE, PushTPixels
 
 
 @pytest.fixture(scope="session")
@@ -143,3 +144,21 @@ def test_picture_shows_agent_block_and_target_where_they_are():
     np.testing.assert_allclose(block, [119, 136, 153], atol=40)  # light slate grey
     assert target[0] > target[1] + 100  # red
     assert nothing.min() > 240
+
+
+def test_pixels_are_what_gym_pusht_observes():
+    import gymnasium
+
+    environment = PushTPixels()
+    environment.reset(seed=4)
+    size = {"observation_width": SIZE, "observation_height": SIZE}
+    theirs = gymnasium.make("gym_pusht/PushT-v0", obs_type="pixels_agent_pos", disable_env_checker=True, **size)
+    theirs.reset(seed=4)
+    for _ in range(3):
+        environment.step(np.array([100.0, 200.0]))
+        seen = theirs.step(np.array([100.0, 200.0]))[0]
+    frame = environment.observe()
+    assert frame["observation.image"].shape == (3, 64, 64)
+    np.testing.assert_array_equal(np.round(frame["observation.image"] * 255), np.moveaxis(seen["pixels"], -1, 0))
+    np.testing.assert_allclose(frame["observation.state"], seen["agent_pos"], rtol=1e-6)
+    assert environment.title != PushT.title

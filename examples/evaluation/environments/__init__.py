@@ -67,6 +67,9 @@ class Environment(Protocol):
     def picture(self) -> npt.NDArray[np.uint8]:
         """The world now, for people: RGB ``[H, W, 3]``."""
 
+    def close(self) -> None:
+        """Free what drawing took; nothing is asked of it any more."""
+
 
 def environment_names() -> list[str]:
     """Of the files in this folder."""

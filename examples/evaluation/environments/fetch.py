@@ -53,7 +53,7 @@ class Fetch:
     def step(self, action: Array) -> None:
         """Move for 0.04 s."""
         self._seen, _, _, truncated, info = self._world.step(np.clip(action, -1, 1).astype(np.float32))
-        self.success = bool(info["is_success"])
+        self.success = self.success or bool(info["is_success"])
         covered = 1.0 if self.success else 1.0 - self._distance() / self._start
         self.score = max(self.score, covered)
         self.done = self.success or truncated
@@ -65,6 +65,11 @@ class Fetch:
     def picture(self) -> npt.NDArray[np.uint8]:
         """From the camera of the world; without a display set MUJOCO_GL=egl."""
         return np.asarray(self._world.render())
+
+    def close(self) -> None:
+        """Nothing more is asked."""
+        for world in self._worlds.values():
+            world.close()
 
     def _distance(self) -> float:
         return float(np.linalg.norm(self._seen["achieved_goal"] - self._seen["desired_goal"]))

@@ -148,8 +148,9 @@ class PushT:
         return {"best coverage": self.coverage}
 
     def observe(self) -> Frame:
-        """``obs``, float32 ``[20]``."""
-        return {"obs": observation(self.state)}
+        """``obs`` or ``observation.state``, as LeRobot calls it: float32 ``[20]``."""
+        seen = observation(self.state)
+        return {"obs": seen, "observation.state": seen}
 
     def step(self, action: Array) -> None:
         """Send the agent towards a position ``[2]``, pixels, for 0.1 s."""
@@ -164,6 +165,10 @@ class PushT:
     def picture(self) -> npt.NDArray[np.uint8]:
         """``[512, 512, 3]``; a red cross is where the agent was last sent."""
         return np.asarray(self._gym.render())
+
+    def close(self) -> None:
+        """Nothing more is asked."""
+        self._gym.close()
 
 
 ENVIRONMENT = PushT
