@@ -31,7 +31,7 @@ VISION = {
     "patch_size": 16,
     "hidden_size": 128,
     "intermediate_size": 512,
-    "num_hidden_layers": 4,
+    "num_hidden_layers": 3,
     "num_attention_heads": 4,
 }
 
@@ -39,7 +39,7 @@ VISION = {
 @click.command()
 @click.argument("drawn", type=click.Path(exists=True, dir_okay=False, path_type=Path))
 @click.option("-o", "--out", required=True, type=click.Path(file_okay=False, path_type=Path))
-@click.option("--steps", default=5000, show_default=True, type=click.IntRange(1))
+@click.option("--steps", default=3500, show_default=True, type=click.IntRange(1))
 @click.option("--batch", default=64, show_default=True, type=click.IntRange(1))
 @click.option("--rate", default=1e-3, show_default=True)
 @click.option("--seed", default=0, show_default=True)
