@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -126,12 +125,16 @@ class Policy:
         torch.manual_seed(seed)
         self.network = MultiTaskDiTPolicy(config)
         self.before, self.after = make_multi_task_dit_pre_post_processors(config, stats)
-        self.averaged = AveragedModel(self.network, avg_fn=_average)
+        self.average_from_here()
 
     @property
     def eyes(self) -> torch.nn.Module:
         """The image encoder."""
         return self.network.observation_encoder.vision_encoder
+
+    def average_from_here(self) -> None:
+        """Forget what was averaged."""
+        self.averaged = AveragedModel(self.network, avg_fn=_average)
 
     @torch.no_grad()
     def look(self, frames: torch.Tensor) -> torch.Tensor:
@@ -151,10 +154,11 @@ class Policy:
             self.eyes.requires_grad_(True)
             self.network.load_state_dict(self.averaged.module.state_dict())
 
-    def prepare(self, batch: dict[str, Any]) -> dict[str, torch.Tensor]:
-        """Raw observations and actions as the network wants them: tokenised and normalised, by lerobot's processor."""
-        done: dict[str, torch.Tensor] = self.before(batch)
-        return done
+    def prepare(self, batch: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """Raw observations and actions ``[N, ...]`` as the network wants them, with the task: lerobot's processor."""
+        count, done = len(batch["action"]), self.before({**batch, "task": [TASK]})
+        tensors = {name: value for name, value in done.items() if isinstance(value, torch.Tensor)}
+        return {name: value.expand(count, -1) if ".language." in name else value for name, value in tensors.items()}
 
     def train(
         self,
@@ -163,7 +167,6 @@ class Policy:
         rate: float,
         save: Callable[[], None],
         every: int = 500,
-        warmup: int = 300,
     ) -> None:
         """Minimise lerobot's loss with AdamW: a linear warm-up, then a cosine to zero.
 
@@ -173,16 +176,15 @@ class Policy:
             rate: learning rate at its highest.
             save: called every so many steps, and at the end.
             every: see ``save``.
-            warmup: steps.
         """
         others, vision = self.network.get_optim_params()
         groups = [{**others, "lr": rate}, {**vision, "lr": rate * self.network.config.vision_encoder_lr_multiplier}]
         optimizer = torch.optim.AdamW(groups, betas=(0.95, 0.999), weight_decay=1e-4)
         schedule = torch.optim.lr_scheduler.LambdaLR(
-            optimizer, lambda k: min((k + 1) / warmup, 0.5 + 0.5 * math.cos(math.pi * min(1.0, k / steps)))
+            optimizer, lambda k: min((k + 1) / (steps / 15), 0.5 + 0.5 * math.cos(math.pi * min(1.0, k / steps)))
         )
         self.network.train()
-        self.averaged = AveragedModel(self.network, avg_fn=_average)
+        self.average_from_here()
         begun, recent = time.monotonic(), 0.0
         for step in range(1, steps + 1):
             loss, _ = self.network.forward(next(batches))
@@ -221,12 +223,12 @@ class Policy:
 
 
 def draw(windows: dict[str, torch.Tensor], size: int, seed: int) -> Iterator[dict[str, torch.Tensor]]:
-    """Batches without end, every epoch in an order of its own; tensors of one row belong to all windows."""
+    """Batches without end, every epoch in an order of its own."""
     generator, count = np.random.default_rng(seed), len(windows["action"])
     while True:
         order = torch.from_numpy(generator.permutation(count))
         for chosen in order.split(size)[: count // size]:
-            yield {name: every[chosen] if len(every) > 1 else every.expand(size, -1) for name, every in windows.items()}
+            yield {name: every[chosen] for name, every in windows.items()}
 
 
 def _identity(frames: torch.Tensor) -> torch.Tensor:

@@ -17,11 +17,12 @@ import numpy as np
 import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.policies.multi_task_dit.configuration_multi_task_dit import MultiTaskDiTConfig
+from safetensors.torch import load_file
 
 sys.path[1:1] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[2] / "evaluation")]
 
 from environments.pusht import observation  # noqa: E402
-from multi_task_dit import ENCODER, TASK, TOKENS, Policy, draw, make_encoder, statistics, window_indices  # noqa: E402
+from multi_task_dit import ENCODER, TOKENS, Policy, draw, make_encoder, statistics, window_indices  # noqa: E402
 
 WINDOW, HORIZON, EXECUTED, STEPS = 2, 10, 8, 10
 
@@ -57,21 +58,24 @@ def configuration() -> MultiTaskDiTConfig:
 @click.option("--batch", default=64, show_default=True, type=click.IntRange(1))
 @click.option("--rate", default=6e-4, show_default=True)
 @click.option("--seed", default=0, show_default=True)
-def main(demonstrations: Path, out: Path, steps: int, batch: int, rate: float, seed: int) -> None:
+@click.option("--start", type=click.Path(exists=True, file_okay=False, path_type=Path), help="A policy to go on from.")
+def main(demonstrations: Path, out: Path, steps: int, batch: int, rate: float, seed: int, start: Path | None) -> None:
     """Train, and keep the averaged policy in --out as it goes."""
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     out = out.resolve()
     out.mkdir(parents=True, exist_ok=True)
     make_encoder(out / ENCODER, {"hidden_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2}, seed)
+    start = None if start is None else start.resolve()
     os.chdir(out)  # lerobot finds the encoder by its name
     with np.load(demonstrations) as data:
         observed, acted = observation(data["state"]), data["action"].astype(np.float32)
         before, after = window_indices(data["episode_ends"], WINDOW, HORIZON, EXECUTED)
     policy = Policy(configuration(), {"observation.state": statistics(observed), "action": statistics(acted)}, seed)
+    if start is not None:
+        policy.network.load_state_dict(load_file(start / "model.safetensors"))
     raw = {"observation.state": torch.from_numpy(observed[before]), "action": torch.from_numpy(acted[after])}
-    prepared = policy.prepare({**raw, "task": [TASK]})
-    windows = {name: value for name, value in prepared.items() if isinstance(value, torch.Tensor)}
+    windows = policy.prepare(raw)
     policy.train(draw(windows, batch, seed), steps, rate, lambda: policy.save(out / "policy", out / ENCODER))
 
 
