@@ -21,7 +21,7 @@ TASK = "push the T onto its place"
 WORLD = 512.0
 
 
-@pytest.mark.parametrize("name", ["flow"])
+@pytest.mark.parametrize("name", ["flow", "pixels"])
 def test_dense_compiled_is_what_lerobot_answered(name: str, once: Once) -> None:
     def convert(directory: Path) -> Program:
         return ttscompile.convert(POLICIES / name / "policy", directory, task=TASK)
