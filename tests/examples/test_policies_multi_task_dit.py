@@ -1,0 +1,64 @@
+"""The policies that lerobot trained: their compiled form gives what lerobot itself gave, and what was drawn for them."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from environments.pusht import observation
+from environments.pusht_lerobot import PushTLeRobot
+from environments.pusht_pixels import PushTPixels
+
+import ttscompile
+from ttscompile.ir.program import Program
+
+from tests.once import Once
+from tests.rounding import PROMISED
+
+POLICIES = Path(__file__).parents[2] / "examples" / "policies"
+TASK = "push the T onto its place"
+WORLD = 512.0
+
+
+@pytest.mark.parametrize("name", ["flow", "pixels"])
+def test_dense_compiled_is_what_lerobot_answered(name: str, once: Once) -> None:
+    def convert(directory: Path) -> Program:
+        return ttscompile.convert(POLICIES / name / "policy", directory, task=TASK)
+
+    policy = ttscompile.load(once.compiled(f"policies-{name}", convert)[0])
+    with np.load(POLICIES / name / "answers.npz", allow_pickle=False) as file:
+        answers = {key: file[key] for key in file.files}
+    windows = {key: answers[key] for key in policy.info.observation}
+    noise = ttscompile.Noise(answers["noise"], None)
+    found = policy.predict_action(windows, noise=noise, plan="dense")["action"]
+    assert found.shape == answers["action"].shape
+    assert answers["action"].std(axis=0).min() > 1, "other windows, other actions"
+    np.testing.assert_allclose(found, answers["action"], rtol=0, atol=PROMISED * WORLD)
+
+
+def test_keypoints_under_lerobots_name() -> None:
+    environment = PushTLeRobot()
+    environment.reset(seed=5)
+    frame = environment.observe()
+    assert list(frame) == ["observation.state"]
+    np.testing.assert_array_equal(frame["observation.state"], observation(environment.state))
+
+
+def test_pictures_of_demonstrations_are_what_the_environment_shows(tmp_path: Path) -> None:
+    environment, states, seen = PushTPixels(), [], []
+    for seed in range(3):
+        environment.reset(seed)
+        states.append(environment.state)
+        seen.append(environment.observe()["observation.image"])
+    np.savez(tmp_path / "demonstrations.npz", state=np.array(states, np.float32))
+    script, out = POLICIES / "pixels" / "pictures.py", tmp_path / "pictures.npz"
+    command = [sys.executable, str(script), str(tmp_path / "demonstrations.npz"), "-o", str(out), "--drawn", "5"]
+    subprocess.run(command, check=True, timeout=120)
+    with np.load(out, allow_pickle=False) as file:
+        assert file["drawn"].shape == (5, 64, 64, 3)
+        assert len({picture.tobytes() for picture in file["drawn"]}) == 5
+        assert file["states"].shape == (5, 5)
+        drawn = np.moveaxis(file["demonstrated"], -1, 1).astype(np.float32) / 255
+    differing = (np.abs(drawn - np.stack(seen)) > 0).any(axis=1).mean()
+    assert differing < 0.001, "a state in float32 draws the same picture, but for a rounded corner"
