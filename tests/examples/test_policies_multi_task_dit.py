@@ -1,4 +1,4 @@
-"""The policies that lerobot trained: their compiled form gives what lerobot itself gave, and what was drawn for them."""
+"""The policies that lerobot trained: compiled, they give what lerobot itself gave; and what was drawn for them."""
 
 import subprocess
 import sys
@@ -11,10 +11,9 @@ from environments.pusht_lerobot import PushTLeRobot
 from environments.pusht_pixels import PushTPixels
 
 import ttscompile
-from ttscompile.ir.program import Program
-
 from tests.once import Once
 from tests.rounding import PROMISED
+from ttscompile.ir.program import Program
 
 POLICIES = Path(__file__).parents[2] / "examples" / "policies"
 TASK = "push the T onto its place"
