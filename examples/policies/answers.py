@@ -1,6 +1,6 @@
 """What lerobot itself answers with a saved policy, for the tests: its observations, its noise, its executed actions.
 
-    python examples/policies/answers.py flow/policy build/policies/flow --environment pusht-lerobot -o flow/answers.npz
+    python examples/policies/answers.py flow/policy build/policies/flow -o flow/answers.npz
 
 lerobot is run from the folder that has the whole encoder (``train.py``'s ``--out``): the saved policy has only its
 configuration.

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from environments.pusht import observation
-from environments.pusht_lerobot import PushTLeRobot
+from environments.pusht import PushT, observation
 from environments.pusht_pixels import PushTPixels
 
 import ttscompile
@@ -37,11 +36,9 @@ def test_dense_compiled_is_what_lerobot_answered(name: str, once: Once) -> None:
 
 
 def test_keypoints_under_lerobots_name() -> None:
-    environment = PushTLeRobot()
+    environment = PushT()
     environment.reset(seed=5)
-    frame = environment.observe()
-    assert list(frame) == ["observation.state"]
-    np.testing.assert_array_equal(frame["observation.state"], observation(environment.state))
+    np.testing.assert_array_equal(environment.observe()["observation.state"], observation(environment.state))
 
 
 def test_pictures_of_demonstrations_are_what_the_environment_shows(tmp_path: Path) -> None:
