@@ -6,7 +6,6 @@ import threading
 import weakref
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ import numpy.typing as npt
 
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import DENSE
-from ttscompile.core.spec import FP32, ChunkSpec, FloatArray, Noise, ObservationSpec
+from ttscompile.core.spec import FP32, FloatArray, Noise
 from ttscompile.errors import (
     ArtifactChangedError,
     IllegalPlanError,
@@ -26,8 +25,9 @@ from ttscompile.errors import (
 from ttscompile.measure.process import Process
 
 from .arrays import Array, check_observation, check_seed, like, read_observation
+from .info import BlockInfo, PolicyInfo
 from .inpainting import check_prefix, prefix_refusal
-from .liveness import RolloutNeeds, rollout_needs
+from .liveness import rollout_needs
 from .open import kind_of, open_runtime
 from .queues import Queues, is_window
 from .report import CallReport
@@ -37,54 +37,6 @@ LONGEST_WAIT = 10.0
 """Seconds that the end of the interpreter waits for a call under way."""
 TRIES = 3
 """Times that ``load`` begins before it gives up on an artifact that is replaced while it is loaded."""
-
-
-@dataclass(frozen=True)
-class BlockInfo:
-    """One residual block: its kind, the shape of one stream's residual, and FLOPs of one evaluation."""
-
-    kind: str
-    shape: tuple[int, ...]
-    flops: int
-
-
-@dataclass(frozen=True)
-class PolicyInfo:
-    """What a compiled policy is.
-
-    Attributes:
-        K: number of denoising steps.
-        blocks: block table, in order of execution.
-        dense_flops: of one call of the policy as it was before it was compiled, one stream.
-        observation: specification of each key of the observation.
-        action: which part of the denoised sample is action, and which of it is executed.
-        sample: ``(T, D)``, the shape of one stream's noise and of what is predicted.
-        original_sample: the same of the original, which may predict more steps; noise of this shape fits as well.
-        stochastic: whether the sampler draws noise in its steps, so that ``Noise.steps`` is needed.
-        identity: sha256 of what the artifact computes.
-        model_identity: the same without plans, corrections and pruner: what calibration leaves as it is.
-        plans: names that ``predict_action(plan=...)`` takes.
-        default_plan: the one that is taken when none is given.
-        precision: of the weights of residual blocks, ``fp32`` or ``int8``.
-        rollout: what keeping the rollout cache of one stream takes.
-        prefix_refusal: why ``predict_action`` takes no ``prefix``; None if it does.
-    """
-
-    K: int
-    blocks: tuple[BlockInfo, ...]
-    dense_flops: int
-    observation: Mapping[str, ObservationSpec]
-    action: ChunkSpec
-    sample: tuple[int, int]
-    original_sample: tuple[int, int]
-    stochastic: bool
-    identity: str
-    model_identity: str
-    plans: tuple[str, ...]
-    default_plan: str
-    precision: str
-    rollout: RolloutNeeds
-    prefix_refusal: str | None
 
 
 def load(

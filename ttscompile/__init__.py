@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from .runtimes.executor import AsyncExecutor as AsyncExecutor
     from .runtimes.executor import ExecutorSettings as ExecutorSettings
     from .runtimes.executor import GuardLimits as GuardLimits
+    from .runtimes.info import PolicyInfo as PolicyInfo
     from .runtimes.policy import CompiledPolicy as CompiledPolicy
-    from .runtimes.policy import PolicyInfo as PolicyInfo
     from .runtimes.policy import load as load
     from .runtimes.report import CallReport as CallReport
     from .samplers.edm import EDMDenoiser as EDMDenoiser
@@ -48,7 +48,8 @@ _HOMES = {
         "errors": ("TtscompileError",),
         "runtimes.report": ("CallReport",),
         "runtimes.executor": ("AsyncExecutor", "ExecutorSettings", "GuardLimits"),
-        "runtimes.policy": ("CompiledPolicy", "PolicyInfo", "load"),
+        "runtimes.info": ("PolicyInfo",),
+        "runtimes.policy": ("CompiledPolicy", "load"),
         "samplers.edm": ("EDMDenoiser", "edm_table"),
         "samplers.flow": ("flow_matching_table",),
         "verification": ("Verification", "verify"),

@@ -14,7 +14,7 @@ import numpy.typing as npt
 import ttscompile
 from ttscompile.cli.output import results_console as results_console
 from ttscompile.cli.output import run as run
-from ttscompile.runtimes.policy import PolicyInfo
+from ttscompile.runtimes.info import PolicyInfo
 
 Plan: TypeAlias = str | npt.NDArray[np.int8]
 """``dense``, the name of a plan in the artifact, or a matrix ``[K, blocks]``."""

@@ -32,7 +32,7 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.cli.output import print_identity
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.timer import Timer, Times
-from ttscompile.runtimes.policy import PolicyInfo
+from ttscompile.runtimes.info import PolicyInfo
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "evaluation"))
 from environments.pusht import FloatArray, PushT

@@ -33,7 +33,7 @@ from ttscompile import AsyncExecutor, ExecutorSettings
 from ttscompile.cli.output import identity_of, print_identity
 from ttscompile.errors import DeadlineMissedError
 from ttscompile.measure.machine import fingerprint, one_line
-from ttscompile.runtimes.policy import PolicyInfo
+from ttscompile.runtimes.info import PolicyInfo
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "evaluation"))
 from environments.pusht import PushT

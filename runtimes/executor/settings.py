@@ -16,7 +16,7 @@ from .window import FrameSpec
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from ttscompile.runtimes.policy import PolicyInfo
+    from ttscompile.runtimes.info import PolicyInfo
 
 INTERPOLATIONS = ("hold", "linear")
 SEAMS = ("replace", "blend", "prefix")

@@ -54,7 +54,8 @@ class ContextValues:
         if piece.outputs:
             feed = {name: np.ascontiguousarray(obs[name]) for name in piece.inputs}
             for name, value in run_named(self._sessions[CONDITION], piece.outputs, feed).items():
-                np.copyto(self.values[name], value)
+                if name in self.values:  # a network that ignores the condition has values that nobody reads
+                    np.copyto(self.values[name], value)
         if STEP in self._manifest.pieces:
             self._run_step(self._manifest.pieces[STEP])
 

@@ -108,7 +108,7 @@ def test_changed_and_missing_files_are_found(int8: Path, name: str) -> None:
     with pytest.raises(ArtifactError, match=f"{name}: expected sha256"):
         load_artifact(int8)
     (int8 / name).unlink()
-    with pytest.raises(ArtifactError, match=f"{name}: the file is missing"):
+    with pytest.raises(ArtifactError, match=f"{name}: cannot be read: the file is missing"):
         load_artifact(int8)
 
 

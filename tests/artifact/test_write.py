@@ -16,6 +16,7 @@ from tests.artifact.folders import contents
 from tests.artifact.tiny import STEPS, tiny_models, tiny_program
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.write import write_artifact
+from ttscompile.core.correction import condition_flops
 from ttscompile.errors import ArtifactError
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Graph, Node
@@ -38,7 +39,9 @@ def test_round_trip(written: Path) -> None:
     assert manifest.plans == {}
     assert manifest.flops.dense == 123_456
     assert manifest.flops.blocks == (2 * 4 * 16 * 16,) * 2
-    assert manifest.flops.prologue == 2 * 2 * 16 + STEPS * 2 * 16 * 16
+    read = condition_flops(STEPS, manifest.spec.sample, manifest.condition_numbers)
+    assert manifest.condition_numbers > 0
+    assert manifest.flops.prologue == 2 * 2 * 16 + STEPS * 2 * 16 * 16 + read
     assert {name: c.binding for name, c in manifest.contexts.items()} == pieces.bindings
     assert artifact.schedule("dense").tolist() == [[0, 0]] * 3
     for name, table in pieces.tables.items():

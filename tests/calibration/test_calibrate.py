@@ -168,7 +168,7 @@ def test_a_state_of_other_settings_is_refused(artifact: Path, recording: Path, c
 
 def test_resuming_with_more_time_goes_on_with_the_same_calls(artifact: Path, recording: Path) -> None:
     with killed():
-        quick(artifact, recording, strategy="interval", max_minutes=1)
+        quick(artifact, recording, strategy="interval", max_minutes=0.1)
     result = quick(artifact, recording, strategy="interval", max_minutes=2, resume=True)
     assert result.calls["calibration"] == 64
 

@@ -275,7 +275,7 @@ def test_the_guard_refuses_and_the_loop_goes_on_with_what_it_has() -> None:
     [
         ({"policy_hz": -1}, "policy_hz must be positive"),
         ({"max_age": inf}, "max_age must be positive and finite"),
-        ({"max_hold": -1}, "max_hold must not be negative"),
+        ({"max_hold": -1}, "max_hold must be an integer of at least 0"),
         ({"rate_tolerance": 0.5}, "rate_tolerance must be between"),
         ({"seam": "glue"}, "seam must be one of"),
         ({"interpolation": "cubic"}, "interpolation must be one of"),

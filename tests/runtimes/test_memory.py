@@ -183,7 +183,7 @@ def test_calibration_runs_the_same_loop_and_its_corrections_help(made: Made) -> 
     calls = replace(calls, path=executor.run_dense(calls))
     plan = np.full((executor.model.steps, executor.model.blocks), T, np.int8)
     plan[[0, 3]] = C
-    corrected = executor.corrected(fit_correction(executor, plan, calls))
+    corrected = executor.corrected(fit_correction(executor, plan, calls, True))
     for each in (executor, corrected):
         with torch.no_grad(), Counted() as counted:
             expected = executor.model.denoise(contexts, initial, steps, plan, correction=each.correction)

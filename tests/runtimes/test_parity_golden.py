@@ -16,7 +16,8 @@ from ttscompile.artifact import load_artifact
 from ttscompile.core.lattice import Source
 from ttscompile.ir.program import Program
 from ttscompile.runtimes import open_runtime
-from ttscompile.runtimes.policy import CompiledPolicy, PolicyInfo
+from ttscompile.runtimes.info import PolicyInfo
+from ttscompile.runtimes.policy import CompiledPolicy
 
 from ..families.support import record
 from ..golden import compiled_golden

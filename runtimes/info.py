@@ -1,0 +1,58 @@
+"""What a compiled policy is, for whoever calls it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from ttscompile.core.spec import ChunkSpec, ObservationSpec
+
+from .liveness import RolloutNeeds
+
+
+@dataclass(frozen=True)
+class BlockInfo:
+    """One residual block: its kind, the shape of one stream's residual, and FLOPs of one evaluation."""
+
+    kind: str
+    shape: tuple[int, ...]
+    flops: int
+
+
+@dataclass(frozen=True)
+class PolicyInfo:
+    """What a compiled policy is.
+
+    Attributes:
+        K: number of denoising steps.
+        blocks: block table, in order of execution.
+        dense_flops: of one call of the policy as it was before it was compiled, one stream.
+        observation: specification of each key of the observation.
+        action: which part of the denoised sample is action, and which of it is executed.
+        sample: ``(T, D)``, the shape of one stream's noise and of what is predicted.
+        original_sample: the same of the original, which may predict more steps; noise of this shape fits as well.
+        stochastic: whether the sampler draws noise in its steps, so that ``Noise.steps`` is needed.
+        identity: sha256 of what the artifact computes.
+        model_identity: the same without plans, corrections and pruner: what calibration leaves as it is.
+        plans: names that ``predict_action(plan=...)`` takes.
+        default_plan: the one that is taken when none is given.
+        precision: of the weights of residual blocks, ``fp32`` or ``int8``.
+        rollout: what keeping the rollout cache of one stream takes.
+        prefix_refusal: why ``predict_action`` takes no ``prefix``; None if it does.
+    """
+
+    K: int
+    blocks: tuple[BlockInfo, ...]
+    dense_flops: int
+    observation: Mapping[str, ObservationSpec]
+    action: ChunkSpec
+    sample: tuple[int, int]
+    original_sample: tuple[int, int]
+    stochastic: bool
+    identity: str
+    model_identity: str
+    plans: tuple[str, ...]
+    default_plan: str
+    precision: str
+    rollout: RolloutNeeds
+    prefix_refusal: str | None
