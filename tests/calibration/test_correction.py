@@ -83,16 +83,18 @@ def test_the_same_calls_give_the_same_bytes(make_task: MakeTask, plan: PlanArray
 
 
 def test_it_reads_the_observation_where_that_helps_on_other_episodes(make_task: MakeTask, plan: PlanArray) -> None:
-    task, held_out = make_task(calls=400, episodes=range(4)), make_task(calls=60, episodes=range(4, 6)).calls
-    blind, reading = fitted(task, plan, reads=False), fitted(task, plan)
-    assert task.whole.reads == (reading.error(plan, held_out) < blind.error(plan, held_out))
-    correction = task.whole.correction(range(0, task.executor.model.steps, 3))
+    task = make_task(calls=400, episodes=range(4))
+    held_out = make_task(calls=60, episodes=range(4, 6)).calls
+    two = task.whole.plan([0, task.executor.model.steps // 2])
+    blind, reading = fitted(task, two, reads=False), fitted(task, two)
+    assert task.whole.reads(2) == (reading.error(two, held_out) < blind.error(two, held_out))
+    correction = task.whole.correction([0, task.executor.model.steps - 2])
     assert correction is not None
-    assert (correction.reads > 0) == task.whole.reads
+    assert (correction.reads > 0) == task.whole.reads(2)
 
 
 def test_calls_of_one_episode_do_not_tell_whether_reading_helps(make_task: MakeTask) -> None:
-    assert make_task(calls=60, episodes=range(1)).whole.reads is False
+    assert make_task(calls=60, episodes=range(1)).whole.reads(2) is False
 
 
 def test_schedules_are_compared_on_other_episodes_than_they_were_fitted_on() -> None:

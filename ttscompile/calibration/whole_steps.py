@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -49,6 +48,7 @@ class WholeSteps:
 
     def __init__(self, executor: Executor, actions: Actions, calls: Calls, seed: int) -> None:
         self._executor, self._actions, self._calls = executor, actions, calls
+        self._reading: dict[int, bool] = {}
         order = np.random.default_rng((seed, 3, 0)).permutation(calls.count)
         held_out = _held_out(calls.episodes[order])
         self._compared = self._fitted = executor.select(calls, order[held_out][:COMPARED])
@@ -76,20 +76,26 @@ class WholeSteps:
         corrected, plain = self._with_and_without(steps)
         if plain.normalised <= corrected.normalised:
             return None
-        return fit_correction(self._executor, self.plan(steps), self._calls, self.reads)
+        return fit_correction(self._executor, self.plan(steps), self._calls, self.reads(len(steps)))
 
-    @cached_property
-    def reads(self) -> bool:
-        """Whether corrections read the observation: if that is better on episodes that they were not fitted on.
+    def reads(self, count: int) -> bool:
+        """Whether corrections of schedules of so many steps read the observation.
 
-        Decided once, on a schedule whose steps halve what is left of the loop: 0, 50, 75, 88, 94, 97 of 100.
+        They do if that is better on episodes that they were not fitted on. Decided once, on a schedule whose steps
+        halve what is left of the loop, as many of 0, 50, 75, 88, 94, 97 of 100 as there are: the fewer steps are
+        computed, the more is left for the observation to tell.
         """
-        if len(np.unique(self._fitted.episodes)) < 2:
-            return False
-        steps = sorted({0, *(self.steps - (self.steps >> i) for i in range(1, 6) if self.steps >> i > 1)})
-        fitted = (fit_correction(self._executor, self.plan(steps), self._fitted, reads) for reads in (False, True))
-        without, reading = (self._errors(steps, correction).normalised for correction in fitted)
-        return reading < without
+        if count not in self._reading:
+            halving = (self.steps - (self.steps >> i) for i in range(1, 6) if self.steps >> i > 1)
+            plan = self.plan([0, *halving][: max(count, 1)])
+            self._reading[count] = len(np.unique(self._fitted.episodes)) > 1 and (
+                self._error_of(plan, reads=True) < self._error_of(plan, reads=False)
+            )
+        return self._reading[count]
+
+    def _error_of(self, plan: PlanArray, reads: bool) -> float:
+        fitted = fit_correction(self._executor, plan, self._fitted, reads)
+        return self._errors(plan, fitted).normalised
 
     def comparing(self, full_steps: int) -> float:
         """Seconds that ``errors`` of a schedule takes, by those so far; 0 before any."""
@@ -101,15 +107,16 @@ class WholeSteps:
         return (1 + share) * self.comparing(full_steps)
 
     def _with_and_without(self, steps: Sequence[int]) -> tuple[Errors, Errors]:
+        plan, reads = self.plan(steps), self.reads(len(steps))
         begun = time.monotonic()
-        fitted = fit_correction(self._executor, self.plan(steps), self._fitted, self.reads)
-        errors = self._errors(steps, fitted), self._errors(steps, None)
+        fitted = fit_correction(self._executor, plan, self._fitted, reads)
+        errors = self._errors(plan, fitted), self._errors(plan, None)
         self._pace = max(self._pace, (time.monotonic() - begun) / len(steps))
         return errors
 
-    def _errors(self, steps: Sequence[int], correction: Correction | None) -> Errors:
+    def _errors(self, plan: PlanArray, correction: Correction | None) -> Errors:
         calls = self._compared
-        samples = self._executor.corrected(correction).run(self.plan(steps), calls)
+        samples = self._executor.corrected(correction).run(plan, calls)
         normalised, units = (self._actions.errors(samples, calls.targets, units=u).mean() for u in (False, True))
         return Errors(float(normalised), float(units))
 
