@@ -85,10 +85,13 @@ def test_the_same_calls_give_the_same_bytes(make_task: MakeTask, plan: PlanArray
 def test_it_reads_the_observation_where_that_helps_on_other_episodes(make_task: MakeTask, plan: PlanArray) -> None:
     task = make_task(calls=400, episodes=range(4))
     held_out = make_task(calls=60, episodes=range(4, 6)).calls
-    two = task.whole.plan([0, task.executor.model.steps // 2])
-    blind, reading = fitted(task, two, reads=False), fitted(task, two)
-    assert task.whole.reads(2) == (reading.error(two, held_out) < blind.error(two, held_out))
-    correction = task.whole.correction([0, task.executor.model.steps - 2])
+    steps = task.executor.model.steps
+    early, late = (task.whole.plan([0, k]) for k in (steps // 2, steps - 2))
+    blind, reading = (
+        min(fitted(task, two, reads).error(two, held_out) for two in (early, late)) for reads in (False, True)
+    )
+    assert task.whole.reads(2) == (reading < blind)
+    correction = task.whole.correction([0, steps - 2])
     assert correction is not None
     assert (correction.reads > 0) == task.whole.reads(2)
 
