@@ -161,7 +161,7 @@ def test_arrays_may_be_packed(url: str) -> None:
             "ObservationError",
             r"must be float64 [2]; found float64 [3]",
         ),
-        ('{"method": "observe", "obs": {"camera": [1]}}', "ObservationError", "the keys ['obs']"),
+        ('{"method": "observe", "obs": {"camera": [1]}}', "ObservationError", "keys ['obs']"),
         (
             '{"method": "observe", "obs": {"obs": [1, 2]}, "t": 1e12}',
             "ObservationError",
@@ -329,15 +329,15 @@ def test_limits_are_checked_and_a_port_that_is_taken_is_told() -> None:
 @pytest.mark.parametrize(
     ("host", "port", "why"),
     [
-        ("", 0, "host is empty"),
-        ("a" * 300, 0, "on a+:0: .*label"),
-        ("\udcff", 0, r"on \\udcff:0: "),
-        ("127.0.0.1", 2**40, "on 127.0.0.1:10995"),
+        ("", 0, "cannot listen: host is empty"),
+        ("a" * 300, 0, "cannot listen on a+:0: .*label"),
+        ("\udcff", 0, r"cannot listen on \\udcff:0: "),
+        ("127.0.0.1", 2**40, "port must be an integer of at least 0 and at most 65535"),
     ],
 )
 def test_what_is_no_address_is_an_error(host: str, port: int, why: str) -> None:
     executor = AsyncExecutor(Quick(FakeClock()), 20, latencies={"dense": 0.01})
-    with executor, pytest.raises(ExecutorError, match=f"cannot listen.*{why}"):
+    with executor, pytest.raises(ExecutorError, match=why):
         asyncio.run(ExecutorServer(executor).run(host, port, asyncio.Event()))
 
 
