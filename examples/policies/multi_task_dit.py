@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.policies.multi_task_dit.configuration_multi_task_dit import MultiTaskDiTConfig
 from lerobot.policies.multi_task_dit.modeling_multi_task_dit import MultiTaskDiTPolicy
 from lerobot.policies.multi_task_dit.processor_multi_task_dit import make_multi_task_dit_pre_post_processors
@@ -29,6 +30,35 @@ TOKENS = 8
 """Length of the tokenised instruction; its words are single tokens."""
 
 ENCODER = "clip-tiny"
+
+WINDOW, HORIZON, EXECUTED, STEPS = 2, 10, 8, 10
+"""Frames that are observed, actions that are predicted and executed, integration steps."""
+
+STATE = "observation.state"
+
+
+def configuration(inputs: dict[str, PolicyFeature]) -> MultiTaskDiTConfig:
+    """4 layers of width 128, and Euler's method, for a policy of two actions that observes these features."""
+    return MultiTaskDiTConfig(
+        input_features=inputs,
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (2,))},
+        device="cpu",
+        push_to_hub=False,
+        n_obs_steps=WINDOW,
+        horizon=HORIZON,
+        n_action_steps=EXECUTED,
+        objective="flow_matching",
+        num_integration_steps=STEPS,
+        hidden_dim=128,
+        num_layers=4,
+        num_heads=4,
+        dropout=0.0,
+        timestep_embed_dim=64,
+        vision_encoder_name=ENCODER,
+        text_encoder_name=ENCODER,
+        image_crop_shape=None,
+        tokenizer_max_length=TOKENS,
+    )
 
 
 def make_encoder(folder: Path, vision: Mapping[str, int], seed: int) -> None:

@@ -64,28 +64,17 @@ def test_processes_fill_the_cache_with_the_episodes_of_one(compiled_pusht, tmp_p
     plan = uniform_plan(manifest.steps, len(manifest.blocks), 1)
     update_calibration(artifact, None, {"one": plan}, "one", {"strategy": "interval"})
     text, told = f"{artifact}:one", []
-    fill_cache(
-        "pusht",
-        [text],
-        [7, 8],
-        1,
-        "onnxruntime",
-        tmp_path / "cache",
-        2,
-        lambda label, count: told.append((label, count)),
-    )
+
+    def fill():
+        cache = tmp_path / "cache"
+        fill_cache(
+            "pusht", [text], [7, 8], 1, "onnxruntime", cache, 2, lambda label, count: told.append((label, count))
+        )
+
+    fill()
     assert told == [(text, 0), (text, 1), (text, 2)]
     cache = Episodes(tmp_path / "cache", "pusht", open_variant(text, "onnxruntime", 1), "onnxruntime")
     assert [cache.read(seed).seed for seed in (7, 8)] == [7, 8]
     told.clear()
-    fill_cache(
-        "pusht",
-        [text],
-        [7, 8],
-        1,
-        "onnxruntime",
-        tmp_path / "cache",
-        2,
-        lambda label, count: told.append((label, count)),
-    )
+    fill()
     assert told == [(text, 2)]

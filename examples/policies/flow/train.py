@@ -16,39 +16,24 @@ import click
 import numpy as np
 import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
-from lerobot.policies.multi_task_dit.configuration_multi_task_dit import MultiTaskDiTConfig
 from safetensors.torch import load_file
 
 sys.path[1:1] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[2] / "evaluation")]
 
 from environments.pusht import observation  # noqa: E402
-from multi_task_dit import ENCODER, TOKENS, Policy, draw, make_encoder, statistics, window_indices  # noqa: E402
-
-WINDOW, HORIZON, EXECUTED, STEPS = 2, 10, 8, 10
-
-
-def configuration() -> MultiTaskDiTConfig:
-    """4 layers of width 128; ten steps of Euler's method."""
-    return MultiTaskDiTConfig(
-        input_features={"observation.state": PolicyFeature(FeatureType.STATE, (20,))},
-        output_features={"action": PolicyFeature(FeatureType.ACTION, (2,))},
-        device="cpu",
-        push_to_hub=False,
-        n_obs_steps=WINDOW,
-        horizon=HORIZON,
-        n_action_steps=EXECUTED,
-        objective="flow_matching",
-        num_integration_steps=STEPS,
-        hidden_dim=128,
-        num_layers=4,
-        num_heads=4,
-        dropout=0.0,
-        timestep_embed_dim=64,
-        vision_encoder_name=ENCODER,
-        text_encoder_name=ENCODER,
-        image_crop_shape=None,
-        tokenizer_max_length=TOKENS,
-    )
+from multi_task_dit import (  # noqa: E402
+    ENCODER,
+    EXECUTED,
+    HORIZON,
+    STATE,
+    WINDOW,
+    Policy,
+    configuration,
+    draw,
+    make_encoder,
+    statistics,
+    window_indices,
+)
 
 
 @click.command()
@@ -71,10 +56,11 @@ def main(demonstrations: Path, out: Path, steps: int, batch: int, rate: float, s
     with np.load(demonstrations) as data:
         observed, acted = observation(data["state"]), data["action"].astype(np.float32)
         before, after = window_indices(data["episode_ends"], WINDOW, HORIZON, EXECUTED)
-    policy = Policy(configuration(), {"observation.state": statistics(observed), "action": statistics(acted)}, seed)
+    feature = PolicyFeature(FeatureType.STATE, (20,))
+    policy = Policy(configuration({STATE: feature}), {STATE: statistics(observed), "action": statistics(acted)}, seed)
     if start is not None:
         policy.network.load_state_dict(load_file(start / "model.safetensors"))
-    raw = {"observation.state": torch.from_numpy(observed[before]), "action": torch.from_numpy(acted[after])}
+    raw = {STATE: torch.from_numpy(observed[before]), "action": torch.from_numpy(acted[after])}
     windows = policy.prepare(raw)
     policy.train(draw(windows, batch, seed), steps, rate, lambda: policy.save(out / "policy", out / ENCODER))
 

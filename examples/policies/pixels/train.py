@@ -20,7 +20,6 @@ import click
 import numpy as np
 import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
-from lerobot.policies.multi_task_dit.configuration_multi_task_dit import MultiTaskDiTConfig
 from safetensors.torch import load_file
 from torch.nn import functional
 
@@ -29,43 +28,19 @@ sys.path[1:1] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[2] /
 from environments.pusht import observation  # noqa: E402
 from multi_task_dit import (  # noqa: E402
     ENCODER,
-    TOKENS,
+    EXECUTED,
+    HORIZON,
+    STATE,
+    WINDOW,
     Policy,
+    configuration,
     draw,
     picture_statistics,
     statistics,
     window_indices,
 )
 
-WINDOW, HORIZON, EXECUTED, STEPS = 2, 10, 8, 10
-STATE, IMAGE = "observation.state", "observation.image"
-
-
-def configuration(size: int) -> MultiTaskDiTConfig:
-    """4 layers of width 128, as in ``flow``; ten steps of Euler's method."""
-    return MultiTaskDiTConfig(
-        input_features={
-            STATE: PolicyFeature(FeatureType.STATE, (2,)),
-            IMAGE: PolicyFeature(FeatureType.VISUAL, (3, size, size)),
-        },
-        output_features={"action": PolicyFeature(FeatureType.ACTION, (2,))},
-        device="cpu",
-        push_to_hub=False,
-        n_obs_steps=WINDOW,
-        horizon=HORIZON,
-        n_action_steps=EXECUTED,
-        objective="flow_matching",
-        num_integration_steps=STEPS,
-        hidden_dim=128,
-        num_layers=4,
-        num_heads=4,
-        dropout=0.0,
-        timestep_embed_dim=64,
-        vision_encoder_name=ENCODER,
-        text_encoder_name=ENCODER,
-        image_crop_shape=None,
-        tokenizer_max_length=TOKENS,
-    )
+IMAGE = "observation.image"
 
 
 def start_from(policy: Policy, source: dict[str, torch.Tensor], points: torch.Tensor, seen: torch.Tensor) -> None:
@@ -138,7 +113,8 @@ def main(
     agent, source = observed[:, 18:], load_file(keypoint_policy / "model.safetensors")
     os.chdir(out)  # lerobot finds the encoder by its name
     stats = {STATE: statistics(agent), IMAGE: picture_statistics(pictures), "action": statistics(acted)}
-    policy = Policy(configuration(pictures.shape[1]), stats, seed)
+    picture = PolicyFeature(FeatureType.VISUAL, (3, *pictures.shape[1:3]))
+    policy = Policy(configuration({STATE: PolicyFeature(FeatureType.STATE, (2,)), IMAGE: picture}), stats, seed)
 
     def prepared(pixels: torch.Tensor, seen: torch.Tensor, done: torch.Tensor) -> dict[str, torch.Tensor]:
         raw = {STATE: torch.from_numpy(agent)[seen], "action": torch.from_numpy(acted)[done]}
