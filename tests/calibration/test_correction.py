@@ -14,7 +14,7 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration import fit_correction as fitting
 from ttscompile.calibration.fit_correction import anchors_of, fit_correction
 from ttscompile.calibration.task import Task
-from ttscompile.calibration.whole_steps import _held_out
+from ttscompile.calibration.whole_steps import _set_apart
 from ttscompile.core.lattice import PlanArray, Source, dense_plan, uniform_plan
 
 from . import tasks
@@ -102,9 +102,9 @@ def test_calls_of_one_episode_do_not_tell_whether_reading_helps(make_task: MakeT
 
 def test_schedules_are_compared_on_other_episodes_than_they_were_fitted_on() -> None:
     episodes = np.array([3, 1, 1, 0, 3, 2, 0, 4])
-    assert _held_out(episodes).tolist() == (episodes == 3).tolist()
-    assert _held_out(np.array([5, 5, 5, 5])).tolist() == [True, False, False, False]
-    assert _held_out(np.array([5])).tolist() == [True]
+    assert _set_apart(episodes).tolist() == (episodes == 3).tolist()
+    assert _set_apart(np.array([5, 5, 5, 5])).tolist() == [True, False, False, False]
+    assert _set_apart(np.array([5])).tolist() == [True]
 
 
 @pytest.mark.parametrize("groups", [1, 3])

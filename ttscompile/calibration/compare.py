@@ -41,7 +41,7 @@ from .targets import dense_rounds, draw_calls
 from .task import Array, Found, Task
 
 LEARNED = 256
-"""Calls that strategies learn from, at most. ``calibrate`` takes up to 960: its corrections are better."""
+"""Calls that strategies learn from, at most. ``calibrate`` takes more: its corrections are better."""
 
 FRACTION = 0.25
 """Share of the episodes to judge on. It is the default of ``calibrate``: with its seed, its plans saw none of them."""

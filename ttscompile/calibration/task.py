@@ -142,7 +142,11 @@ class Task:
         """
         correction = self.whole.correction(steps)
         reads = 0 if correction is None else correction.reads
-        return Found(self.whole.plan(steps), {"steps": list(steps), "reads": reads, **notes}, correction)
+        return Found(
+            self.whole.plan(steps),
+            {"steps": list(steps), "numbers_read_of_the_observation": reads, **notes},
+            correction,
+        )
 
 
 class Search(Protocol):

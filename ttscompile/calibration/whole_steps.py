@@ -50,10 +50,10 @@ class WholeSteps:
         self._executor, self._actions, self._calls = executor, actions, calls
         self._reading: dict[int, bool] = {}
         order = np.random.default_rng((seed, 3, 0)).permutation(calls.count)
-        held_out = _held_out(calls.episodes[order])
-        self._compared = self._fitted = executor.select(calls, order[held_out][:COMPARED])
-        if not held_out.all():
-            self._fitted = executor.select(calls, order[~held_out][:FITTED])
+        apart = _set_apart(calls.episodes[order])
+        self._compared = self._fitted = executor.select(calls, order[apart][:COMPARED])
+        if not apart.all():
+            self._fitted = executor.select(calls, order[~apart][:FITTED])
 
     @property
     def steps(self) -> int:
@@ -96,6 +96,7 @@ class WholeSteps:
         return self._reading[count]
 
     def _error_of(self, plan: PlanArray, reads: bool) -> float:
+        """Normalised error of a schedule with a correction that may, or may not, read the observation."""
         fitted = fit_correction(self._executor, plan, self._fitted, reads)
         return self._errors(plan, fitted).normalised
 
@@ -123,7 +124,7 @@ class WholeSteps:
         return Errors(float(normalised), float(units))
 
 
-def _held_out(episodes: IntArray) -> BoolArray:
+def _set_apart(episodes: IntArray) -> BoolArray:
     """Which calls, of the episodes ``[n]``, are compared on: all of a quarter of the episodes, the first ones.
 
     A correction reads the observation, and those of one episode are nearly the same. If there is one episode alone, a
