@@ -51,7 +51,7 @@ EVALUATIONS_A_MINUTE = 6400
 FEWEST_CALLS, MOST_CALLS = 64, 3072
 
 MOST_NEEDED = 1024
-"""Calls that a correction needs at most, however many numbers it reads: they are answered whatever the time."""
+"""Calls that a correction needs at most, however much it reads: these are answered whatever the time."""
 
 CALLS_A_FEATURE = 3
 """Calls to learn from at least, for each number that a correction reads. On Push-T (97 of them, 95 %) one that is
