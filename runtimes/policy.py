@@ -22,7 +22,7 @@ from ttscompile.errors import (
     RuntimeUnavailableError,
     TtscompileError,
 )
-from ttscompile.measure.process import Process
+from ttscompile.measure.process import LONGEST_WAIT, Process
 
 from .arrays import Array, check_observation, check_seed, like, read_observation
 from .info import BlockInfo, PolicyInfo
@@ -33,8 +33,6 @@ from .queues import Queues, is_window
 from .report import CallReport
 from .runtime import Runtime
 
-LONGEST_WAIT = 10.0
-"""Seconds that the end of the interpreter waits for a call under way."""
 TRIES = 3
 """Times that ``load`` begins before it gives up on an artifact that is replaced while it is loaded."""
 

@@ -15,16 +15,13 @@ import numpy as np
 import numpy.typing as npt
 
 from ttscompile.errors import ExecutorError, NonFiniteActionsError
-from ttscompile.measure.process import Process
+from ttscompile.measure.process import LONGEST_WAIT, Process
 
 from .feasibility import Feasibility, LatencyWindow, fast_enough
 from .measure import Clock, measure_latencies
 from .settings import ExecutorSettings, Policy, Resolved
 from .state import ExecutorState, Job
 from .trace import Trace
-
-LONGEST_WAIT = 10.0
-"""Seconds that the end of the interpreter waits for a call under way."""
 
 
 class Worker:

@@ -9,6 +9,9 @@ from __future__ import annotations
 
 import os
 
+LONGEST_WAIT = 10.0
+"""Seconds that the end of the interpreter waits for a call under way."""
+
 
 class Process:
     """The process that this was made in.
