@@ -1,0 +1,199 @@
+"""The U-Net of Diffusion Policy, rebuilt from its configuration; LeRobot's ``diffusion`` has the same network.
+
+Written from the description of the network, with attribute names under which the weights of an original checkpoint
+load as they are.
+
+Source: Chi et al., Diffusion Policy (arXiv 2303.04137), the convolutional network, after Janner et al. (arXiv
+2205.09991); FiLM of Perez et al. (arXiv 1709.07871).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from torch import nn
+
+from ..errors import CheckpointError
+from .transformer_for_diffusion import SinusoidalEmbedding
+
+_GROUPS_AT_THE_END = 8
+"""Of the last convolution, whatever ``n_groups`` says, as in the original."""
+_OPTIONAL = ("local_cond_dim", "global_cond_dim")
+_SIZES = ("input_dim", *_OPTIONAL, "diffusion_step_embed_dim", "kernel_size", "n_groups")
+
+
+def _refusal(name: str, found: object, expected: str) -> CheckpointError:
+    return CheckpointError(f"{name} of the U-Net is {found!r:.200}; expected {expected}.")
+
+
+@dataclass(frozen=True)
+class UNetConfig:
+    """Sizes and variant of one network; the names are those of the original configuration.
+
+    Attributes:
+        input_dim: channels of sample and prediction.
+        local_cond_dim: channels of a condition for each step of the sample; None for none.
+        global_cond_dim: channels of the condition vector; None for none.
+        diffusion_step_embed_dim: width of the timestep's embedding.
+        down_dims: channels of the levels; every level but the last halves the number of steps.
+        kernel_size: of the convolutions.
+        n_groups: of their group norms.
+        cond_predict_scale: whether the condition scales the features as well as shifting them.
+    """
+
+    input_dim: int
+    local_cond_dim: int | None = None
+    global_cond_dim: int | None = None
+    diffusion_step_embed_dim: int = 256
+    down_dims: tuple[int, ...] = (256, 512, 1024)
+    kernel_size: int = 3
+    n_groups: int = 8
+    cond_predict_scale: bool = False
+
+    def __post_init__(self) -> None:
+        if type(self.cond_predict_scale) is not bool:
+            raise _refusal("cond_predict_scale", self.cond_predict_scale, "true or false")
+        dims = self.down_dims
+        if not isinstance(dims, (list, tuple)) or not dims or any(type(n) is not int or n < 1 for n in dims):
+            raise _refusal("down_dims", dims, "positive whole numbers")
+        object.__setattr__(self, "down_dims", tuple(dims))
+        for name in _SIZES:
+            value = getattr(self, name)
+            if (value is not None or name not in _OPTIONAL) and (type(value) is not int or value < 1):
+                raise _refusal(name, value, "a whole number from 1")
+        if self.diffusion_step_embed_dim < 4 or self.diffusion_step_embed_dim % 2:
+            raise _refusal("diffusion_step_embed_dim", self.diffusion_step_embed_dim, "an even width from 4 on")
+        if self.kernel_size % 2 == 0:
+            raise _refusal("kernel_size", self.kernel_size, "an odd number")
+        if any(n % self.n_groups for n in dims) or dims[0] % _GROUPS_AT_THE_END:
+            found = f"down_dims = {list(dims)} with n_groups = {self.n_groups}"
+            raise CheckpointError(
+                f"the U-Net has {found}; expected channels that the groups divide, the first also by"
+                f" {_GROUPS_AT_THE_END}."
+            )
+
+    @property
+    def divisor(self) -> int:
+        """What the number of steps of the sample has to be divisible by, so that halving and doubling give it again."""
+        return int(2 ** (len(self.down_dims) - 1))
+
+    @property
+    def condition_dim(self) -> int:
+        """Channels of the timestep's embedding and the condition vector together."""
+        return self.diffusion_step_embed_dim + (self.global_cond_dim or 0)
+
+
+class ConvolutionBlock(nn.Module):
+    """Convolution, group norm, Mish; a module within a module, as the checkpoints name their weights."""
+
+    def __init__(self, channels_in: int, channels: int, kernel_size: int, groups: int) -> None:
+        super().__init__()
+        convolution = nn.Conv1d(channels_in, channels, kernel_size, padding=kernel_size // 2)
+        self.block = nn.Sequential(convolution, nn.GroupNorm(groups, channels), nn.Mish())
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """``[B, channels_in, T]`` -> ``[B, channels, T]``."""
+        return self.block(x)  # type: ignore[no-any-return]
+
+
+class ConditionedBlock(nn.Module):
+    """Two convolutions with FiLM between them, and a shortcut around both."""
+
+    def __init__(self, channels_in: int, channels: int, config: UNetConfig) -> None:
+        super().__init__()
+        self.scales = config.cond_predict_scale
+        sizes = ((channels_in, channels), (channels, channels))
+        self.blocks = nn.ModuleList(ConvolutionBlock(*each, config.kernel_size, config.n_groups) for each in sizes)
+        film = nn.Linear(config.condition_dim, channels * (1 + self.scales))
+        self.cond_encoder = nn.Sequential(nn.Mish(), film)
+        self.residual_conv = nn.Conv1d(channels_in, channels, 1) if channels_in != channels else nn.Identity()
+
+    def forward(self, x: torch.Tensor, condition: torch.Tensor) -> torch.Tensor:
+        """``[B, channels_in, T]`` and ``[B, C]`` -> ``[B, channels, T]``."""
+        inner = self.blocks[0](x)
+        film = self.cond_encoder(condition).unsqueeze(-1)
+        if self.scales:
+            scale, shift = film.chunk(2, dim=1)
+            inner = inner * scale + shift
+        else:
+            inner = inner + film
+        return self.blocks[1](inner) + self.residual_conv(x)  # type: ignore[no-any-return]
+
+
+class _Resize(nn.Module):
+    """A strided convolution, in a module of its own as the checkpoints name its weights."""
+
+    def __init__(self, convolution: nn.Module) -> None:
+        super().__init__()
+        self.conv = convolution
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return self.conv(x)  # type: ignore[no-any-return]
+
+
+class ConditionalUnet1D(nn.Module):
+    """The denoiser: noisy sample, timestep and conditions to a prediction, by convolutions along the chunk's time."""
+
+    def __init__(self, config: UNetConfig) -> None:
+        super().__init__()
+        self.config = config
+        width, dims = config.diffusion_step_embed_dim, config.down_dims
+        self.diffusion_step_encoder = nn.Sequential(
+            SinusoidalEmbedding(width), nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width)
+        )
+        self.local_cond_encoder = None
+        if config.local_cond_dim is not None:
+            # The second one is in every checkpoint, and the original never uses what it gives.
+            each = (ConditionedBlock(config.local_cond_dim, dims[0], config) for _ in range(2))
+            self.local_cond_encoder = nn.ModuleList(each)
+        self.down_modules = nn.ModuleList()
+        for level, (before, after) in enumerate(pairwise((config.input_dim, *dims))):
+            halve = _Resize(nn.Conv1d(after, after, 3, 2, 1)) if level < len(dims) - 1 else nn.Identity()
+            blocks = (ConditionedBlock(before, after, config), ConditionedBlock(after, after, config))
+            self.down_modules.append(nn.ModuleList((*blocks, halve)))
+        self.mid_modules = nn.ModuleList(ConditionedBlock(dims[-1], dims[-1], config) for _ in range(2))
+        self.up_modules = nn.ModuleList()
+        for after, before in pairwise(reversed(dims)):
+            double = _Resize(nn.ConvTranspose1d(before, before, 4, 2, 1))
+            blocks = (ConditionedBlock(2 * after, before, config), ConditionedBlock(before, before, config))
+            self.up_modules.append(nn.ModuleList((*blocks, double)))
+        last = ConvolutionBlock(dims[0], dims[0], config.kernel_size, _GROUPS_AT_THE_END)
+        self.final_conv = nn.Sequential(last, nn.Conv1d(dims[0], config.input_dim, 1))
+
+    def forward(
+        self,
+        sample: torch.Tensor,
+        timestep: torch.Tensor,
+        global_cond: torch.Tensor | None = None,
+        local_cond: torch.Tensor | None = None,
+    ) -> torch.Tensor:
+        """Evaluate the denoiser once.
+
+        Args:
+            sample: float32 ``[B, T, input_dim]``, T divisible by ``config.divisor``.
+            timestep: int64 ``[B]``.
+            global_cond: float32 ``[B, global_cond_dim]``; None without one.
+            local_cond: float32 ``[B, T, local_cond_dim]``; None without one.
+
+        Returns:
+            float32 ``[B, T, input_dim]``.
+        """
+        condition = self.diffusion_step_encoder(timestep)
+        if global_cond is not None:
+            condition = torch.cat((condition, global_cond), dim=-1)
+        x = sample.transpose(1, 2)
+        skipped = []
+        for level, (first, second, resize) in enumerate(self.down_modules):  # type: ignore[misc]
+            x = first(x, condition)
+            if level == 0 and local_cond is not None and self.local_cond_encoder is not None:
+                x = x + self.local_cond_encoder[0](local_cond.transpose(1, 2), condition)
+            x = second(x, condition)
+            skipped.append(x)
+            x = resize(x)
+        for block in self.mid_modules:
+            x = block(x, condition)
+        for first, second, resize in self.up_modules:  # type: ignore[misc]
+            x = resize(second(first(torch.cat((x, skipped.pop()), dim=1), condition), condition))
+        return self.final_conv(x).transpose(1, 2)  # type: ignore[no-any-return]
