@@ -24,7 +24,8 @@ from ttscompile.frontends import diffusion_policy, load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import AS_SAVED
-from ttscompile.frontends.robomimic_encoder import ResidualBlock, SpatialSoftmax
+from ttscompile.frontends.resnet import ResidualBlock
+from ttscompile.frontends.robomimic_encoder import SpatialSoftmax
 from ttscompile.ir.flops import graph_flops
 from ttscompile.ir.program import Program
 from ttscompile.lower.program import lower_graph

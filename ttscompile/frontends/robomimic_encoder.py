@@ -3,15 +3,15 @@
 Written from the description of the networks, with attribute names under which the weights of an original checkpoint
 load. torchvision and robomimic are not needed.
 
-Source: robomimic 0.2 (Mandlekar et al., arXiv 2108.03298) as Diffusion Policy configures it; ResNet-18 of He et al.
-(arXiv 1512.03385); spatial softmax of Finn et al. (arXiv 1509.06113).
+Source: robomimic 0.2 (Mandlekar et al., arXiv 2108.03298) as Diffusion Policy configures it; spatial softmax of Finn
+et al. (arXiv 1509.06113).
 """
 
 from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,52 +19,11 @@ import torch
 from torch import nn
 
 from .image_geometry import ResizeCrop
+from .resnet import CHANNELS, SHRINKS, Norm, group_norm, resnet
 
 KEYPOINTS = 32
 FEATURES = 64
 """Width of a camera's features; both as in robomimic's image experiments, which Diffusion Policy takes over."""
-
-_STAGES = ((64, 1), (128, 2), (256, 2), (512, 2))  # channels and stride of the four stages, two blocks each
-_SHRINKS = 32
-
-Norm = Callable[[int], nn.Module]
-
-
-def group_norm(channels: int) -> nn.Module:
-    """What Diffusion Policy puts in the place of batch norm: groups of 16 channels."""
-    return nn.GroupNorm(channels // 16, channels)
-
-
-class ResidualBlock(nn.Module):
-    """``relu(x + norm(conv(relu(norm(conv(x))))))``; the shortcut is a strided 1 x 1 convolution where sizes change."""
-
-    def __init__(self, channels_in: int, channels: int, stride: int, norm: Norm) -> None:
-        super().__init__()
-        self.conv1 = nn.Conv2d(channels_in, channels, 3, stride, padding=1, bias=False)
-        self.bn1 = norm(channels)
-        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
-        self.bn2 = norm(channels)
-        self.downsample = None
-        if stride != 1 or channels_in != channels:
-            self.downsample = nn.Sequential(nn.Conv2d(channels_in, channels, 1, stride, bias=False), norm(channels))
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """``[N, channels_in, H, W]`` -> ``[N, channels, H / stride, W / stride]``, rounded up."""
-        shortcut = x if self.downsample is None else self.downsample(x)
-        inner = self.bn2(self.conv2(torch.relu(self.bn1(self.conv1(x)))))
-        return torch.relu(inner + shortcut)
-
-
-def _resnet18(channels: int, norm: Norm) -> nn.Module:
-    """ResNet-18 without its pooling and classifier: ``[N, C, H, W]`` -> ``[N, 512, H / 32, W / 32]``, rounded up."""
-    stem = nn.Conv2d(channels, 64, 7, stride=2, padding=3, bias=False)
-    layers: list[nn.Module] = [stem, norm(64), nn.ReLU(), nn.MaxPool2d(3, stride=2, padding=1)]
-    width = 64
-    for channels_out, stride in _STAGES:
-        first = ResidualBlock(width, channels_out, stride, norm)
-        layers.append(nn.Sequential(first, ResidualBlock(channels_out, channels_out, 1, norm)))
-        width = channels_out
-    return nn.Sequential(OrderedDict(nets=nn.Sequential(*layers)))  # as the checkpoint names and numbers them
 
 
 class SpatialSoftmax(nn.Module):
@@ -76,7 +35,7 @@ class SpatialSoftmax(nn.Module):
 
     def __init__(self, height: int, width: int) -> None:
         super().__init__()
-        self.nets = nn.Conv2d(_STAGES[-1][0], KEYPOINTS, 1)
+        self.nets = nn.Conv2d(CHANNELS, KEYPOINTS, 1)
         x, y = np.meshgrid(np.linspace(-1.0, 1.0, width), np.linspace(-1.0, 1.0, height))
         self.register_buffer("temperature", torch.ones(1))
         self.register_buffer("pos_x", torch.from_numpy(x.reshape(1, -1)).float())
@@ -115,8 +74,9 @@ class CameraEncoder(nn.Module):
         channels, height, width = camera.shape
         self.crop = ResizeCrop(height, width, crop=camera.crop)
         height, width = self.crop.size
-        self.backbone = _resnet18(channels, norm)
-        self.pool = SpatialSoftmax(math.ceil(height / _SHRINKS), math.ceil(width / _SHRINKS))
+        numbered = nn.Sequential(*resnet(channels, norm))
+        self.backbone = nn.Sequential(OrderedDict(nets=numbered))  # as the checkpoint names them
+        self.pool = SpatialSoftmax(math.ceil(height / SHRINKS), math.ceil(width / SHRINKS))
         self.linear = nn.Linear(2 * KEYPOINTS, FEATURES)
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:

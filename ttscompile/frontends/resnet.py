@@ -1,0 +1,76 @@
+"""ResNet, rebuilt: the residual network with which robot policies read images, without its pooling and classifier.
+
+Written from the description of the network, with the attribute names of torchvision's, which is not needed.
+
+Source: He et al. (arXiv 1512.03385); group norm in the place of batch norm as in Diffusion Policy (arXiv 2303.04137).
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+
+import torch
+from torch import nn
+
+DEPTHS: Mapping[str, tuple[int, ...]] = {"resnet18": (2, 2, 2, 2), "resnet34": (3, 4, 6, 3)}
+"""Blocks of the four stages, by the name of the network. Deeper ones have blocks of another kind."""
+CHANNELS = 512
+"""Of the features."""
+SHRINKS = 32
+"""Pixels of the image for one of the features, along each axis."""
+
+_STAGES = ((64, 1), (128, 2), (256, 2), (512, 2))  # channels and stride of the four stages
+
+Norm = Callable[[int], nn.Module]
+
+
+def group_norm(channels: int) -> nn.Module:
+    """What policies put in the place of batch norm: groups of 16 channels."""
+    return nn.GroupNorm(channels // 16, channels)
+
+
+class ResidualBlock(nn.Module):
+    """``relu(x + norm(conv(relu(norm(conv(x))))))``; the shortcut is a strided 1 x 1 convolution where sizes change."""
+
+    def __init__(self, channels_in: int, channels: int, stride: int, norm: Norm) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(channels_in, channels, 3, stride, padding=1, bias=False)
+        self.bn1 = norm(channels)
+        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
+        self.bn2 = norm(channels)
+        self.downsample = None
+        if stride != 1 or channels_in != channels:
+            self.downsample = nn.Sequential(nn.Conv2d(channels_in, channels, 1, stride, bias=False), norm(channels))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """``[N, channels_in, H, W]`` -> ``[N, channels, H / stride, W / stride]``, rounded up."""
+        shortcut = x if self.downsample is None else self.downsample(x)
+        inner = self.bn2(self.conv2(torch.relu(self.bn1(self.conv1(x)))))
+        return torch.relu(inner + shortcut)
+
+
+def resnet(channels: int, norm: Norm, name: str = "resnet18") -> nn.Sequential:
+    """A ResNet without its pooling and classifier: ``[N, C, H, W]`` -> ``[N, 512, H / 32, W / 32]``, rounded up.
+
+    Its layers have torchvision's names (``conv1``, ``layer1``); ``nn.Sequential(*resnet(...))`` numbers them, as the
+    checkpoints of code that took ``list(children())`` of torchvision's network do.
+
+    Args:
+        channels: C.
+        norm: makes the norm of so many channels, ``group_norm`` or ``nn.BatchNorm2d``.
+        name: key of ``DEPTHS``.
+    """
+    layers: OrderedDict[str, nn.Module] = OrderedDict(
+        conv1=nn.Conv2d(channels, 64, 7, stride=2, padding=3, bias=False),
+        bn1=norm(64),
+        relu=nn.ReLU(),
+        maxpool=nn.MaxPool2d(3, stride=2, padding=1),
+    )
+    width = 64
+    for stage, ((channels_out, stride), depth) in enumerate(zip(_STAGES, DEPTHS[name], strict=True), start=1):
+        first = ResidualBlock(width, channels_out, stride, norm)
+        others = (ResidualBlock(channels_out, channels_out, 1, norm) for _ in range(depth - 1))
+        layers[f"layer{stage}"] = nn.Sequential(first, *others)
+        width = channels_out
+    return nn.Sequential(layers)
