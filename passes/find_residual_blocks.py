@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from ttscompile.errors import NoResidualBlocksError
+from ttscompile.errors import NoResidualBlocksError, PassError
 from ttscompile.ir.dataflow import between, dominators, reachable_from, reaching
 from ttscompile.ir.flops import node_flops
 from ttscompile.ir.graph import Graph, Node, Ref, TensorType
@@ -18,6 +18,8 @@ from ttscompile.ir.program import Block
 _ADD = "aten.add.Tensor"
 _SOFTMAX = "aten.softmax.int"
 _ATTENTION = "aten.scaled_dot_product_attention.default"
+_LEAST_SHARE = 0.5
+"""Of the FLOPs of a step that the blocks have to hold; less than that could be saved otherwise."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class BlockTable:
         kinds, groups = dict.fromkeys(b.kind for b in self.blocks), Counter(b.group for b in self.blocks)
         alone = (b.index for b in self.blocks if groups[b.group] == 1)
         return (
-            f"{len(self.blocks)} blocks: {', '.join(kinds)}",
+            f"{_count(len(self.blocks), 'block')}: {', '.join(kinds)}",
             f"{len(self.blocks)} branches in {len(groups)} FORWARD groups",
             *(f"block {index} is alone in its group: FORWARD is its own TIMESTEP" for index in alone),
             *self.declined,
@@ -51,6 +53,10 @@ class _Link(NamedTuple):
     stream: str
     residual: str
     result: str
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'s' * (number != 1)}"
 
 
 def find_residual_blocks(graph: Graph, sample: str) -> BlockTable:
@@ -66,13 +72,15 @@ def find_residual_blocks(graph: Graph, sample: str) -> BlockTable:
         sample: name of its noisy sample.
 
     Raises:
-        NoResidualBlocksError: there is no such addition; names the node at which the search ended.
+        NoResidualBlocksError: there is no such addition, and names the node at which the search ended; or what is
+            outside the blocks and depends on the sample holds most of the work, as with a U-Net.
+        PassError: the output does not depend on the sample.
     """
     # A split is no stream, whatever the type of its first part.
     several = {node.name for node in graph.nodes if len(node.types) > 1}
     points = [name for name in dominators(graph, [sample], graph.outputs) if name not in several]
     if sample not in points:
-        raise NoResidualBlocksError(f"the output does not depend on the sample %{sample}.")
+        raise PassError(f"the output does not depend on the sample %{sample}: there is no loop to compile.")
     loop = reachable_from(graph, [sample])
     links, declined = _links(graph, points, loop)
     if not links:
@@ -83,10 +91,26 @@ def find_residual_blocks(graph: Graph, sample: str) -> BlockTable:
             "no residual block found: between the sample and the output no value a is updated as a + f(a)."
             f" The search walked {len(points)} dominators and ended at {where}."
             + "".join(f"\n  declined: {reason}" for reason in declined)
-            + "\nNothing can be reused then. If the output is the sample plus more, use EDMDenoiser and edm_table."
+            + "\nIf the output is the sample plus more, EDMDenoiser and edm_table give finer blocks."
         )
     links = _main_stream(graph, links, declined)
-    return BlockTable(tuple(_chain(graph, points, links, declined)), tuple(declined))
+    blocks = tuple(_chain(graph, points, links, declined, loop))
+    share = _share(graph, blocks, loop)
+    if share < _LEAST_SHARE:
+        raise NoResidualBlocksError(
+            f"what was found is a chain of {_count(len(blocks), 'block')}, which holds {share:.0%} of what is computed at each"
+            f" step; expected {_LEAST_SHARE:.0%} or more, since the rest could not be reused."
+        )
+    return BlockTable(blocks, tuple(declined))
+
+
+def _share(graph: Graph, blocks: Sequence[Block], loop: set[str]) -> float:
+    """FLOPs of the blocks, over those of all that depends on the sample; 1 where nothing has any."""
+    types = graph.types()
+    inside = {n.name for b in blocks for n in between(graph, b.stream, b.residual or b.result)}
+    work = {node.name: node_flops(node, types) for node in graph.nodes if node.name in loop}
+    total = sum(work.values())
+    return sum(work[name] for name in inside) / total if total else 1.0
 
 
 def _links(graph: Graph, points: Sequence[str], loop: set[str]) -> tuple[list[_Link], list[str]]:
@@ -133,7 +157,7 @@ def _main_stream(graph: Graph, links: list[_Link], declined: list[str]) -> list[
     return [link for link in links if types[link.result] == main]
 
 
-def _chain(graph: Graph, points: Sequence[str], links: list[_Link], declined: list[str]) -> list[Block]:
+def _chain(graph: Graph, points: Sequence[str], links: list[_Link], declined: list[str], loop: set[str]) -> list[Block]:
     """Blocks from links, with coarse blocks over what lies between and around them.
 
     Blocks of one kind are one FORWARD group. The residual of a coarse block also holds what happens to the stream
@@ -147,7 +171,7 @@ def _chain(graph: Graph, points: Sequence[str], links: list[_Link], declined: li
 
     def add(stream: str, result: str, residual: str | None, reason: str = "", hides: bool = False) -> None:
         nodes = between(graph, stream, residual if residual is not None else result)
-        kind = _kind(graph, nodes, stream, hides)
+        kind = _kind(graph, nodes, stream, hides, loop)
         group = groups.setdefault((kind, residual is None), len(groups))
         blocks.append(Block(len(blocks), kind, stream, result, residual, stream_type, group, reason))
 
@@ -187,10 +211,11 @@ def _describe(nodes: Sequence[Node]) -> str:
     return f"%{first.name} = {first.op} ({first.source or 'source unknown'}){more}"
 
 
-def _kind(graph: Graph, nodes: Sequence[Node], stream: str, hides: bool) -> str:
-    """``self_attention``, ``cross_attention``, ``feed_forward``, or a signature of the structure.
+def _kind(graph: Graph, nodes: Sequence[Node], stream: str, hides: bool, loop: set[str]) -> str:
+    """``self_attention``, ``cross_attention``, ``feed_forward``, ``network``, or a signature of the structure.
 
-    ``nodes`` are the block's, into which ``stream`` flows; it may be a coarse one that ``hides`` several residuals.
+    ``nodes`` are the block's, into which ``stream`` flows; it may be a coarse one that ``hides`` several residuals. One
+    of another structure that holds all that is computed in the ``loop`` is the network.
     """
     types, producers = graph.types(), graph.producers()
     inside = {n.name for n in nodes} | {stream}
@@ -209,6 +234,8 @@ def _kind(graph: Graph, nodes: Sequence[Node], stream: str, hides: bool) -> str:
         return attentions[0] if around.issuperset(contractions) else f"{attentions[0]}+feed_forward"
     if not attentions and contractions and not convolves and not hides:
         return "feed_forward"
+    if contractions and all(n.name in contractions for n in graph.nodes if n.name in loop and node_flops(n, types) > 0):
+        return "network"
     signature = hashlib.sha256("|".join(n.op for n in nodes).encode()).hexdigest()[:8]
     shape = f"{len(attentions)}attention_" if attentions else ""
     return f"{shape}{len(nodes)}ops_{signature}"

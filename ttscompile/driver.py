@@ -20,7 +20,7 @@ from .capture.narrow import narrow, unneeded
 from .core.given import integer
 from .core.paths import require_free_or_path
 from .core.spec import FP32, PolicySpec
-from .errors import ArtifactError, PassError, SpecError
+from .errors import ArtifactError, NoResidualBlocksError, PassError, SpecError
 from .frontends import load_checkpoint_policy
 from .frontends.encoded import parts
 from .frontends.families import LoadOptions
@@ -36,9 +36,10 @@ from .lower.single_file import lower_single_file
 from .passes.base import After, Before, Pass
 from .passes.clean_up import CleanUp
 from .passes.cut_copies import CutCopies
-from .passes.find_residual_blocks import find_residual_blocks
+from .passes.find_residual_blocks import BlockTable, find_residual_blocks
 from .passes.hoist import Hoist
 from .passes.insert_pruner import InsertPruner
+from .passes.one_block import OneBlock
 from .passes.partition import Partition
 from .passes.regroup_sums import RegroupSums
 from .passes.split_features import SplitFeatures
@@ -215,8 +216,7 @@ def transform(module: nn.Module, spec: PolicySpec, *, explain: Explain = _silent
     verify(captured)
     for simplify in (CleanUp[Captured](), CutCopies(), WidenAttention(), RegroupSums()):
         captured = _run(simplify, captured, explain)
-    table = find_residual_blocks(captured.denoiser, spec.sample_argument)
-    explain("find_residual_blocks", table.notes)
+    captured, table = _find_blocks(captured, explain)
     cut = _run(Partition(table.blocks), captured, explain)
     for split in (UnfoldBatch(), SplitTokens(), SplitFeatures(), CleanUp[Cut]()):
         cut = _run(split, cut, explain)
@@ -224,6 +224,18 @@ def transform(module: nn.Module, spec: PolicySpec, *, explain: Explain = _silent
     for finish in (InsertPruner(), CleanUp[Program]()):
         program = _run(finish, program, explain)
     return program
+
+
+def _find_blocks(captured: Captured, explain: Explain) -> tuple[Captured, BlockTable]:
+    """The residual blocks of the network; or the whole network as one, where no chain of them holds most of it."""
+    sample = captured.spec.sample_argument
+    try:
+        table = find_residual_blocks(captured.denoiser, sample)
+    except NoResidualBlocksError as error:
+        captured = _run(OneBlock(str(error)), captured, explain)
+        table = find_residual_blocks(captured.denoiser, sample)
+    explain("find_residual_blocks", table.notes)
+    return captured, table
 
 
 def _dense_flops(module: nn.Module, graph: Graph, spec: PolicySpec) -> int:

@@ -28,7 +28,7 @@ class PassError(TtscompileError):
 
 
 class NoResidualBlocksError(PassError):
-    """The denoiser has no chain of residual additions; names the node where the search ended."""
+    """No chain of residual additions holds most of the denoiser; says where the search ended."""
 
 
 class LoweringError(TtscompileError):

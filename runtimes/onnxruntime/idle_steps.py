@@ -46,6 +46,7 @@ class IdleSteps:
         self.total = np.zeros(stream, np.float32)
         product, shift = session.run([PRODUCT, SHIFT], {TOTAL: self.total})
         self._product, self._shift = np.ascontiguousarray(product), np.broadcast_to(shift, shape).copy()
+        self._held = not product.any()  # the prediction is the total's, whatever the sample is
         self._base = np.zeros((len(product), streams, horizon), np.float32)
         self._prepare = Bound(session, {TOTAL: self.total}, {BASE: self._base})
         self._clip = None
@@ -110,13 +111,14 @@ class IdleSteps:
         result = np.empty((*self._features.shape[:2], (1 + self._memories) * horizon), np.float32)
         next_sample, next_memory = result[:, :, :horizon], _by_part(result[:, :, horizon:], horizon)
         for k in range(first, stop):
-            dot(product, flat_sample, out=flat_y)
-            add(y, base, out=y)
-            np.multiply(norm, norm, out=squares)
-            dot(ones, flat_squares, out=flat_deviation)
-            np.sqrt(deviation, out=deviation)
-            np.divide(numerator, deviation, out=prediction)
-            add(prediction, self._shift, out=prediction)
+            if k == first or not self._held:
+                dot(product, flat_sample, out=flat_y)
+                add(y, base, out=y)
+                np.multiply(norm, norm, out=squares)
+                dot(ones, flat_squares, out=flat_deviation)
+                np.sqrt(deviation, out=deviation)
+                np.divide(numerator, deviation, out=prediction)
+                add(prediction, self._shift, out=prediction)
             if self._clip is not None:
                 denoised, (low, high) = self._parts[2], self._clip
                 dot(self._to_x0[k], read, out=denoised.reshape(1, -1))

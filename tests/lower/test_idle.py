@@ -74,6 +74,35 @@ def reads_a_context() -> LoopPiece:
     return LoopPiece(replace(graph, inputs={**graph.inputs, "c": f32(B, 1, 4)}), "h")
 
 
+@pytest.mark.parametrize("carried", [False, True], ids=["of the stream", "beside the sample"])
+def test_an_affine_tail_has_the_form(carried: bool) -> None:
+    """Where the stream carries the sample beside the prediction (``OneBlock``), the prediction is the total's alone."""
+    program = toy_program(normed=True)
+    pieces, weights = program.pieces, values_of(program)
+    if carried:
+        padded = node("h0", "constant_pad_nd.default", STREAM, Ref("sample"), (0, 2), 0.0)
+        beside = LoopPiece(Graph({"sample": SAMPLE}, {}, (padded,), ("h0",)), "sample")
+        taken = LoopPiece(
+            Graph({"h": STREAM}, {}, (node("out", "slice.Tensor", SAMPLE, Ref("h"), 2, 2, 4),), ("out",)), "h"
+        )
+        pieces = replace(pieces, stem=beside, tail=taken)
+    else:
+        pieces = replace(pieces, tail=tail(head_of("h")))
+    model, why = lower_idle(pieces, weights, OPSET)
+    assert (model is None, why) == (False, "")
+    rng = np.random.default_rng(0)
+    x, total = (rng.standard_normal(shape).astype(np.float32) for shape in ((5, 3, 2), (5, 3, 4)))
+    base, product, shift = session(model, {}).run(list(IDLE_OUTPUTS), {TOTAL: total})
+    assert product.any() == (not carried)
+    y = np.einsum("ed,dbt->ebt", product, x.transpose(2, 0, 1)) + base
+    found = y[3:] / np.sqrt((y[:3] ** 2).sum(axis=0)) + shift
+    tensors = {name: torch.from_numpy(value) for name, value in weights.items()}
+    stream = evaluate(pieces.stem.graph, tensors, {"sample": torch.from_numpy(x)})[0] + torch.from_numpy(total)
+    with Counted() as counted:
+        expected = evaluate(pieces.tail.graph, tensors, {pieces.tail.stream: stream})[0]
+    assert_equal_but_for_rounding(found, expected.numpy().transpose(2, 0, 1), 4 * max(counted.terms, 1))
+
+
 def test_a_norm_without_weights_and_a_stem_with_positions_have_the_form() -> None:
     program = toy_program(normed=True)
     moved = stem(node("h0", "add.Tensor", STREAM, Ref("l"), Ref("position")), position=f32(3, 4))
@@ -94,7 +123,7 @@ def test_a_norm_without_weights_and_a_stem_with_positions_have_the_form() -> Non
             {"stem": stem(node("h0", "mul.Tensor", STREAM, Ref("l"), Ref("scale")), scale=f32(3, 1))},
             "every token of sample alike",
         ),
-        ({"tail": tail(head_of("h"))}, "does not begin with a LayerNorm"),
+        ({"tail": tail(node("g", "gelu.default", STREAM, Ref("h")), head_of("g"))}, "not known to be affine"),
         ({"tail": tail(NORM, node("g", "gelu.default", STREAM, Ref("n")), head_of("g"))}, "not known to be affine"),
         (
             {"tail": tail(NORM, node("s", "add.Tensor", STREAM, Ref("n"), Ref("h")), head_of("s"))},

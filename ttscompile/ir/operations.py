@@ -203,6 +203,7 @@ _GROUPS: tuple[tuple[str, Operation], ...] = (
     ("split split_with_sizes", replace(_PARTS, along=2)),
     ("diagonal", _PARTS),
     ("expand repeat tile repeat_interleave", _REPEATS),
+    ("pad constant_pad_nd", _LINEAR_IN_FIRST),
     ("flip", replace(_LINEAR_IN_FIRST, along=1)),
     ("roll", replace(_LINEAR_IN_FIRST, along=2)),
     # Element-wise arithmetic.
@@ -243,7 +244,7 @@ _GROUPS: tuple[tuple[str, Operation], ...] = (
     ("full full_like fill", Operation(filled=_value(1))),
     ("new_full", Operation(filled=_value(2))),
     # Nothing that a pass asks about.
-    (f"{GETITEM} cat concat stack tril triu pad constant_pad_nd", Operation()),
+    (f"{GETITEM} cat concat stack tril triu", Operation()),
     ("arange linspace logspace eye empty empty_like new_empty scalar_tensor type_as copy meshgrid", Operation()),
     ("sum mean prod amax amin max min argmax argmin any all std var std_mean var_mean logsumexp", Operation()),
     ("norm linalg_vector_norm linalg_norm sort argsort topk diff trapezoid", Operation()),

@@ -13,6 +13,9 @@ basis E of these directions, u what the total and the stem's constants say of th
 
 All but x is known as soon as the total is, which many steps in a row share. So a step is arithmetic on numbers of the
 size of the sample, in place of tensors of T x W and of seventeen operations of a session.
+
+Where the tail is affine itself, y is [0, 1] and the rest of the above: prediction = x A H + u H + h. With one block for
+the whole network (``passes.one_block``) A H is zero, and the prediction is the total's.
 """
 
 from __future__ import annotations
@@ -68,7 +71,10 @@ def _lower(pieces: Pieces, weights: Weights, opset: int) -> ModelProto:
         raise _Declined(f"the residual stream is {kind}, and the sample {sample}: not one vector for each token")
     turned = kind.shape[0] != Batch()  # tokens first
     stem = _affine(_wide(pieces.stem.graph), weights, turned_out=turned)
-    norm, rest = _split_at_norm(pieces.tail.graph, pieces.tail.stream)
+    tail, stream = pieces.tail.graph, pieces.tail.stream
+    if all(node.op != _NORM for node in tail.nodes):
+        return _write_affine(kind, turned, stem, _affine(_wide(tail), weights, turned_in=turned), opset)
+    norm, rest = _split_at_norm(tail, stream)
     head = _affine(_wide(rest), weights, turned_in=turned)
     dimensions, width = stem.matrix.shape
     if dimensions >= width:
@@ -95,11 +101,27 @@ def _write(kind: TensorType, turned: bool, stem: _Affine, head: _Affine, eps: fl
     along = w.op("Div", projected, w.constant(root, np.float32))
     numerator = w.op("MatMul", u, w.constant(head.matrix, np.float32))
     rows = w.op("Concat", along, deviation, numerator, axis=2)
-    w.rename(w.op("Transpose", rows, perm=[2, 0, 1]), BASE)
     product = np.concatenate([triangle / root, np.zeros((1, dimensions)), (centred @ head.matrix).T])
+    return _finish(w, kind, rows, product, head, opset)
+
+
+def _write_affine(kind: TensorType, turned: bool, stem: _Affine, head: _Affine, opset: int) -> ModelProto:
+    dimensions = len(stem.matrix)
+    w = GraphWriter()
+    total = w.op("Transpose", TOTAL, perm=[1, 0, 2]) if turned else TOTAL
+    offset = w.op("Add", total, w.constant(stem.constant[None], np.float32))
+    numerator = w.op("MatMul", offset, w.constant(head.matrix, np.float32))
+    blank = w.op("Mul", w.op("Slice", offset, *map(w.constant, ([0], [1], [2]))), w.constant(0.0, np.float32))
+    rows = w.op("Concat", *dimensions * [blank], w.op("Add", blank, w.constant(1.0, np.float32)), numerator, axis=2)
+    product = np.concatenate([np.zeros((dimensions + 1, dimensions)), (stem.matrix @ head.matrix).T])
+    return _finish(w, kind, rows, product, head, opset)
+
+
+def _finish(w: GraphWriter, kind: TensorType, rows: str, product: Wide, head: _Affine, opset: int) -> ModelProto:
+    tokens, dimensions = head.constant.shape
+    w.rename(w.op("Transpose", rows, perm=[2, 0, 1]), BASE)
     w.rename(w.constant(product, np.float32), PRODUCT)
     w.rename(w.constant(head.constant.T[:, None], np.float32), SHIFT)
-    tokens = len(stem.constant)
     shapes = {BASE: [len(product), "B", tokens], PRODUCT: product.shape, SHIFT: [dimensions, 1, tokens]}
     outputs = [tensor(name, np.float32, shape) for name, shape in shapes.items()]
     given = tensor(TOTAL, np.float32, [n if isinstance(n, int) else str(n) for n in kind.shape])

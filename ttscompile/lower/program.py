@@ -28,6 +28,7 @@ from .idle import lower_idle
 from .joint import lower_all_blocks
 from .layout import sink_layout
 from .onnx_model import flatten_attention, name_model, only
+from .translations import TRANSLATIONS
 
 OPSET = 23
 """Has Gelu (20) and Attention (23). Measured with onnxruntime 1.31, 1 thread, blocks of width 256, 16 tokens, 4 heads:
@@ -151,7 +152,14 @@ def _run_exporter(graphs: list[Graph]) -> onnx.ModelProto:
     with _quiet(), without_stack_traces(), torch.no_grad():
         module, shapes = _build(graphs), tuple(dynamic)
         program = torch.export.export(module, tuple(examples), dynamic_shapes=shapes, strict=False)
-        result = torch.onnx.export(program, (), dynamo=True, opset_version=OPSET, verbose=False)
+        result = torch.onnx.export(
+            program,
+            (),
+            dynamo=True,
+            opset_version=OPSET,
+            verbose=False,
+            custom_translation_table=dict(TRANSLATIONS),
+        )
     assert result is not None
     return result.model_proto
 
