@@ -98,8 +98,8 @@ def find_residual_blocks(graph: Graph, sample: str) -> BlockTable:
     share = _share(graph, blocks, loop)
     if share < _LEAST_SHARE:
         raise NoResidualBlocksError(
-            f"what was found is a chain of {_count(len(blocks), 'block')}, which holds {share:.0%} of what is computed at each"
-            f" step; expected {_LEAST_SHARE:.0%} or more, since the rest could not be reused."
+            f"what was found is a chain of {_count(len(blocks), 'block')}, which holds {share:.0%} of what is computed"
+            f" at each step; expected {_LEAST_SHARE:.0%} or more, since the rest could not be reused."
         )
     return BlockTable(blocks, tuple(declined))
 
