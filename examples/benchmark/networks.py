@@ -16,13 +16,10 @@ from ttscompile.artifact.write import update_calibration
 from ttscompile.core.lattice import PlanArray, uniform_plan
 from ttscompile.core.spec import ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
 from ttscompile.frontends import load_checkpoint_policy
+from ttscompile.frontends.conditioning import TokensDenoiser
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.scheduler import configured_sampler
-from ttscompile.frontends.transformer_for_diffusion import (
-    ConditionedDenoiser,
-    TransformerConfig,
-    TransformerForDiffusion,
-)
+from ttscompile.frontends.transformer_for_diffusion import TransformerConfig, TransformerForDiffusion
 
 PUSHT = Path(__file__).parents[1] / "pusht" / "pusht_dpt_ema_fp16.ckpt"
 PUSHT_WIDTH = 256
@@ -78,7 +75,7 @@ def random_network(width: int, sampler: str, steps: int, layers: int = 8) -> Net
         sampler=sampler_of(sampler, steps),
         chunk=ChunkSpec(action, observed - 1, observed + 7),
     )
-    return Network("random weights", width, ConditionedDenoiser(TransformerForDiffusion(config)).eval(), spec)
+    return Network("random weights", width, TokensDenoiser(TransformerForDiffusion(config)).eval(), spec)
 
 
 def sampler_of(name: str, steps: int) -> SamplerTable:

@@ -43,7 +43,7 @@ PAYLOADS: list[tuple[dict[str, Any], str, str]] = [
     ),
     ({"joint_blocks.0.context_block.attn.qkv.weight": W}, r"two streams \(MM-DiT\)", "becomes one block"),
     ({"transformer_blocks.0.attn.add_q_proj.weight": W}, r"two streams \(MM-DiT\)", "becomes one block"),
-    ({"model": {"down_modules.0.0.blocks.0.block.0.weight": W}}, "weights of a U-Net", "train_diffusion_transformer"),
+    ({"model": {"down_modules.0.0.blocks.0.block.0.weight": W}}, "weights of a U-Net", "do not say how they"),
     ({"base.layers.0.q_proj.lora_A.weight": W}, "an adapter .LoRA.", "merge_and_unload"),
     ({"blocks.0.weight": W, "head.bias": W}, "a plain dictionary of weights", "do not say how they are connected"),
     ({}, "a plain dictionary of weights", r"its entries \(none\)"),
@@ -63,14 +63,14 @@ def test_torch_files(tmp_path: Path, payload: dict[str, Any], what: str, remedy:
 
 
 NAMES = [
-    ("DiffusionUnetHybridImagePolicy", "a U-Net.*no residual stream.*train_diffusion_transformer"),
+    ("DiffusionUnetTimmPolicy", "a diffusion policy with another observation encoder.*inside the module"),
     ("DP3", "3D Diffusion Policy, a U-Net"),
     ("SimpleDP3", "3D Diffusion Policy, a U-Net"),
     ("BETLowdimPolicy", "a policy without diffusion.*no denoising loop"),
     ("RobomimicImagePolicy", "a policy without diffusion"),
     (
         "DiffusionTransformerTimmPolicy",
-        "a diffusion transformer with another observation encoder.*inside the module",
+        "a diffusion policy with another observation encoder.*inside the module",
     ),
     ("MyPolicy", f"a policy of its own kind.*{OWN_MODULE}"),
 ]

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import nn
@@ -185,7 +186,9 @@ class ConditionalUnet1D(nn.Module):
             condition = torch.cat((condition, global_cond), dim=-1)
         x = sample.transpose(1, 2)
         skipped = []
-        for level, (first, second, resize) in enumerate(self.down_modules):  # type: ignore[misc]
+        down: Any = self.down_modules  # lists of modules, as torch does not say
+        up: Any = self.up_modules
+        for level, (first, second, resize) in enumerate(down):
             x = first(x, condition)
             if level == 0 and local_cond is not None and self.local_cond_encoder is not None:
                 x = x + self.local_cond_encoder[0](local_cond.transpose(1, 2), condition)
@@ -194,6 +197,6 @@ class ConditionalUnet1D(nn.Module):
             x = resize(x)
         for block in self.mid_modules:
             x = block(x, condition)
-        for first, second, resize in self.up_modules:  # type: ignore[misc]
+        for first, second, resize in up:
             x = resize(second(first(torch.cat((x, skipped.pop()), dim=1), condition), condition))
         return self.final_conv(x).transpose(1, 2)  # type: ignore[no-any-return]

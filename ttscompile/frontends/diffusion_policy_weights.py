@@ -8,11 +8,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
+from torch import nn
 
 from ..core.spec import Affine
 from ..errors import CheckpointError
 from .saved_weights import as_float32, require_weights
-from .transformer_for_diffusion import TransformerConfig, TransformerForDiffusion
 
 _OTHER_KEY = re.compile(
     r"(model\.)?_dummy_variable|mask_generator\..*|normalizer\.params_dict\.\w+\.(scale|offset|input_stats\.\w+)"
@@ -49,32 +49,32 @@ def choose_weights(state_dicts: Any, use_ema: Any) -> tuple[Weights, str]:
     return as_float32({key: value for key, value in weights.items() if not str(key).endswith(_COUNTERS)}), found
 
 
-def build_network(config: TransformerConfig, weights: Weights) -> TransformerForDiffusion:
-    """The network of a configuration, which is made only if the checkpoint has weights for one of its size.
+def require_room(needed: Mapping[str, int], weights: Weights, where: str = "cfg.policy.model.") -> None:
+    """Raise unless the checkpoint has weights for a network of the configured sizes, before it is made.
+
+    Args:
+        needed: weights that the network has at least, by the setting that asks for them.
+        weights: all there are.
+        where: the settings stand, for messages.
 
     Raises:
         CheckpointError: it has not: whatever the configuration says, no more memory is taken than the file has.
     """
     total = sum(value.numel() for value in weights.values())
-    width, tokens = config.n_emb, config.trunk_tokens
-    channels = max(config.input_dim, config.output_dim, config.cond_dim)
-    parts = {
-        "n_emb": width * width,
-        "input_dim, output_dim or cond_dim": width * channels,
-        "horizon": max(width * tokens, tokens * tokens if config.causal_attn else 0),
-        "n_obs_steps": max(width * config.memory_tokens, tokens * config.memory_tokens if config.causal_attn else 0),
-        "n_layer or n_cond_layers": max(config.n_layer, config.n_cond_layers) * width,
-    }
-    for name, needed in parts.items():
-        if needed > total:
+    for name, count in needed.items():
+        if count > total:
             raise CheckpointError(
-                f"cfg.policy.model.{name} asks for at least {needed} weights; the checkpoint holds {total} in all. The"
+                f"{where}{name} asks for at least {count} weights; the checkpoint holds {total} in all. The"
                 " configuration describes another network than the one that was saved, or the file is incomplete."
             )
-    return TransformerForDiffusion(config)
 
 
-def load_network(network: TransformerForDiffusion, weights: Weights) -> None:
+def network_weights(weights: Weights) -> Weights:
+    """Those of the policy that are not of its observation encoder."""
+    return {key: value for key, value in weights.items() if not key.startswith("obs_encoder.")}
+
+
+def load_network(network: nn.Module, weights: Weights) -> None:
     """Fill the network; every weight must be there, of the right shape, finite, and nothing else may be there."""
     expected = {f"model.{key}": value for key, value in network.state_dict().items()}
     found = {key: value for key, value in weights.items() if not _OTHER_KEY.fullmatch(key)}

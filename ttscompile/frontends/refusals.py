@@ -55,13 +55,11 @@ class Refusal:
 
 
 POLICIES = (
-    Refusal(r"unet", "a U-Net", _U_NET),
     Refusal(r"dp3", "3D Diffusion Policy, a U-Net on point clouds", _U_NET),
     Refusal(r"^(ibc|bet|robomimic)", "a policy without diffusion", _NO_LOOP),
     Refusal(
-        r"transformer",
-        "a diffusion transformer with another observation encoder than the two that are read, low-dimensional and"
-        " robomimic's",
+        r"transformer|unet",
+        "a diffusion policy with another observation encoder than those that are read",
         f"{_BUILD}, its observation encoder inside the module: hoisting takes it out of the loop.",
     ),
     Refusal(r"", "a policy of its own kind", f"If it has a transformer denoiser: {_BUILD}."),
@@ -112,7 +110,7 @@ STATES = (
         f"{_BUILD}. Two streams that attend to each other make no chain of additions: what lies between two points"
         " that all paths cross becomes one block, and where there are none the compiler says so.",
     ),
-    Refusal(r"(^|\.)(down|up)_modules\.|(^|\.)unet\.", "weights of a U-Net", _U_NET),
+    Refusal(r"(^|\.)(down|up)_modules\.|(^|\.)unet\.", "weights of a U-Net", _WEIGHTS),
     Refusal(r"\blora_[AB]\b", "an adapter (LoRA) without the weights that it adapts", _MERGE),
     Refusal(r"", "a plain dictionary of weights", _WEIGHTS),
 )

@@ -1,0 +1,81 @@
+"""Run the original U-Nets on seeded weights, and write what they give: ``unet_VARIANT.npz``.
+
+Not run by the tests. Needs real-stanford/diffusion_policy (5ba07ac) importable, and this repository::
+
+    PYTHONPATH=path/to/diffusion_policy:. python -m tests.frontends.golden.make_unets
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import diffusers.schedulers as schedulers
+import numpy as np
+import torch
+
+from .. import unets
+
+PROBED = (0, 17, 59)
+"""Timesteps of single evaluations."""
+
+
+def main() -> None:
+    """One file a variant."""
+    for variant in unets.VARIANTS:
+        path = Path(__file__).with_name(f"unet_{variant}.npz")
+        np.savez_compressed(path, **run(variant))
+        print(path, path.stat().st_size, "bytes")
+
+
+def made(settings: dict[str, Any]) -> Any:
+    """What ``hydra.utils.instantiate`` makes of an entry of the configuration."""
+    arguments = dict(settings)
+    module, _, name = arguments.pop("_target_").rpartition(".")
+    return getattr(schedulers if module == "diffusers.schedulers" else import_module(module), name)(**arguments)
+
+
+@torch.no_grad()
+def run(variant: str) -> dict[str, Any]:
+    """The original's actions, and single evaluations of its network, with noise from outside."""
+    settings = dict(unets.configuration(variant)["policy"])
+    for name in ("noise_scheduler", "model"):
+        settings[name] = made(settings[name])
+    policy = made(settings)
+    own, weights = policy.state_dict(), unets.state_dict(variant)
+    assert all("_dummy_variable" in name for name in set(own) - set(weights)), sorted(set(own) - set(weights))
+    assert all(name.startswith("normalizer.") for name in set(weights) - set(own)), sorted(set(weights) - set(own))
+    policy.load_state_dict(weights, strict=False)
+    policy.eval()
+    evaluations: list[tuple[tuple[Any, ...], dict[str, Any], Any]] = []
+    policy.model.register_forward_hook(
+        lambda module, args, kwargs, out: evaluations.append((args, kwargs, out)), with_kwargs=True
+    )
+    observation = {key: torch.from_numpy(value) for key, value in unets.observation(variant).items()}
+    steps = settings["n_action_steps"] if settings.get("pred_action_steps_only") else settings["horizon"]
+    initial, draws = unets.noise((steps, policy.model.final_conv[1].out_channels))
+    order = iter(torch.from_numpy(draws))
+    schedule = type(policy.noise_scheduler).__module__
+    with (
+        patch("torch.randn", lambda *args, **kwargs: torch.from_numpy(initial).clone()),
+        patch(f"{schedule}.randn_tensor", lambda *args, **kwargs: next(order)),
+    ):
+        result = policy.predict_action(observation)
+    # The network was called on the first sample, with the observation in it; once more on this, at other timesteps.
+    (first, *_), given, _ = evaluations[0]
+    evaluations.clear()
+    for timestep in PROBED:
+        policy.model(first, torch.tensor(timestep), **given)
+    return {
+        "action": result["action"].numpy(),
+        "action_pred": result["action_pred"].numpy(),
+        "timesteps": policy.noise_scheduler.timesteps.numpy(),
+        "probe_t": np.array(PROBED),
+        "probe_out": np.stack([out.numpy() for *_, out in evaluations]),
+    }
+
+
+if __name__ == "__main__":
+    main()

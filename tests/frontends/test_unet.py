@@ -1,0 +1,174 @@
+"""Diffusion Policy's U-Nets, against numbers that the original gave; see ``golden/make_unets.py``."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tests.rounding import PROMISED, Counted, assert_equal_but_for_rounding
+from ttscompile.core.spec import Noise, PolicySpec
+from ttscompile.errors import CheckpointError
+from ttscompile.frontends import diffusion_policy, load_checkpoint_policy
+from ttscompile.frontends.eager import eager_policy, evaluation
+from ttscompile.frontends.families import AS_SAVED
+
+from . import unets
+from .hybrid import Array
+
+GIVEN = {"steps_only": "global condition", "local": "local condition", "inpainting": "inpainting"}
+SAVED_BY_THE_ORIGINAL = {"global": "global condition", "local": "local condition", "inpainting": "inpainting"}
+
+
+def recorded(variant: str) -> dict[str, Array]:
+    """What the original gave."""
+    with np.load(Path(__file__).parent / "golden" / f"unet_{variant}.npz") as numbers:
+        return dict(numbers)
+
+
+def inputs(spec: PolicySpec, observation: dict[str, Array]) -> dict[str, torch.Tensor]:
+    """Observations as the module takes them."""
+    made = {}
+    for key, array in observation.items():
+        normalizer = spec.observations[key].normalizer
+        made[key] = torch.from_numpy(array if normalizer is None else normalizer.normalize(array))
+    return made
+
+
+@pytest.mark.parametrize("variant", unets.VARIANTS)
+def test_the_original_gave_the_same(variant: str, tmp_path: Path) -> None:
+    """Single evaluations, and the actions of a whole call, from the file that is saved."""
+    torch.save(unets.payload(variant), tmp_path / "policy.ckpt")
+    module, spec = load_checkpoint_policy(tmp_path / "policy.ckpt")
+    assert (spec.source["variant"], spec.source["weights"]) == (GIVEN[variant], "ema_model")
+    numbers, observation = recorded(variant), inputs(spec, unets.observation(variant))
+    noise = Noise(*unets.noise(spec.sample))
+    with torch.inference_mode():
+        evaluate = evaluation(module, spec, observation)
+        for timestep, expected in zip(numbers["probe_t"], numbers["probe_out"], strict=True):
+            with Counted() as counted:
+                found = evaluate(torch.from_numpy(noise.initial), torch.full((unets.STREAMS,), int(timestep)))
+            assert_equal_but_for_rounding(found, expected, counted.terms, counted.angle)
+    assert spec.sampler.timesteps.tolist() == numbers["timesteps"].tolist()
+    actions = spec.chunk.unnormalized(eager_policy(module, spec)(observation, noise).numpy())
+    tolerance = PROMISED * np.ptp(numbers["action_pred"])
+    assert np.abs(actions - numbers["action_pred"]).max() < tolerance
+    executed = actions[:, spec.chunk.start : spec.chunk.stop]
+    assert executed.shape == numbers["action"].shape
+    assert np.abs(executed - numbers["action"]).max() < tolerance
+
+
+@pytest.mark.parametrize("name", SAVED_BY_THE_ORIGINAL)
+def test_checkpoints_that_the_original_saved(name: str, shared: Path) -> None:
+    """Read with the classes that are pickled in them, to the stored actions."""
+    base = shared / "golden" / "diffusion_policy_unet" / name
+    module, spec = load_checkpoint_policy(base.with_suffix(".ckpt"))
+    assert spec.source["variant"] == SAVED_BY_THE_ORIGINAL[name]
+    with np.load(base.with_suffix(".npz")) as numbers:
+        noise = Noise(numbers["noise_initial"], numbers["noise_steps"])
+        sample = eager_policy(module, spec)(inputs(spec, {"obs": numbers["obs"]}), noise).numpy()
+        actions, tolerance = spec.chunk.unnormalized(sample), PROMISED * np.ptp(numbers["action_pred"])
+        assert np.abs(actions - numbers["action_pred"]).max() < tolerance
+        executed = actions[:, spec.chunk.start : spec.chunk.stop]
+        assert executed.shape == numbers["action"].shape
+        assert np.abs(executed - numbers["action"]).max() < tolerance
+
+
+# Settings
+
+Build = Callable[..., tuple[Any, PolicySpec]]
+
+
+@pytest.fixture
+def build() -> Build:
+    """Build a policy with changes to ``cfg.policy``, to its ``model``, and to its weights, without a file."""
+
+    def run(
+        variant: str,
+        model: dict[str, Any] | None = None,
+        weights: dict[str, torch.Tensor] | None = None,
+        **policy: Any,
+    ) -> tuple[Any, PolicySpec]:
+        config = copy.deepcopy(unets.configuration(variant))
+        config["policy"].update(policy)
+        config["policy"]["model"].update(model or {})
+        state = unets.state_dict(variant) | (weights or {})
+        return diffusion_policy.build({"cfg": config, "state_dicts": {"ema_model": state}}, AS_SAVED)
+
+    return run
+
+
+def test_the_executed_steps(build: Build) -> None:
+    """They begin with the step of the last observation, or after it, and end with the horizon."""
+    for given, expected in (({}, (2, 6)), ({"oa_step_convention": True}, (1, 5)), ({"n_action_steps": 8}, (2, 8))):
+        chunk = build("local", **given)[1].chunk
+        assert (chunk.start, chunk.stop) == expected
+
+
+def test_the_observed_steps_have_their_place(build: Build) -> None:
+    """Beside the sample's first steps, with zeros after; in the sample, whatever was there; or as one vector."""
+    x, t = torch.randn(1, 8, 8), torch.tensor([7])
+    obs = torch.randn(1, unets.OBSERVED, unets.LOW_DIM)
+    with torch.inference_mode():
+        network = build("local")[0].model
+        placed = torch.zeros(1, 8, unets.LOW_DIM)
+        placed[:, : unets.OBSERVED] = obs
+        found = build("local")[0](x[..., : unets.ACTION], t, obs)
+        assert torch.equal(found, network(x[..., : unets.ACTION], t, local_cond=placed))
+        network = build("inpainting")[0].model
+        placed = x.clone()
+        placed[:, : unets.OBSERVED, unets.ACTION :] = obs
+        assert torch.equal(build("inpainting")[0](x, t, obs), network(placed, t))
+        network, short = build("steps_only")[0].model, x[:, :4, : unets.ACTION]
+        found = build("steps_only")[0](short, t, obs)
+        assert torch.equal(found, network(short, t, global_cond=obs.reshape(1, -1)))
+
+
+@pytest.mark.parametrize(
+    ("variant", "given", "message"),
+    [
+        ("local", {"horizon": 7}, r"cfg\.policy\.horizon is 7; expected a multiple of 2, because a U-Net of 2 levels"),
+        ("steps_only", {"n_action_steps": 6}, r"cfg\.policy\.n_action_steps is 6; expected a multiple of 4"),
+        ("local", {"horizon": 10**9}, r"cfg\.policy\.horizon is 1000000000; expected .* 4096 at most"),
+        ("local", {"horizon": None}, r"cfg\.policy\.horizon is None; expected a positive whole number"),
+        ("local", {"horizon": 2}, r"n_obs_steps = 2 leaves nothing of horizon = 2"),
+        ("inpainting", {"horizon": 2, "n_obs_steps": 4, "oa_step_convention": True}, r"n_obs_steps = 4 leaves nothing"),
+        ("local", {"obs_as_global_cond": True}, "both true; the original refuses this, too"),
+        ("local", {"pred_action_steps_only": True}, "pred_action_steps_only needs obs_as_global_cond"),
+        ("local", {"oa_step_convention": "yes"}, r"oa_step_convention is 'yes'; expected true or false"),
+        (
+            "local",
+            {"obs_as_local_cond": False},
+            r"model\.input_dim is 3; expected 8 with the observation as inpainting",
+        ),
+        ("local", {"obs_dim": 6}, r"model\.local_cond_dim is 5; expected 6 with the observation as local condition"),
+        ("steps_only", {"n_obs_steps": 3}, r"model\.global_cond_dim is 10; expected 15 with"),
+        ("local", {"model": {"input_dim": None}}, r"model\.input_dim is missing"),
+        ("local", {"model": {"input_dim": "3"}}, r"input_dim of the U-Net is '3'"),
+        (
+            "local",
+            {"model": {"down_dims": [8 * 10**6, 8 * 10**6]}},
+            r"asks for at least \d+ weights; the checkpoint holds",
+        ),
+        ("local", {"model": {"down_dims": [16, 20]}}, r"model\.\S+ has shape \(24,.*; expected \(20,"),
+        ("local", {"model": {"kernel_size": 4}}, r"kernel_size of the U-Net is 4; expected an odd number"),
+        (
+            "local",
+            {"model": {"cond_predict_scale": False}},
+            r"cond_encoder\S+ has shape \(32, 16\); expected \(16, 16\)",
+        ),
+        ("local", {"model": {"attention": True}}, "settings that ConditionalUnet1D does not know: attention"),
+        ("local", {"model": {"_target_": "fork.Unet"}}, "network is Unet; expected ConditionalUnet1D"),
+        ("local", {"guidance": 2.0}, r"cfg\.policy has settings that are not known: guidance"),
+        ("local", {"weights": {"model.extra": torch.zeros(2)}}, r"unexpected model\.extra"),
+    ],
+)
+def test_settings_that_do_not_fit(build: Build, variant: str, given: dict[str, Any], message: str) -> None:
+    """Each is named, with what was expected."""
+    with pytest.raises(CheckpointError, match=message):
+        build(variant, **given)

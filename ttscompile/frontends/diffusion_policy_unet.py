@@ -1,0 +1,108 @@
+"""Diffusion Policy's U-Nets: configuration and weights to a denoiser.
+
+Source: ``DiffusionUnetLowdimPolicy`` of real-stanford/diffusion_policy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any, Literal
+
+from torch import nn
+
+from ..core.spec import ObservationSpec
+from ..errors import CheckpointError
+from .conditional_unet1d import ConditionalUnet1D, UNetConfig
+from .conditioning import GlobalDenoiser, InpaintingDenoiser, LocalDenoiser
+from .diffusion_policy_parts import Rebuilt, Saved, network_settings, require_sizes
+from .diffusion_policy_weights import Weights, affine, load_network, require_room
+
+_NETWORK = "ConditionalUnet1D"
+_SETTINGS = frozenset(field.name for field in fields(UNetConfig))
+_SWITCHES = ("obs_as_global_cond", "obs_as_local_cond", "pred_action_steps_only", "oa_step_convention")
+_MOST_STEPS = 4096
+"""Of a chunk, which the weights do not limit; in use are 4 to 64."""
+
+Given = Literal["global condition", "local condition", "inpainting"]
+"""How the network is given the observation."""
+
+
+def low_dim(saved: Saved) -> Rebuilt:
+    """``DiffusionUnetLowdimPolicy``."""
+    settings = saved.settings
+    as_global, as_local, only_steps, from_last = (settings.flag(name, False) for name in _SWITCHES)
+    if as_global and as_local:
+        raise settings.error("obs_as_global_cond and obs_as_local_cond are both true; the original refuses this, too")
+    if only_steps and not as_global:
+        raise settings.error("pred_action_steps_only needs obs_as_global_cond; the original refuses this, too")
+    given: Given = "global condition" if as_global else "local condition" if as_local else "inpainting"
+    obs_dim, action_dim, n_obs_steps = saved.sizes("obs_dim", "action_dim", "n_obs_steps")
+    config = network_config(network_settings(saved.config, _NETWORK, _SETTINGS), "cfg.policy.model.")
+    expected = {
+        "input_dim": action_dim + (obs_dim if given == "inpainting" else 0),
+        "global_cond_dim": obs_dim * n_obs_steps if as_global else None,
+        "local_cond_dim": obs_dim if as_local else None,
+    }
+    sizes = f"action_dim = {action_dim}, obs_dim = {obs_dim} and n_obs_steps = {n_obs_steps}"
+    require_sizes(config, expected, f"the observation as {given}, {sizes}")
+    steps = "n_action_steps" if only_steps else "horizon"
+    start = 0 if only_steps else n_obs_steps - from_last
+    module, sample = denoiser(saved, saved.weights, config, given, action_dim, steps, start)
+    return Rebuilt(
+        module,
+        {"obs": ObservationSpec((n_obs_steps, obs_dim), affine(saved.weights, "obs", obs_dim))},
+        sample,
+        action_dim,
+        start,
+        given,
+        frozenset({*_SWITCHES, "obs_dim", "action_dim", "model"}),
+    )
+
+
+def network_config(values: dict[str, Any], where: str) -> UNetConfig:
+    """A U-Net's settings, which stand at ``where``, as a record."""
+    if values.get("input_dim") is None:
+        raise CheckpointError(f"{where}input_dim is missing; it is needed to rebuild the network.")
+    return UNetConfig(**{name: value for name, value in values.items() if name in _SETTINGS})
+
+
+def denoiser(
+    saved: Saved, weights: Weights, config: UNetConfig, given: Given, action_dim: int, steps: str, start: int
+) -> tuple[nn.Module, tuple[int, int]]:
+    """The network with its weights, as it is given the observation, and the shape ``(T, D)`` of its sample.
+
+    Args:
+        saved: the policy.
+        weights: of the policy, without those of an encoder.
+        config: of its network.
+        given: how it is given the observation.
+        action_dim: Da.
+        steps: name of the setting that says how many steps its sample has.
+        start: the first of them that is executed.
+
+    Raises:
+        CheckpointError: the network cannot halve and double so many steps, or they end before what is asked of them;
+            weights that do not fit.
+    """
+    horizon, n_obs_steps = saved.settings.number(steps, most=_MOST_STEPS), saved.settings.number("n_obs_steps")
+    if horizon % config.divisor:
+        levels = len(config.down_dims)
+        halves = f"a U-Net of {levels} levels halves the steps of its sample {levels - 1} times, and doubles them again"
+        raise saved.settings.error(f"{steps} is {horizon}; expected a multiple of {config.divisor}, because {halves}")
+    if start >= horizon or (given != "global condition" and n_obs_steps > horizon):
+        raise saved.settings.error(f"n_obs_steps = {n_obs_steps} leaves nothing of {steps} = {horizon}")
+    width, dims = config.diffusion_step_embed_dim, config.down_dims
+    needed = {
+        "input_dim": config.input_dim * dims[0],
+        "local_cond_dim": (config.local_cond_dim or 0) * dims[0],
+        "global_cond_dim": (config.global_cond_dim or 0) * dims[0],
+        "diffusion_step_embed_dim": width * max(width, *dims),
+        "down_dims or kernel_size": config.kernel_size * sum(n * n for n in dims),
+    }
+    require_room(needed, weights)
+    network = ConditionalUnet1D(config)
+    load_network(network, weights)
+    sample = (horizon, config.input_dim)
+    if given == "inpainting":
+        return InpaintingDenoiser(network, sample, action_dim, n_obs_steps), sample
+    return (GlobalDenoiser if given == "global condition" else LocalDenoiser)(network), sample
