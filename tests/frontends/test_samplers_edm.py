@@ -14,7 +14,7 @@ import ttscompile
 from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile import EDMDenoiser, edm_table
 from ttscompile.core.spec import ChunkSpec, Noise, ObservationSpec, PolicySpec
-from ttscompile.errors import NoResidualBlocksError, SpecError
+from ttscompile.errors import SpecError
 from ttscompile.frontends.eager import eager_policy
 
 DATA = 0.5
@@ -82,8 +82,9 @@ def test_the_loop_is_the_original(sigmas: list[float], clip: float | None) -> No
 
 
 def test_its_blocks_are_found_and_the_artifact_acts_as_the_original(tmp_path: Path) -> None:
-    with pytest.raises(NoResidualBlocksError, match=r"EDMDenoiser and edm_table"):
-        ttscompile.compile_denoiser(Preconditioned(Network()).eval(), spec(SIGMAS))
+    told: dict[str, tuple[str, ...]] = {}
+    coarse = ttscompile.compile_denoiser(Preconditioned(Network()).eval(), spec(SIGMAS), explain=told.__setitem__)
+    assert len(coarse.blocks) == 1 and "EDMDenoiser and edm_table give finer blocks" in told["OneBlock"][0]
     program = ttscompile.compile_denoiser(EDMDenoiser(Network(), SIGMAS, DATA).eval(), spec(SIGMAS), tmp_path)
     assert len(program.blocks) == 2
     rng = np.random.default_rng(1)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 from torch import nn
 
+import ttscompile
 from tests.passes.graphs import B, Builder
 from tests.passes.specs import toy_spec
 from ttscompile.driver import transform
@@ -89,3 +93,37 @@ def test_a_unet_is_one_block_and_its_films_are_tables() -> None:
     assert "aten.linear.default" not in operations, "what FiLM computes is known before the loop"
     steps = program.spec.sampler.steps
     assert program.pieces.tables and all(table.shape[0] == steps for table in program.pieces.tables.values())
+
+
+class NoResidual(nn.Module):
+    """A toy without any."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.net = nn.Sequential(nn.Linear(2, 8), nn.GELU(), nn.Linear(8, 2))
+
+    def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
+        return self.net(sample) * obs.flatten(1).mean(1)[:, None, None] * timestep[:, None, None]
+
+
+def test_the_note_says_where_the_search_for_a_chain_ended() -> None:
+    told: dict[str, tuple[str, ...]] = {}
+    transform(NoResidual(), toy_spec(obs=(3, 7)), explain=told.__setitem__)
+    assert re.search(r"ended at %\w+ = aten\.mul\.Tensor \(test_one_block\.py:\d+ in forward\)", told["OneBlock"][0])
+
+
+def test_both_runtimes_agree_on_random_plans_of_one_block(tmp_path: Path) -> None:
+    spec = toy_spec(obs=(2, 7), sample=(4, 2), steps=6)
+    ttscompile.compile_denoiser(Conditioned().eval(), spec, tmp_path)
+    policies = [ttscompile.load(tmp_path, runtime=name) for name in ("onnxruntime", "reference")]
+    rng = np.random.default_rng(0)
+    for plan in [*rng.integers(0, 4, (6, 6, 1)).astype(np.int8), np.array([[0], [2], [2], [2], [2], [2]], np.int8)]:
+        plan[0] = 0
+        obs = rng.standard_normal((1, 2, 7)).astype(np.float32)
+        noise = ttscompile.Noise(rng.standard_normal((1, 4, 2)).astype(np.float32))
+        given = []
+        for policy in policies:
+            policy.reset()
+            policy.predict_action({"obs": obs}, noise=noise, plan="dense")
+            given.append(policy.predict_action({"obs": obs}, noise=noise, plan=plan)["action_pred"])
+        np.testing.assert_allclose(given[0], given[1], rtol=0, atol=1e-4)
