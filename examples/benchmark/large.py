@@ -1,9 +1,11 @@
-"""A diffusion transformer of 300 million random weights: what it takes to compile it, and to run one call.
+"""A network of hundreds of millions of random weights: what it takes to compile it, and to run one call.
 
     python examples/benchmark/large.py [--layers 16] [--width 1024] [--output DIR]
+    python examples/benchmark/large.py --unet 512,1024,2048 --horizon 64        # LeRobot's U-Net
+    python examples/benchmark/large.py --unet 256,512,1024 --horizon 16         # Diffusion Policy's
 
-The network is an ordinary DiT with adaLN-Zero, 32 action tokens and an observation vector; nothing in it is made for
-ttscompile. Converting and running are two processes, so that each has its own peak of resident memory.
+The transformer is an ordinary DiT with adaLN-Zero. Both have 14 actions and an observation vector of 64 numbers, and
+four steps. Converting and running are two processes, so that each has its own peak of resident memory.
 """
 
 from __future__ import annotations
@@ -15,60 +17,31 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-HORIZON, ACTIONS, OBSERVED, STEPS = 32, 14, 64, 4
+if TYPE_CHECKING:
+    from torch import nn
+
+STEPS = 4
 
 
-def convert(folder: Path, layers: int, width: int) -> None:
-    """Make the network and compile it; print what each stage took."""
+def convert(folder: Path, network: nn.Module, horizon: int) -> None:
+    """Compile the network; print what each stage took."""
     import numpy as np
     import torch
-    from torch import Tensor, nn
-    from torch.nn import functional
+    from large_networks import ACTIONS, OBSERVED
 
     import ttscompile
     from ttscompile import ChunkSpec, ObservationSpec, PolicySpec
     from ttscompile.samplers.flow import flow_matching_table
 
-    class Layer(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.qkv, self.out = nn.Linear(width, 3 * width), nn.Linear(width, width)
-            self.up, self.down = nn.Linear(width, 4 * width), nn.Linear(4 * width, width)
-            self.modulate = nn.Linear(width, 6 * width)
-
-        def forward(self, x: Tensor, c: Tensor) -> Tensor:
-            s1, c1, g1, s2, c2, g2 = self.modulate(functional.silu(c))[:, None].chunk(6, -1)
-            n = functional.layer_norm(x, (width,)) * (1 + c1) + s1
-            q, k, v = (part.unflatten(-1, (-1, 64)).transpose(1, 2) for part in self.qkv(n).chunk(3, -1))
-            x = x + g1 * self.out(functional.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
-            n = functional.layer_norm(x, (width,)) * (1 + c2) + s2
-            return x + g2 * self.down(functional.gelu(self.up(n), approximate="tanh"))
-
-    class Network(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.embed, self.head = nn.Linear(ACTIONS, width), nn.Linear(width, ACTIONS)
-            self.observe, self.time = nn.Linear(OBSERVED, width), nn.Linear(256, width)
-            self.layers = nn.ModuleList(Layer() for _ in range(layers))
-
-        def forward(self, sample: Tensor, timestep: Tensor, obs: Tensor) -> Tensor:
-            angle = timestep[:, None] * torch.exp(-torch.arange(128) / 14)
-            c = self.time(torch.cat([angle.sin(), angle.cos()], -1)) + self.observe(obs)
-            x = self.embed(sample)
-            for layer in self.layers:
-                x = layer(x, c)
-            return self.head(functional.layer_norm(x, (width,)))
-
-    torch.manual_seed(0)
-    network = Network().eval()
     count = sum(p.numel() for p in network.parameters())
     print(f"{count / 1e6:.0f} million weights, {count * 4 / 2**30:.2f} GiB; {peak()} GiB before compiling")
     spec = PolicySpec(
-        sample=(HORIZON, ACTIONS),
+        sample=(horizon, ACTIONS),
         observations={"obs": ObservationSpec((OBSERVED,))},
         sampler=flow_matching_table(STEPS),
-        chunk=ChunkSpec(ACTIONS, 0, HORIZON),
+        chunk=ChunkSpec(ACTIONS, 0, horizon),
     )
     start = last = time.perf_counter()
 
@@ -83,12 +56,15 @@ def convert(folder: Path, layers: int, width: int) -> None:
 
     rng = np.random.default_rng(0)
     obs = rng.standard_normal((1, OBSERVED), dtype=np.float32)
-    sample = rng.standard_normal((1, HORIZON, ACTIONS), dtype=np.float32)
+    sample = rng.standard_normal((1, horizon, ACTIONS), dtype=np.float32)
     np.savez(folder / "call.npz", obs=obs, noise=sample)
     x = torch.from_numpy(sample)
+    torch.set_num_threads(1)
+    start = time.perf_counter()
     with torch.no_grad():
         for t in spec.sampler.timesteps:
             x = x + network(x, torch.full((1,), float(t)), torch.from_numpy(obs)) / STEPS
+    print(f"{time.perf_counter() - start:7.1f} s  the same call in eager PyTorch on one thread")
     np.save(folder / "expected.npy", x.numpy())
 
 
@@ -121,11 +97,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
     parser.add_argument("--layers", type=int, default=16)
     parser.add_argument("--width", type=int, default=1024)
+    parser.add_argument("--unet", help="channels of the levels of a U-Net, in place of the transformer")
+    parser.add_argument("--horizon", type=int, default=32, help="actions of a chunk")
     parser.add_argument("--output", type=Path, help="a folder to keep the artifact in; a temporary one otherwise")
     parser.add_argument("--only", choices=["convert", "run"], help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.only == "convert":
-        convert(options.output, options.layers, options.width)
+        from large_networks import transformer, unet
+
+        levels = None if options.unet is None else [int(width) for width in options.unet.split(",")]
+        network = transformer(options.layers, options.width) if levels is None else unet(levels)
+        convert(options.output, network.eval(), options.horizon)
     elif options.only == "run":
         run(options.output)
     else:
@@ -133,8 +115,9 @@ def main() -> None:
             folder = options.output or Path(temporary)
             folder.mkdir(parents=True, exist_ok=True)
             for part in ("convert", "run"):
-                own = [f"--layers={options.layers}", f"--width={options.width}", f"--output={folder}"]
-                subprocess.run([sys.executable, __file__, *own, f"--only={part}"], check=True)
+                own = [f"--layers={options.layers}", f"--width={options.width}", f"--horizon={options.horizon}"]
+                own += [] if options.unet is None else [f"--unet={options.unet}"]
+                subprocess.run([sys.executable, __file__, *own, f"--output={folder}", f"--only={part}"], check=True)
 
 
 if __name__ == "__main__":
