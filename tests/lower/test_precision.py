@@ -10,14 +10,18 @@ import numpy.typing as npt
 import onnx
 import onnxruntime
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from onnx import ModelProto, NodeProto, TensorProto
 from onnx.helper import make_graph, make_model, make_node, make_opsetid, make_tensor_value_info
+from torch.nn import functional
 
 from tests.lower.modules import captured, random_values
+from tests.runtimes.toys import B, f32, node
 from ttscompile.errors import LoweringError
 from ttscompile.ir.evaluate import evaluate
+from ttscompile.ir.graph import Graph, Ref
 from ttscompile.lower.precision import lower_precision, quantize_matrix, quantize_model
 from ttscompile.lower.program import lower_graph
 from ttscompile.measure.machine import has_integer_dot_product
@@ -204,3 +208,19 @@ def test_a_precision_that_cannot_be_had_is_refused_with_what_can() -> None:
     for name in ("bf16", "int4"):
         with pytest.raises(LoweringError, match=f"'{name}': expected one of 'fp32', 'int8'"):
             lower_precision({}, {}, name)
+
+
+def test_the_product_that_a_convolution_became_is_found_behind_its_reshape() -> None:
+    """``lower.translations``: ``[out, channels, kernel]`` is turned and reshaped to ``[kernel * channels, out]``."""
+    rng = np.random.default_rng(0)
+    sizes = {"w": (5, 4, 3), "b": (5,)}
+    weights = {name: rng.standard_normal(size).astype(np.float32) for name, size in sizes.items()}
+    kind, made = f32(B, 4, 7), f32(B, 5, 7)
+    convolution = node("y", "conv1d.default", made, Ref("x"), Ref("w"), Ref("b"), (1,), (1,))
+    graph = Graph({"x": kind}, {"w": f32(5, 4, 3), "b": f32(5)}, (convolution,), ("y",))
+    quantised, constants = quantize_model(lower_graph(graph, "block_00"), weights)
+    assert constants["w.int8"].shape == (12, 5)
+    x = rng.standard_normal((2, 4, 7)).astype(np.float32)
+    found = session(quantised, {**weights, **constants}).run(None, {"x": x})[0]
+    expected = functional.conv1d(torch.from_numpy(x), *map(torch.from_numpy, weights.values()), padding=1).numpy()
+    assert 0 < np.linalg.norm(found - expected) / np.linalg.norm(expected) < 0.02

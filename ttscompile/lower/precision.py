@@ -8,12 +8,12 @@ norms, attention, activations, biases, and the residual itself.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from onnx import AttributeProto, ModelProto, NodeProto, TensorProto, helper
+from onnx import AttributeProto, ModelProto, NodeProto, TensorProto, helper, numpy_helper
 
 from ..core.spec import INT8, PRECISIONS
 from ..errors import LoweringError
@@ -34,13 +34,20 @@ MOST_ROWS = 2**31 // (255 * LARGEST) - 1
 """Terms of a sum of products that an int32 holds whatever their values."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
+class _Matrix:
+    """A constant float32 matrix ``[rows, columns]``, and the constant that it was made of."""
+
+    name: str
+    value: Array
+
+
+@dataclass(frozen=True, eq=False)
 class _Product:
-    """``x @ w + bias`` with a constant ``w``."""
+    """``x @ matrix + bias``."""
 
     x: str  # name of the float32 input
-    weight: str  # name of the constant
-    transposed: bool  # whether the constant is w.T
+    matrix: _Matrix
     bias: str  # name of a constant [columns]; empty if there is none
 
 
@@ -104,16 +111,12 @@ def quantize_model(model: ModelProto, weights: Mapping[str, Array]) -> tuple[Mod
         float32 ``[columns]``. No constants if there was nothing to replace.
     """
     known = {t.name: weights[t.name] for t in model.graph.initializer if t.name in weights}
-    flipped = {
-        node.output[0]: node.input[0]
-        for node in model.graph.node
-        if node.op_type == "Transpose" and node.input[0] in known and _attributes(node).get("perm", [1, 0]) == [1, 0]
-    }
+    matrices = _matrices(model, known)
     constants: dict[str, Array] = {}
     nodes = []
     for node in model.graph.node:
-        product = _product(node, known, flipped)
-        nodes.append(node if product is None else _integer_product(node, product, known[product.weight], constants))
+        product = _product(node, known, matrices)
+        nodes.append(node if product is None else _integer_product(node, product, constants))
     nodes = live_nodes(nodes, {value.name for value in model.graph.output})
     quantized = ModelProto()
     quantized.CopyFrom(model)
@@ -145,7 +148,25 @@ def quantize_matrix(matrix: Array) -> tuple[npt.NDArray[np.int8], npt.NDArray[np
     return np.clip(np.rint(matrix / scale), -LARGEST, LARGEST).astype(np.int8), scale
 
 
-def _product(node: NodeProto, known: Mapping[str, Array], flipped: Mapping[str, str]) -> _Product | None:
+def _matrices(model: ModelProto, known: Mapping[str, Array]) -> dict[str, _Matrix]:
+    """The constants by the names of their values, and what transpositions and reshapes make of them."""
+    shapes = {t.name: numpy_helper.to_array(t) for t in model.graph.initializer if t.raw_data or t.int64_data}
+    found = {name: _Matrix(name, value) for name, value in known.items() if value.dtype == np.float32}
+    for node in model.graph.node:
+        before = found.get(node.input[0]) if node.input else None
+        if before is None:
+            continue
+        if node.op_type == "Transpose":
+            value = before.value.transpose(_attributes(node).get("perm"))
+        elif node.op_type == "Reshape" and node.input[1] in shapes:
+            value = before.value.reshape(shapes[node.input[1]])
+        else:
+            continue
+        found[node.output[0]] = _Matrix(before.name, value)
+    return found
+
+
+def _product(node: NodeProto, known: Mapping[str, Array], matrices: Mapping[str, _Matrix]) -> _Product | None:
     """What a node multiplies, if it is a product by a constant matrix that can be done in integers."""
     attributes = _attributes(node)
     if node.op_type == "Gemm":
@@ -156,28 +177,27 @@ def _product(node: NodeProto, known: Mapping[str, Array], flipped: Mapping[str, 
         flip, bias = False, ""
     else:
         return None
-    x, w = node.input[0], node.input[1]
-    product = _Product(x, flipped.get(w, w), flip != (w in flipped), bias)
-    matrix = known.get(product.weight)
-    if x in known or x in flipped or matrix is None or matrix.ndim != 2 or matrix.dtype != np.float32:
+    x, matrix = node.input[0], matrices.get(node.input[1])
+    if x in matrices or matrix is None or matrix.value.ndim != 2:
         return None
-    rows, columns = matrix.shape[::-1] if product.transposed else matrix.shape
+    value = matrix.value.T if flip else matrix.value
+    rows, columns = value.shape
     if not 0 < rows <= MOST_ROWS or (bias and (bias not in known or known[bias].shape != (columns,))):
         return None
-    return product
+    return _Product(x, replace(matrix, value=value), bias)
 
 
-def _integer_product(node: NodeProto, product: _Product, matrix: Array, constants: dict[str, Array]) -> NodeProto:
+def _integer_product(node: NodeProto, product: _Product, constants: dict[str, Array]) -> NodeProto:
     """The node that takes the place of ``node``; its constants go into ``constants``.
 
     No two products share them: onnxruntime 1.31 cannot load such a model where it has to make the integers unsigned
     ("Attempt to replace the existing tensor"), which is on processors whose sums saturate.
     """
-    name = f"{product.weight}.{INT8}"
+    name = f"{product.matrix.name}.{INT8}"
     while name in constants:
         name += "_"
     scale = f"{name}.scale"
-    values, scales = quantize_matrix(matrix.T if product.transposed else matrix)
+    values, scales = quantize_matrix(product.matrix.value)
     constants[name], constants[scale] = np.ascontiguousarray(values), scales
     inputs = [product.x, name, scale, "", product.bias] if product.bias else [product.x, name, scale]
     return NodeProto(name=node.name, op_type=_PRODUCT, domain=_DOMAIN, input=inputs, output=node.output)
