@@ -21,8 +21,11 @@ STREAMS = 3
 
 
 def policy_stream(name: str) -> tuple[int, ...]:
-    """Shape of one stream's residuals, wherever the module keeps its streams: four tokens of the module's width."""
-    return (4, 2) if name == "bare observation" else (4, 16)
+    """Shape of one stream's residuals, wherever the module keeps its streams: four tokens of the module's width.
+
+    A network that is one block has the sample beside the prediction.
+    """
+    return (4, {"bare observation": 2, "U-Net": 4}.get(name, 16))
 
 
 @pytest.mark.parametrize("name", MODULES)

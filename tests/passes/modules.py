@@ -14,6 +14,7 @@ from tests.passes.graphs import B, Builder
 from tests.passes.specs import toy_spec
 from ttscompile import ObservationSpec, PolicySpec
 from ttscompile.driver import transform
+from ttscompile.frontends.conditional_unet1d import ConditionalUnet1D, UNetConfig
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Batch, Graph, Ref
 from ttscompile.ir.pieces import LoopPiece
@@ -98,12 +99,25 @@ class BareObservation(nn.Module):
         return h + self.ff(h)
 
 
+class UNet(nn.Module):
+    """Convolutions with skips around them, no residual stream: it becomes one block."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        sizes = {"diffusion_step_embed_dim": 8, "down_dims": (8, 16), "cond_predict_scale": True}
+        self.net = ConditionalUnet1D(UNetConfig(2, global_cond_dim=21, **sizes))
+
+    def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
+        return self.net(sample, timestep, obs.flatten(1))  # type: ignore[no-any-return]
+
+
 MODULES = {
     "tokens": TokenDecoder,
     "condition encoder mixes tokens": lambda: TokenDecoder(encoder_layers=1),
     "adaLN": AdaLN,
     "sequence first": SequenceFirst,
     "bare observation": BareObservation,
+    "U-Net": UNet,
 }
 
 

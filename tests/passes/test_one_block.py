@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from torch import nn
 
-import ttscompile
 from tests.passes.graphs import B, Builder
+from tests.passes.modules import explained
 from tests.passes.specs import toy_spec
 from ttscompile.driver import transform
 from ttscompile.errors import PassError
-from ttscompile.frontends.conditional_unet1d import ConditionalUnet1D, UNetConfig
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Graph
 from ttscompile.ir.program import Captured
@@ -71,21 +69,8 @@ def test_a_prediction_of_another_shape_is_refused() -> None:
         OneBlock("")(captured(plain(B, 4, 6)))
 
 
-class Conditioned(nn.Module):
-    """A U-Net that reads the observation as its condition vector."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        sizes = {"diffusion_step_embed_dim": 8, "down_dims": (8, 16), "cond_predict_scale": True}
-        self.net = ConditionalUnet1D(UNetConfig(2, global_cond_dim=14, **sizes))
-
-    def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
-        return self.net(sample, timestep, obs.flatten(1))  # type: ignore[no-any-return]
-
-
 def test_a_unet_is_one_block_and_its_films_are_tables() -> None:
-    told: dict[str, tuple[str, ...]] = {}
-    program = transform(Conditioned().eval(), toy_spec(obs=(2, 7), sample=(4, 2)), explain=told.__setitem__)
+    _, program, told = explained("U-Net")
     assert "hold" in told["OneBlock"][0] and "1 block: network" in told["find_residual_blocks"][0]
     (block,) = program.blocks
     assert (block.kind, block.type.shape) == ("network", (B, 4, 4))
@@ -110,20 +95,3 @@ def test_the_note_says_where_the_search_for_a_chain_ended() -> None:
     told: dict[str, tuple[str, ...]] = {}
     transform(NoResidual(), toy_spec(obs=(3, 7)), explain=told.__setitem__)
     assert re.search(r"ended at %\w+ = aten\.mul\.Tensor \(test_one_block\.py:\d+ in forward\)", told["OneBlock"][0])
-
-
-def test_both_runtimes_agree_on_random_plans_of_one_block(tmp_path: Path) -> None:
-    spec = toy_spec(obs=(2, 7), sample=(4, 2), steps=6)
-    ttscompile.compile_denoiser(Conditioned().eval(), spec, tmp_path)
-    policies = [ttscompile.load(tmp_path, runtime=name) for name in ("onnxruntime", "reference")]
-    rng = np.random.default_rng(0)
-    for plan in [*rng.integers(0, 4, (6, 6, 1)).astype(np.int8), np.array([[0], [2], [2], [2], [2], [2]], np.int8)]:
-        plan[0] = 0
-        obs = rng.standard_normal((1, 2, 7)).astype(np.float32)
-        noise = ttscompile.Noise(rng.standard_normal((1, 4, 2)).astype(np.float32))
-        given = []
-        for policy in policies:
-            policy.reset()
-            policy.predict_action({"obs": obs}, noise=noise, plan="dense")
-            given.append(policy.predict_action({"obs": obs}, noise=noise, plan=plan)["action_pred"])
-        np.testing.assert_allclose(given[0], given[1], rtol=0, atol=1e-4)
