@@ -89,7 +89,7 @@ def configuration(variant: str) -> dict[str, Any]:
 def state_dict(variant: str, seed: int = 0) -> dict[str, torch.Tensor]:
     """The weights as the original saves them: image encoders twice, normalisers and masks among them."""
     config = configuration(variant)["policy"]
-    encoder = _encoder(config)
+    encoder = build_encoder(config)
     as_cond = config.get("obs_as_cond", True)
     channels = ACTION + (0 if as_cond else encoder.width)
     names = ("n_layer", "n_head", "n_emb", "horizon", "n_obs_steps")
@@ -105,6 +105,12 @@ def state_dict(variant: str, seed: int = 0) -> dict[str, torch.Tensor]:
     )
     weights = fill({f"model.{key}": value for key, value in network.state_dict().items()}, seed)
     weights |= {"_dummy_variable": torch.zeros(0), "model._dummy_variable": torch.zeros(0)}
+    return weights | encoder_weights(encoder, seed) | normalizer(variant)
+
+
+def encoder_weights(encoder: ObservationEncoder, seed: int) -> dict[str, torch.Tensor]:
+    """Those of robomimic's encoder, as the original saves them."""
+    weights = {}
     for key, position in encoder.position.items():
         prefix = f"obs_encoder.obs_nets.{key}."
         once = fill({prefix + name: v for name, v in encoder.cameras[position].state_dict().items()}, seed)
@@ -113,10 +119,11 @@ def state_dict(variant: str, seed: int = 0) -> dict[str, torch.Tensor]:
             weights[prefix + _TWINS[part] + name.removeprefix(prefix + part)] = value
             if part != "linear.":
                 weights[name] = value
-    return weights | normalizer(variant)
+    return weights
 
 
-def _encoder(config: Mapping[str, Any]) -> ObservationEncoder:
+def build_encoder(config: Mapping[str, Any]) -> ObservationEncoder:
+    """robomimic's encoder of ``cfg.policy``."""
     obs = config["shape_meta"]["obs"]
     crop = None if config["crop_shape"] is None else tuple(config["crop_shape"])
     inputs = {

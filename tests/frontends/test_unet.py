@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from contextlib import nullcontext
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,7 @@ from ttscompile.frontends.families import AS_SAVED
 from . import unets
 from .hybrid import Array
 
-GIVEN = {"steps_only": "global condition", "local": "local condition", "inpainting": "inpainting"}
+GIVEN = {"local": "local condition", "inpainting": "inpainting", "hybrid_inpainting": "inpainting"}
 SAVED_BY_THE_ORIGINAL = {"global": "global condition", "local": "local condition", "inpainting": "inpainting"}
 
 
@@ -44,8 +46,10 @@ def inputs(spec: PolicySpec, observation: dict[str, Array]) -> dict[str, torch.T
 def test_the_original_gave_the_same(variant: str, tmp_path: Path) -> None:
     """Single evaluations, and the actions of a whole call, from the file that is saved."""
     torch.save(unets.payload(variant), tmp_path / "policy.ckpt")
-    module, spec = load_checkpoint_policy(tmp_path / "policy.ckpt")
-    assert (spec.source["variant"], spec.source["weights"]) == (GIVEN[variant], "ema_model")
+    smaller = pytest.warns(UserWarning, match=r"images of '[ab]' are made smaller, \d\d x \d\d to 34 x 36")
+    with smaller if variant == "images_shared" else nullcontext():
+        module, spec = load_checkpoint_policy(tmp_path / "policy.ckpt")
+    assert (spec.source["variant"], spec.source["weights"]) == (GIVEN.get(variant, "global condition"), "ema_model")
     numbers, observation = recorded(variant), inputs(spec, unets.observation(variant))
     noise = Noise(*unets.noise(spec.sample))
     with torch.inference_mode():
@@ -82,22 +86,26 @@ def test_checkpoints_that_the_original_saved(name: str, shared: Path) -> None:
 # Settings
 
 Build = Callable[..., tuple[Any, PolicySpec]]
+_weights = cache(unets.state_dict)
 
 
 @pytest.fixture
 def build() -> Build:
-    """Build a policy with changes to ``cfg.policy``, to its ``model``, and to its weights, without a file."""
+    """Build a policy with changes to ``cfg.policy``, to an entry of it, and to its weights, without a file."""
 
     def run(
         variant: str,
         model: dict[str, Any] | None = None,
+        encoder: dict[str, Any] | None = None,
         weights: dict[str, torch.Tensor] | None = None,
         **policy: Any,
     ) -> tuple[Any, PolicySpec]:
         config = copy.deepcopy(unets.configuration(variant))
         config["policy"].update(policy)
-        config["policy"]["model"].update(model or {})
-        state = unets.state_dict(variant) | (weights or {})
+        for name, changes in (("model", model), ("obs_encoder", encoder)):
+            if changes:
+                config["policy"][name].update(changes)
+        state = _weights(variant) | (weights or {})
         return diffusion_policy.build({"cfg": config, "state_dicts": {"ema_model": state}}, AS_SAVED)
 
     return run
@@ -172,3 +180,76 @@ def test_settings_that_do_not_fit(build: Build, variant: str, given: dict[str, A
     """Each is named, with what was expected."""
     with pytest.raises(CheckpointError, match=message):
         build(variant, **given)
+
+
+def test_sizes_by_camera(build: Build) -> None:
+    """Each may have its own; margins of 2.5 and 3.5 pixels are rounded to even numbers."""
+    sizes = {"wrist": [36, 36], "front": [38, 35]}
+    module, _ = build("images", encoder={"crop_shape": sizes, "resize_shape": {"wrist": [41, 43], "front": [45, 50]}})
+    found = [(each.geometry.top, each.geometry.left, *each.geometry.size) for each in module.encoder.cameras]
+    assert found == [(4, 8, 38, 35), (2, 4, 36, 36)]  # the features are in the order of the names
+
+
+_GET_RESNET = {"_target_": "a.get_resnet", "name": "resnet50"}
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"_target_": "umi.TimmObsEncoder"}, r"obs_encoder is TimmObsEncoder; expected MultiImageObsEncoder"),
+        ({"dropout": 0.1}, r"settings that MultiImageObsEncoder does not know: dropout"),
+        ({"rgb_model": _GET_RESNET}, r"rgb_model\.name is 'resnet50'; expected resnet18 or resnet34"),
+        ({"rgb_model": {"_target_": "torchvision.models.vit"}}, r"rgb_model is made by vit; expected get_resnet"),
+        ({"rgb_model": _GET_RESNET | {"name": "resnet34"}}, r"torchvision's ResNets: missing \S+layer1\.2\.conv1"),
+        ({"crop_shape": [41, 30]}, r"crop_shape is \[41, 30\], and the images of 'front' are 41 x 43"),
+        ({"crop_shape": 36}, r"crop_shape is 36; expected \[height, width\]"),
+        ({"resize_shape": [10**6, 10**6]}, r"resize_shape is .* of 4096 pixels at most"),
+        ({"use_group_norm": False}, r"missing obs_encoder\.key_model_map\.front\.bn1\.running_mean"),
+        ({"share_rgb_model": True}, r"missing obs_encoder\.key_model_map\.rgb\.conv1\.weight"),
+        ({"imagenet_norm": "yes"}, r"obs_encoder\.imagenet_norm is 'yes'; expected true or false"),
+    ],
+)
+def test_image_encoders_that_do_not_fit(build: Build, given: dict[str, Any], message: str) -> None:
+    """Each is named, with what was expected."""
+    with pytest.raises(CheckpointError, match=message):
+        build("images", encoder=given)
+
+
+@pytest.mark.parametrize(
+    ("key", "entry", "message"),
+    [
+        ("wrist", {"shape": [4, 41, 43], "type": "rgb"}, r"obs\.wrist\.shape is .*; expected 3 channels"),
+        ("wrist", {"shape": [3, 9000, 43], "type": "rgb"}, r"obs\.wrist\.shape is .*; expected .* 4096 pixels at most"),
+        ("pos", {"shape": [2, 2]}, r"obs\.pos\.shape is \[2, 2\]; expected one number"),
+        ("pos", {"shape": [4], "type": "depth"}, r"obs\.pos\.type is 'depth'; expected low_dim or rgb"),
+        ("third", {"shape": [3, 41, 43], "type": "rgb"}, r"no normalizer\.params_dict\.third\.scale"),
+    ],
+)
+def test_observations_that_do_not_fit(build: Build, key: str, entry: dict[str, Any], message: str) -> None:
+    """Each is named, with what was expected."""
+    meta = copy.deepcopy(unets.configuration("images")["policy"]["shape_meta"])
+    meta["obs"][key] = entry
+    with pytest.raises(CheckpointError, match=message):
+        build("images", encoder={"shape_meta": meta})
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"horizon": 7}, r"cfg\.policy\.horizon is 7; expected a multiple of 2"),
+        ({"n_obs_steps": 3}, r"cond_encoder\.1\.weight has shape \(32, 2074\); expected \(32, 3103\)"),
+        ({"kernel_size": 4}, r"kernel_size of the U-Net is 4"),
+        ({"obs_as_global_cond": "no"}, r"obs_as_global_cond is 'no'; expected true or false"),
+        ({"obs_encoder": None}, r"obs_encoder is None; expected MultiImageObsEncoder"),
+        ({"oa_step_convention": True}, r"settings that are not known: oa_step_convention"),
+        ({"weights": {"obs_encoder.extra": torch.zeros(1)}}, r"unexpected obs_encoder\.extra"),
+        (
+            {"weights": {f"normalizer.params_dict.front.{name}": torch.ones(3) for name in ("scale", "offset")}},
+            r"params_dict\.front has 3 entries; expected one for the whole image",
+        ),
+    ],
+)
+def test_policies_on_images_that_do_not_fit(build: Build, given: dict[str, Any], message: str) -> None:
+    """Each is named, with what was expected."""
+    with pytest.raises(CheckpointError, match=message):
+        build("images", **given)

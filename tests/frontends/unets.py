@@ -11,14 +11,18 @@ import numpy as np
 import torch
 
 from ttscompile.frontends.conditional_unet1d import ConditionalUnet1D, UNetConfig
+from ttscompile.frontends.multi_image_encoder import MultiImageEncoder, View
+from ttscompile.frontends.resnet import group_norm
 
-from .hybrid import Array, fill
+from . import hybrid
+from .hybrid import Array
 
 STREAMS, STEPS, OBSERVED, ACTION = 2, 6, 2, 3
 LOW_DIM = 5
-_POLICY = "diffusion_policy.policy.diffusion_unet_lowdim_policy.DiffusionUnetLowdimPolicy"
-_NETWORK = "diffusion_policy.model.diffusion.conditional_unet1d.ConditionalUnet1D"
+_ORIGINAL = "diffusion_policy"
 _TINY = {"diffusion_step_embed_dim": 16, "down_dims": [16, 24], "kernel_size": 3, "n_groups": 4}
+_HYBRID = "diffusion_unet_hybrid_image_policy.DiffusionUnetHybridImagePolicy"
+_IMAGES = "diffusion_unet_image_policy.DiffusionUnetImagePolicy"
 
 VARIANTS: dict[str, dict[str, Any]] = {
     # Three levels, FiLM without scales, DDIM, and a sample of the executed steps alone.
@@ -30,7 +34,47 @@ VARIANTS: dict[str, dict[str, Any]] = {
     # Without oa_step_convention the first step after the observed ones is executed first.
     "local": {"policy": {"obs_as_local_cond": True}, "model": {"cond_predict_scale": True}},
     "inpainting": {"policy": {}, "model": {"cond_predict_scale": True}},
+    "hybrid": {
+        "of": _HYBRID,
+        "obs": {"pos": {"shape": [4]}, "front": {"shape": [3, 40, 43], "type": "rgb"}},
+        "policy": {"crop_shape": [34, 36], "obs_encoder_group_norm": True, "eval_fixed_crop": True},
+    },
+    "hybrid_inpainting": {
+        "of": _HYBRID,
+        "obs": {"front": {"shape": [3, 33, 34], "type": "rgb"}, "pos": {"shape": [2]}},
+        "policy": {"crop_shape": None, "obs_as_global_cond": False, "cond_predict_scale": False},
+        "scheduler": "DDIMScheduler",
+    },
+    # Cameras, and what is no image, in another order than the features; odd margins.
+    "images": {
+        "of": _IMAGES,
+        "obs": {
+            "wrist": {"shape": [3, 41, 43], "type": "rgb"},
+            "pos": {"shape": [4]},
+            "front": {"shape": [3, 41, 43], "type": "rgb"},
+            "grip": {"shape": [1]},
+        },
+        "encoder": {"crop_shape": [36, 36], "use_group_norm": True, "imagenet_norm": True},
+        "policy": {},
+    },
+    # One deeper ResNet for both, which keeps its batch norm; images made smaller, and of no random crop none at all.
+    "images_shared": {
+        "of": _IMAGES,
+        "obs": {"b": {"shape": [3, 50, 70], "type": "rgb"}, "a": {"shape": [3, 40, 30], "type": "rgb"}},
+        "encoder": {
+            "rgb_model": {"name": "resnet34"},
+            "share_rgb_model": True,
+            "use_group_norm": True,
+            "resize_shape": [34, 36],
+            "crop_shape": [20, 20],
+            "random_crop": False,
+        },
+        "policy": {},
+        "scheduler": "DDIMScheduler",
+    },
 }
+LOW = tuple(name for name, made in VARIANTS.items() if "of" not in made)
+"""Those of the low-dimensional policy."""
 
 
 def scheduler(name: str) -> dict[str, Any]:
@@ -51,37 +95,87 @@ def scheduler(name: str) -> dict[str, Any]:
 def configuration(variant: str) -> dict[str, Any]:
     """``cfg`` as it is saved, resolved."""
     made = VARIANTS[variant]
+    policy = {
+        "_target_": f"{_ORIGINAL}.policy.{made.get('of', 'diffusion_unet_lowdim_policy.DiffusionUnetLowdimPolicy')}",
+        "noise_scheduler": scheduler(made.get("scheduler", "DDPMScheduler")),
+        "num_inference_steps": STEPS,
+        "horizon": 8,
+        "n_action_steps": 4,
+        "n_obs_steps": OBSERVED,
+        **made["policy"],
+    }
+    if variant in LOW:
+        policy |= {"obs_dim": LOW_DIM, "action_dim": ACTION, "model": _model(made)}
+    else:
+        policy = {**_TINY, **policy, "shape_meta": {"obs": made["obs"], "action": {"shape": [ACTION]}}}
+    if made.get("of") == _IMAGES:
+        get_resnet = {"_target_": f"{_ORIGINAL}.model.vision.model_getter.get_resnet", "name": "resnet18"}
+        policy["obs_encoder"] = {
+            "_target_": f"{_ORIGINAL}.model.vision.multi_image_obs_encoder.MultiImageObsEncoder",
+            "shape_meta": policy["shape_meta"],
+            **made["encoder"],
+            "rgb_model": {**get_resnet, "weights": None, **made["encoder"].get("rgb_model", {})},
+        }
+    return {"training": {"use_ema": True}, "policy": policy}
+
+
+def _model(made: dict[str, Any]) -> dict[str, Any]:
+    """``cfg.policy.model`` of the low-dimensional policy."""
     as_global, as_local = (made["policy"].get(f"obs_as_{name}_cond", False) for name in ("global", "local"))
-    model = {
-        "_target_": _NETWORK,
+    return {
+        "_target_": f"{_ORIGINAL}.model.diffusion.conditional_unet1d.ConditionalUnet1D",
         "input_dim": ACTION + (0 if as_global or as_local else LOW_DIM),
         "global_cond_dim": LOW_DIM * OBSERVED if as_global else None,
         "local_cond_dim": LOW_DIM if as_local else None,
         **_TINY,
         **made["model"],
     }
-    policy = {
-        "_target_": _POLICY,
-        "model": model,
-        "noise_scheduler": scheduler(made.get("scheduler", "DDPMScheduler")),
-        "num_inference_steps": STEPS,
-        "horizon": 8,
-        "obs_dim": LOW_DIM,
-        "action_dim": ACTION,
-        "n_action_steps": 4,
-        "n_obs_steps": OBSERVED,
-        **made["policy"],
-    }
-    return {"training": {"use_ema": True}, "policy": policy}
 
 
 def state_dict(variant: str, seed: int = 0) -> dict[str, torch.Tensor]:
     """The weights as the original saves them, normalisers among them."""
-    model = {key: value for key, value in configuration(variant)["policy"]["model"].items() if key != "_target_"}
+    made, policy = VARIANTS[variant], configuration(variant)["policy"]
+    weights = {"_dummy_variable": torch.zeros(0), "mask_generator._dummy_variable": torch.zeros(0)}
+    if variant in LOW:
+        model = {key: value for key, value in policy["model"].items() if key != "_target_"}
+        widths = {"obs": LOW_DIM}
+    else:
+        as_global = policy.get("obs_as_global_cond", True)
+        if made["of"] == _HYBRID:
+            encoder: Any = hybrid.build_encoder(policy)
+            weights |= hybrid.encoder_weights(encoder, seed)
+        else:
+            encoder = _images_encoder(policy["obs_encoder"])
+            weights |= _images_weights(encoder, policy["obs_encoder"], seed)
+        model = _TINY | {key: policy[key] for key in ("cond_predict_scale",) if key in policy}
+        model = {"cond_predict_scale": True} | model
+        model["input_dim"] = ACTION + (0 if as_global else encoder.width)
+        model["global_cond_dim"] = OBSERVED * encoder.width if as_global else None
+        widths = {key: 1 if each.get("type") == "rgb" else each["shape"][0] for key, each in made["obs"].items()}
     network = ConditionalUnet1D(UNetConfig(**model))
-    weights = fill({f"model.{key}": value for key, value in network.state_dict().items()}, seed)
-    weights |= {"_dummy_variable": torch.zeros(0), "mask_generator._dummy_variable": torch.zeros(0)}
-    return weights | normalizer({"obs": LOW_DIM, "action": ACTION})
+    weights |= hybrid.fill({f"model.{key}": value for key, value in network.state_dict().items()}, seed)
+    return weights | normalizer(widths | {"action": ACTION})
+
+
+def _images_encoder(config: dict[str, Any]) -> MultiImageEncoder:
+    """With networks of the right sizes; how images reach them does not matter to the weights."""
+    obs = config["shape_meta"]["obs"]
+    view = View(8, 8, None, None, (1.0,) * 3, (0.0,) * 3)
+    views = {key: view for key, each in sorted(obs.items()) if each.get("type") == "rgb"}
+    low_dim = {key: each["shape"][0] for key, each in sorted(obs.items()) if each.get("type") != "rgb"}
+    shared = config.get("share_rgb_model", False)
+    norm = group_norm if config.get("use_group_norm") and not shared else torch.nn.BatchNorm2d
+    return MultiImageEncoder(views, low_dim, config["rgb_model"]["name"], norm, shared)
+
+
+def _images_weights(encoder: MultiImageEncoder, config: dict[str, Any], seed: int) -> dict[str, torch.Tensor]:
+    """Under the names of the original."""
+    named = {}
+    for key, network in zip(encoder.views, encoder.networks, strict=False):
+        owner = "rgb" if config.get("share_rgb_model") else key
+        for name, value in network.state_dict().items():
+            named[f"obs_encoder.key_model_map.{owner}.{name}"] = value
+    return hybrid.fill(named, seed) | {"obs_encoder._dummy_variable": torch.zeros(0)}
 
 
 def normalizer(widths: dict[str, int]) -> dict[str, torch.Tensor]:
@@ -94,9 +188,11 @@ def normalizer(widths: dict[str, int]) -> dict[str, torch.Tensor]:
 
 
 def observation(variant: str) -> dict[str, Array]:
-    """What the policy is given."""
+    """What the policy is given, images in 0..1."""
     rng = np.random.RandomState(7)
-    return {"obs": rng.uniform(-1, 1, (STREAMS, OBSERVED, LOW_DIM)).astype(np.float32)}
+    shapes = {key: each["shape"] for key, each in VARIANTS[variant].get("obs", {"obs": {"shape": [LOW_DIM]}}).items()}
+    low = 0.0 if variant not in LOW else -1.0
+    return {key: rng.uniform(low, 1, (STREAMS, OBSERVED, *shape)).astype(np.float32) for key, shape in shapes.items()}
 
 
 def noise(sample: tuple[int, int]) -> tuple[Array, Array]:

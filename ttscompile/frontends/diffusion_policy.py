@@ -30,6 +30,8 @@ _POLICIES: Mapping[str, Callable[[Saved], Rebuilt]] = {
     "DiffusionTransformerLowdimPolicy": transformer.low_dim,
     "DiffusionTransformerHybridImagePolicy": transformer.on_images,
     "DiffusionUnetLowdimPolicy": unet.low_dim,
+    "DiffusionUnetHybridImagePolicy": unet.hybrid,
+    "DiffusionUnetImagePolicy": unet.images,
 }
 """By the class name of the original policy."""
 

@@ -1,10 +1,12 @@
 """Diffusion Policy's U-Nets: configuration and weights to a denoiser.
 
-Source: ``DiffusionUnetLowdimPolicy`` of real-stanford/diffusion_policy.
+Source: ``DiffusionUnetLowdimPolicy``, ``DiffusionUnetHybridImagePolicy`` and ``DiffusionUnetImagePolicy`` of
+real-stanford/diffusion_policy.
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
 from dataclasses import fields
 from typing import Any, Literal
 
@@ -14,12 +16,33 @@ from ..core.spec import ObservationSpec
 from ..errors import CheckpointError
 from .conditional_unet1d import ConditionalUnet1D, UNetConfig
 from .conditioning import GlobalDenoiser, InpaintingDenoiser, LocalDenoiser
-from .diffusion_policy_parts import Rebuilt, Saved, network_settings, require_sizes
-from .diffusion_policy_weights import Weights, affine, load_network, require_room
+from .diffusion_policy_hybrid import ENCODER_KEYS
+from .diffusion_policy_hybrid import build_encoder as build_robomimic_encoder
+from .diffusion_policy_images import build_encoder as build_image_encoder
+from .diffusion_policy_images import encoder_settings
+from .diffusion_policy_parts import (
+    Observed,
+    Rebuilt,
+    Saved,
+    network_settings,
+    observation_specs,
+    read_shape_meta,
+    require_sizes,
+)
+from .diffusion_policy_weights import Weights, affine, load_network, network_weights, require_room
+from .encoded import EncodedDenoiser
 
 _NETWORK = "ConditionalUnet1D"
 _SETTINGS = frozenset(field.name for field in fields(UNetConfig))
 _SWITCHES = ("obs_as_global_cond", "obs_as_local_cond", "pred_action_steps_only", "oa_step_convention")
+_DEFAULTS: Mapping[str, Any] = {
+    "diffusion_step_embed_dim": 256,
+    "down_dims": [256, 512, 1024],
+    "kernel_size": 5,
+    "n_groups": 8,
+    "cond_predict_scale": True,
+}
+"""Of the policies on images, which are not those of the network."""
 _MOST_STEPS = 4096
 """Of a chunk, which the weights do not limit; in use are 4 to 64."""
 
@@ -56,6 +79,56 @@ def low_dim(saved: Saved) -> Rebuilt:
         start,
         given,
         frozenset({*_SWITCHES, "obs_dim", "action_dim", "model"}),
+    )
+
+
+def hybrid(saved: Saved) -> Rebuilt:
+    """``DiffusionUnetHybridImagePolicy``."""
+    action_dim, observed = read_shape_meta(saved.settings, "low_dim", "rgb")
+    encoder = build_robomimic_encoder(saved.settings, observed, saved.weights)
+    return behind_encoder(saved, encoder, encoder.width, observed, action_dim, ENCODER_KEYS)
+
+
+def images(saved: Saved) -> Rebuilt:
+    """``DiffusionUnetImagePolicy``."""
+    action_dim, _ = read_shape_meta(saved.settings, "low_dim", "rgb")
+    settings = encoder_settings(saved.settings)
+    _, observed = read_shape_meta(settings, "low_dim", "rgb")
+    encoder = build_image_encoder(settings, observed, saved.weights)
+    return behind_encoder(saved, encoder, encoder.width, observed, action_dim, {"shape_meta", "obs_encoder"})
+
+
+def behind_encoder(
+    saved: Saved, encoder: nn.Module, width: int, observed: Observed, action_dim: int, known: Collection[str]
+) -> Rebuilt:
+    """A U-Net whose settings stand among the policy's own, on what an encoder makes of the observed steps.
+
+    Args:
+        saved: the policy.
+        encoder: observations by key to ``[B, To, width]``.
+        width: of a step's features.
+        observed: what it takes.
+        action_dim: Da.
+        known: settings of ``cfg.policy`` that are the encoder's.
+    """
+    as_global = saved.settings.flag("obs_as_global_cond", True)
+    (n_obs_steps,) = saved.sizes("n_obs_steps")
+    config = UNetConfig(
+        input_dim=action_dim + (0 if as_global else width),
+        global_cond_dim=width * n_obs_steps if as_global else None,
+        **{name: saved.policy.get(name, default) for name, default in _DEFAULTS.items()},
+    )
+    given: Given = "global condition" if as_global else "inpainting"
+    start = n_obs_steps - 1
+    module, sample = denoiser(saved, network_weights(saved.weights), config, given, action_dim, "horizon", start)
+    return Rebuilt(
+        EncodedDenoiser(encoder, module),
+        observation_specs(observed, n_obs_steps, saved.weights),
+        sample,
+        action_dim,
+        start,
+        given,
+        frozenset({"obs_as_global_cond", *_DEFAULTS, *known}),
     )
 
 

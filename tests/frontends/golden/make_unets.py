@@ -1,8 +1,9 @@
 """Run the original U-Nets on seeded weights, and write what they give: ``unet_VARIANT.npz``.
 
-Not run by the tests. Needs real-stanford/diffusion_policy (5ba07ac) importable, and this repository::
+Not run by the tests. Needs real-stanford/diffusion_policy (5ba07ac) and ARISE-Initiative/robomimic v0.2.0 importable,
+and this repository. torchvision need not be there::
 
-    PYTHONPATH=path/to/diffusion_policy:. python -m tests.frontends.golden.make_unets
+    PYTHONPATH=path/to/diffusion_policy:path/to/robomimic:. python -m tests.frontends.golden.make_unets
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 import torch
 
 from .. import unets
+from .torchvision_stand_in import put_in_place
 
 PROBED = (0, 17, 59)
 """Timesteps of single evaluations."""
@@ -24,6 +26,7 @@ PROBED = (0, 17, 59)
 
 def main() -> None:
     """One file a variant."""
+    put_in_place()
     for variant in unets.VARIANTS:
         path = Path(__file__).with_name(f"unet_{variant}.npz")
         np.savez_compressed(path, **run(variant))
@@ -32,7 +35,10 @@ def main() -> None:
 
 def made(settings: dict[str, Any]) -> Any:
     """What ``hydra.utils.instantiate`` makes of an entry of the configuration."""
-    arguments = dict(settings)
+    arguments = {
+        key: made(value) if isinstance(value, dict) and "_target_" in value else value
+        for key, value in settings.items()
+    }
     module, _, name = arguments.pop("_target_").rpartition(".")
     return getattr(schedulers if module == "diffusers.schedulers" else import_module(module), name)(**arguments)
 
@@ -40,12 +46,11 @@ def made(settings: dict[str, Any]) -> Any:
 @torch.no_grad()
 def run(variant: str) -> dict[str, Any]:
     """The original's actions, and single evaluations of its network, with noise from outside."""
-    settings = dict(unets.configuration(variant)["policy"])
-    for name in ("noise_scheduler", "model"):
-        settings[name] = made(settings[name])
+    settings = unets.configuration(variant)["policy"]
     policy = made(settings)
     own, weights = policy.state_dict(), unets.state_dict(variant)
-    assert all("_dummy_variable" in name for name in set(own) - set(weights)), sorted(set(own) - set(weights))
+    unknown = sorted(set(own) - set(weights))
+    assert all(name.endswith(("_dummy_variable", "num_batches_tracked")) for name in unknown), unknown
     assert all(name.startswith("normalizer.") for name in set(weights) - set(own)), sorted(set(weights) - set(own))
     policy.load_state_dict(weights, strict=False)
     policy.eval()

@@ -1,0 +1,146 @@
+"""Diffusion Policy's encoder of several cameras: its configuration and weights to ``MultiImageEncoder``.
+
+Source: ``MultiImageObsEncoder`` and ``get_resnet`` of real-stanford/diffusion_policy.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import torch
+from torch import nn
+
+from ..errors import CheckpointError
+from .diffusion_policy_parts import Observed, image_normalizer
+from .diffusion_policy_weights import Weights
+from .multi_image_encoder import COLOURS, MultiImageEncoder, View
+from .resnet import DEPTHS, Norm, group_norm
+from .saved_weights import require_weights
+from .settings import Settings
+
+_ENCODER = "MultiImageObsEncoder"
+_KNOWN = {"_target_", "shape_meta", "rgb_model", "resize_shape", "crop_shape", "random_crop"}
+_KNOWN |= {"use_group_norm", "share_rgb_model", "imagenet_norm"}
+_PREFIX = "obs_encoder."
+_MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of the colours of ImageNet
+_MOST_PIXELS = 4096
+
+
+def encoder_settings(settings: Settings) -> Settings:
+    """``cfg.policy.obs_encoder``.
+
+    Raises:
+        CheckpointError: it is of another class, or has settings that this one does not know.
+    """
+    values = settings.values.get("obs_encoder")
+    found = str(values.get("_target_")).rpartition(".")[2] if isinstance(values, dict) else f"{values!r:.80}"
+    if found != _ENCODER or not isinstance(values, dict):
+        raise CheckpointError(
+            f"cfg.policy.obs_encoder is {found}; expected {_ENCODER}. Use ttscompile.compile_denoiser(module, spec) on"
+            " a network of your own, its observation encoder inside the module."
+        )
+    unknown = sorted(set(values) - _KNOWN)
+    if unknown:
+        raise CheckpointError(
+            f"cfg.policy.obs_encoder has settings that {_ENCODER} does not know: {', '.join(unknown)}. The encoder was"
+            " changed; use ttscompile.compile_denoiser(module, spec)."
+        )
+    return Settings(values, f"{settings.where}obs_encoder.", settings.remedy)
+
+
+def build_encoder(settings: Settings, observed: Observed, weights: Weights) -> MultiImageEncoder:
+    """The observation encoder with its weights; normalisers of images are part of it.
+
+    Args:
+        settings: ``cfg.policy.obs_encoder``.
+        observed: of its ``shape_meta``.
+        weights: of the policy.
+
+    Raises:
+        CheckpointError: settings, weights or normalisers that do not fit.
+    """
+    flags = {name: settings.flag(name, False) for name in ("use_group_norm", "share_rgb_model", "imagenet_norm")}
+    views: dict[str, View] = {}
+    low_dim: dict[str, int] = {}
+    for key, (kind, shape) in sorted(observed.items()):  # the original sorts them, too
+        if kind == "rgb":
+            views[key] = _view(settings, key, shape, image_normalizer(weights, key), flags["imagenet_norm"])
+        elif len(shape) == 1:
+            low_dim[key] = shape[0]
+        else:
+            raise settings.error(f"shape_meta.obs.{key}.shape is {list(shape)}; expected one number")
+    shared = flags["share_rgb_model"]
+    # The original puts group norm into the networks of single cameras, and leaves the shared one as it is.
+    norm: Norm = group_norm if flags["use_group_norm"] and not shared else nn.BatchNorm2d
+    arguments = (views, low_dim, _network(settings) if views else next(iter(DEPTHS)), norm, shared)
+    owners = ["rgb"] if shared else list(views)
+
+    def saved_name(name: str) -> str:
+        _, index, rest = name.split(".", 2)
+        return f"{_PREFIX}key_model_map.{owners[int(index)]}.{rest}"
+
+    with torch.device("meta"):  # compared before memory of the configured sizes is taken
+        expected = MultiImageEncoder(*arguments).state_dict()
+    names = {saved_name(name): name for name in expected if not name.endswith("num_batches_tracked")}
+    found = {key: value for key, value in weights.items() if key.startswith(_PREFIX)}
+    found.pop(f"{_PREFIX}_dummy_variable", None)
+    require_weights(
+        {full: expected[name] for full, name in names.items()},
+        found,
+        "cfg.policy.obs_encoder",
+        what=f"the weights of the image encoder are not those of {_ENCODER} with torchvision's ResNets",
+    )
+    encoder = MultiImageEncoder(*arguments)
+    encoder.load_state_dict({name: found[full] for full, name in names.items()}, strict=False)
+    return encoder
+
+
+def _network(settings: Settings) -> str:
+    """Name of the ResNet, a key of ``DEPTHS``; which weights it began its training with does not matter."""
+    values = settings.values.get("rgb_model")
+    model = Settings(values if isinstance(values, dict) else {}, f"{settings.where}rgb_model.", settings.remedy)
+    made_by = str(model.values.get("_target_")).rpartition(".")[2]
+    if made_by not in ("get_resnet", "get_r3m"):
+        raise settings.error(f"rgb_model is made by {made_by}; expected get_resnet with {' or '.join(DEPTHS)}")
+    if model.values.get("name") not in DEPTHS:
+        raise model.refusal("name", " or ".join(DEPTHS))
+    return str(model.values["name"])
+
+
+def _view(
+    settings: Settings, key: str, shape: tuple[int, ...], normalizer: tuple[float, float], imagenet: bool
+) -> View:
+    """How one camera's images reach the network."""
+    channels, height, width = shape
+    if channels != COLOURS:
+        raise settings.error(
+            f"shape_meta.obs.{key}.shape is {list(shape)}; expected {COLOURS} channels of an RGB image"
+        )
+    resize, crop = _size(settings, "resize_shape", key), _size(settings, "crop_shape", key)
+    whole = resize or (height, width)
+    if whole[0] < height or whole[1] < width:
+        warnings.warn(
+            f"the images of {key!r} are made smaller, {height} x {width} to {whole[0]} x {whole[1]}. That is done as in"
+            " the original's environment (torchvision 0.13: bilinear, without antialiasing); from 0.17 on torchvision"
+            " does it with antialiasing. If the policy was trained so, resize the images before.",
+            stacklevel=2,
+        )
+    if not settings.flag("random_crop", True):
+        crop = None  # the original makes a crop of the centre then, and never uses it
+    if crop is not None and (crop[0] >= whole[0] or crop[1] >= whole[1]):
+        found = f"crop_shape is {list(crop)}, and the images of {key!r} are {whole[0]} x {whole[1]}"
+        raise settings.error(f"{found}; expected a crop that is smaller; the original refuses this, too")
+    scale, offset = normalizer
+    mean, deviation = (_MEAN, _DEVIATION) if imagenet else ((0.0,) * COLOURS, (1.0,) * COLOURS)
+    scales = tuple(scale / each for each in deviation)
+    offsets = tuple((offset - middle) / each for middle, each in zip(mean, deviation, strict=True))
+    return View(height, width, resize, crop, scales, offsets)
+
+
+def _size(settings: Settings, name: str, key: str) -> tuple[int, int] | None:
+    """A size for all cameras, or of this one among those by key."""
+    value: Any = settings.values.get(name)
+    if isinstance(value, dict):
+        return Settings(value, f"{settings.where}{name}.", settings.remedy).size(key, None, _MOST_PIXELS)
+    return settings.size(name, None, _MOST_PIXELS)
