@@ -13,13 +13,18 @@ import numpy as np
 import pytest
 import torch
 
-from tests.rounding import PROMISED, Counted, assert_equal_but_for_rounding
+import ttscompile
+from tests.rounding import PROMISED, Counted, assert_equal_but_for_rounding, bound
+from ttscompile.artifact import load_artifact
 from ttscompile.core.spec import Noise, PolicySpec
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends import diffusion_policy, load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy, evaluation
 from ttscompile.frontends.families import AS_SAVED
+from ttscompile.ir.program import Program
+from ttscompile.runtimes import open_runtime
 
+from ..runtimes.agreement import call_terms, largest_difference
 from . import unets
 from .hybrid import Array
 
@@ -253,3 +258,33 @@ def test_policies_on_images_that_do_not_fit(build: Build, given: dict[str, Any],
     """Each is named, with what was expected."""
     with pytest.raises(CheckpointError, match=message):
         build("images", **given)
+
+
+# Compiled
+
+COMPILED = ("local", "images")
+
+
+@pytest.fixture(scope="module", params=COMPILED)
+def compiled(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Program, Path]:
+    """Variant, program and artifact of a policy, converted once."""
+    folder = tmp_path_factory.mktemp(request.param)
+    torch.save(unets.payload(request.param), folder / "policy.ckpt")
+    return request.param, ttscompile.convert(folder / "policy.ckpt", folder / "compiled"), folder / "compiled"
+
+
+@pytest.mark.slow
+def test_compiled_is_the_original(compiled: tuple[str, Program, Path]) -> None:
+    """From raw observations to actions, through the artifact, in both runtimes; which agree on random plans, too."""
+    variant, program, directory = compiled
+    numbers, observation = recorded(variant), unets.observation(variant)
+    for runtime in ("onnxruntime", "reference"):
+        policy = ttscompile.load(directory, runtime=runtime)
+        out = policy.predict_action(observation, noise=Noise(*unets.noise(program.spec.sample)), plan="dense")
+        for name in ("action", "action_pred"):
+            assert out[name].shape == numbers[name].shape
+            assert np.abs(out[name] - numbers[name]).max() < PROMISED * np.ptp(numbers["action_pred"])
+    artifact = load_artifact(directory)
+    runtimes = open_runtime(artifact, "onnxruntime"), open_runtime(artifact, "reference")
+    found = largest_difference(artifact, *runtimes, np.random.default_rng(0), 2, calls=3)
+    assert found < bound(call_terms(artifact))
