@@ -64,8 +64,6 @@ def test_torch_files(tmp_path: Path, payload: dict[str, Any], what: str, remedy:
 
 NAMES = [
     ("DiffusionUnetTimmPolicy", "a diffusion policy with another observation encoder.*inside the module"),
-    ("DP3", "3D Diffusion Policy, a U-Net"),
-    ("SimpleDP3", "3D Diffusion Policy, a U-Net"),
     ("BETLowdimPolicy", "a policy without diffusion.*no denoising loop"),
     ("RobomimicImagePolicy", "a policy without diffusion"),
     (

@@ -1,4 +1,4 @@
-"""Diffusion Policy's U-Nets, against numbers that the original gave; see ``golden/make_unets.py``."""
+"""The U-Nets of Diffusion Policy and 3D Diffusion Policy: what the originals gave; see ``golden/make_unets.py``."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from ttscompile.frontends.families import AS_SAVED
 from ttscompile.ir.program import Program
 from ttscompile.runtimes import open_runtime
 
+from ..families.support import record
 from ..runtimes.agreement import call_terms, largest_difference
 from . import unets
 from .hybrid import Array
@@ -187,12 +188,11 @@ def test_settings_that_do_not_fit(build: Build, variant: str, given: dict[str, A
         build(variant, **given)
 
 
-def test_sizes_by_camera(build: Build) -> None:
-    """Each may have its own; margins of 2.5 and 3.5 pixels are rounded to even numbers."""
-    sizes = {"wrist": [36, 36], "front": [38, 35]}
-    module, _ = build("images", encoder={"crop_shape": sizes, "resize_shape": {"wrist": [41, 43], "front": [45, 50]}})
-    found = [(each.geometry.top, each.geometry.left, *each.geometry.size) for each in module.encoder.cameras]
-    assert found == [(4, 8, 38, 35), (2, 4, 36, 36)]  # the features are in the order of the names
+def test_the_centre_is_looked_at(build: Build) -> None:
+    """Of images that are resized first, where that is asked for; margins of 4.5 and 7.5 are rounded to even numbers."""
+    module, _ = build("images", encoder={"crop_shape": [36, 35], "resize_shape": [45, 50]})
+    found = {(each.geometry.top, each.geometry.left, *each.geometry.size) for each in module.encoder.cameras}
+    assert found == {(4, 8, 36, 35)}
 
 
 _GET_RESNET = {"_target_": "a.get_resnet", "name": "resnet50"}
@@ -260,9 +260,65 @@ def test_policies_on_images_that_do_not_fit(build: Build, given: dict[str, Any],
         build("images", **given)
 
 
+_NO_COLOUR = {"point_cloud": {"shape": [20, 2]}, "agent_pos": {"shape": [4]}}
+_CLOUD = {"in_channels": 3, "out_channels": 24, "use_layernorm": True, "final_norm": "layernorm"}
+
+
+@pytest.mark.parametrize(
+    ("variant", "given", "message"),
+    [
+        (
+            "dp3",
+            {"condition_type": "cross_attention_film"},
+            r"is 'cross_attention_film'; expected film or add or mlp_film",
+        ),
+        ("dp3", {"condition_type": "film"}, r"missing model\S+cond_encoder|unexpected model\S+cond_encoder"),
+        ("dp3", {"obs_as_global_cond": False}, r"obs_as_global_cond is false; expected true"),
+        ("dp3", {"eta": 0.5}, r"cfg\.policy has settings that 3D Diffusion Policy does not know: eta"),
+        ("dp3", {"use_up_condition": 1}, r"cfg\.policy\.use_up_condition is 1; expected true or false"),
+        ("dp3", {"pointnet_type": "transformer"}, r"pointnet_type is 'transformer'; expected pointnet"),
+        (
+            "dp3",
+            {"pointcloud_encoder_cfg": None},
+            r"pointcloud_encoder_cfg is None; expected the settings of a PointNet",
+        ),
+        (
+            "dp3",
+            {"pointcloud_encoder_cfg": _CLOUD | {"final_norm": "batch"}},
+            r"final_norm is 'batch'; expected none or",
+        ),
+        ("dp3", {"pointcloud_encoder_cfg": _CLOUD | {"use_layernorm": False}}, r"unexpected obs_encoder\S+mlp\.1\."),
+        ("dp3", {"pointcloud_encoder_cfg": _CLOUD | {"out_channels": 10**9}}, r"out_channels asks for at least"),
+        ("dp3", {"encoder_output_dim": 32}, r"encoder_output_dim is 32; expected 24, which its PointNet gives"),
+        ("dp3", {"use_pc_color": True, "horizon": 8}, r"extractor\.mlp\.9\.weight|mlp\.0\.weight has shape"),
+        ("dp3_add", {"use_pc_color": True}, r"obs\.point_cloud is \[20, 3\]; expected the shape \[points, 6\]"),
+        ("dp3", {"shape_meta": {"obs": _NO_COLOUR, "action": {"shape": [3]}}}, r"\[20, 2\]; expected .*\[points, 3\]"),
+        (
+            "dp3",
+            {"shape_meta": {"obs": {"agent_pos": {"shape": [4]}}, "action": {"shape": [3]}}},
+            "point_cloud is missing",
+        ),
+        ("simple_dp3", {"horizon": 6}, r"horizon is 6; expected a multiple of 4"),
+        ("simple_dp3", {"_target_": "a.DP3"}, r"missing model\.down_modules"),
+    ],
+)
+def test_point_cloud_policies_that_do_not_fit(build: Build, variant: str, given: dict[str, Any], message: str) -> None:
+    """Each is named, with what was expected."""
+    with pytest.raises(CheckpointError, match=message):
+        build(variant, **given)
+
+
 # Compiled
 
-COMPILED = ("local", "images")
+COMPILED = {
+    "local": "Diffusion Policy, U-Net on low-dimensional observations",
+    "images": "Diffusion Policy, U-Net on images",
+    "dp3": "3D Diffusion Policy",
+}
+"""Variant, and the row of the support table.
+
+The three ways of giving the observation are in them, but for inpainting, which the transformers are compiled with.
+"""
 
 
 @pytest.fixture(scope="module", params=COMPILED)
@@ -288,3 +344,9 @@ def test_compiled_is_the_original(compiled: tuple[str, Program, Path]) -> None:
     runtimes = open_runtime(artifact, "onnxruntime"), open_runtime(artifact, "reference")
     found = largest_difference(artifact, *runtimes, np.random.default_rng(0), 2, calls=3)
     assert found < bound(call_terms(artifact))
+    record(
+        COMPILED[variant],
+        "predictions at three timesteps and actions that the original gave, 1e-5 of the range",
+        f"{program.spec.sampler.name} {unets.STEPS}",
+        program,
+    )

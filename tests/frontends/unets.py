@@ -12,6 +12,7 @@ import torch
 
 from ttscompile.frontends.conditional_unet1d import ConditionalUnet1D, UNetConfig
 from ttscompile.frontends.multi_image_encoder import MultiImageEncoder, View
+from ttscompile.frontends.point_cloud_encoder import PointCloudEncoder, PointNet
 from ttscompile.frontends.resnet import group_norm
 
 from . import hybrid
@@ -23,6 +24,7 @@ _ORIGINAL = "diffusion_policy"
 _TINY = {"diffusion_step_embed_dim": 16, "down_dims": [16, 24], "kernel_size": 3, "n_groups": 4}
 _HYBRID = "diffusion_unet_hybrid_image_policy.DiffusionUnetHybridImagePolicy"
 _IMAGES = "diffusion_unet_image_policy.DiffusionUnetImagePolicy"
+_DP3, _SIMPLE = "dp3.DP3", "simple_dp3.SimpleDP3"
 
 VARIANTS: dict[str, dict[str, Any]] = {
     # Three levels, FiLM without scales, DDIM, and a sample of the executed steps alone.
@@ -72,9 +74,52 @@ VARIANTS: dict[str, dict[str, Any]] = {
         "policy": {},
         "scheduler": "DDIMScheduler",
     },
+    # Colours that are not looked at; points of the robot; a condition with a layer of its own, and not everywhere.
+    "dp3": {
+        "of": _DP3,
+        "obs": {
+            "agent_pos": {"shape": [4]},
+            "point_cloud": {"shape": [20, 6], "type": "point_cloud"},
+            "imagin_robot": {"shape": [5, 7], "type": "point_cloud"},
+            "image": {"shape": [3, 84, 84], "type": "rgb"},
+        },
+        "policy": {
+            "condition_type": "mlp_film",
+            "use_mid_condition": False,
+            "encoder_output_dim": 24,
+            "pointcloud_encoder_cfg": {
+                "in_channels": 3,
+                "out_channels": 24,
+                "use_layernorm": True,
+                "final_norm": "layernorm",
+                "normal_channel": False,
+            },
+        },
+    },
+    "simple_dp3": {
+        "of": _SIMPLE,
+        "obs": {"point_cloud": {"shape": [20, 6], "type": "point_cloud"}, "agent_pos": {"shape": [4]}},
+        "policy": {
+            "down_dims": [16, 24, 24],
+            "encoder_output_dim": 16,
+            "use_pc_color": True,
+            "pointcloud_encoder_cfg": {"in_channels": 6, "out_channels": 16},
+        },
+    },
+    "dp3_add": {
+        "of": _DP3,
+        "obs": {"point_cloud": {"shape": [20, 3], "type": "point_cloud"}, "agent_pos": {"shape": [4]}},
+        "policy": {
+            "condition_type": "add",
+            "encoder_output_dim": 256,
+            "pointcloud_encoder_cfg": {"in_channels": 3, "use_projection": False},
+        },
+    },
 }
 LOW = tuple(name for name, made in VARIANTS.items() if "of" not in made)
 """Those of the low-dimensional policy."""
+POINTS = tuple(name for name, made in VARIANTS.items() if made.get("of") in (_DP3, _SIMPLE))
+"""Those of 3D Diffusion Policy."""
 
 
 def scheduler(name: str) -> dict[str, Any]:
@@ -95,9 +140,12 @@ def scheduler(name: str) -> dict[str, Any]:
 def configuration(variant: str) -> dict[str, Any]:
     """``cfg`` as it is saved, resolved."""
     made = VARIANTS[variant]
+    original = "diffusion_policy_3d" if variant in POINTS else _ORIGINAL
     policy = {
-        "_target_": f"{_ORIGINAL}.policy.{made.get('of', 'diffusion_unet_lowdim_policy.DiffusionUnetLowdimPolicy')}",
-        "noise_scheduler": scheduler(made.get("scheduler", "DDPMScheduler")),
+        "_target_": f"{original}.policy.{made.get('of', 'diffusion_unet_lowdim_policy.DiffusionUnetLowdimPolicy')}",
+        "noise_scheduler": scheduler("DDIMScheduler") | {"prediction_type": "sample"}
+        if variant in POINTS
+        else scheduler(made.get("scheduler", "DDPMScheduler")),
         "num_inference_steps": STEPS,
         "horizon": 8,
         "n_action_steps": 4,
@@ -141,20 +189,34 @@ def state_dict(variant: str, seed: int = 0) -> dict[str, torch.Tensor]:
         widths = {"obs": LOW_DIM}
     else:
         as_global = policy.get("obs_as_global_cond", True)
-        if made["of"] == _HYBRID:
-            encoder: Any = hybrid.build_encoder(policy)
+        if variant in POINTS:
+            encoder: Any = _points_encoder(policy)
+            named = {f"obs_encoder.{name}": value for name, value in encoder.state_dict().items()}
+            weights |= hybrid.fill(named, seed)
+        elif made["of"] == _HYBRID:
+            encoder = hybrid.build_encoder(policy)
             weights |= hybrid.encoder_weights(encoder, seed)
         else:
             encoder = _images_encoder(policy["obs_encoder"])
             weights |= _images_weights(encoder, policy["obs_encoder"], seed)
-        model = _TINY | {key: policy[key] for key in ("cond_predict_scale",) if key in policy}
-        model = {"cond_predict_scale": True} | model
+        model = {"cond_predict_scale": policy.get("cond_predict_scale", True)} | {key: policy[key] for key in _TINY}
+        if variant in POINTS:
+            model["cond_predict_scale"] = policy.get("condition_type") != "add"
+            model |= {"condition_layer": policy.get("condition_type") == "mlp_film"}
+            model["blocks"] = 1 if made["of"] == _SIMPLE else 2
         model["input_dim"] = ACTION + (0 if as_global else encoder.width)
         model["global_cond_dim"] = OBSERVED * encoder.width if as_global else None
-        widths = {key: 1 if each.get("type") == "rgb" else each["shape"][0] for key, each in made["obs"].items()}
+        widths = {key: 1 if each.get("type") == "rgb" else each["shape"][-1] for key, each in made["obs"].items()}
     network = ConditionalUnet1D(UNetConfig(**model))
     weights |= hybrid.fill({f"model.{key}": value for key, value in network.state_dict().items()}, seed)
     return weights | normalizer(widths | {"action": ACTION})
+
+
+def _points_encoder(policy: dict[str, Any]) -> PointCloudEncoder:
+    cloud, coloured = policy["pointcloud_encoder_cfg"], policy.get("use_pc_color", False)
+    norms, last_norm = cloud.get("use_layernorm", False), cloud.get("final_norm") == "layernorm"
+    extractor = PointNet(coloured, cloud.get("out_channels"), norms, last_norm)
+    return PointCloudEncoder(extractor, 6 if coloured else 3, policy["shape_meta"]["obs"]["agent_pos"]["shape"][0])
 
 
 def _images_encoder(config: dict[str, Any]) -> MultiImageEncoder:
@@ -190,8 +252,10 @@ def normalizer(widths: dict[str, int]) -> dict[str, torch.Tensor]:
 def observation(variant: str) -> dict[str, Array]:
     """What the policy is given, images in 0..1."""
     rng = np.random.RandomState(7)
-    shapes = {key: each["shape"] for key, each in VARIANTS[variant].get("obs", {"obs": {"shape": [LOW_DIM]}}).items()}
-    low = 0.0 if variant not in LOW else -1.0
+    keys = VARIANTS[variant].get("obs", {"obs": {"shape": [LOW_DIM]}})
+    # 3D Diffusion Policy may be configured with images, which it never looks at.
+    shapes = {key: each["shape"] for key, each in keys.items() if variant not in POINTS or key != "image"}
+    low = 0.0 if VARIANTS[variant].get("of") in (_HYBRID, _IMAGES) else -1.0
     return {key: rng.uniform(low, 1, (STREAMS, OBSERVED, *shape)).astype(np.float32) for key, shape in shapes.items()}
 
 

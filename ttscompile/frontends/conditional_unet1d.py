@@ -1,4 +1,4 @@
-"""The U-Net of Diffusion Policy, rebuilt from its configuration; LeRobot's ``diffusion`` has the same network.
+"""The U-Net of Diffusion Policy, 3D Diffusion Policy and LeRobot's ``diffusion``, rebuilt from its configuration.
 
 Written from the description of the network, with attribute names under which the weights of an original checkpoint
 load as they are.
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import nn
@@ -42,6 +42,10 @@ class UNetConfig:
         kernel_size: of the convolutions.
         n_groups: of their group norms.
         cond_predict_scale: whether the condition scales the features as well as shifting them.
+        condition_layer: whether a layer of the condition's own width comes before scale and shift.
+        blocks: of a level and in the middle, 2 or 1.
+        conditioned: whether the levels down, the middle, and those up are given the condition; the weights for it are
+            there in any case.
     """
 
     input_dim: int
@@ -52,6 +56,9 @@ class UNetConfig:
     kernel_size: int = 3
     n_groups: int = 8
     cond_predict_scale: bool = False
+    condition_layer: bool = False
+    blocks: Literal[1, 2] = 2
+    conditioned: tuple[bool, bool, bool] = (True, True, True)
 
     def __post_init__(self) -> None:
         if type(self.cond_predict_scale) is not bool:
@@ -107,20 +114,27 @@ class ConditionedBlock(nn.Module):
         self.scales = config.cond_predict_scale
         sizes = ((channels_in, channels), (channels, channels))
         self.blocks = nn.ModuleList(ConvolutionBlock(*each, config.kernel_size, config.n_groups) for each in sizes)
-        film = nn.Linear(config.condition_dim, channels * (1 + self.scales))
-        self.cond_encoder = nn.Sequential(nn.Mish(), film)
+        width = config.condition_dim
+        before = (nn.Mish(), nn.Linear(width, width)) if config.condition_layer else ()
+        self.cond_encoder = nn.Sequential(*before, nn.Mish(), nn.Linear(width, channels * (1 + self.scales)))
         self.residual_conv = nn.Conv1d(channels_in, channels, 1) if channels_in != channels else nn.Identity()
 
-    def forward(self, x: torch.Tensor, condition: torch.Tensor) -> torch.Tensor:
-        """``[B, channels_in, T]`` and ``[B, C]`` -> ``[B, channels, T]``."""
+    def forward(self, x: torch.Tensor, condition: torch.Tensor | None) -> torch.Tensor:
+        """``[B, channels_in, T]``, and ``[B, C]`` or None for no FiLM -> ``[B, channels, T]``."""
         inner = self.blocks[0](x)
-        film = self.cond_encoder(condition).unsqueeze(-1)
-        if self.scales:
-            scale, shift = film.chunk(2, dim=1)
-            inner = inner * scale + shift
-        else:
-            inner = inner + film
+        if condition is not None:
+            film = self.cond_encoder(condition).unsqueeze(-1)
+            if self.scales:
+                scale, shift = film.chunk(2, dim=1)
+                inner = inner * scale + shift
+            else:
+                inner = inner + film
         return self.blocks[1](inner) + self.residual_conv(x)  # type: ignore[no-any-return]
+
+
+def _level(channels_in: int, channels: int, config: UNetConfig) -> list[nn.Module]:
+    """The blocks of one level, the first of which changes the number of channels."""
+    return [ConditionedBlock(channels if i else channels_in, channels, config) for i in range(config.blocks)]
 
 
 class _Resize(nn.Module):
@@ -152,14 +166,12 @@ class ConditionalUnet1D(nn.Module):
         self.down_modules = nn.ModuleList()
         for level, (before, after) in enumerate(pairwise((config.input_dim, *dims))):
             halve = _Resize(nn.Conv1d(after, after, 3, 2, 1)) if level < len(dims) - 1 else nn.Identity()
-            blocks = (ConditionedBlock(before, after, config), ConditionedBlock(after, after, config))
-            self.down_modules.append(nn.ModuleList((*blocks, halve)))
-        self.mid_modules = nn.ModuleList(ConditionedBlock(dims[-1], dims[-1], config) for _ in range(2))
+            self.down_modules.append(nn.ModuleList((*_level(before, after, config), halve)))
+        self.mid_modules = nn.ModuleList(_level(dims[-1], dims[-1], config))
         self.up_modules = nn.ModuleList()
         for after, before in pairwise(reversed(dims)):
             double = _Resize(nn.ConvTranspose1d(before, before, 4, 2, 1))
-            blocks = (ConditionedBlock(2 * after, before, config), ConditionedBlock(before, before, config))
-            self.up_modules.append(nn.ModuleList((*blocks, double)))
+            self.up_modules.append(nn.ModuleList((*_level(2 * after, before, config), double)))
         last = ConvolutionBlock(dims[0], dims[0], config.kernel_size, _GROUPS_AT_THE_END)
         self.final_conv = nn.Sequential(last, nn.Conv1d(dims[0], config.input_dim, 1))
 
@@ -184,19 +196,24 @@ class ConditionalUnet1D(nn.Module):
         condition = self.diffusion_step_encoder(timestep)
         if global_cond is not None:
             condition = torch.cat((condition, global_cond), dim=-1)
+        on_down, on_middle, on_up = (condition if each else None for each in self.config.conditioned)
         x = sample.transpose(1, 2)
         skipped = []
         down: Any = self.down_modules  # lists of modules, as torch does not say
         up: Any = self.up_modules
-        for level, (first, second, resize) in enumerate(down):
-            x = first(x, condition)
+        for level, (first, *others, resize) in enumerate(down):
+            x = first(x, on_down)
             if level == 0 and local_cond is not None and self.local_cond_encoder is not None:
                 x = x + self.local_cond_encoder[0](local_cond.transpose(1, 2), condition)
-            x = second(x, condition)
+            for block in others:
+                x = block(x, on_down)
             skipped.append(x)
             x = resize(x)
         for block in self.mid_modules:
-            x = block(x, condition)
-        for first, second, resize in up:
-            x = resize(second(first(torch.cat((x, skipped.pop()), dim=1), condition), condition))
+            x = block(x, on_middle)
+        for *blocks, resize in up:
+            x = torch.cat((x, skipped.pop()), dim=1)
+            for block in blocks:
+                x = block(x, on_up)
+            x = resize(x)
         return self.final_conv(x).transpose(1, 2)  # type: ignore[no-any-return]

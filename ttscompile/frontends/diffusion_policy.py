@@ -1,7 +1,7 @@
-"""Diffusion Policy: checkpoint to module and ``PolicySpec``.
+"""Diffusion Policy and 3D Diffusion Policy: checkpoint to module and ``PolicySpec``.
 
-Policies with DDPM and DDIM as real-stanford/diffusion_policy trains and saves them. A policy is rebuilt from
-configuration and weights; the packages ``diffusion_policy`` and ``robomimic`` are not needed. What is the same
+Policies with DDPM and DDIM as real-stanford/diffusion_policy and YanjieZe/3D-Diffusion-Policy train and save them. A
+policy is rebuilt from configuration and weights; neither these packages nor robomimic are needed. What is the same
 for all of them is here; each kind of policy is a row of ``_POLICIES``.
 """
 
@@ -17,6 +17,7 @@ from ..core.spec import ChunkSpec, PolicySpec
 from ..errors import CheckpointError
 from . import diffusion_policy_transformer as transformer
 from . import diffusion_policy_unet as unet
+from . import dp3
 from .checkpoint import plain_config, read_checkpoint
 from .diffusion_policy_parts import COMMON_KEYS, Rebuilt, Saved
 from .diffusion_policy_weights import affine, choose_weights
@@ -32,6 +33,8 @@ _POLICIES: Mapping[str, Callable[[Saved], Rebuilt]] = {
     "DiffusionUnetLowdimPolicy": unet.low_dim,
     "DiffusionUnetHybridImagePolicy": unet.hybrid,
     "DiffusionUnetImagePolicy": unet.images,
+    "DP3": dp3.full,
+    "SimpleDP3": dp3.simple,
 }
 """By the class name of the original policy."""
 

@@ -6,7 +6,6 @@ Source: ``MultiImageObsEncoder`` and ``get_resnet`` of real-stanford/diffusion_p
 from __future__ import annotations
 
 import warnings
-from typing import Any
 
 import torch
 from torch import nn
@@ -117,7 +116,7 @@ def _view(
         raise settings.error(
             f"shape_meta.obs.{key}.shape is {list(shape)}; expected {COLOURS} channels of an RGB image"
         )
-    resize, crop = _size(settings, "resize_shape", key), _size(settings, "crop_shape", key)
+    resize, crop = (settings.size(name, None, _MOST_PIXELS) for name in ("resize_shape", "crop_shape"))
     whole = resize or (height, width)
     if whole[0] < height or whole[1] < width:
         warnings.warn(
@@ -136,11 +135,3 @@ def _view(
     scales = tuple(scale / each for each in deviation)
     offsets = tuple((offset - middle) / each for middle, each in zip(mean, deviation, strict=True))
     return View(height, width, resize, crop, scales, offsets)
-
-
-def _size(settings: Settings, name: str, key: str) -> tuple[int, int] | None:
-    """A size for all cameras, or of this one among those by key."""
-    value: Any = settings.values.get(name)
-    if isinstance(value, dict):
-        return Settings(value, f"{settings.where}{name}.", settings.remedy).size(key, None, _MOST_PIXELS)
-    return settings.size(name, None, _MOST_PIXELS)

@@ -7,7 +7,6 @@ real-stanford/diffusion_policy.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import fields
 from typing import Any, Literal
 
 from torch import nn
@@ -33,16 +32,16 @@ from .diffusion_policy_weights import Weights, affine, load_network, network_wei
 from .encoded import EncodedDenoiser
 
 _NETWORK = "ConditionalUnet1D"
-_SETTINGS = frozenset(field.name for field in fields(UNetConfig))
+_SETTINGS = frozenset({"input_dim", "local_cond_dim", "global_cond_dim", "diffusion_step_embed_dim", "down_dims"})
+_SETTINGS |= {"kernel_size", "n_groups", "cond_predict_scale"}
 _SWITCHES = ("obs_as_global_cond", "obs_as_local_cond", "pred_action_steps_only", "oa_step_convention")
-_DEFAULTS: Mapping[str, Any] = {
+DEFAULTS: Mapping[str, Any] = {
     "diffusion_step_embed_dim": 256,
     "down_dims": [256, 512, 1024],
     "kernel_size": 5,
     "n_groups": 8,
-    "cond_predict_scale": True,
 }
-"""Of the policies on images, which are not those of the network."""
+"""Of the policies behind an encoder, which are not those of the network."""
 _MOST_STEPS = 4096
 """Of a chunk, which the weights do not limit; in use are 4 to 64."""
 
@@ -86,7 +85,7 @@ def hybrid(saved: Saved) -> Rebuilt:
     """``DiffusionUnetHybridImagePolicy``."""
     action_dim, observed = read_shape_meta(saved.settings, "low_dim", "rgb")
     encoder = build_robomimic_encoder(saved.settings, observed, saved.weights)
-    return behind_encoder(saved, encoder, encoder.width, observed, action_dim, ENCODER_KEYS)
+    return _on_images(saved, encoder, encoder.width, observed, action_dim, ENCODER_KEYS)
 
 
 def images(saved: Saved) -> Rebuilt:
@@ -95,13 +94,27 @@ def images(saved: Saved) -> Rebuilt:
     settings = encoder_settings(saved.settings)
     _, observed = read_shape_meta(settings, "low_dim", "rgb")
     encoder = build_image_encoder(settings, observed, saved.weights)
-    return behind_encoder(saved, encoder, encoder.width, observed, action_dim, {"shape_meta", "obs_encoder"})
+    return _on_images(saved, encoder, encoder.width, observed, action_dim, {"shape_meta", "obs_encoder"})
+
+
+def _on_images(
+    saved: Saved, encoder: nn.Module, width: int, observed: Observed, action_dim: int, known: Collection[str]
+) -> Rebuilt:
+    defaults = {**DEFAULTS, "cond_predict_scale": True}
+    network = {name: saved.policy.get(name, default) for name, default in defaults.items()}
+    return behind_encoder(saved, encoder, width, observed, action_dim, network, {*known, *defaults})
 
 
 def behind_encoder(
-    saved: Saved, encoder: nn.Module, width: int, observed: Observed, action_dim: int, known: Collection[str]
+    saved: Saved,
+    encoder: nn.Module,
+    width: int,
+    observed: Observed,
+    action_dim: int,
+    network: Mapping[str, Any],
+    known: Collection[str],
 ) -> Rebuilt:
-    """A U-Net whose settings stand among the policy's own, on what an encoder makes of the observed steps.
+    """A U-Net on what an encoder makes of the observed steps.
 
     Args:
         saved: the policy.
@@ -109,14 +122,15 @@ def behind_encoder(
         width: of a step's features.
         observed: what it takes.
         action_dim: Da.
-        known: settings of ``cfg.policy`` that are the encoder's.
+        network: settings of the U-Net, but for its channels.
+        known: settings of ``cfg.policy`` that were read for encoder and network.
     """
     as_global = saved.settings.flag("obs_as_global_cond", True)
     (n_obs_steps,) = saved.sizes("n_obs_steps")
     config = UNetConfig(
         input_dim=action_dim + (0 if as_global else width),
         global_cond_dim=width * n_obs_steps if as_global else None,
-        **{name: saved.policy.get(name, default) for name, default in _DEFAULTS.items()},
+        **network,
     )
     given: Given = "global condition" if as_global else "inpainting"
     start = n_obs_steps - 1
@@ -128,7 +142,7 @@ def behind_encoder(
         action_dim,
         start,
         given,
-        frozenset({"obs_as_global_cond", *_DEFAULTS, *known}),
+        frozenset({"obs_as_global_cond", *known}),
     )
 
 

@@ -55,7 +55,6 @@ class Refusal:
 
 
 POLICIES = (
-    Refusal(r"dp3", "3D Diffusion Policy, a U-Net on point clouds", _U_NET),
     Refusal(r"^(ibc|bet|robomimic)", "a policy without diffusion", _NO_LOOP),
     Refusal(
         r"transformer|unet",

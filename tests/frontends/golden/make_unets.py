@@ -1,21 +1,24 @@
 """Run the original U-Nets on seeded weights, and write what they give: ``unet_VARIANT.npz``.
 
-Not run by the tests. Needs real-stanford/diffusion_policy (5ba07ac) and ARISE-Initiative/robomimic v0.2.0 importable,
-and this repository. torchvision need not be there::
+Not run by the tests. Needs real-stanford/diffusion_policy (5ba07ac), ARISE-Initiative/robomimic v0.2.0 and
+YanjieZe/3D-Diffusion-Policy importable, and this repository. torchvision and pytorch3d need not be there::
 
-    PYTHONPATH=path/to/diffusion_policy:path/to/robomimic:. python -m tests.frontends.golden.make_unets
+    PYTHONPATH=path/to/diffusion_policy:path/to/robomimic:path/to/3D-Diffusion-Policy:. \\
+        python -m tests.frontends.golden.make_unets
 """
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
+from unittest.mock import MagicMock, patch
 
 import diffusers.schedulers as schedulers
 import numpy as np
 import torch
+from omegaconf import OmegaConf
 
 from .. import unets
 from .torchvision_stand_in import put_in_place
@@ -27,6 +30,7 @@ PROBED = (0, 17, 59)
 def main() -> None:
     """One file a variant."""
     put_in_place()
+    sys.modules.setdefault("pytorch3d.ops", sys.modules.setdefault("pytorch3d", MagicMock()))  # imported, never called
     for variant in unets.VARIANTS:
         path = Path(__file__).with_name(f"unet_{variant}.npz")
         np.savez_compressed(path, **run(variant))
@@ -36,7 +40,7 @@ def main() -> None:
 def made(settings: dict[str, Any]) -> Any:
     """What ``hydra.utils.instantiate`` makes of an entry of the configuration."""
     arguments = {
-        key: made(value) if isinstance(value, dict) and "_target_" in value else value
+        key: value if not isinstance(value, dict) else made(value) if "_target_" in value else OmegaConf.create(value)
         for key, value in settings.items()
     }
     module, _, name = arguments.pop("_target_").rpartition(".")
@@ -69,10 +73,11 @@ def run(variant: str) -> dict[str, Any]:
     ):
         result = policy.predict_action(observation)
     # The network was called on the first sample, with the observation in it; once more on this, at other timesteps.
-    (first, *_), given, _ = evaluations[0]
+    positional, given, _ = evaluations[0]
+    given = dict(zip(("sample", "timestep"), positional, strict=False)) | given
     evaluations.clear()
     for timestep in PROBED:
-        policy.model(first, torch.tensor(timestep), **given)
+        policy.model(**(given | {"timestep": torch.tensor(timestep)}))
     return {
         "action": result["action"].numpy(),
         "action_pred": result["action_pred"].numpy(),

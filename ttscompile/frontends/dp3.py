@@ -1,0 +1,105 @@
+"""3D Diffusion Policy: configuration and weights to an observation encoder and a U-Net.
+
+Its checkpoints have the form of Diffusion Policy's, and its networks are the U-Net of that with other conditions.
+
+Source: ``DP3`` and ``SimpleDP3`` of YanjieZe/3D-Diffusion-Policy (Ze et al., arXiv 2403.03954).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ..errors import CheckpointError
+from .diffusion_policy_parts import COMMON_KEYS, Observed, Rebuilt, Saved, read_shape_meta
+from .diffusion_policy_unet import DEFAULTS, behind_encoder
+from .diffusion_policy_weights import Weights, require_room
+from .point_cloud_encoder import COLOURED, PLACE, POINTS, ROBOT, STATE, PointCloudEncoder, PointNet
+from .saved_weights import require_weights
+from .settings import Settings
+
+_NAME = "3D Diffusion Policy"
+_CHANGED = "The policy was changed; use ttscompile.compile_denoiser(module, spec)."
+_PREFIX = "obs_encoder."
+_CONDITIONS = {
+    "film": {"cond_predict_scale": True},
+    "add": {"cond_predict_scale": False},
+    "mlp_film": {"cond_predict_scale": True, "condition_layer": True},
+}
+_PLACES = ("use_down_condition", "use_mid_condition", "use_up_condition")
+_ENCODER_KEYS = {"shape_meta", "encoder_output_dim", "use_pc_color", "pointnet_type", "pointcloud_encoder_cfg"}
+_UNUSED = {"crop_shape", "use_point_crop"}  # of the policy: one has no image, the other is for its environments
+_KNOWN = {*DEFAULTS, *_PLACES, *_ENCODER_KEYS, *_UNUSED, "condition_type", "obs_as_global_cond"}
+
+
+def full(saved: Saved) -> Rebuilt:
+    """``DP3``."""
+    return _rebuilt(saved, 2)
+
+
+def simple(saved: Saved) -> Rebuilt:
+    """``SimpleDP3``, whose U-Net has half as many blocks."""
+    return _rebuilt(saved, 1)
+
+
+def _rebuilt(saved: Saved, blocks: int) -> Rebuilt:
+    settings = saved.settings
+    unknown = sorted(set(saved.policy) - _KNOWN - COMMON_KEYS)
+    if unknown:
+        raise CheckpointError(f"cfg.policy has settings that {_NAME} does not know: {', '.join(unknown)}. {_CHANGED}")
+    if not settings.flag("obs_as_global_cond", True):
+        raise settings.error("obs_as_global_cond is false; expected true, without which the original cannot run either")
+    condition = settings.values.get("condition_type", "film")
+    if condition not in _CONDITIONS:
+        raise settings.error(
+            f"condition_type is {condition!r:.80}; expected {' or '.join(_CONDITIONS)}. The original's networks with"
+            " cross_attention_* cannot run: they put a timestep without an axis of observed steps beside observations"
+            " with one"
+        )
+    action_dim, every = read_shape_meta(settings, "low_dim", "point_cloud", "rgb", "depth")
+    observed = {key: each for key, each in every.items() if key in (POINTS, STATE, ROBOT)}
+    encoder = _encoder(settings, observed, saved.weights)
+    network: dict[str, Any] = {name: saved.policy.get(name, default) for name, default in DEFAULTS.items()}
+    network |= _CONDITIONS[condition]
+    network |= {"blocks": blocks, "conditioned": tuple(settings.flag(name, True) for name in _PLACES)}
+    return behind_encoder(saved, encoder, encoder.width, observed, action_dim, network, _KNOWN)
+
+
+def _encoder(settings: Settings, observed: Observed, weights: Weights) -> PointCloudEncoder:
+    """The observation encoder with its weights.
+
+    Raises:
+        CheckpointError: observations, settings or weights that do not fit.
+    """
+    coloured = settings.flag("use_pc_color", False)
+    settings.choice("pointnet_type", "pointnet")
+    values = settings.values.get("pointcloud_encoder_cfg")
+    cloud = Settings(values if isinstance(values, dict) else {}, f"{settings.where}pointcloud_encoder_cfg.")
+    if not isinstance(values, dict):
+        raise settings.refusal("pointcloud_encoder_cfg", "the settings of a PointNet")
+    for key, axes in ((POINTS, 2), (STATE, 1), (ROBOT, 2)):
+        if key == ROBOT and key not in observed:
+            continue
+        shape = observed[key][1] if key in observed else ()
+        if len(shape) != axes or (axes == 2 and shape[-1] < (COLOURED if coloured else PLACE)):
+            found = f"{list(shape)}" if key in observed else "missing"
+            wanted = f"[points, {COLOURED if coloured else PLACE}]" if axes == 2 else "[length]"
+            raise settings.error(f"shape_meta.obs.{key} is {found}; expected the shape {wanted}")
+    # Only the PointNet without colours can do without the last layer.
+    projected = cloud.flag("use_projection", True) or coloured
+    features = cloud.number("out_channels", 1024) if projected else None
+    last_norm = cloud.choice("final_norm", "none", "layernorm") == "layernorm"
+    state = observed[STATE][1][0]
+    require_room({"out_channels": features or 0, f"shape_meta.obs.{STATE}": state}, weights, settings.where)
+    extractor = PointNet(coloured, features, cloud.flag("use_layernorm", False), last_norm)
+    if settings.number("encoder_output_dim", 256) != extractor.width:
+        found = f"encoder_output_dim is {settings.values.get('encoder_output_dim', 256)}"
+        raise settings.error(f"{found}; expected {extractor.width}, which its PointNet gives")
+    encoder = PointCloudEncoder(extractor, COLOURED if coloured else PLACE, state)
+    found_weights = {key: value for key, value in weights.items() if key.startswith(_PREFIX)}
+    require_weights(
+        {_PREFIX + name: value for name, value in encoder.state_dict().items()},
+        found_weights,
+        f"{settings.where}pointcloud_encoder_cfg",
+    )
+    encoder.load_state_dict({key.removeprefix(_PREFIX): value for key, value in found_weights.items()})
+    return encoder
