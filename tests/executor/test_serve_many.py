@@ -5,15 +5,10 @@ from __future__ import annotations
 import gc
 import threading
 import tracemalloc
-from contextlib import suppress
 from pathlib import Path
 
-from ttscompile.runtimes.executor import ExecutorSettings
-
-from .serving import ServerError, connected, serving
-
-SETTINGS = ExecutorSettings(max_hold=1000, trace_events=0, statistics_window=16)
-"""What is remembered on purpose is soon full."""
+from .served import SETTINGS, served, talk
+from .serving import connected, serving
 
 MOST_BYTES_EACH = 20
 
@@ -24,17 +19,13 @@ def state() -> tuple[int, int, int]:
     return tracemalloc.get_traced_memory()[0], len([*Path("/proc/self/fd").iterdir()]), threading.active_count()
 
 
-def talk(url: str, connections: int, rounds: int) -> int:
-    """Number of messages: two that are right and two that are not, a round."""
+def talk_often(url: str, connections: int, rounds: int) -> int:
+    """Number of messages."""
+    count = 0
     for _ in range(connections):
         with connected(url) as call:
-            for _ in range(rounds):
-                call("observe", obs={"obs": [0.0, 0.0]})
-                call("info")
-                for method in ("observe", "nothing"):
-                    with suppress(ServerError):
-                        call(method)
-    return 4 * connections * rounds
+            count += len(talk(call, rounds))
+    return count
 
 
 def test_memory_files_and_threads_stay_as_they_were() -> None:
@@ -42,11 +33,19 @@ def test_memory_files_and_threads_stay_as_they_were() -> None:
     with serving(settings=SETTINGS) as url:
         tracemalloc.start()
         try:
-            talk(url, 20, 10)
+            talk_often(url, 20, 10)
             bytes_before, *before = state()
-            count = talk(url, 30, 25)
+            count = talk_often(url, 30, 25)
             bytes_after, *after = state()
         finally:
             tracemalloc.stop()
     assert after == before
     assert bytes_after - bytes_before < MOST_BYTES_EACH * count
+
+
+def test_what_is_printed_of_a_million() -> None:
+    """A short version of ``served.py``."""
+    first, *_, last = made = served(400)
+    assert [tenth["messages"] for tenth in made] == [40 * number for number in range(1, 11)]
+    assert (last["descriptors"], last["threads"]) == (first["descriptors"], first["threads"])
+    assert 0 < last["median_ms"] < 1000

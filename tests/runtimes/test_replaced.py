@@ -24,7 +24,7 @@ from ttscompile.errors import ArtifactChangedError, ArtifactError
 from ttscompile.runtimes import open as opening
 from ttscompile.runtimes import policy
 
-from .replaced import CHANGES, answer, load_often, prepared, reuse
+from .replaced import CHANGES, COMMANDS, answer, load_often, prepared, prepared_by_commands, reuse
 from .toys import toy_program, written_artifact
 from .unloaded import left
 
@@ -245,6 +245,12 @@ def test_loads_while_another_process_changes_the_artifact(way: str, tmp_path: Pa
 @pytest.mark.soak
 def test_ten_thousand_loads(tmp_path: Path) -> None:
     made = load_often(*prepared(tmp_path), loads=10_000, ways=CHANGES, longest=0.05)
+    assert made["mixed"] == 0, made
+
+
+@pytest.mark.soak
+def test_loads_while_commands_change_the_artifact(tmp_path: Path) -> None:
+    made = load_often(*prepared_by_commands(tmp_path), loads=10**6, ways=[COMMANDS], longest=0.05, seconds=60)
     assert made["mixed"] == 0, made
 
 
