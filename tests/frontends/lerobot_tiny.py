@@ -10,8 +10,7 @@ import torch
 from safetensors.torch import save_file
 
 from ttscompile.frontends.clip import TextConfig, VisionConfig
-from ttscompile.frontends.lerobot import Network
-from ttscompile.frontends.lerobot_config import read_lerobot_config
+from ttscompile.frontends.lerobot_multi_task_dit import MultiTaskDiTConfig, Network, read_config
 
 TO, DS, DA, SIDE = 2, 5, 3, 24
 
@@ -134,7 +133,7 @@ def _statistics(generator: torch.Generator, images: list[str]) -> dict[str, torc
 
 def _weights(directory: Path, generator: torch.Generator) -> dict[str, torch.Tensor]:
     """Random weights under the names that lerobot with transformers 4 saves."""
-    config = read_lerobot_config_without_weights(directory)
+    config = dit_config(directory)
     vision = VisionConfig(**VISION) if config.cameras else None
     found = {}
     for name, value in Network(config, vision, TextConfig(**TEXT)).state_dict().items():
@@ -146,7 +145,6 @@ def _weights(directory: Path, generator: torch.Generator) -> dict[str, torch.Ten
     return found
 
 
-def read_lerobot_config_without_weights(directory: Path) -> Any:
-    """The configuration, as it is read once the weights are there."""
-    (directory / "model.safetensors").touch()
-    return read_lerobot_config(directory)
+def dit_config(directory: Path) -> MultiTaskDiTConfig:
+    """The configuration as it is read."""
+    return read_config(directory, json.loads((directory / "config.json").read_text(encoding="utf-8")))

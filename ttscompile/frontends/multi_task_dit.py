@@ -19,7 +19,9 @@ from torch.nn import functional
 
 from .clip import ClipText, ClipVision, TextConfig, VisionConfig
 from .image_geometry import ResizeCrop
-from .lerobot_processors import Normalizer
+from .lerobot_config import STATE, LeRobotConfig
+from .lerobot_policy import Measured
+from .lerobot_processors import Processors
 from .transformer_for_diffusion import SinusoidalEmbedding
 
 
@@ -204,15 +206,15 @@ class ObservationEncoder(nn.Module):
         return torch.cat(parts, dim=-1).flatten(1)
 
 
-class ConditionEncoder(nn.Module):
+class ConditionEncoder(Measured):
     """Raw observations to the condition vector: normalised, cropped and encoded.
 
     Args:
-        observation_encoder: CLIP and the projection.
-        names: by which the state and the images of each camera are given, in the order of the policy.
-        tokens: the names of the instruction's tokens and of their mask.
+        config: of the policy.
+        processors: its normalisers, and the robot's names of the observations.
         geometry: resizes and crops the frames of all cameras; None without cameras.
-        normalizers: of the state, and of each camera.
+        observation_encoder: CLIP and the projection.
+        tokens: the names of the instruction's tokens and of their mask.
         task: tokens int64 ``[1, L]`` and mask bool ``[1, L]`` of the one instruction that is compiled in; None where it
             is an input.
     """
@@ -222,29 +224,23 @@ class ConditionEncoder(nn.Module):
 
     def __init__(
         self,
-        observation_encoder: ObservationEncoder,
-        names: Sequence[str],
-        tokens: tuple[str, str],
+        config: LeRobotConfig,
+        processors: Processors,
         geometry: ResizeCrop | None,
-        normalizers: Sequence[Normalizer],
+        observation_encoder: ObservationEncoder,
+        tokens: tuple[str, str],
         task: tuple[torch.Tensor, torch.Tensor] | None = None,
     ) -> None:
-        super().__init__()
-        self.observation_encoder = observation_encoder
-        self.names, self.tokens, self.geometry, self.has_task = tuple(names), tokens, geometry, task is not None
-        self.normalizers = nn.ModuleList(normalizers)
+        super().__init__(config, processors, geometry)
+        self.observation_encoder, self.tokens, self.has_task = observation_encoder, tokens, task is not None
         if task is not None:
             self.register_buffer("task_tokens", task[0], persistent=False)
             self.register_buffer("task_mask", task[1], persistent=False)
 
     def forward(self, observations: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """Observations ``[B, ...]`` by name -> ``[B, C]``."""
-        state = self.normalizers[0](observations[self.names[0]])
-        images = []
-        for name, normalizer in zip(self.names[1:], self.normalizers[1:], strict=True):
-            assert self.geometry is not None
-            # Normalised after the crop: pixels that nobody sees need no arithmetic.
-            images.append(normalizer(self.geometry(observations[name].flatten(0, 1))))
+        measured = self.measured(observations)
+        images = [measured[key] for key in self.cameras]
         given = (self.task_tokens, self.task_mask) if self.has_task else (observations[name] for name in self.tokens)
         tokens, mask = given
-        return self.observation_encoder(state, images, tokens, mask)  # type: ignore[no-any-return]
+        return self.observation_encoder(measured[STATE], images, tokens, mask)  # type: ignore[no-any-return]
