@@ -92,16 +92,25 @@ def save_policy(
     write_json(directory / "config.json", _BASE | {"input_features": inputs, "output_features": outputs} | changes)
 
     generator = torch.Generator().manual_seed(len(changes))
-    statistics = _statistics(generator, images)
-    normalizer = {
-        "eps": 1e-8,
-        "features": inputs | outputs,
-        "norm_map": dict(zip(("VISUAL", "STATE", "ACTION"), modes, strict=True)),
-    }
+    norm_map = dict(zip(("VISUAL", "STATE", "ACTION"), modes, strict=True))
+    write_processors(directory, inputs | outputs, norm_map, renamed or {}, _statistics(generator, images))
+    save_file(_weights(directory, generator), directory / "model.safetensors")
+    return directory
+
+
+def write_processors(
+    directory: Path,
+    features: dict[str, Any],
+    norm_map: dict[str, str],
+    renamed: dict[str, str],
+    statistics: dict[str, torch.Tensor],
+) -> None:
+    """Save both pipelines of a policy and their statistics."""
+    normalizer = {"eps": 1e-8, "features": features, "norm_map": norm_map}
     save_file(statistics, directory / "before.safetensors")
     save_file(statistics, directory / "after.safetensors")
     before = [
-        {"registry_name": "rename_observations_processor", "config": {"rename_map": renamed or {}}},
+        {"registry_name": "rename_observations_processor", "config": {"rename_map": renamed}},
         {"registry_name": "to_batch_processor", "config": {}},
         {"registry_name": "device_processor", "config": {"device": "cpu", "float_dtype": None}},
         {"registry_name": "normalizer_processor", "config": normalizer, "state_file": "before.safetensors"},
@@ -109,8 +118,6 @@ def save_policy(
     after = [{"registry_name": "unnormalizer_processor", "config": normalizer, "state_file": "after.safetensors"}]
     write_json(directory / "policy_preprocessor.json", {"name": "policy_preprocessor", "steps": before})
     write_json(directory / "policy_postprocessor.json", {"name": "policy_postprocessor", "steps": after})
-    save_file(_weights(directory, generator), directory / "model.safetensors")
-    return directory
 
 
 def _statistics(generator: torch.Generator, images: list[str]) -> dict[str, torch.Tensor]:

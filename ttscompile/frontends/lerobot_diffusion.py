@@ -132,7 +132,8 @@ def _network(settings: Settings, shared: LeRobotConfig, frame: int) -> UNetConfi
         already = str(error).startswith(settings.where)
         raise error if already else CheckpointError(f"{settings.where}{error}") from error
     if shared.horizon % config.divisor:
-        raise settings.error(f"horizon is {shared.horizon}; {len(dims)} levels need one that {config.divisor} divides")
+        expected = f"a multiple of {config.divisor}, because a U-Net of {len(dims)} levels halves it"
+        raise settings.refusal("horizon", expected, shared.horizon)
     return config
 
 
@@ -150,7 +151,7 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     try:
         # Compared before anything of the configured sizes is made, so that no more memory is taken than the file has.
         with torch.device("meta"):
-            expected = _as_saved(Network(config))
+            expected = as_saved(Network(config))
         require_weights(expected, weights, "config.json")
         network = Network(config)
         _load_weights(network, weights)
@@ -162,7 +163,7 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     return module.eval(), policy_spec(config, processors, diffusion_sampler(config, options), source)
 
 
-def _as_saved(network: Network) -> dict[str, torch.Tensor]:
+def as_saved(network: Network) -> dict[str, torch.Tensor]:
     """The weights of a network, not copied, under lerobot's names."""
     own, found = network.state_dict(), {}
     for name, value in own.items():
@@ -177,7 +178,7 @@ def _as_saved(network: Network) -> dict[str, torch.Tensor]:
 
 def _load_weights(network: Network, weights: Mapping[str, torch.Tensor]) -> None:
     """Fill a network with weights that have its names and shapes; the grids of keypoints have to be its own."""
-    for name, value in _as_saved(network).items():
+    for name, value in as_saved(network).items():
         if not name.endswith(_GRID):
             value.copy_(weights[name])
         elif not torch.allclose(value, weights[name], atol=_ROUNDING):
