@@ -247,6 +247,20 @@ def test_another_environment(changed: Callable[..., Path]) -> None:
         load_checkpoint_policy(changed(input_features=inputs))
 
 
+def test_a_network_that_was_compiled_in_training(changed: Callable[..., Path]) -> None:
+    """With ``compile_model`` lerobot saves its weights a level deeper."""
+
+    def wrap(weights: dict[str, torch.Tensor]) -> None:
+        for name in [name for name in weights if ".unet." in name]:
+            weights[name.replace(".unet.", ".unet._orig_mod.")] = weights.pop(name)
+
+    module, _ = load(changed(weights=wrap, compile_model=True))
+    drawn = lerobot_unets.observation("separate")
+    given = {name.replace(".", "_"): torch.from_numpy(value) for name, value in drawn.items()}
+    with torch.inference_mode():
+        assert module.encoder(given).shape == recorded("separate")["condition"].shape
+
+
 @pytest.mark.parametrize("option", ["task", "encoders"])
 def test_options_of_other_types(saved: Path, option: str) -> None:
     """There is no instruction to compile in."""

@@ -23,10 +23,10 @@ from .clip import NAME_FOLDER, TextConfig, VisionConfig, encoder_config, find_en
 from .encoded import EncodedDenoiser
 from .families import LoadOptions
 from .image_geometry import ResizeCrop
-from .lerobot_config import CONFIG, MOST, MOST_PIXELS, LeRobotConfig, read_lerobot_config
-from .lerobot_policy import diffusion_sampler, policy_spec, read_weights
+from .lerobot_config import CONFIG, MOST, MOST_PIXELS, STATE, LeRobotConfig, read_lerobot_config
+from .lerobot_policy import Measured, diffusion_sampler, policy_spec, read_weights
 from .lerobot_processors import PREPROCESSOR, Processors, read_processors
-from .multi_task_dit import ConditionEncoder, DiffusionTransformer, DiTConfig, ObservationEncoder
+from .multi_task_dit import DiffusionTransformer, DiTConfig, ObservationEncoder
 from .saved_weights import require_weights
 from .scheduler import MOST_STEPS
 from .settings import Settings
@@ -273,6 +273,46 @@ class Network(nn.Module):
         frame = config.state_dim + (0 if vision is None else vision.hidden_size * cameras) + width
         self.noise_predictor = DiffusionTransformer(config.network, frames * frame)
         self.observation_encoder = ObservationEncoder(cameras, vision, text, width, config.separate_encoders, frames)
+
+
+class ConditionEncoder(Measured):
+    """Raw observations to the condition vector: normalised, cropped and encoded.
+
+    Args:
+        config: of the policy.
+        processors: its normalisers, and the robot's names of the observations.
+        geometry: resizes and crops the frames of all cameras; None without cameras.
+        observation_encoder: CLIP and the projection.
+        tokens: the names of the instruction's tokens and of their mask.
+        task: tokens int64 ``[1, L]`` and mask bool ``[1, L]`` of the one instruction that is compiled in; None where it
+            is an input.
+    """
+
+    task_tokens: torch.Tensor
+    task_mask: torch.Tensor
+
+    def __init__(
+        self,
+        config: LeRobotConfig,
+        processors: Processors,
+        geometry: ResizeCrop | None,
+        observation_encoder: ObservationEncoder,
+        tokens: tuple[str, str],
+        task: tuple[torch.Tensor, torch.Tensor] | None = None,
+    ) -> None:
+        super().__init__(config, processors, geometry)
+        self.observation_encoder, self.tokens, self.has_task = observation_encoder, tokens, task is not None
+        if task is not None:
+            self.register_buffer("task_tokens", task[0], persistent=False)
+            self.register_buffer("task_mask", task[1], persistent=False)
+
+    def forward(self, observations: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """Observations ``[B, ...]`` by name -> ``[B, C]``."""
+        measured = self.measured(observations)
+        images = [measured[key] for key in self.cameras]
+        given = (self.task_tokens, self.task_mask) if self.has_task else (observations[name] for name in self.tokens)
+        tokens, mask = given
+        return self.observation_encoder(measured[STATE], images, tokens, mask)  # type: ignore[no-any-return]
 
 
 def _require_network(

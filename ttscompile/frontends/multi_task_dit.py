@@ -10,7 +10,7 @@ with Transformers (arXiv 2212.09748): adaLN-Zero with six modulations a layer.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -18,10 +18,6 @@ from torch import nn
 from torch.nn import functional
 
 from .clip import ClipText, ClipVision, TextConfig, VisionConfig
-from .image_geometry import ResizeCrop
-from .lerobot_config import STATE, LeRobotConfig
-from .lerobot_policy import Measured
-from .lerobot_processors import Processors
 from .transformer_for_diffusion import SinusoidalEmbedding
 
 
@@ -204,43 +200,3 @@ class ObservationEncoder(nn.Module):
         if sentence.shape[0] == 1:  # one instruction, known when the policy is compiled, for all streams
             parts[-1] = parts[-1].expand(state.shape[0], -1, -1)
         return torch.cat(parts, dim=-1).flatten(1)
-
-
-class ConditionEncoder(Measured):
-    """Raw observations to the condition vector: normalised, cropped and encoded.
-
-    Args:
-        config: of the policy.
-        processors: its normalisers, and the robot's names of the observations.
-        geometry: resizes and crops the frames of all cameras; None without cameras.
-        observation_encoder: CLIP and the projection.
-        tokens: the names of the instruction's tokens and of their mask.
-        task: tokens int64 ``[1, L]`` and mask bool ``[1, L]`` of the one instruction that is compiled in; None where it
-            is an input.
-    """
-
-    task_tokens: torch.Tensor
-    task_mask: torch.Tensor
-
-    def __init__(
-        self,
-        config: LeRobotConfig,
-        processors: Processors,
-        geometry: ResizeCrop | None,
-        observation_encoder: ObservationEncoder,
-        tokens: tuple[str, str],
-        task: tuple[torch.Tensor, torch.Tensor] | None = None,
-    ) -> None:
-        super().__init__(config, processors, geometry)
-        self.observation_encoder, self.tokens, self.has_task = observation_encoder, tokens, task is not None
-        if task is not None:
-            self.register_buffer("task_tokens", task[0], persistent=False)
-            self.register_buffer("task_mask", task[1], persistent=False)
-
-    def forward(self, observations: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        """Observations ``[B, ...]`` by name -> ``[B, C]``."""
-        measured = self.measured(observations)
-        images = [measured[key] for key in self.cameras]
-        given = (self.task_tokens, self.task_mask) if self.has_task else (observations[name] for name in self.tokens)
-        tokens, mask = given
-        return self.observation_encoder(measured[STATE], images, tokens, mask)  # type: ignore[no-any-return]
