@@ -119,18 +119,16 @@ def _network(settings: Settings, shared: LeRobotConfig, frame: int) -> UNetConfi
     dims: Any = settings.values.get("down_dims", [512, 1024, 2048])
     if not is_shape(dims, MOST) or len(dims) > _MOST_LEVELS:
         raise settings.refusal("down_dims", f"up to {_MOST_LEVELS} positive whole numbers, {MOST} at most")
-    sizes = {"kernel_size": 5, "n_groups": 8, "diffusion_step_embed_dim": 128}
+    defaults = {"kernel_size": 5, "n_groups": 8, "diffusion_step_embed_dim": 128}
+    sizes = {name: settings.number(name, default, MOST) for name, default in defaults.items()}
+    scales = settings.flag("use_film_scale_modulation", True)
+    observed = frame * shared.n_obs_steps
     try:
         config = UNetConfig(
-            input_dim=shared.action_dim,
-            global_cond_dim=frame * shared.n_obs_steps,
-            down_dims=tuple(dims),
-            cond_predict_scale=settings.flag("use_film_scale_modulation", True),
-            **{name: settings.number(name, default, MOST) for name, default in sizes.items()},
+            shared.action_dim, global_cond_dim=observed, down_dims=tuple(dims), cond_predict_scale=scales, **sizes
         )
     except CheckpointError as error:
-        already = str(error).startswith(settings.where)
-        raise error if already else CheckpointError(f"{settings.where}{error}") from error
+        raise CheckpointError(f"{settings.where}{error}") from error
     if shared.horizon % config.divisor:
         expected = f"a multiple of {config.divisor}, because a U-Net of {len(dims)} levels halves it"
         raise settings.refusal("horizon", expected, shared.horizon)
