@@ -10,8 +10,7 @@ import torch
 from safetensors.torch import save_file
 
 from ttscompile.frontends.clip import TextConfig, VisionConfig
-from ttscompile.frontends.lerobot import Network
-from ttscompile.frontends.lerobot_config import read_lerobot_config
+from ttscompile.frontends.lerobot_multi_task_dit import MultiTaskDiTConfig, Network, read_config
 
 TO, DS, DA, SIDE = 2, 5, 3, 24
 
@@ -93,16 +92,25 @@ def save_policy(
     write_json(directory / "config.json", _BASE | {"input_features": inputs, "output_features": outputs} | changes)
 
     generator = torch.Generator().manual_seed(len(changes))
-    statistics = _statistics(generator, images)
-    normalizer = {
-        "eps": 1e-8,
-        "features": inputs | outputs,
-        "norm_map": dict(zip(("VISUAL", "STATE", "ACTION"), modes, strict=True)),
-    }
+    norm_map = dict(zip(("VISUAL", "STATE", "ACTION"), modes, strict=True))
+    write_processors(directory, inputs | outputs, norm_map, renamed or {}, _statistics(generator, images))
+    save_file(_weights(directory, generator), directory / "model.safetensors")
+    return directory
+
+
+def write_processors(
+    directory: Path,
+    features: dict[str, Any],
+    norm_map: dict[str, str],
+    renamed: dict[str, str],
+    statistics: dict[str, torch.Tensor],
+) -> None:
+    """Save both pipelines of a policy and their statistics."""
+    normalizer = {"eps": 1e-8, "features": features, "norm_map": norm_map}
     save_file(statistics, directory / "before.safetensors")
     save_file(statistics, directory / "after.safetensors")
     before = [
-        {"registry_name": "rename_observations_processor", "config": {"rename_map": renamed or {}}},
+        {"registry_name": "rename_observations_processor", "config": {"rename_map": renamed}},
         {"registry_name": "to_batch_processor", "config": {}},
         {"registry_name": "device_processor", "config": {"device": "cpu", "float_dtype": None}},
         {"registry_name": "normalizer_processor", "config": normalizer, "state_file": "before.safetensors"},
@@ -110,8 +118,6 @@ def save_policy(
     after = [{"registry_name": "unnormalizer_processor", "config": normalizer, "state_file": "after.safetensors"}]
     write_json(directory / "policy_preprocessor.json", {"name": "policy_preprocessor", "steps": before})
     write_json(directory / "policy_postprocessor.json", {"name": "policy_postprocessor", "steps": after})
-    save_file(_weights(directory, generator), directory / "model.safetensors")
-    return directory
 
 
 def _statistics(generator: torch.Generator, images: list[str]) -> dict[str, torch.Tensor]:
@@ -134,7 +140,7 @@ def _statistics(generator: torch.Generator, images: list[str]) -> dict[str, torc
 
 def _weights(directory: Path, generator: torch.Generator) -> dict[str, torch.Tensor]:
     """Random weights under the names that lerobot with transformers 4 saves."""
-    config = read_lerobot_config_without_weights(directory)
+    config = dit_config(directory)
     vision = VisionConfig(**VISION) if config.cameras else None
     found = {}
     for name, value in Network(config, vision, TextConfig(**TEXT)).state_dict().items():
@@ -146,7 +152,6 @@ def _weights(directory: Path, generator: torch.Generator) -> dict[str, torch.Ten
     return found
 
 
-def read_lerobot_config_without_weights(directory: Path) -> Any:
-    """The configuration, as it is read once the weights are there."""
-    (directory / "model.safetensors").touch()
-    return read_lerobot_config(directory)
+def dit_config(directory: Path) -> MultiTaskDiTConfig:
+    """The configuration as it is read."""
+    return read_config(directory, json.loads((directory / "config.json").read_text(encoding="utf-8")))

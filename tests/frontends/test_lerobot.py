@@ -27,13 +27,12 @@ from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.image_geometry import ResizeCrop
-from ttscompile.frontends.lerobot import Network, with_inputs
-from ttscompile.frontends.lerobot_config import read_lerobot_config
+from ttscompile.frontends.lerobot_multi_task_dit import Network, with_inputs
 from ttscompile.frontends.lerobot_processors import Normalizer, Statistics, read_processors
 from ttscompile.runtimes import open_runtime
 
 from ..runtimes.agreement import call_terms, largest_difference
-from .lerobot_tiny import DA, DS, SIDE, TEXT, TO, VISION, change_json, save_policy
+from .lerobot_tiny import DA, DS, SIDE, TEXT, TO, VISION, change_json, dit_config, save_policy
 
 STATE, TOKENS, MASK = "observation.state", "observation.language.tokens", "observation.language.attention_mask"
 PLAIN = {"use_rope": False, "use_positional_encoding": True}
@@ -97,7 +96,7 @@ def test_learned_positions_and_plain_attention(tmp_path: Path) -> None:
 
 def test_a_whole_number_is_a_base(tmp_path: Path) -> None:
     """JSON written by hand says 10000."""
-    assert type(read_lerobot_config(save_policy(tmp_path, rope_base=10000)).network.rope_base) is float
+    assert type(dit_config(save_policy(tmp_path, rope_base=10000)).network.rope_base) is float
 
 
 @pytest.mark.parametrize("separate", [False, True])
@@ -264,7 +263,7 @@ def test_a_task_that_is_compiled_in_leaves_no_text_encoder(tmp_path: Path) -> No
     directory = save_policy(tmp_path, num_layers=1)
     module, spec = load(directory)
     obs = observe(spec, streams=1)
-    config = read_lerobot_config(directory)
+    config = dit_config(directory)
     task = (obs[TOKENS], obs[MASK])
     network = Network(config, None, TextConfig(**TEXT))
     baked = with_inputs(network, config, read_processors(directory, config.features), None, task)

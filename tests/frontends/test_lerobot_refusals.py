@@ -260,14 +260,14 @@ def test_missing_statistics_are_said(tmp_path: Path) -> None:
         load_checkpoint_policy(directory)
 
 
-@pytest.mark.parametrize("kind", ["diffusion", "act", "smolvla", "pi0", "groot", "pi0_fast", "something_new"])
+@pytest.mark.parametrize("kind", ["act", "smolvla", "pi0", "groot", "pi0_fast", "something_new"])
 def test_other_policies_are_refused_by_name(tmp_path: Path, kind: str) -> None:
     """Each with what can be done instead."""
     directory = save_policy(tmp_path)
     change_json(directory / "config.json", type=kind)
     with pytest.raises(CheckpointError, match=kind) as caught:
         load_checkpoint_policy(directory)
-    remedy = {"diffusion": "multi_task_dit", "act": "no denoising loop", "pi0_fast": "no denoising loop"}
+    remedy = {"act": "no denoising loop", "pi0_fast": "no denoising loop"}
     assert re.search(remedy.get(kind, "compile_denoiser"), str(caught.value))
 
 

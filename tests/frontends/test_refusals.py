@@ -83,7 +83,7 @@ def test_other_policies(payload: Callable[..., Any], save: Callable[..., Path], 
         load_checkpoint_policy(save(built))
 
 
-LEROBOT_TYPES = ["diffusion", "act", "vqbet", "pi0_fast", "tdmpc", "sac", "smolvla", "wall_x", "something_new"]
+LEROBOT_TYPES = ["act", "vqbet", "pi0_fast", "tdmpc", "sac", "smolvla", "wall_x", "something_new"]
 
 DIRECTORY_FILES: list[tuple[list[str], str]] = [
     (["adapter_config.json", "adapter_model.safetensors"], "PEFT adapter.*adapter_config.json.*Merge"),

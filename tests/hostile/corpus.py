@@ -68,8 +68,10 @@ def _checkpoints(folder: Path) -> None:
 
 
 def _lerobot(folder: Path) -> None:
+    from tests.frontends import lerobot_unets
     from tests.frontends.lerobot_tiny import save_policy
 
+    lerobot_unets.save("states", folder / "unet" / "policy")
     policies = {
         "images": {
             "cameras": ("top", "wrist"),

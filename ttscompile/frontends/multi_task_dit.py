@@ -10,7 +10,7 @@ with Transformers (arXiv 2212.09748): adaLN-Zero with six modulations a layer.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -18,8 +18,6 @@ from torch import nn
 from torch.nn import functional
 
 from .clip import ClipText, ClipVision, TextConfig, VisionConfig
-from .image_geometry import ResizeCrop
-from .lerobot_processors import Normalizer
 from .transformer_for_diffusion import SinusoidalEmbedding
 
 
@@ -202,49 +200,3 @@ class ObservationEncoder(nn.Module):
         if sentence.shape[0] == 1:  # one instruction, known when the policy is compiled, for all streams
             parts[-1] = parts[-1].expand(state.shape[0], -1, -1)
         return torch.cat(parts, dim=-1).flatten(1)
-
-
-class ConditionEncoder(nn.Module):
-    """Raw observations to the condition vector: normalised, cropped and encoded.
-
-    Args:
-        observation_encoder: CLIP and the projection.
-        names: by which the state and the images of each camera are given, in the order of the policy.
-        tokens: the names of the instruction's tokens and of their mask.
-        geometry: resizes and crops the frames of all cameras; None without cameras.
-        normalizers: of the state, and of each camera.
-        task: tokens int64 ``[1, L]`` and mask bool ``[1, L]`` of the one instruction that is compiled in; None where it
-            is an input.
-    """
-
-    task_tokens: torch.Tensor
-    task_mask: torch.Tensor
-
-    def __init__(
-        self,
-        observation_encoder: ObservationEncoder,
-        names: Sequence[str],
-        tokens: tuple[str, str],
-        geometry: ResizeCrop | None,
-        normalizers: Sequence[Normalizer],
-        task: tuple[torch.Tensor, torch.Tensor] | None = None,
-    ) -> None:
-        super().__init__()
-        self.observation_encoder = observation_encoder
-        self.names, self.tokens, self.geometry, self.has_task = tuple(names), tokens, geometry, task is not None
-        self.normalizers = nn.ModuleList(normalizers)
-        if task is not None:
-            self.register_buffer("task_tokens", task[0], persistent=False)
-            self.register_buffer("task_mask", task[1], persistent=False)
-
-    def forward(self, observations: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        """Observations ``[B, ...]`` by name -> ``[B, C]``."""
-        state = self.normalizers[0](observations[self.names[0]])
-        images = []
-        for name, normalizer in zip(self.names[1:], self.normalizers[1:], strict=True):
-            assert self.geometry is not None
-            # Normalised after the crop: pixels that nobody sees need no arithmetic.
-            images.append(normalizer(self.geometry(observations[name].flatten(0, 1))))
-        given = (self.task_tokens, self.task_mask) if self.has_task else (observations[name] for name in self.tokens)
-        tokens, mask = given
-        return self.observation_encoder(state, images, tokens, mask)  # type: ignore[no-any-return]

@@ -82,13 +82,12 @@ ENTRIES = (Refusal(r"^parameter$", "a checkpoint of Dita", _DITA),)
 """By an entry of a torch checkpoint."""
 
 LEROBOT = (
-    Refusal(r"^diffusion$", "a U-Net", _U_NET),
     Refusal(r"^act$", "a transformer that predicts actions in one evaluation", _NO_LOOP),
     Refusal(r"^(vqbet|pi0_fast)$", "autoregressive over codes of actions", _NO_LOOP),
     Refusal(r"^tdmpc$", "a world model with a planner", _NO_LOOP),
     Refusal(r"^sac$", "an actor of reinforcement learning", _NO_LOOP),
     Refusal(r"^(smolvla|pi0|pi05|groot|xvla|wall_x)$", "a vision-language model with an action head", _HEAD),
-    Refusal(r"", "not known", f"Expected multi_task_dit. If its denoiser is a transformer: {_BUILD}."),
+    Refusal(r"", "not known", f"Expected diffusion or multi_task_dit. If its denoiser is a transformer: {_BUILD}."),
 )
 """By the type of a LeRobot policy, in lower case."""
 
@@ -203,8 +202,8 @@ def refuse_directory(path: Path) -> NoReturn:
             raise _refused(path, row.what, how, row.remedy)
     raise CheckpointError(
         f"{path} is a directory without a policy that is read: found {', '.join(names[:6]) or 'nothing'}; expected the"
-        " config.json and model.safetensors of LeRobot's multi_task_dit, or give a .ckpt file of Diffusion Policy."
-        f" Otherwise: {_BUILD}."
+        " config.json and model.safetensors of LeRobot's diffusion or multi_task_dit, or give a .ckpt file of Diffusion"
+        f" Policy. Otherwise: {_BUILD}."
     )
 
 

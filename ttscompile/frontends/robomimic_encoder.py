@@ -27,22 +27,22 @@ FEATURES = 64
 
 
 class SpatialSoftmax(nn.Module):
-    """Expected position, in -1..1, of each of 32 learned keypoints under a softmax over a map of ``height x width``."""
+    """Expected position, in -1..1, of each learned keypoint under a softmax over a map of ``height x width``."""
 
     temperature: torch.Tensor
     pos_x: torch.Tensor
     pos_y: torch.Tensor
 
-    def __init__(self, height: int, width: int) -> None:
+    def __init__(self, height: int, width: int, keypoints: int = KEYPOINTS) -> None:
         super().__init__()
-        self.nets = nn.Conv2d(CHANNELS, KEYPOINTS, 1)
+        self.nets = nn.Conv2d(CHANNELS, keypoints, 1)
         x, y = np.meshgrid(np.linspace(-1.0, 1.0, width), np.linspace(-1.0, 1.0, height))
         self.register_buffer("temperature", torch.ones(1))
         self.register_buffer("pos_x", torch.from_numpy(x.reshape(1, -1)).float())
         self.register_buffer("pos_y", torch.from_numpy(y.reshape(1, -1)).float())
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
-        """``[N, 512, height, width]`` -> ``[N, 64]``: x and y of keypoint 0, of keypoint 1, and so on."""
+        """``[N, 512, height, width]`` -> ``[N, 2 keypoints]``: x and y of keypoint 0, of keypoint 1, and so on."""
         attention = (self.nets(features).flatten(2) / self.temperature).softmax(-1)
         positions = torch.cat((self.pos_x, self.pos_y)).T
         return torch.flatten(attention @ positions, 1)

@@ -1,0 +1,129 @@
+"""What is around the network of every LeRobot policy: its observations, its sampler, its chunk and its weights."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import nn
+
+from ..core.spec import ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
+from .families import LoadOptions
+from .image_geometry import ResizeCrop
+from .lerobot_config import ACTION, CONFIG, WEIGHTS, LeRobotConfig
+from .lerobot_processors import Normalizer, Processors
+from .saved_weights import as_float32, read_tensors
+from .scheduler import configured_sampler
+
+_SCHEDULER_SETTINGS = {
+    "num_train_timesteps": 100,
+    "beta_start": 0.0001,
+    "beta_end": 0.02,
+    "beta_schedule": "squaredcos_cap_v2",
+    "clip_sample": True,
+    "clip_sample_range": 1.0,
+}
+
+
+class Measured(nn.Module):
+    """Base of the encoders of conditions: what the robot measures to what lerobot hands to a policy's network.
+
+    Args:
+        config: of the policy.
+        processors: its normalisers, and the robot's names of the observations.
+        geometry: resizes and crops the frames of all cameras; None without cameras.
+    """
+
+    def __init__(self, config: LeRobotConfig, processors: Processors, geometry: ResizeCrop | None) -> None:
+        super().__init__()
+        self.names = {key: processors.renamed.get(key, key).replace(".", "_") for key in config.features}
+        del self.names[ACTION]
+        self.cameras, self.geometry = tuple(config.cameras), geometry
+        self.normalizers = nn.ModuleList(Normalizer(processors.normalizers.get(key)) for key in self.names)
+
+    def measured(self, observations: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """By the policy's names: vectors ``[B, To, D]``, and of each camera ``[B * To, 3, *geometry.size]``."""
+        found = {}
+        for (key, name), normalizer in zip(self.names.items(), self.normalizers, strict=True):
+            value = observations[name]
+            if key in self.cameras:
+                assert self.geometry is not None
+                # Normalised after the crop: pixels that nobody sees need no arithmetic.
+                value = self.geometry(value.flatten(0, 1))
+            found[key] = normalizer(value)
+        return found
+
+
+def policy_spec(
+    config: LeRobotConfig,
+    processors: Processors,
+    sampler: SamplerTable,
+    source: Mapping[str, str],
+    more: Mapping[str, ObservationSpec] | None = None,
+) -> PolicySpec:
+    """The specification of a policy.
+
+    Args:
+        config: of the policy.
+        processors: its normalisers, and the robot's names of the observations.
+        sampler: its denoising loop.
+        source: what distinguishes it, beside the format.
+        more: observations beside those that ``Measured`` takes.
+    """
+    start = config.n_obs_steps - 1
+    return PolicySpec(
+        sample=(config.horizon, config.action_dim),
+        observations=_observations(config, processors) | dict(more or {}),
+        sampler=sampler,
+        chunk=ChunkSpec(
+            action_dim=config.action_dim,
+            start=start,
+            stop=min(start + config.n_action_steps, config.horizon),
+            normalizer=None if processors.action is None else processors.action.inverse(),
+            ranged=processors.action is not None and processors.action.mode == "MIN_MAX",
+        ),
+        source={"format": "lerobot", **source},
+    )
+
+
+def _observations(config: LeRobotConfig, processors: Processors) -> dict[str, ObservationSpec]:
+    """What the robot gives, under its own names; images as float32 of 0..1, channels first."""
+    specs = {}
+    for key, (kind, shape) in config.features.items():
+        if kind == "ACTION":
+            continue
+        statistics, whole = processors.normalizers.get(key), (config.n_obs_steps, *shape)
+        usual = None if statistics is None or kind == "VISUAL" else statistics.usual_range
+        bounds = (0.0, 1.0) if kind == "VISUAL" else usual
+        specs[processors.renamed.get(key, key)] = ObservationSpec(whole, bounds=bounds)
+    return specs
+
+
+def diffusion_sampler(config: LeRobotConfig, options: LoadOptions) -> SamplerTable:
+    """The denoising loop of a policy that was trained with diffusion; the defaults are lerobot's.
+
+    Raises:
+        CheckpointError: settings that are not possible.
+        SpecError: the sampler asked for is not possible.
+    """
+    settings = config.settings.values
+    scheduler = {key: settings.get(key, default) for key, default in _SCHEDULER_SETTINGS.items()}
+    scheduler["_target_"] = f"{config.settings.choice('noise_scheduler_type', 'DDPM', 'DDIM')}Scheduler"
+    scheduler["prediction_type"] = config.settings.choice("prediction_type", "epsilon", "sample")
+    where = str(config.directory / CONFIG)
+    return configured_sampler(scheduler, settings.get("num_inference_steps"), options, where=where)
+
+
+def read_weights(config: LeRobotConfig, *without: str) -> dict[str, torch.Tensor]:
+    """The weights of a policy as float32.
+
+    Args:
+        config: of the policy.
+        without: ends of the names of what a network does not need.
+
+    Raises:
+        CheckpointError: missing, damaged, or no weights.
+    """
+    path = config.directory / WEIGHTS
+    saved = {name: value for name, value in read_tensors(path).items() if not name.endswith(without)}
+    return as_float32(saved, f"{path}: ")
