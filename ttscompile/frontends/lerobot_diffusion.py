@@ -119,13 +119,15 @@ def _network(settings: Settings, shared: LeRobotConfig, frame: int) -> UNetConfi
     dims: Any = settings.values.get("down_dims", [512, 1024, 2048])
     if not is_shape(dims, MOST) or len(dims) > _MOST_LEVELS:
         raise settings.refusal("down_dims", f"up to {_MOST_LEVELS} positive whole numbers, {MOST} at most")
-    defaults = {"kernel_size": 5, "n_groups": 8, "diffusion_step_embed_dim": 128}
-    sizes = {name: settings.number(name, default, MOST) for name, default in defaults.items()}
-    scales = settings.flag("use_film_scale_modulation", True)
-    observed = frame * shared.n_obs_steps
     try:
         config = UNetConfig(
-            shared.action_dim, global_cond_dim=observed, down_dims=tuple(dims), cond_predict_scale=scales, **sizes
+            shared.action_dim,
+            global_cond_dim=frame * shared.n_obs_steps,
+            diffusion_step_embed_dim=settings.number("diffusion_step_embed_dim", 128, MOST),
+            down_dims=tuple(dims),
+            kernel_size=settings.number("kernel_size", 5, MOST),
+            n_groups=settings.number("n_groups", 8, MOST),
+            cond_predict_scale=settings.flag("use_film_scale_modulation", True),
         )
     except CheckpointError as error:
         raise CheckpointError(f"{settings.where}{error}") from error

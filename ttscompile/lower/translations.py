@@ -17,10 +17,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from onnxscript import ir
-from onnxscript import opset23 as op
+from onnxscript import ir, opset23
 
-Value = Any  # onnxscript's values, whose stubs do not know Python's operators
+op: Any = opset23  # its stubs describe tensors, and here values of a graph are given
 
 FEW = 32
 """Up to so many positions a convolution is a product of rows; from 16 on both are as fast, and integers do products."""
@@ -33,13 +32,13 @@ def _sizes(value: ir.Value) -> list[int]:
 
 
 def group_norm(
-    input: Value,
+    input: Any,
     num_groups: int,
-    weight: Value | None = None,
-    bias: Value | None = None,
+    weight: Any = None,
+    bias: Any = None,
     eps: float = 1e-5,
     cudnn_enabled: bool = True,
-) -> Value:
+) -> Any:
     """``aten.group_norm`` by InstanceNormalization, of which each group is a channel."""
     channels, *inner = _sizes(input)
     grouped = op.Reshape(input, op.Constant(value_ints=[0, num_groups, -1]))
@@ -53,14 +52,14 @@ def group_norm(
 
 
 def conv1d(
-    input: Value,
-    weight: Value,
-    bias: Value | None = None,
+    input: Any,
+    weight: Any,
+    bias: Any = None,
     stride: Sequence[int] = (1,),
     padding: Sequence[int] = (0,),
     dilation: Sequence[int] = (1,),
     groups: int = 1,
-) -> Value:
+) -> Any:
     """``aten.conv1d``: over few positions as one product, ``[positions, kernel * channels]`` by the weights."""
     (_, positions), (out, size) = _sizes(input), (int(weight.shape[0]), int(weight.shape[2]))
     (step,), (edge,), (spread,) = stride, padding, dilation
