@@ -31,7 +31,11 @@ _OCTO = "Octo denoises with a small MLP on one readout token, not with a transfo
 _HYBRID_VLA = "It denoises inside its language model, in one sequence with the text: it has no action head to compile."
 _MOST_FILES = 10_000  # looked at in a directory; somebody may give the root of a disk
 _ARTIFACT, _LOAD = "an artifact that is compiled already", "Load it with ttscompile.load, or calibrate it."
-_NO_LOOP = "There is no denoising loop to compile."
+_NO_LOOP = (
+    "There is no denoising loop to compile. Export its network with torch.onnx.export and run it with onnxruntime, or"
+    " use torch.compile."
+)
+_NO_POLICY = "There is no denoising loop to compile. llama.cpp runs such files."
 _MERGE = "Merge it into its base model (PeftModel.merge_and_unload), save that policy, and convert the result."
 _WEIGHTS = (
     "Weights do not say how they are connected. Convert what the training saved, which holds the configuration too; or"
@@ -172,7 +176,7 @@ def refuse_file(path: Path) -> None:
     if head.startswith(b"\x89HDF\r\n"):
         raise _refused(path, "an HDF5 file, data or Keras weights", "its first bytes", _WEIGHTS)
     if head.startswith(b"GGUF"):
-        raise _refused(path, "a GGUF file, a quantised language model", "its first bytes", _NO_LOOP)
+        raise _refused(path, "a GGUF file, a quantised language model", "its first bytes", _NO_POLICY)
     if not zipfile.is_zipfile(path):
         return
     try:
