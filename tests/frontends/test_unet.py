@@ -204,6 +204,10 @@ _GET_RESNET = {"_target_": "a.get_resnet", "name": "resnet50"}
         ({"_target_": "umi.TimmObsEncoder"}, r"obs_encoder is TimmObsEncoder; expected MultiImageObsEncoder"),
         ({"dropout": 0.1}, r"settings that MultiImageObsEncoder does not know: dropout"),
         ({"rgb_model": _GET_RESNET}, r"rgb_model\.name is 'resnet50'; expected resnet18 or resnet34"),
+        (
+            {"rgb_model": _GET_RESNET | {"name": ["resnet18"]}},
+            r"rgb_model\.name is \['resnet18'\]; expected resnet18 or",
+        ),
         ({"rgb_model": {"_target_": "torchvision.models.vit"}}, r"rgb_model is made by vit; expected get_resnet"),
         ({"rgb_model": _GET_RESNET | {"name": "resnet34"}}, r"torchvision's ResNets: missing \S+layer1\.2\.conv1"),
         ({"crop_shape": [41, 30]}, r"crop_shape is \[41, 30\], and the images of 'front' are 41 x 43"),
@@ -273,6 +277,7 @@ _CLOUD = {"in_channels": 3, "out_channels": 24, "use_layernorm": True, "final_no
             r"is 'cross_attention_film'; expected film or add or mlp_film",
         ),
         ("dp3", {"condition_type": "film"}, r"missing model\S+cond_encoder|unexpected model\S+cond_encoder"),
+        ("dp3", {"condition_type": ["film"]}, r"condition_type is \['film'\]; expected film or add"),
         ("dp3", {"obs_as_global_cond": False}, r"obs_as_global_cond is false; expected true"),
         ("dp3", {"eta": 0.5}, r"cfg\.policy has settings that 3D Diffusion Policy does not know: eta"),
         ("dp3", {"use_up_condition": 1}, r"cfg\.policy\.use_up_condition is 1; expected true or false"),
@@ -293,6 +298,11 @@ _CLOUD = {"in_channels": 3, "out_channels": 24, "use_layernorm": True, "final_no
         ("dp3", {"use_pc_color": True, "horizon": 8}, r"extractor\.mlp\.9\.weight|mlp\.0\.weight has shape"),
         ("dp3_add", {"use_pc_color": True}, r"obs\.point_cloud is \[20, 3\]; expected the shape \[points, 6\]"),
         ("dp3", {"shape_meta": {"obs": _NO_COLOUR, "action": {"shape": [3]}}}, r"\[20, 2\]; expected .*\[points, 3\]"),
+        (
+            "dp3",
+            {"shape_meta": {"obs": _NO_COLOUR | {"point_cloud": {"shape": [10**9, 3]}}, "action": {"shape": [3]}}},
+            "expected the shape .*, 65536 points at most",
+        ),
         (
             "dp3",
             {"shape_meta": {"obs": {"agent_pos": {"shape": [4]}}, "action": {"shape": [3]}}},

@@ -54,6 +54,7 @@ def make(folder: Path) -> None:
 def _checkpoints(folder: Path) -> None:
     import torch
 
+    from tests.frontends import unets
     from tests.frontends.conftest import _config, _weights
 
     folder.mkdir()
@@ -62,6 +63,8 @@ def _checkpoints(folder: Path) -> None:
         states = {key: _weights(config["policy"]["model"], seed) for seed, key in enumerate(("model", "ema_model"))}
         payload = {"cfg": config, "state_dicts": states, "pickles": {"epoch": b"not even a pickle"}}
         torch.save(payload, folder / f"{name}.ckpt")
+    for name in ("local", "dp3"):
+        torch.save(unets.payload(name), folder / f"unet-{name}.ckpt")
     shared = find_shared(ROOT)
     if shared is not None:
         shutil.copy(shared / "golden" / "diffusion_policy" / "bert.ckpt", folder / "golden.ckpt")

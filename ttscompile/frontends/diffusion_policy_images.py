@@ -102,7 +102,7 @@ def _network(settings: Settings) -> str:
     made_by = str(model.values.get("_target_")).rpartition(".")[2]
     if made_by not in ("get_resnet", "get_r3m"):
         raise settings.error(f"rgb_model is made by {made_by}; expected get_resnet with {' or '.join(DEPTHS)}")
-    if model.values.get("name") not in DEPTHS:
+    if model.values.get("name") not in tuple(DEPTHS):
         raise model.refusal("name", " or ".join(DEPTHS))
     return str(model.values["name"])
 

@@ -25,6 +25,8 @@ _CONDITIONS = {
     "add": {"cond_predict_scale": False},
     "mlp_film": {"cond_predict_scale": True, "condition_layer": True},
 }
+_MOST_POINTS = 2**16
+"""Of a cloud, which the weights do not limit; in use are 512 to 4096."""
 _PLACES = ("use_down_condition", "use_mid_condition", "use_up_condition")
 _ENCODER_KEYS = {"shape_meta", "encoder_output_dim", "use_pc_color", "pointnet_type", "pointcloud_encoder_cfg"}
 _UNUSED = {"crop_shape", "use_point_crop"}  # of the policy: one has no image, the other is for its environments
@@ -49,7 +51,7 @@ def _rebuilt(saved: Saved, blocks: int) -> Rebuilt:
     if not settings.flag("obs_as_global_cond", True):
         raise settings.error("obs_as_global_cond is false; expected true, without which the original cannot run either")
     condition = settings.values.get("condition_type", "film")
-    if condition not in _CONDITIONS:
+    if condition not in tuple(_CONDITIONS):
         raise settings.error(
             f"condition_type is {condition!r:.80}; expected {' or '.join(_CONDITIONS)}. The original's networks with"
             " cross_attention_* cannot run: they put a timestep without an axis of observed steps beside observations"
@@ -80,9 +82,10 @@ def _encoder(settings: Settings, observed: Observed, weights: Weights) -> PointC
         if key == ROBOT and key not in observed:
             continue
         shape = observed[key][1] if key in observed else ()
-        if len(shape) != axes or (axes == 2 and shape[-1] < (COLOURED if coloured else PLACE)):
+        channels = COLOURED if coloured else PLACE
+        if len(shape) != axes or (axes == 2 and (shape[1] < channels or max(shape) > _MOST_POINTS)):
             found = f"{list(shape)}" if key in observed else "missing"
-            wanted = f"[points, {COLOURED if coloured else PLACE}]" if axes == 2 else "[length]"
+            wanted = f"[points, {channels}], {_MOST_POINTS} points at most" if axes == 2 else "[length]"
             raise settings.error(f"shape_meta.obs.{key} is {found}; expected the shape {wanted}")
     # Only the PointNet without colours can do without the last layer.
     projected = cloud.flag("use_projection", True) or coloured
