@@ -10,11 +10,13 @@ YanjieZe/3D-Diffusion-Policy importable, and this repository. torchvision and py
 from __future__ import annotations
 
 import sys
+import typing
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock, patch
 
+import diffusers.optimization
 import diffusers.schedulers as schedulers
 import numpy as np
 import torch
@@ -30,6 +32,8 @@ PROBED = (0, 17, 59)
 def main() -> None:
     """One file a variant."""
     put_in_place()
+    for name in ("Union", "Optional"):  # the original imports them from there; today's diffusers has them no longer
+        setattr(diffusers.optimization, name, getattr(typing, name))
     sys.modules.setdefault("pytorch3d.ops", sys.modules.setdefault("pytorch3d", MagicMock()))  # imported, never called
     for variant in unets.VARIANTS:
         path = Path(__file__).with_name(f"unet_{variant}.npz")
