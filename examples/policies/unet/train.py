@@ -46,7 +46,7 @@ def windows(ends: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
 @click.argument("original", type=click.Path(exists=True, file_okay=False, path_type=Path))
 @click.option("--demonstrations", type=click.Path(exists=True, dir_okay=False, path_type=Path), required=True)
 @click.option("-o", "--output", type=click.Path(file_okay=False, path_type=Path), required=True)
-@click.option("--steps", default=24000, show_default=True, type=click.IntRange(1))
+@click.option("--steps", default=10000, show_default=True, type=click.IntRange(1))
 @click.option("--save-every", default=2000, show_default=True, type=click.IntRange(1), help="Steps.")
 @click.option("--seed", default=0, show_default=True)
 @click.option("--resume", is_flag=True, help="Go on from the last checkpoint in the folder.")
