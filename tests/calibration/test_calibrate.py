@@ -262,3 +262,18 @@ def test_the_split_is_by_episode(count: int, fraction: float) -> None:
     if count == 100:
         assert split != split_episodes(count, fraction, seed=1)
         assert len(split.validation) == round(100 * fraction)
+
+
+def test_a_rival_is_corrected_on_request(compiled: Path, recording: Path, tmp_path: Path) -> None:
+    """The schedule stays what it is; its errors fall, and the artifact keeps the correction."""
+    results, schedules = [], []
+    for correct in (False, True):
+        directory = Path(shutil.copytree(compiled, tmp_path / f"{correct}"))
+        results.append(quick(directory, recording, strategy="interval", correct=correct, max_intervals=None))
+        artifact = load_artifact(directory)
+        schedules.append(artifact.schedule("schedule"))
+        assert ((artifact.manifest.calibration or {}).get("corrected") is True) == correct
+        assert ("schedule" in artifact.corrections) == correct
+    np.testing.assert_array_equal(*schedules)
+    plain, corrected = (result.plans["schedule"].error for result in results)
+    assert corrected < 0.7 * plain

@@ -82,6 +82,13 @@ def test_every_plan_is_measured_on_the_same_calls(frontier: Comparison) -> None:
     assert frontier.calls == 8
 
 
+def test_rivals_take_part_with_a_correction_of_their_own(planned: Path, recording: Path) -> None:
+    found = points(compare(planned, [recording], ["interval"], [0.5], calls=8, learned=400, correct=True))
+    plain, corrected = found["interval", "0.5"], found["interval, corrected", "0.5"]
+    assert corrected.sparsity == plain.sparsity
+    assert corrected.error < 0.7 * plain.error
+
+
 def test_it_says_where_plans_may_have_been_learned_from_these_episodes(planned: Path, frontier: Comparison) -> None:
     assert len(frontier.warnings) == 1
     assert frontier.warnings[0].startswith(

@@ -13,9 +13,10 @@ from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration import fit_correction as fitting
 from ttscompile.calibration.fit_correction import anchors_of, fit_correction
-from ttscompile.calibration.task import Task
+from ttscompile.calibration.task import Found, Task
 from ttscompile.calibration.whole_steps import _set_apart
 from ttscompile.core.lattice import PlanArray, Source, dense_plan, uniform_plan
+from ttscompile.errors import CalibrationError
 
 from . import tasks
 from .tasks import MakeTask
@@ -94,6 +95,26 @@ def test_it_reads_the_observation_where_that_helps_on_other_episodes(make_task: 
     correction = task.whole.correction([0, steps - 2])
     assert correction is not None
     assert (correction.reads > 0) == task.whole.reads(2)
+
+
+def test_any_schedule_can_be_corrected(make_task: MakeTask, plan: PlanArray) -> None:
+    """Also one that computes single blocks, of a strategy that fits no correction itself."""
+    task, held_out = make_task(calls=400, episodes=range(4)), make_task(calls=60, episodes=range(4, 6)).calls
+    single = plan.copy()
+    single[1, :2] = Source.COMPUTE
+    for schedule in (plan, single):
+        found = task.corrected(Found(schedule, {"made": "by hand"}))
+        assert found.correction is not None
+        assert found.notes["corrected"] is True and found.notes["made"] == "by hand"
+        better = replace(task, executor=task.executor.corrected(found.correction))
+        assert better.error(schedule, held_out) < 0.5 * task.error(schedule, held_out)
+
+
+def test_a_plan_that_reads_earlier_calls_is_not_corrected(make_task: MakeTask, plan: PlanArray) -> None:
+    rollout = plan.copy()
+    rollout[1, 0] = Source.ROLLOUT
+    with pytest.raises(CalibrationError, match="reads residuals of earlier calls.* Leave --correct out"):
+        make_task(calls=20).corrected(Found(rollout))
 
 
 def test_calls_of_one_episode_do_not_tell_whether_reading_helps(make_task: MakeTask) -> None:

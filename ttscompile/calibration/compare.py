@@ -86,6 +86,7 @@ def compare(
     seed: int = 0,
     intervals: int | None = None,
     max_minutes: float = 3.0,
+    correct: bool = False,
     progress: Progress = lambda what, done, total: None,
 ) -> Comparison:
     """Measure plans against each other. Nothing is written.
@@ -104,6 +105,8 @@ def compare(
         intervals: of a search, at most; None for the strategy's own number.
         max_minutes: of a search, about: what it has found by then takes part, and a warning says so. A strategy that
             has no plan within the budget by then is left out.
+        correct: let the plans of strategies that fit no correction take part a second time, with one that is fitted to
+            them, where that is better. Their series are called ``STRATEGY, corrected``.
         progress: told how far it is.
 
     Raises:
@@ -143,6 +146,8 @@ def compare(
         else:
             found[strategy, sparsity] = one
             cut += [name] * short
+            if correct and not strategy_of(strategy).fits_correction:
+                found[f"{strategy}, corrected", sparsity] = task.corrected(one)
     if wished:
         progress("search", len(wished), len(wished))
     warnings = _warnings(artifact, split, compared)

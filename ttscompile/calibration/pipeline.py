@@ -77,6 +77,7 @@ def calibrate(
     validation_fraction: float = 0.25,
     observation: Mapping[str, Sequence[str]] | None = None,
     max_intervals: int | None = None,
+    correct: bool = False,
     progress: bool = True,
 ) -> CalibrationResult:
     """Learn which residuals an artifact can reuse, from a few recorded episodes, and write the plans into it.
@@ -107,6 +108,8 @@ def calibrate(
             it be known; what has to be done at least is done. Also decides how many calls are used.
         validation_fraction: of the episodes.
         observation: by key, the arrays of a recording that it is made of, where they are called otherwise.
+        correct: fit a correction of the sampler to the schedule of a strategy that fits none itself, and keep it if it
+            is better on calls that it was not fitted on. For comparisons: it costs such a strategy nothing at run time.
         max_intervals: an end that does not depend on the machine's speed; None for the strategy's own.
         progress: show a bar on standard error.
 
@@ -139,7 +142,7 @@ def calibrate(
         episodes = load_episodes(spec, trajectories, observation)
         split = split_episodes(len(episodes), validation_fraction, seed)
         features = FEATURES * spec.sample[0] + 1
-        fewest = min(CALLS_A_FEATURE * features, MOST_NEEDED) if chosen.fits_correction else FEWEST_CALLS
+        fewest = min(CALLS_A_FEATURE * features, MOST_NEEDED) if chosen.fits_correction or correct else FEWEST_CALLS
         limit = int(np.clip(EVALUATIONS_A_MINUTE / spec.sampler.steps * max_minutes, fewest, MOST_CALLS))
         state = StateFile(
             Path(path),
@@ -151,6 +154,7 @@ def calibrate(
                 "seed": seed,
                 "validation_fraction": validation_fraction,
                 "max_intervals": max_intervals,
+                "correct": correct,
             },
         )
         if not (resume and state.load()):
@@ -180,6 +184,8 @@ def calibrate(
                 budget = budget_of_error(crowded, goal, artifact.manifest.steps, len(artifact.manifest.blocks))
             task = replace(task, budget=budget.cells, clock=clock.until(1 - SHARE) if chosen.fits_correction else clock)
             found, intervals, stopped = _search(open_search(strategy, task), state, task.clock, bar, max_intervals)
+            if correct and not chosen.fits_correction:
+                found = task.corrected(found)
             if goal.kind == ERROR:
                 found, budget = _relax(artifact, crowded, task, found, budget, sets["validation"])
             named, skipped = named_plans(crowded, task, chosen, budget.cells)

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -14,7 +14,8 @@ import numpy.typing as npt
 
 from ..artifact.load import Artifact
 from ..core.correction import Correction
-from ..core.lattice import PlanArray
+from ..core.lattice import PlanArray, Source
+from ..errors import CalibrationError
 from .calls import Actions, Calls
 from .execute import Executor
 from .whole_steps import WholeSteps
@@ -147,6 +148,22 @@ class Task:
             {"steps": list(steps), "numbers_read_of_the_observation": reads, **notes},
             correction,
         )
+
+    def corrected(self, found: Found) -> Found:
+        """The schedule that a strategy found, with a correction where that is better; see ``whole_steps``.
+
+        Raises:
+            CalibrationError: the schedule reads the rollout cache, or comes with a pruner.
+        """
+        if (found.schedule == Source.ROLLOUT.value).any() or found.pruner is not None:
+            raise CalibrationError(
+                "a correction is fitted to a schedule on calls of their own; this one reads residuals of earlier calls,"
+                " or comes with a pruner. Leave --correct out, or take another strategy."
+            )
+        correction = self.whole.correction_of(found.schedule)
+        reads = 0 if correction is None else correction.reads
+        notes = {**found.notes, "corrected": correction is not None, "numbers_read_of_the_observation": reads}
+        return replace(found, correction=correction, notes=notes)
 
 
 class Search(Protocol):

@@ -12,7 +12,7 @@ from ..core.correction import Correction
 from ..core.lattice import BoolArray, PlanArray, whole_steps_plan
 from .calls import Actions, Calls, IntArray
 from .execute import Executor
-from .fit_correction import fit_correction
+from .fit_correction import anchors_of, fit_correction
 
 FITTED, COMPARED = 384, 128
 """Calls on which a candidate's correction is fitted, and others on which its error is measured; fewer if there are
@@ -69,14 +69,18 @@ class WholeSteps:
 
         Or without one where that is better: fitted on too few calls, a correction does harm.
         """
-        return min(self._with_and_without(steps), key=lambda errors: errors.normalised)
+        return min(self._with_and_without(self.plan(steps)), key=lambda errors: errors.normalised)
 
     def correction(self, steps: Sequence[int]) -> Correction | None:
         """The correction of a schedule, fitted on all calls; None where the schedule is better without."""
-        corrected, plain = self._with_and_without(steps)
+        return self.correction_of(self.plan(steps))
+
+    def correction_of(self, plan: PlanArray) -> Correction | None:
+        """The same for any plan ``[K, blocks]`` that reads no rollout cache: calls stand alone here."""
+        corrected, plain = self._with_and_without(plan)
         if plain.normalised <= corrected.normalised:
             return None
-        return fit_correction(self._executor, self.plan(steps), self._calls, self.reads(len(steps)))
+        return fit_correction(self._executor, plan, self._calls, self.reads(_full_steps(plan)))
 
     def reads(self, count: int) -> bool:
         """Whether corrections of schedules of so many steps read the observation.
@@ -109,12 +113,13 @@ class WholeSteps:
         share = self._calls.count / (self._fitted.count + 2 * self._compared.count)
         return (1 + share) * self.comparing(full_steps)
 
-    def _with_and_without(self, steps: Sequence[int]) -> tuple[Errors, Errors]:
-        plan, reads = self.plan(steps), self.reads(len(steps))
+    def _with_and_without(self, plan: PlanArray) -> tuple[Errors, Errors]:
+        full = _full_steps(plan)
+        reads = self.reads(full)
         begun = time.monotonic()
         fitted = fit_correction(self._executor, plan, self._fitted, reads)
         errors = self._errors(plan, fitted), self._errors(plan, None)
-        self._pace = max(self._pace, (time.monotonic() - begun) / len(steps))
+        self._pace = max(self._pace, (time.monotonic() - begun) / full)
         return errors
 
     def _errors(self, plan: PlanArray, correction: Correction | None) -> Errors:
@@ -122,6 +127,11 @@ class WholeSteps:
         samples = self._executor.corrected(correction).run(plan, calls)
         normalised, units = (self._actions.errors(samples, calls.targets, units=u).mean() for u in (False, True))
         return Errors(float(normalised), float(units))
+
+
+def _full_steps(plan: PlanArray) -> int:
+    """How many steps of a plan are anchors: those of a schedule of whole steps that are computed."""
+    return max(1, int(anchors_of(plan).sum()))
 
 
 def _set_apart(episodes: IntArray) -> BoolArray:

@@ -50,6 +50,11 @@ from ttscompile.report.summary import document
     show_default=True,
     help=f"How the plan is found. {'; '.join(f'{one.name}: {one.source}' for one in STRATEGIES)}.",
 )
+@click.option(
+    "--correct",
+    is_flag=True,
+    help="Fit a correction of the sampler to the schedule of a strategy that fits none: fair comparisons with tts.",
+)
 @seed_option("Of the split, the noise and the training.")
 @click.option(
     "--max-minutes",

@@ -84,6 +84,11 @@ def _sparsities(_: click.Context, __: click.Parameter, value: str | None) -> tup
     show_default=True,
     help="Limit of each search, about; there is one for each strategy and sparsity.",
 )
+@click.option(
+    "--correct",
+    is_flag=True,
+    help="Let plans of strategies that fit no correction take part a second time, with one that is fitted to them.",
+)
 @count_option("--intervals", "Of each search, at most; for a quick look.", default=None)
 @seed_option("Of the split, the noise and the searches.")
 @click.option("--plot", "picture", type=PICTURE, help="Draw into this file (.png, .svg, .pdf).")
