@@ -55,6 +55,7 @@ def test_every_file_up_to_the_next_option_is_taken(arguments: list[str], asked: 
         "observation": {},
         "target_sparsity": None,
         "strategy": "tts",
+        "correct": False,
         "seed": 3,
         "resume": False,
         "target_flops": None,

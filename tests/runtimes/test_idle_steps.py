@@ -12,6 +12,7 @@ from ttscompile import SamplerTable, Source
 from ttscompile.artifact import Artifact
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import legalize, uniform_plan
+from ttscompile.ir.graph import Node, Ref
 from ttscompile.ir.pieces import IDLE
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.onnxruntime.backend import OnnxBackend
@@ -105,7 +106,15 @@ def test_runs_of_idle_steps_go_through_numpy_and_prepare_once(
     assert (runs, len(prepared)) == ([(1, 4), (8, 12)], 2)
 
 
-def test_a_network_of_another_form_has_no_such_steps(toy_artifact: Artifact) -> None:
+def test_a_network_of_another_form_has_no_such_steps(make_artifact: MakeArtifact) -> None:
+    """Its prediction is not affine in the stream."""
+    program = toy_program()
+    tail = program.pieces.tail
+    (out,) = tail.graph.outputs
+    bent = Node("bent", "aten.tanh.default", (Ref(out),), (), (tail.type,))
+    graph = replace(tail.graph, nodes=(*tail.graph.nodes, bent), outputs=("bent",))
+    pieces = replace(program.pieces, tail=replace(tail, graph=graph))
+    toy_artifact = make_artifact(replace(program, pieces=pieces))
     assert IDLE not in toy_artifact.manifest.pieces
     runtime = open_runtime(toy_artifact)
     assert isinstance(runtime.backend, OnnxBackend)

@@ -106,7 +106,7 @@ def toy_program(
 
     Block b is ``tanh(h W_b + c_b)`` where c_b is a table row, a condition value or a step value, in turn.
     With ``sequence_first`` the stream is ``[T, B, W]`` rather than ``[B, T, W]``. With ``normed`` the tail begins with
-    a LayerNorm, and idle steps have a piece of their own.
+    a LayerNorm; without, it is affine.
     """
     channels, width = 2, 4
     rng = np.random.default_rng(seed)
