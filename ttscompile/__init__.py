@@ -1,4 +1,4 @@
-"""An ahead-of-time compiler for diffusion-transformer robot policies.
+"""An ahead-of-time compiler for diffusion policies of robots.
 
 ``import ttscompile`` loads neither torch nor onnx: the names below are imported when they are first used (PEP 562), so
 that a robot with numpy and onnxruntime alone can ``load`` an artifact, and the compiler's dependencies are only needed

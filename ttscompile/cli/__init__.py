@@ -31,7 +31,7 @@ from ttscompile.cli.verify import verify
 @click.version_option(__version__, prog_name="ttscompile")
 @click.option(TRACEBACK, is_flag=True, expose_value=False, help="Show where a defect of ttscompile is.")
 def main() -> None:
-    """Compile diffusion-transformer robot policies into artifacts that run in real time without PyTorch."""
+    """Compile diffusion policies of robots into artifacts that run in real time without PyTorch."""
 
 
 # In the order in which they are used; a line each, short enough for a terminal of 80 columns.
