@@ -224,3 +224,17 @@ def test_the_product_that_a_convolution_became_is_found_behind_its_reshape() -> 
     found = session(quantised, {**weights, **constants}).run(None, {"x": x})[0]
     expected = functional.conv1d(torch.from_numpy(x), *map(torch.from_numpy, weights.values()), padding=1).numpy()
     assert 0 < np.linalg.norm(found - expected) / np.linalg.norm(expected) < 0.02
+
+
+def test_convolutions_that_stay_are_counted() -> None:
+    """One over few positions, which is a product, and one over many."""
+    few, many = f32(B, 4, 7), f32(B, 4, 40)
+    values = {name: np.ones((4, 4, 3), np.float32) for name in ("v", "w")}
+    nodes = tuple(
+        node(out, "conv1d.default", kind, Ref(into), Ref(weight), None, (1,), (1,))
+        for out, kind, into, weight in (("y", few, "x", "v"), ("z", many, "long", "w"))
+    )
+    graph = Graph({"x": few, "long": many}, dict.fromkeys(values, f32(4, 4, 3)), nodes, ("y", "z"))
+    _, constants, notes = lower_precision({"block_00": lower_graph(graph, "block_00")}, values, "int8")
+    assert set(constants) == {"v.int8", "v.int8.scale"}
+    assert notes[1] == "convolutions that stay fp32, over more than 32 positions, in groups, or transposed: 1"

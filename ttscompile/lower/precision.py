@@ -19,6 +19,7 @@ from ..core.spec import INT8, PRECISIONS
 from ..errors import LoweringError
 from ..ir.pieces import is_block
 from .onnx_model import live_nodes
+from .translations import FEW
 
 Array = npt.NDArray[Any]
 
@@ -85,7 +86,11 @@ def lower_precision(
         )
     megabytes = sum(value.nbytes for value in constants.values()) / 1e6
     note = f"{precision}: {replaced} matrices of {len(made)} of {len(blocks)} blocks, {megabytes:.1f} MB"
-    left = (f"{name} stays fp32: no product with constant weights" for name in blocks if name not in made)
+    left = [f"{name} stays fp32: no product with constant weights" for name in blocks if name not in made]
+    whole = sum(node.op_type in ("Conv", "ConvTranspose") for model in made.values() for node in model.graph.node)
+    left += [f"convolutions that stay fp32, over more than {FEW} positions, in groups, or transposed: {whole}"] * (
+        whole > 0
+    )
     return made, constants, (note, *left)
 
 
