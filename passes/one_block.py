@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from ttscompile.ir.dataflow import reachable_from
 from ttscompile.ir.graph import Node, Ref, TensorType
 from ttscompile.ir.program import Captured
 
@@ -45,14 +44,11 @@ class OneBlock(Pass[Captured, Captured]):
         type_ = graph.inputs[sample]
         if graph.types()[made] != type_:
             raise self.fail(f"the prediction is {graph.types()[made]}, and the sample {type_}; expected the same.")
-        width = type_.shape[-1]
-        if made not in reachable_from(graph, [sample]) or not isinstance(width, int):
-            raise self.fail(f"the prediction %{made} does not depend on the last axis of the sample %{sample}.")
-        wide = TensorType((*type_.shape[:-1], 2 * width), type_.dtype)
+        *others, width = program.spec.sample
+        wide, last = TensorType((type_.shape[0], *others, 2 * width), type_.dtype), len(others) + 1
         stream, taken, residual, updated, prediction = (
             f"{sample}.{name}" for name in ("stream", "taken", "residual", "updated", "prediction")
         )
-        last = len(type_.shape) - 1
 
         def own(node: Node) -> Node:
             return node.renamed(lambda name: taken if name == sample else name)

@@ -12,10 +12,12 @@ from __future__ import annotations
 
 import argparse
 import resource
+import statistics
 import subprocess
 import sys
 import tempfile
 import time
+import timeit
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -93,13 +95,7 @@ def run(folder: Path) -> None:
 
 def seconds(call: Callable[[], object]) -> float:
     """Median of five calls after one that does not count."""
-    call()
-    times = []
-    for _ in range(5):
-        start = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - start)
-    return sorted(times)[2]
+    return statistics.median(timeit.repeat(call, number=1, repeat=6)[1:])
 
 
 def peak() -> float:

@@ -18,6 +18,7 @@ from ttscompile import SamplerTable
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.write import update_calibration
 from ttscompile.calibration.compare import _require_same_policy, compare
+from ttscompile.calibration.task import Found, Task
 from ttscompile.cli import main
 from ttscompile.cli.compare import default_sparsities
 from ttscompile.core.lattice import uniform_plan
@@ -87,6 +88,18 @@ def test_rivals_take_part_with_a_correction_of_their_own(planned: Path, recordin
     plain, corrected = found["interval", "0.5"], found["interval, corrected", "0.5"]
     assert corrected.sparsity == plain.sparsity
     assert corrected.error < 0.7 * plain.error
+
+
+def test_a_plan_that_cannot_be_corrected_is_left_out_with_the_reason(
+    planned: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(self: Task, found: Found) -> Found:
+        raise CalibrationError("reads residuals of earlier calls")
+
+    monkeypatch.setattr(Task, "corrected", refuse)
+    found = compare(planned, [recording], ["interval"], [0.5], calls=4, correct=True)
+    assert found.skipped == {"interval, corrected 0.5": "reads residuals of earlier calls"}
+    assert ("interval", "0.5") in points(found)
 
 
 def test_it_says_where_plans_may_have_been_learned_from_these_episodes(planned: Path, frontier: Comparison) -> None:

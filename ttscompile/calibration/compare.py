@@ -147,7 +147,11 @@ def compare(
             found[strategy, sparsity] = one
             cut += [name] * short
             if correct and not strategy_of(strategy).fits_correction:
-                found[f"{strategy}, corrected", sparsity] = task.corrected(one)
+                series = f"{strategy}, corrected"
+                try:
+                    found[series, sparsity] = task.corrected(one)
+                except CalibrationError as error:
+                    skipped[f"{series} {sparsity:g}"] = str(error)
     if wished:
         progress("search", len(wished), len(wished))
     warnings = _warnings(artifact, split, compared)

@@ -109,7 +109,7 @@ def calibrate(
         validation_fraction: of the episodes.
         observation: by key, the arrays of a recording that it is made of, where they are called otherwise.
         correct: fit a correction of the sampler to the schedule of a strategy that fits none itself, and keep it if it
-            is better on calls that it was not fitted on. For comparisons: it costs such a strategy nothing at run time.
+            is better on calls that it was not fitted on.
         max_intervals: an end that does not depend on the machine's speed; None for the strategy's own.
         progress: show a bar on standard error.
 
@@ -138,6 +138,8 @@ def calibrate(
         artifact = load_artifact(Path(path))
         goal = goal_of(*asked, usual=usual_sparsity(artifact.manifest.steps))
         spec, chosen = artifact.manifest.spec, strategy_of(strategy)
+        if correct and chosen.fits_correction:
+            raise CalibrationError(f"strategy {strategy!r} fits a correction of its own. Leave --correct out.")
         budget = _known_budget(artifact, goal, chosen, validation_fraction, max_minutes)
         episodes = load_episodes(spec, trajectories, observation)
         split = split_episodes(len(episodes), validation_fraction, seed)
@@ -184,7 +186,7 @@ def calibrate(
                 budget = budget_of_error(crowded, goal, artifact.manifest.steps, len(artifact.manifest.blocks))
             task = replace(task, budget=budget.cells, clock=clock.until(1 - SHARE) if chosen.fits_correction else clock)
             found, intervals, stopped = _search(open_search(strategy, task), state, task.clock, bar, max_intervals)
-            if correct and not chosen.fits_correction:
+            if correct:
                 found = task.corrected(found)
             if goal.kind == ERROR:
                 found, budget = _relax(artifact, crowded, task, found, budget, sets["validation"])

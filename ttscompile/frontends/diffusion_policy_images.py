@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from ..errors import CheckpointError
-from .diffusion_policy_parts import Observed, image_normalizer
+from .diffusion_policy_parts import MOST_PIXELS, Observed, image_normalizer
 from .diffusion_policy_weights import Weights
 from .multi_image_encoder import COLOURS, MultiImageEncoder, View
 from .resnet import DEPTHS, Norm, group_norm
@@ -23,7 +23,6 @@ _KNOWN = {"_target_", "shape_meta", "rgb_model", "resize_shape", "crop_shape", "
 _KNOWN |= {"use_group_norm", "share_rgb_model", "imagenet_norm"}
 _PREFIX = "obs_encoder."
 _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of the colours of ImageNet
-_MOST_PIXELS = 4096
 
 
 def encoder_settings(settings: Settings) -> Settings:
@@ -116,7 +115,7 @@ def _view(
         raise settings.error(
             f"shape_meta.obs.{key}.shape is {list(shape)}; expected {COLOURS} channels of an RGB image"
         )
-    resize, crop = (settings.size(name, None, _MOST_PIXELS) for name in ("resize_shape", "crop_shape"))
+    resize, crop = (settings.size(name, None, MOST_PIXELS) for name in ("resize_shape", "crop_shape"))
     whole = resize or (height, width)
     if whole[0] < height or whole[1] < width:
         warnings.warn(

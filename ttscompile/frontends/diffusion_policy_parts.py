@@ -19,7 +19,7 @@ COMMON_KEYS = frozenset(
 )
 """Settings of ``cfg.policy`` that all have."""
 
-_MOST_PIXELS = 4096
+MOST_PIXELS = 4096
 """Of an image along one axis, which the weights do not limit."""
 
 Observed = Mapping[str, tuple[str, tuple[int, ...]]]
@@ -97,8 +97,8 @@ def read_shape_meta(settings: Settings, *types: str) -> tuple[int, Observed]:
         kind = types[0] if key == "action" else each.choice("type", *types)
         if key == "action" and len(shape) != 1:
             raise each.refusal("shape", "one number")
-        if kind == "rgb" and (len(shape) != 3 or max(shape) > _MOST_PIXELS):
-            raise each.refusal("shape", f"[C, H, W], {_MOST_PIXELS} pixels at most")
+        if kind == "rgb" and (len(shape) != 3 or max(shape) > MOST_PIXELS):
+            raise each.refusal("shape", f"[C, H, W], {MOST_PIXELS} pixels at most")
         observed[key] = (kind, tuple(shape))
     _, (action_dim, *_) = observed.pop("action")
     if not observed:

@@ -35,7 +35,7 @@ _NO_LOOP = (
     "There is no denoising loop to compile. Export its network with torch.onnx.export and run it with onnxruntime, or"
     " use torch.compile."
 )
-_NO_POLICY = "There is no denoising loop to compile. llama.cpp runs such files."
+_LLAMA = "There is no denoising loop to compile. llama.cpp runs such files."
 _MERGE = "Merge it into its base model (PeftModel.merge_and_unload), save that policy, and convert the result."
 _WEIGHTS = (
     "Weights do not say how they are connected. Convert what the training saved, which holds the configuration too; or"
@@ -65,7 +65,7 @@ POLICIES = (
         "a diffusion policy with another observation encoder than those that are read",
         f"{_BUILD}, its observation encoder inside the module: hoisting takes it out of the loop.",
     ),
-    Refusal(r"", "a policy of its own kind", f"If it has a transformer denoiser: {_BUILD}."),
+    Refusal(r"", "a policy of its own kind", f"If it denoises: {_BUILD}."),
 )
 """By the class name of a configuration's ``policy``, in lower case."""
 
@@ -91,7 +91,7 @@ LEROBOT = (
     Refusal(r"^tdmpc$", "a world model with a planner", _NO_LOOP),
     Refusal(r"^sac$", "an actor of reinforcement learning", _NO_LOOP),
     Refusal(r"^(smolvla|pi0|pi05|groot|xvla|wall_x)$", "a vision-language model with an action head", _HEAD),
-    Refusal(r"", "not known", f"Expected diffusion or multi_task_dit. If its denoiser is a transformer: {_BUILD}."),
+    Refusal(r"", "not known", f"Expected diffusion or multi_task_dit. If it denoises: {_BUILD}."),
 )
 """By the type of a LeRobot policy, in lower case."""
 
@@ -176,7 +176,7 @@ def refuse_file(path: Path) -> None:
     if head.startswith(b"\x89HDF\r\n"):
         raise _refused(path, "an HDF5 file, data or Keras weights", "its first bytes", _WEIGHTS)
     if head.startswith(b"GGUF"):
-        raise _refused(path, "a GGUF file, a quantised language model", "its first bytes", _NO_POLICY)
+        raise _refused(path, "a GGUF file, a quantised language model", "its first bytes", _LLAMA)
     if not zipfile.is_zipfile(path):
         return
     try:

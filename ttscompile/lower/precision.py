@@ -88,9 +88,8 @@ def lower_precision(
     note = f"{precision}: {replaced} matrices of {len(made)} of {len(blocks)} blocks, {megabytes:.1f} MB"
     left = [f"{name} stays fp32: no product with constant weights" for name in blocks if name not in made]
     whole = sum(node.op_type in ("Conv", "ConvTranspose") for model in made.values() for node in model.graph.node)
-    left += [f"convolutions that stay fp32, over more than {FEW} positions, in groups, or transposed: {whole}"] * (
-        whole > 0
-    )
+    if whole:
+        left.append(f"convolutions that stay fp32, over more than {FEW} positions, in groups, or transposed: {whole}")
     return made, constants, (note, *left)
 
 
