@@ -70,7 +70,7 @@ def convert(folder: Path, network: nn.Module, horizon: int) -> None:
         return x
 
     with torch.inference_mode():
-        print(f"{seconds(eager):8.2f} s  a call of {STEPS} steps in eager PyTorch, on one thread")
+        print(f"{seconds(eager):8.3f} s  a call of {STEPS} steps in eager PyTorch, on one thread")
         np.save(folder / "expected.npy", eager().numpy())
 
 
@@ -88,7 +88,7 @@ def run(folder: Path) -> None:
     out = policy.predict_action({"obs": call["obs"]}, noise=noise, plan="dense")
     error = np.abs(out["action_pred"] - np.load(folder / "expected.npy")).max()
     taken = seconds(lambda: policy.predict_action({"obs": call["obs"]}, noise=noise, plan="dense"))
-    print(f"{taken:8.2f} s  a dense call of {STEPS} steps, on one thread, {error:.1e} from eager")
+    print(f"{taken:8.3f} s  a dense call of {STEPS} steps, on one thread, {error:.1e} from eager")
     size = sum(file.stat().st_size for file in (folder / "compiled").iterdir()) / 2**30
     print(f"{peak():8.2f} GiB at most while it ran; the artifact has {size:.2f} GiB")
 

@@ -14,9 +14,11 @@ import sys
 import time
 import typing
 from collections.abc import Callable
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -38,13 +40,48 @@ def find_original(original: Path) -> None:
         setattr(diffusers.optimization, name, getattr(typing, name))
 
 
-def configuration(original: Path, name: str, changes: dict[str, Any]) -> Any:
+def recipe_options(steps: int, save_every: int) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """What every recipe is given on the command line, with these defaults."""
+    options = (
+        click.argument("original", type=click.Path(exists=True, file_okay=False, path_type=Path)),
+        click.option("--demonstrations", type=click.Path(exists=True, dir_okay=False, path_type=Path), required=True),
+        click.option("-o", "--output", type=click.Path(file_okay=False, path_type=Path), required=True),
+        click.option("--steps", default=steps, show_default=True, type=click.IntRange(1)),
+        click.option("--save-every", default=save_every, show_default=True, type=click.IntRange(1), help="Steps."),
+        click.option("--seed", default=0, show_default=True),
+        click.option("--resume", is_flag=True, help="Go on from the last checkpoint in the folder."),
+    )
+    return lambda command: reduce(lambda made, option: option(made), reversed(options), command)
+
+
+def cut(ends: npt.NDArray[np.int64], horizon: int, before: int, after: int) -> npt.NDArray[np.int64]:
+    """Numbers of the frames of each training example, cut within an episode as the original cuts them.
+
+    Args:
+        ends: ``[E]``, number of frames up to the end of each episode.
+        horizon: T, the frames of an example.
+        before: How often at most an episode's first frame is repeated.
+        after: The same of its last frame.
+
+    Returns:
+        ``[N, T]``.
+    """
+    rows = []
+    for first, end in zip([0, *ends[:-1]], ends, strict=True):
+        starts = np.arange(first - before, end - horizon + after + 1)
+        rows.append(np.clip(starts[:, None] + np.arange(horizon), first, end - 1))
+    return np.concatenate(rows)
+
+
+def configuration(original: Path, name: str, changes: dict[str, Any], seed: int, steps: int) -> Any:
     """One of the original's configurations, changed and resolved.
 
     Args:
         original: The original's checkout.
         name: The configuration's file.
         changes: Entries that the recipe sets.
+        seed: Of weights, examples and noise.
+        steps: Of the training.
     """
     from omegaconf import OmegaConf
 
@@ -52,7 +89,8 @@ def configuration(original: Path, name: str, changes: dict[str, Any]) -> Any:
     config = OmegaConf.load(original / "diffusion_policy" / "config" / name)
     for entry in ("defaults", "hydra", "multi_run", "logging", "checkpoint"):
         config.pop(entry, None)
-    merged = OmegaConf.merge(config, changes)
+    training = {"device": "cpu", "seed": seed, "lr_warmup_steps": 300, "num_epochs": 1, "max_train_steps": steps}
+    merged = OmegaConf.merge(config, {**changes, "training": training})
     OmegaConf.resolve(merged)
     return merged
 
@@ -96,9 +134,9 @@ def train(
     obs: torch.Tensor,
     action: torch.Tensor,
     frames: npt.NDArray[np.int64],
-    output: Path,
     name: str,
     *,
+    output: Path,
     optimizer: Callable[[Any], torch.optim.Optimizer],
     time_embedding: Callable[[Any], Any],
     steps: int,
@@ -113,8 +151,8 @@ def train(
         obs: ``[F, Do]``, the frames' observations.
         action: ``[F, Da]``, their actions.
         frames: ``[N, T]``, the frames of each example.
-        output: The folder.
         name: What the small checkpoints' names begin with.
+        output: The folder.
         optimizer: Makes the optimiser of a policy.
         time_embedding: Gives the network's module that turns timesteps into numbers.
         steps: Steps in all, those before ``resume`` included.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -13,28 +12,12 @@ from original import EagerPolicy
 from variants import open_variant, seeded_noise
 
 import ttscompile
+from tests.examples.recipes import script
 from tests.rounding import PROMISED
 
 FOLDER = Path(__file__).parents[2] / "examples" / "policies" / "metaworld"
 CHECKPOINT = FOLDER / "metaworld_dpt_ema_fp16.ckpt"
 TASKS = 12
-
-
-def script(name: str) -> ModuleType:
-    """Loaded under a name of its own: other folders of examples have scripts of the same names.
-
-    What it puts into the path is taken out again: the folder beside it would pass for the package metaworld.
-    """
-    spec = importlib.util.spec_from_file_location(f"metaworld_{name}", FOLDER / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    path = list(sys.path)
-    try:
-        spec.loader.exec_module(module)
-    finally:
-        sys.path[:] = path
-    return module
 
 
 def windows() -> np.ndarray:
@@ -65,7 +48,7 @@ def test_the_checkpoint_fits_in_a_repository() -> None:
 
 def test_examples_are_cut_within_an_episode() -> None:
     """As the original cuts them: an observation before the first action, five repeated actions after the last."""
-    frames = script("train").windows(np.zeros(7), np.array([3, 7]))
+    frames = script(FOLDER, "train").windows(np.zeros(7), np.array([3, 7]))
     assert frames.tolist() == [
         [0, 0, 1, 2, 2, 2, 2, 2],
         [0, 1, 2, 2, 2, 2, 2, 2],
@@ -78,7 +61,7 @@ def test_examples_are_cut_within_an_episode() -> None:
 def test_no_example_executes_actions_during_a_push() -> None:
     pushed = np.zeros(20)
     pushed[[8, 9]] = 1
-    frames = script("train").windows(pushed, np.array([20]))
+    frames = script(FOLDER, "train").windows(pushed, np.array([20]))
     assert frames[:, 1].tolist() == [0, 1, 2, 10, 11, 12, 13, 14, 15, 16, 17, 18], "the first executed action"
     assert 9 in frames[:, 0], "what a push has done is observed"
 
@@ -87,7 +70,7 @@ def test_no_example_executes_actions_during_a_push() -> None:
 def demonstrations() -> ModuleType:
     if importlib.util.find_spec("metaworld") is None:
         pytest.skip("NO TESTS OF META-WORLD'S EXPERTS: metaworld is not installed; pip install 'ttscompile[examples]'")
-    return script("demonstrations")
+    return script(FOLDER, "demonstrations")
 
 
 @pytest.mark.filterwarnings("ignore:Constant.s. may be too high")

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -13,29 +10,13 @@ from original import EagerPolicy
 from variants import open_variant, seeded_noise
 
 import ttscompile
+from tests.examples.recipes import script
 from tests.rounding import PROMISED
 
 FOLDER = Path(__file__).parents[2] / "examples" / "policies" / "unet"
 CHECKPOINT = FOLDER / "pusht_unet_ema_fp16.ckpt"
 WORLD = 512
 """Pixels, the range of the actions."""
-
-
-def script(name: str) -> ModuleType:
-    """Loaded under a name of its own: other folders of examples have scripts of the same names.
-
-    What it puts into the path is taken out again: the folder beside it would pass for the package metaworld.
-    """
-    spec = importlib.util.spec_from_file_location(f"unet_{name}", FOLDER / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    path = list(sys.path)
-    try:
-        spec.loader.exec_module(module)
-    finally:
-        sys.path[:] = path
-    return module
 
 
 def test_the_checkpoint_compiles_and_dense_is_the_eager_policy(tmp_path: Path) -> None:
@@ -60,7 +41,7 @@ def test_the_checkpoint_fits_in_a_repository() -> None:
 def test_examples_are_cut_within_an_episode() -> None:
     """As the original cuts them: one observation before the first action, seven repeated actions after the last."""
     pytest.importorskip("gym_pusht", reason="the recipe takes its observations from gym-pusht's adapter")
-    frames = script("train").windows(np.array([3, 23]))
+    frames = script(FOLDER, "train").windows(np.array([3, 23]))
     assert frames.min() == 3, "an episode of three frames is too short for an example"
     assert frames[0].tolist() == [3, *range(3, 18)]
     assert frames[-1].tolist() == [*range(14, 23), *[22] * 7]

@@ -19,7 +19,7 @@ import torch
 
 sys.path[1:1] = [str(Path(__file__).parents[1])]
 
-from diffusion_policy_training import configuration, find_original, train  # noqa: E402
+from diffusion_policy_training import configuration, cut, find_original, recipe_options, train  # noqa: E402
 
 HORIZON, WINDOW, EXECUTED = 8, 2, 4
 """T, To and Ta."""
@@ -40,26 +40,14 @@ def windows(pushed: npt.NDArray[Any], ends: npt.NDArray[np.int64]) -> npt.NDArra
     Returns:
         ``[N, HORIZON]``.
     """
-    rows = []
-    for first, end in zip([0, *ends[:-1]], ends, strict=True):
-        starts = np.arange(first - (WINDOW - 1), end - HORIZON + UNDISTURBED)
-        rows.append(np.clip(starts[:, None] + np.arange(HORIZON), first, end - 1))
-    frames = np.concatenate(rows)
+    frames = cut(ends, HORIZON, WINDOW - 1, UNDISTURBED - 1)
     undisturbed = frames[:, WINDOW - 1 : WINDOW - 1 + UNDISTURBED]
     return np.asarray(frames[(pushed[undisturbed] == 0).all(axis=1)])
 
 
 @click.command()
-@click.argument("original", type=click.Path(exists=True, file_okay=False, path_type=Path))
-@click.option("--demonstrations", type=click.Path(exists=True, dir_okay=False, path_type=Path), required=True)
-@click.option("-o", "--output", type=click.Path(file_okay=False, path_type=Path), required=True)
-@click.option("--steps", default=8000, show_default=True, type=click.IntRange(1))
-@click.option("--save-every", default=1000, show_default=True, type=click.IntRange(1), help="Steps.")
-@click.option("--seed", default=0, show_default=True)
-@click.option("--resume", is_flag=True, help="Go on from the last checkpoint in the folder.")
-def main(
-    original: Path, demonstrations: Path, output: Path, steps: int, save_every: int, seed: int, resume: bool
-) -> None:
+@recipe_options(steps=8000, save_every=1000)
+def main(original: Path, demonstrations: Path, steps: int, seed: int, **run: Any) -> None:
     """Train on one thread, and write checkpoints into a folder."""
     find_original(original)
     with np.load(demonstrations) as file:
@@ -72,23 +60,20 @@ def main(
         "policy": {"model": {"n_layer": 6, "n_head": 4, "n_emb": 128, "p_drop_attn": 0.0}},
         "dataloader": {"batch_size": 64},
         "optimizer": {"learning_rate": 1e-3, "weight_decay": 1e-3},
-        "training": {"device": "cpu", "seed": seed, "lr_warmup_steps": 300, "num_epochs": 1, "max_train_steps": steps},
     }
     name = "train_diffusion_transformer_lowdim_pusht_workspace.yaml"
-    config = configuration(original, name, changes)
+    config = configuration(original, name, changes, seed, steps)
     train(
         config,
         obs,
         action,
         frames,
-        output,
         "metaworld_dpt",
         optimizer=lambda policy: policy.get_optimizer(**config.optimizer),
         time_embedding=lambda network: network.time_emb,
         steps=steps,
-        save_every=save_every,
         seed=seed,
-        resume=resume,
+        **run,
     )
 
 
