@@ -59,6 +59,21 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 
 
+def scheduler(name: str) -> dict[str, Any]:
+    """Settings of a scheduler."""
+    return {
+        "_target_": f"diffusers.schedulers.{name}",
+        # Ten times the steps taken: the first of them all divides by next to nothing, which magnifies rounding.
+        "num_train_timesteps": 10 * STEPS,
+        "beta_start": 0.0001,
+        "beta_end": 0.02,
+        "beta_schedule": "squaredcos_cap_v2",
+        "clip_sample": True,
+        "clip_sample_range": 4.0,  # wide, so that few actions are where clipping hides what made them
+        "prediction_type": "epsilon",
+    }
+
+
 def configuration(variant: str) -> dict[str, Any]:
     """``cfg`` as it is saved, resolved."""
     made = VARIANTS[variant]
@@ -68,17 +83,7 @@ def configuration(variant: str) -> dict[str, Any]:
             "_target_": "diffusion_policy.policy.diffusion_transformer_hybrid_image_policy"
             ".DiffusionTransformerHybridImagePolicy",
             "shape_meta": {"obs": made["obs"], "action": {"shape": [ACTION]}},
-            "noise_scheduler": {
-                "_target_": f"diffusers.schedulers.{made['scheduler']}",
-                # Ten times the steps taken: the first of them all divides by next to nothing, which magnifies rounding.
-                "num_train_timesteps": 10 * STEPS,
-                "beta_start": 0.0001,
-                "beta_end": 0.02,
-                "beta_schedule": "squaredcos_cap_v2",
-                "clip_sample": True,
-                "clip_sample_range": 4.0,  # wide, so that few actions are where clipping hides what made them
-                "prediction_type": "epsilon",
-            },
+            "noise_scheduler": scheduler(made["scheduler"]),
             "num_inference_steps": STEPS,
             **_SMALL,
             **made["policy"],

@@ -122,30 +122,15 @@ POINTS = tuple(name for name, made in VARIANTS.items() if made.get("of") in (_DP
 """Those of 3D Diffusion Policy."""
 
 
-def scheduler(name: str) -> dict[str, Any]:
-    """Settings of a scheduler."""
-    return {
-        "_target_": f"diffusers.schedulers.{name}",
-        # Ten times the steps taken: the first of them all divides by next to nothing, which magnifies rounding.
-        "num_train_timesteps": 10 * STEPS,
-        "beta_start": 0.0001,
-        "beta_end": 0.02,
-        "beta_schedule": "squaredcos_cap_v2",
-        "clip_sample": True,
-        "clip_sample_range": 4.0,  # wide, so that few actions are where clipping hides what made them
-        "prediction_type": "epsilon",
-    }
-
-
 def configuration(variant: str) -> dict[str, Any]:
     """``cfg`` as it is saved, resolved."""
     made = VARIANTS[variant]
     original = "diffusion_policy_3d" if variant in POINTS else _ORIGINAL
     policy = {
         "_target_": f"{original}.policy.{made.get('of', 'diffusion_unet_lowdim_policy.DiffusionUnetLowdimPolicy')}",
-        "noise_scheduler": scheduler("DDIMScheduler") | {"prediction_type": "sample"}
+        "noise_scheduler": hybrid.scheduler("DDIMScheduler") | {"prediction_type": "sample"}
         if variant in POINTS
-        else scheduler(made.get("scheduler", "DDPMScheduler")),
+        else hybrid.scheduler(made.get("scheduler", "DDPMScheduler")),
         "num_inference_steps": STEPS,
         "horizon": 8,
         "n_action_steps": 4,
