@@ -91,7 +91,7 @@ def find_residual_blocks(graph: Graph, sample: str) -> BlockTable:
             "no residual block found: between the sample and the output no value a is updated as a + f(a)."
             f" The search walked {len(points)} dominators and ended at {where}."
             + "".join(f"\n  declined: {reason}" for reason in declined)
-            + "\nIf the output is the sample plus more, EDMDenoiser and edm_table give finer blocks."
+            + "\nIf the output is the sample times something plus more, EDMDenoiser and edm_table give finer blocks."
         )
     links = _main_stream(graph, links, declined)
     blocks = tuple(_chain(graph, points, links, declined, loop))

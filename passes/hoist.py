@@ -64,7 +64,15 @@ class Hoist(Pass[Cut, Program]):
                 **dict.fromkeys(at[Binding.STEP], Binding.STEP),
             },
         )
-        new = Program(spec, program.denoiser, program.weights, program.blocks, pieces, dense_flops=program.dense_flops)
+        new = Program(
+            spec,
+            program.denoiser,
+            program.weights,
+            program.blocks,
+            pieces,
+            dense_flops=program.dense_flops,
+            unmoved=program.unmoved,
+        )
         return PassResult(new, _notes(new))
 
     def ensures(self, program: Program) -> None:

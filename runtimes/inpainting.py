@@ -75,12 +75,19 @@ def noise_levels(sampler: SamplerTable) -> Levels | None:
     """``signal`` and ``deviation``, float64 ``[K]``: a sample before step k is ``signal * clean + deviation * noise``.
 
     They follow from how the table predicts the clean sample: ``x0 = (x - sigma eps) / alpha`` or ``alpha x - sigma v``
-    with ``alpha^2 + sigma^2 = 1``; or ``x0 = x + left v`` on a straight line from noise. A table that holds no clean
-    sample (Runge-Kutta), or in whose network's output it cannot be told apart, has none.
+    with ``alpha^2 + sigma^2 = 1``; or ``x0 = x + left v`` on a straight line from noise; each of them also as
+    ``SamplerTable.with_skip`` writes it. A table that holds no clean sample (Runge-Kutta), or in whose network's output
+    it cannot be told apart, has none.
 
     Returns:
         None if they do not follow.
     """
+    levels = _levels(sampler)
+    return levels if levels is not None else _levels(sampler.without_skip())
+
+
+def _levels(sampler: SamplerTable) -> Levels | None:
+    """Of a table as samplers make it."""
     sample, out = sampler.sample_to_x0.astype(np.float64), sampler.out_to_x0.astype(np.float64)
     if (sample > 0).all() and _keeps_variance(1 / sample, -out / sample):
         return 1 / sample, -out / sample

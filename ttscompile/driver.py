@@ -39,6 +39,7 @@ from .passes.cut_copies import CutCopies
 from .passes.find_residual_blocks import BlockTable, find_residual_blocks
 from .passes.hoist import Hoist
 from .passes.insert_pruner import InsertPruner
+from .passes.move_skip import MoveSkip, skips_network
 from .passes.one_block import OneBlock
 from .passes.partition import Partition
 from .passes.regroup_sums import RegroupSums
@@ -229,6 +230,8 @@ def transform(module: nn.Module, spec: PolicySpec, *, explain: Explain = _silent
 def _find_blocks(captured: Captured, explain: Explain) -> tuple[Captured, BlockTable]:
     """The residual blocks of the network; or the whole network as one, where no chain of them holds most of it."""
     sample = captured.spec.sample_argument
+    if skips_network(captured.denoiser, sample) and _finer_inside(captured):
+        captured = _run(MoveSkip(), captured, explain)
     try:
         table = find_residual_blocks(captured.denoiser, sample)
     except NoResidualBlocksError as error:
@@ -236,6 +239,18 @@ def _find_blocks(captured: Captured, explain: Explain) -> tuple[Captured, BlockT
         table = find_residual_blocks(captured.denoiser, sample)
     explain("find_residual_blocks", table.notes)
     return captured, table
+
+
+def _finer_inside(captured: Captured) -> bool:
+    """Whether a network that predicts the sample plus more has several blocks in what it adds, and one without."""
+    counts = []
+    for each in (captured, MoveSkip()(captured).program):
+        try:
+            counts.append(len(find_residual_blocks(each.denoiser, each.spec.sample_argument).blocks))
+        except NoResidualBlocksError:
+            counts.append(1)
+    whole, inside = counts
+    return whole == 1 < inside
 
 
 def _dense_flops(module: nn.Module, graph: Graph, spec: PolicySpec) -> int:

@@ -32,7 +32,7 @@ from ttscompile.core.spec import FP32
 from ttscompile.errors import ArtifactError, RuntimeUnavailableError
 from ttscompile.ir.graph import TensorType
 from ttscompile.ir.joint import Joint, join
-from ttscompile.ir.pieces import ADVANCE, IDLE, JOINT, OF_ALL_BLOCKS, PRUNER, RESIDUAL, STEM, STREAM, block_name
+from ttscompile.ir.pieces import ADVANCE, IDLE, JOINT, LAYERS, OF_ALL_BLOCKS, PRUNER, RESIDUAL, STEM, STREAM, block_name
 from ttscompile.measure.machine import has_integer_dot_product
 
 Array: TypeAlias = npt.NDArray[Any]
@@ -72,7 +72,7 @@ def open_sessions(artifact: Artifact, threads: int, blocks: bool = True) -> dict
         ArtifactError: onnxruntime refuses a graph.
     """
     single = {block_name(b) for b in range(len(artifact.manifest.blocks))}
-    sessions = _open(artifact, set(artifact.manifest.pieces) - single - {JOINT}, threads)
+    sessions = _open(artifact, set(artifact.manifest.pieces) - single - {JOINT, LAYERS}, threads)
     return sessions | _open_blocks(artifact, threads) if blocks else sessions
 
 
@@ -84,6 +84,16 @@ def open_blocks(artifact: Artifact, threads: int) -> dict[str, Any]:
     """
     with artifact.reading():
         return _open_blocks(artifact, threads)
+
+
+def open_layers(artifact: Artifact) -> dict[str, Any]:
+    """What runs the piece ``layers``, by its name, some time after the artifact was loaded; for ``verify``.
+
+    Raises:
+        ArtifactError: the artifact on disk is no longer the one that was loaded, or onnxruntime refuses the graph.
+    """
+    with artifact.reading():
+        return _open(artifact, [LAYERS], 1)
 
 
 def _open_blocks(artifact: Artifact, threads: int) -> dict[str, Any]:

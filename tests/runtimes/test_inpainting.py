@@ -24,7 +24,7 @@ from ttscompile.errors import ObservationError
 from ttscompile.ir.program import Program
 from ttscompile.lower.program import lower_program
 from ttscompile.runtimes import open_runtime
-from ttscompile.runtimes.inpainting import MaskedUpdates, known_samples, noise_levels, prefix_refusal
+from ttscompile.runtimes.inpainting import TOLERANCE, MaskedUpdates, known_samples, noise_levels, prefix_refusal
 from ttscompile.runtimes.reference.model import ReferenceModel
 from ttscompile.samplers.flow import flow_matching_table
 from ttscompile.samplers.multistep import set_timesteps
@@ -101,6 +101,9 @@ def test_noise_levels_are_those_of_the_schedule(scheduler: type[Any], settings: 
     assert levels is not None
     kept = made.alphas_cumprod.numpy()[table.timesteps.astype(int)]
     assert_equal_but_for_rounding(levels, [np.sqrt(kept), np.sqrt(1 - kept)], terms=36)
+    moved = noise_levels(table.with_skip())
+    assert moved is not None
+    np.testing.assert_allclose(moved, levels, atol=TOLERANCE)
 
 
 @pytest.mark.parametrize(("start", "end"), [(0.0, 1.0), (1.0, 0.0)])

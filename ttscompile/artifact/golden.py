@@ -20,6 +20,7 @@ import numpy.typing as npt
 from ..core.spec import FloatArray, Noise, PolicySpec
 from ..errors import ArtifactError
 from ..ir.graph import TensorType
+from ..ir.pieces import LAYERS
 from . import tensors
 from .strict_json import REMEDY
 
@@ -51,6 +52,8 @@ class Golden:
         steps: int64 ``[A]``, the steps whose residuals are kept.
         scales: float32 ``[blocks]``, standard deviation of the residual stream before each block.
         residuals: float32 ``[A, blocks, B, DIGITS]``, projections of each block's residual on ``probe_stream``.
+        layers: float32 ``[E, L, DIGITS]``, projections of what each output of the piece ``layers`` is on
+            ``probe_stream``, of all streams together; None where there is no such piece.
         evaluated: int64 ``[E]``, steps at which single evaluations of the network are kept.
         inputs: float32 ``[E, B, T, D]``, the samples that it was given there.
         outputs: float32 ``[E, B, T, D]``, what it gave.
@@ -68,6 +71,7 @@ class Golden:
     steps: npt.NDArray[np.int64]
     scales: FloatArray
     residuals: FloatArray
+    layers: FloatArray | None
     evaluated: npt.NDArray[np.int64]
     inputs: FloatArray
     outputs: FloatArray
@@ -159,6 +163,8 @@ def load_golden(artifact: Artifact) -> Golden:
     }
     if spec.sampler.stochastic:
         float32["draws"] = (steps, *sample)
+    if LAYERS in manifest.pieces:
+        float32["layers"] = (evaluated, len(manifest.pieces[LAYERS].outputs), DIGITS)
     wanted = {name: ("float32", shape) for name, shape in float32.items()}
     wanted |= {"steps": ("int64", (anchors,)), "evaluated": ("int64", (evaluated,))}
     for key, one in spec.observations.items():

@@ -245,7 +245,7 @@ class Manifest:
         spec: the policy beside its network.
         blocks: block table, in order of execution.
         pieces: ONNX graphs: ``condition``, ``step``, ``pruner``, ``stem``, ``advance``, ``block_00``...; those that the
-            policy has; and ``blocks``, all of its blocks in one (``ir.joint``).
+            policy has; ``blocks``, all of its blocks in one (``ir.joint``); and of one block alone ``layers``.
         contexts: binding and type of every context.
         features: condition values that the pruner reads, and corrections.
         flops: see ``FlopsRecord``.

@@ -18,6 +18,7 @@ from ..ir import pieces as names
 from ..ir.flops import graph_flops
 from ..ir.graph import Graph
 from ..ir.joint import join
+from ..ir.layers import layers_graph
 from ..ir.program import Binding, Program
 from . import tensors
 from .bind import REPORT, interface
@@ -125,7 +126,7 @@ def piece_records(
     Args:
         program: in its pieces.
         models: from ``lower_program``: of the same names, but ``advance`` in place of ``tail``, ``blocks``,
-            ``dense_step``, and perhaps ``idle``.
+            ``dense_step``, and perhaps ``idle`` and ``layers``.
         files: file name of each model.
 
     Raises:
@@ -238,5 +239,8 @@ def _interfaces(program: Program) -> dict[str, PieceRecord]:
     read = dict.fromkeys(name for piece in pieces.blocks for name in piece.contexts)
     whole = (names.STREAM, *(names.CONTEXT + name for name in read))
     found[names.DENSE_STEP] = record(whole, names.dense_step_outputs(len(pieces.blocks)), names.STREAM, read)
+    if (inside := layers_graph(program)) is not None:
+        (block,) = pieces.blocks
+        found[names.LAYERS] = record(inside.inputs, inside.outputs, block.stream, block.contexts)
     found[names.IDLE] = record((names.TOTAL,), names.IDLE_OUTPUTS)
     return found

@@ -130,6 +130,24 @@ class SamplerTable:
         object.__setattr__(self, "memory_to_next", memory_to_next)
         object.__setattr__(self, "to_memory", to_memory)
 
+    def with_skip(self) -> SamplerTable:
+        """The table for a network that predicts ``out - x``: it adds the sample itself, wherever ``out`` is read."""
+        return self._moved(1)
+
+    def without_skip(self) -> SamplerTable:
+        """The table of which ``with_skip`` makes this one."""
+        return self._moved(-1)
+
+    def _moved(self, times: int) -> SamplerTable:
+        to_memory = self.to_memory.copy()
+        to_memory[..., 1] += times * to_memory[..., 2]
+        return replace(
+            self,
+            sample_to_x0=self.sample_to_x0 + times * self.out_to_x0,
+            sample_to_next=self.sample_to_next + times * self.out_to_next,
+            to_memory=to_memory,
+        )
+
     @property
     def memories(self) -> int:
         """S, how many arrays of the sample's shape are carried from step to step beside it."""

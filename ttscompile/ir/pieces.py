@@ -40,6 +40,9 @@ DENSE_STEP = "dense_step"
 IDLE = "idle"
 """What steps need of the sum that they add where they compute no block (``lower.idle``); not every network has it."""
 
+LAYERS: Final = "layers"
+"""The results of the layers of a network that is one block (``ir.layers``); ``verify`` alone opens it."""
+
 OF_ALL_BLOCKS = (JOINT, DENSE_STEP)
 """Pieces that hold all blocks once more."""
 

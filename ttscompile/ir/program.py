@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from ..core.spec import PolicySpec
+from ..core.spec import PolicySpec, SamplerTable
 from .graph import Graph, TensorType
 from .pieces import CONDITION, PRUNER, STEM, STEP, TAIL, LoopPiece, block_name
 
@@ -135,12 +135,15 @@ class Phase:
         denoiser: graph of one evaluation: inputs sample, timestep, observations; output the prediction.
         weights: value of every constant of every graph.
         dense_flops: of one call as the module makes it: K evaluations, one stream.
+        unmoved: the sampler's table for what the module predicts, where that is the sample plus what the denoiser
+            predicts (``MoveSkip``); None where both predict the same, and ``spec`` has this table.
     """
 
     spec: PolicySpec
     denoiser: Graph
     weights: Mapping[str, npt.NDArray[np.generic]]
     dense_flops: int = field(default=0, kw_only=True)
+    unmoved: SamplerTable | None = field(default=None, kw_only=True)
 
     def graphs(self) -> dict[str, Graph]:
         """Every graph by name."""

@@ -21,7 +21,8 @@ import torch
 from ..errors import LoweringError
 from ..ir.evaluate import resolve_op, without_stack_traces
 from ..ir.graph import Argument, Batch, Enum, Graph, Node, Ref, TensorType
-from ..ir.pieces import ADVANCE, IDLE, TAIL
+from ..ir.layers import layers_graph
+from ..ir.pieces import ADVANCE, IDLE, LAYERS, TAIL
 from ..ir.program import Program
 from .advance import fuse_advance
 from .idle import lower_idle
@@ -59,15 +60,17 @@ def lower_program(program: Program) -> dict[str, onnx.ModelProto]:
     Returns:
         By name: ``condition``, ``step`` (if any), ``pruner`` (if any), ``stem``, ``block_00``, ``block_01``..,
         ``advance`` (tail, sampler update and stem in one; see ``lower.advance``), ``blocks`` and ``dense_step`` (all
-        blocks in one; see ``ir.joint``) and, if stem and tail allow it, ``idle`` (see ``lower.idle``). Graphs of one
-        structure are exported once.
+        blocks in one; see ``ir.joint``), if stem and tail allow it ``idle`` (see ``lower.idle``), and of one block
+        alone ``layers`` (see ``ir.layers``). Graphs of one structure are exported once.
 
     Raises:
         LoweringError: as ``lower_graph``.
     """
     pieces = program.pieces
     graphs = {name: graph for name, graph in pieces.graphs().items() if name != TAIL}
-    models = _lower({**graphs, ADVANCE: fuse_advance(pieces.tail, pieces.stem, program.spec)})
+    inside = layers_graph(program)
+    own = {ADVANCE: fuse_advance(pieces.tail, pieces.stem, program.spec)} | ({} if inside is None else {LAYERS: inside})
+    models = _lower({**graphs, **own})
     idle, _ = lower_idle(pieces, program.weights, OPSET)
     return {**models, **lower_all_blocks(pieces.blocks, models), **({} if idle is None else {IDLE: idle})}
 

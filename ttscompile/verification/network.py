@@ -94,13 +94,16 @@ def check_blocks(artifact: Artifact, golden: Golden, probe: Probe) -> tuple[Rung
     errors = block_errors(manifest, golden, probe.block)
     kinds = tuple(block.kind for block in manifest.blocks)
     wrong, step, told = describe_blocks(errors, golden.steps, kinds)
+    layer: str | None = None
     if wrong:
-        told += _shared_context(manifest, wrong)
+        layer, where = _first_layer(manifest, golden, probe)
+        told += _shared_context(manifest, wrong) + where
     else:
         told = f"residuals of {len(kinds)} blocks at {len(golden.steps)} of {manifest.steps} steps are the original's"
     remedy = f"The weights or graphs of these blocks are not the checkpoint's. {CONVERT}"
     worst = float(errors.max())
-    rung = judged(BLOCK, worst, RESIDUAL, "of the residual", told, remedy, step=step, blocks=wrong)
+    details = {"layer": layer}
+    rung = judged(BLOCK, worst, RESIDUAL, "of the residual", told, remedy, step=step, blocks=wrong, details=details)
     return rung, ErrorMap(golden.steps, errors, RESIDUAL, kinds)
 
 
@@ -117,6 +120,20 @@ def describe_blocks(
     more = f" and {len(wrong) - 6} more" if len(wrong) > 6 else ""
     plural = "s" * (len(wrong) > 1)
     return wrong, step, f"block{plural} {', '.join(shown)}{more} of {len(steps)}, first at step {step}"
+
+
+def _first_layer(manifest: Manifest, golden: Golden, probe: Probe) -> tuple[str | None, str]:
+    """The first layer inside the one block whose result differs, by name and in words; None where none can be named."""
+    if golden.layers is None:
+        return None, ""
+    stream = probe_stream(0, manifest.blocks[0].type, golden.streams, float(golden.scales[0]))
+    for k, expected in zip(golden.evaluated.tolist(), golden.layers, strict=True):
+        found = probe.layers(k, stream)
+        for (name, result), one in zip(found.items(), expected, strict=True):
+            if not relative(project(result, None)[0], one) <= RESIDUAL:
+                return name, f". Inside it {name!r} is the first layer that differs, at step {k}"
+    shown = ", ".join(map(str, golden.evaluated.tolist()))
+    return None, f". Each of its {golden.layers.shape[1]} layers is right at steps {shown}"
 
 
 def _shared_context(manifest: Manifest, wrong: tuple[int, ...]) -> str:

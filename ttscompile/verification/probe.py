@@ -17,9 +17,9 @@ from ..core.correction import HISTORY, Correction, no_correction
 from ..core.lattice import PlanArray, Source
 from ..core.spec import FloatArray, Noise
 from ..core.update import clips, matrices
-from ..ir.pieces import ADVANCE, CONDITION, PREDICTION, STEM, STEP, STREAM, TAIL, advance_context, block_name
+from ..ir.pieces import ADVANCE, CONDITION, LAYERS, PREDICTION, STEM, STEP, STREAM, TAIL, advance_context, block_name
 from ..ir.program import Binding
-from ..runtimes.onnxruntime.sessions import open_sessions, repeat_streams, run_named
+from ..runtimes.onnxruntime.sessions import open_layers, open_sessions, repeat_streams, run_named
 
 Array = npt.NDArray[Any]
 
@@ -33,7 +33,7 @@ class Probe:
     """
 
     def __init__(self, artifact: Artifact, obs: Mapping[str, Array]) -> None:
-        self._manifest = artifact.manifest
+        self._artifact, self._manifest = artifact, artifact.manifest
         self._sessions = open_sessions(artifact, 1)
         self.streams = len(next(iter(obs.values())))
         tables = {
@@ -70,6 +70,19 @@ class Probe:
     def block(self, b: int, k: int, stream: FloatArray) -> FloatArray:
         """The residual of block b at step k."""
         return self._run(block_name(b), stream, k)
+
+    def layers(self, k: int, stream: FloatArray) -> dict[str, FloatArray]:
+        """What each layer of the one block gives at step k, by the layer's name, in the order of execution.
+
+        Empty where the artifact has no such piece.
+        """
+        record = self._manifest.pieces.get(LAYERS)
+        if record is None:
+            return {}
+        if LAYERS not in self._sessions:
+            self._sessions |= open_layers(self._artifact)
+        feed = {name: stream if name == record.stream else self._contexts[k][name] for name in record.inputs}
+        return run_named(self._sessions[LAYERS], record.outputs, feed)
 
     def tail(self, stream: FloatArray, k: int) -> FloatArray:
         """The prediction at step k, ``[B, T, D]``; what else ``advance`` computes is left aside."""

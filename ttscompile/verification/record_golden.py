@@ -24,6 +24,7 @@ from ..frontends.encoded import parts
 from ..ir.dataflow import reachable_from
 from ..ir.evaluate import Evaluator
 from ..ir.graph import Graph, backward_slice
+from ..ir.layers import layers
 from ..ir.program import Block, Program
 from ..ir.rows import Rows
 from ..runtimes.reference.model import ReferenceModel
@@ -77,6 +78,8 @@ def _record_original(module: nn.Module, program: Program) -> Golden:
         observations[key] = np.stack([np.resize(each, one.shape) for each in pattern(raw, one.shape)])
         normalized[key] = one.normalized(observations[key])
     original, kept = spec.original, spec.sample[0]
+    if program.unmoved is not None:
+        original = replace(original, sampler=program.unmoved)
     shape = (streams, *original.sample)
     initial = draw.standard_normal(shape, dtype=np.float32)
     draws = draw.standard_normal((steps, *shape), dtype=np.float32) if spec.sampler.stochastic else None
@@ -92,6 +95,8 @@ def _record_original(module: nn.Module, program: Program) -> Golden:
     tensors = {key: torch.from_numpy(value) for key, value in normalized.items()}
     sample = eager_policy(copied, original)(tensors, Noise(initial, draws)).numpy()
     given, predicted = (np.stack(each) for each in zip(*evaluations, strict=True))
+    if program.unmoved is not None:
+        predicted = predicted - given
     # What the artifact predicts of it: the original has all steps, and says what those that are kept should be.
     initial, sample, given, predicted = (each[..., :kept, :] for each in (initial, sample, given, predicted))
     draws = None if draws is None else draws[..., :kept, :]
@@ -105,6 +110,8 @@ def _record_original(module: nn.Module, program: Program) -> Golden:
     anchors = _spread(steps, steps if small else max(3, int(steps * EFFORT / program.dense_flops)))
     inside = _Inside(program, tensors, streams)
     scales = inside.scales(given[steps // 2], steps // 2)
+    residuals, _ = inside.alone(anchors, scales)
+    _, layers = inside.alone(evaluated, scales)
     return Golden(
         observations={key: pattern(value, spec.observations[key].shape) for key, value in observations.items()},
         normalized={key: pattern(value, spec.observations[key].shape) for key, value in normalized.items()},
@@ -112,7 +119,8 @@ def _record_original(module: nn.Module, program: Program) -> Golden:
         draws=draws,
         steps=anchors,
         scales=scales,
-        residuals=inside.residuals(anchors, scales),
+        residuals=residuals,
+        layers=layers if layers.size else None,
         evaluated=evaluated,
         inputs=given[evaluated],
         outputs=predicted[evaluated],
@@ -170,7 +178,8 @@ class _Inside:
         self._observations = dict(observations)
         whole = program.denoiser
         self._closed = replace(whole, outputs=tuple(block.stream for block in self._blocks))
-        self._open = _opened(whole, self._blocks)
+        opened = _opened(whole, self._blocks)
+        self._open = replace(opened, outputs=(*opened.outputs, *layers(program).values()))
         self._condition, self._loop = _split(self._open, [program.spec.sample_argument, program.spec.timestep_argument])
 
     def scales(self, sample: FloatArray, k: int) -> FloatArray:
@@ -180,8 +189,12 @@ class _Inside:
             streams = Evaluator(self._closed, self._weights)(inputs)
         return np.array([max(float(stream.std()), 1e-3) for stream in streams], np.float32)
 
-    def residuals(self, anchors: npt.NDArray[np.int64], scales: FloatArray) -> FloatArray:
-        """Projections of each block's residual on its ``probe_stream``, ``[A, blocks, B, DIGITS]``."""
+    def alone(self, steps: npt.NDArray[np.int64], scales: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Projections of what each block, and each layer, gives on ``probe_stream`` at these A steps.
+
+        Returns:
+            Of residuals ``[A, blocks, B, DIGITS]``, and of layers ``[A, L, DIGITS]``.
+        """
         probes = [
             torch.from_numpy(probe_stream(block.index, block.type, self._streams, float(scale)))
             for block, scale in zip(self._blocks, scales, strict=True)
@@ -191,14 +204,18 @@ class _Inside:
             values = Evaluator(self._condition, self._weights)(self._observations)
         fixed = dict(zip(self._condition.outputs, values, strict=True))
         given = dict(zip(list(self._open.inputs)[-len(probes) :], probes, strict=True))
-        found = np.zeros((len(anchors), len(self._blocks), self._streams, DIGITS), np.float32)
-        for i, k in enumerate(anchors.tolist()):
+        blocks, layers = len(self._blocks), len(self._open.outputs) - len(self._blocks)
+        found = np.zeros((len(steps), blocks, self._streams, DIGITS), np.float32)
+        inside = np.zeros((len(steps), layers, DIGITS), np.float32)
+        for i, k in enumerate(steps.tolist()):
             with torch.inference_mode():
                 results = run({**fixed, **given, **self._at(k)})
-            for b, (block, result) in enumerate(zip(self._blocks, results, strict=True)):
+            for b, (block, result) in enumerate(zip(self._blocks, results[:blocks], strict=True)):
                 residual = result if block.residual is not None else result - probes[b]
                 found[i, b] = project(residual.numpy(), block.type.batch_axis)
-        return found
+            for layer, result in enumerate(results[blocks:]):
+                (inside[i, layer],) = project(result.numpy(), None)
+        return found, inside
 
     def _at(self, k: int) -> dict[str, torch.Tensor]:
         """Timestep and observations at step k."""

@@ -1,0 +1,144 @@
+"""A network that is one block: its layers are recorded, and the first that differs is named."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+import ttscompile
+from tests.passes.modules import MODULES, compiled
+from tests.passes.specs import toy_spec
+from ttscompile.artifact import tensors
+from ttscompile.artifact.bind import EMBEDDED_BYTES
+from ttscompile.artifact.golden import load_golden, probe_stream, project
+from ttscompile.artifact.load import Artifact, load_artifact, read_manifest
+from ttscompile.core.spec import PolicySpec
+from ttscompile.errors import ArtifactError
+from ttscompile.ir.layers import layers, layers_graph
+from ttscompile.ir.operations import operation
+from ttscompile.ir.program import Program
+from ttscompile.runtimes.onnxruntime import sessions
+from ttscompile.verification.network import RESIDUAL, relative
+from ttscompile.verification.probe import Probe
+from ttscompile.verification.rung import Rung
+
+from .broken import edit_manifest, edited
+
+
+def spec() -> PolicySpec:
+    """With more steps than those at which layers are recorded."""
+    return toy_spec(sample=(4, 2), obs=(3, 7), steps=7)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Program]:
+    """A small U-Net, compiled."""
+    directory = tmp_path_factory.mktemp("unet") / "compiled"
+    torch.manual_seed(0)
+    return directory, ttscompile.compile_denoiser(MODULES["U-Net"]().eval(), spec(), directory)
+
+
+@pytest.fixture
+def artifact(made: tuple[Path, Program], tmp_path: Path) -> Path:
+    """A copy of it."""
+    return Path(shutil.copytree(made[0], tmp_path / "compiled"))
+
+
+def failure(artifact: Path) -> Rung:
+    """The lowest rung that fails."""
+    found = ttscompile.verify(artifact)
+    assert found.first_failure is not None
+    return found.first_failure
+
+
+def weighted(program: Program) -> list[str]:
+    """Weights of the layers that have any too large to be kept in the graph, in the order of execution."""
+    return [name for name in map("{}.weight".format, layers(program)) if program.weights[name].nbytes > EMBEDDED_BYTES]
+
+
+def test_every_layer_of_the_network_is_recorded(made: tuple[Path, Program]) -> None:
+    directory, program = made
+    found = layers(program)
+    inside = program.pieces.blocks[0].graph
+    convolutions = [n.name for n in inside.nodes if operation(n.op).name.startswith("conv")]
+    assert set(convolutions) - set(inside.outputs) <= set(found.values())
+    assert next(iter(found)) == "net.down_modules.0.0.blocks.0.block.0"
+    graph = layers_graph(program)
+    assert graph is not None and graph.outputs == tuple(found)
+    artifact = load_artifact(directory)
+    golden = load_golden(artifact)
+    assert golden.layers is not None and golden.layers.shape[1] == len(found)
+    probe = Probe(artifact, golden.network_observations(artifact.manifest.spec))
+    stream = probe_stream(0, artifact.manifest.blocks[0].type, golden.streams, float(golden.scales[0]))
+    for k, expected in zip(golden.evaluated.tolist(), golden.layers, strict=True):
+        results = probe.layers(k, stream)
+        assert list(results) == list(found)
+        for result, one in zip(results.values(), expected, strict=True):
+            assert relative(project(result, None)[0], one) < RESIDUAL / 10
+
+
+@pytest.mark.parametrize("place", [0, -1])
+def test_the_weights_of_one_layer(place: int, artifact: Path, made: tuple[Path, Program]) -> None:
+    name = weighted(made[1])[place]
+    with edited(artifact, "weights") as arrays:
+        arrays[name][:, 0] *= 1.2  # not all of them: a norm of each channel follows
+    rung = failure(artifact)
+    assert (rung.name, rung.blocks, rung.details["layer"]) == ("block", (0,), name.removesuffix(".weight"))
+    assert f"Inside it {name.removesuffix('.weight')!r} is the first layer that differs, at step 0" in rung.told
+
+
+def test_weights_of_two_layers_exchanged(artifact: Path, made: tuple[Path, Program]) -> None:
+    weights = made[1].weights
+    names = weighted(made[1])
+    one, other = next((a, b) for a, b in combinations(names, 2) if weights[a].shape == weights[b].shape)
+    with edited(artifact, "weights") as arrays:
+        arrays[one], arrays[other] = arrays[other].copy(), arrays[one].copy()
+    assert failure(artifact).details["layer"] == one.removesuffix(".weight")
+
+
+def test_a_fault_that_is_in_no_layer(artifact: Path) -> None:
+    """The table of one step that is not among those at which layers are recorded."""
+    manifest, golden = read_manifest(artifact), load_golden(load_artifact(artifact))
+    (step,) = set(range(manifest.steps)) - set(golden.evaluated.tolist())
+    with edited(artifact, "weights") as arrays:
+        for name in arrays:
+            if name.startswith("table/"):
+                arrays[name][step] += 0.1
+    rung = failure(artifact)
+    assert (rung.name, rung.step, rung.details["layer"]) == ("block", step, None)
+    assert golden.layers is not None
+    assert f"Each of its {golden.layers.shape[1]} layers is right at steps 0, 1, " in rung.told
+
+
+def test_a_record_of_other_layers_is_refused(artifact: Path) -> None:
+    path = artifact / "golden.safetensors"
+    arrays = tensors.read(path)
+    path.write_bytes(tensors.serialize({**arrays, "layers": arrays["layers"][:, 1:].copy()}))
+    edit_manifest(artifact)
+    with pytest.raises(ArtifactError, match="golden record"):
+        ttscompile.verify(artifact)
+
+
+def test_no_call_opens_the_layers(artifact: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: set[str] = set()
+    original = sessions._open
+
+    def watched(artifact: Artifact, pieces: Iterable[str], threads: int) -> dict[str, Any]:
+        opened.update(pieces := set(pieces))
+        return original(artifact, pieces, threads)
+
+    monkeypatch.setattr(sessions, "_open", watched)
+    ttscompile.load(artifact)
+    assert "advance" in opened and "layers" not in opened
+
+
+def test_a_policy_of_several_blocks_has_no_layers() -> None:
+    """Its blocks are named already."""
+    _, program = compiled("tokens")
+    assert layers(program) == {} and layers_graph(program) is None
