@@ -16,6 +16,7 @@ from ttscompile.cli.convert import convert
 from ttscompile.cli.doctor import doctor
 from ttscompile.cli.ending import TRACEBACK, Commands
 from ttscompile.cli.inspect import inspect
+from ttscompile.cli.oracle import oracle
 from ttscompile.cli.realtime import realtime
 from ttscompile.cli.report import report
 from ttscompile.cli.serve import serve
@@ -44,6 +45,7 @@ for _command, _what in (
     (report, "All about an artifact on one page."),
     (bench, "Time calls, beside what they replace."),
     (compare, "Action error against latency, of plans and strategies."),
+    (oracle, "Would it pay to choose a plan for each call?"),
     (realtime, "Which plans keep up with a control loop on this machine."),
     (serve, "Drive a robot from another process, over a local WebSocket."),
 ):

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from ttscompile.calibration.strategies import NAMES
 from ttscompile.cli.options import (
@@ -17,7 +16,16 @@ from ttscompile.cli.options import (
     seed_option,
     threads_option,
 )
-from ttscompile.cli.output import manifest_of, only_results_on_stdout, print_json, progress, results, say, table
+from ttscompile.cli.output import (
+    counted_parts,
+    manifest_of,
+    only_results_on_stdout,
+    print_json,
+    progress,
+    results,
+    say,
+    table,
+)
 from ttscompile.cli.recordings import FilesCommand, Sources, require_recordings, trajectories_options
 from ttscompile.cli.types import PATH, PICTURE, TEXT, Number
 from ttscompile.errors import ArtifactChangedError, RuntimeUnavailableError
@@ -120,16 +128,7 @@ def compare(
         ) from error
     if sparsities is None:
         sparsities = default_sparsities(manifests[directory].steps)
-    columns = (TextColumn("{task.description:<28}"), BarColumn(bar_width=24), MofNCompleteColumn(), TimeElapsedColumn())
-    told = progress()
-    with only_results_on_stdout(), Progress(*columns, console=told, disable=not told.is_terminal) as bar:
-        task = bar.add_task("loading", total=None)
-
-        def tell(what: str, done: int, total: int) -> None:
-            if not told.is_terminal and what != bar.tasks[task].description:  # a log has no bar
-                say(told, what)
-            bar.update(task, description=what, completed=done, total=total)
-
+    with only_results_on_stdout(), counted_parts() as tell:
         found = measure(
             directory,
             trajectories,
@@ -143,6 +142,7 @@ def compare(
         )
     if any(manifest_of(path).identity != manifest.identity for path, manifest in manifests.items()):
         raise ArtifactChangedError(f"{directory}: it, or another that was compared, was replaced meanwhile. Try again.")
+    told = progress()
     say(told, *(f"warning: {warning}" for warning in found.warnings))
     machine, threads = fingerprint(), f"{found.threads} thread{'s' * (found.threads > 1)}"
     if as_json:
