@@ -134,7 +134,7 @@ def _on_average(known: Array, guessed: Array, steps: npt.NDArray[np.int64], budg
             low = price
         else:
             high = price
-    return (guessed + high * steps).argmin(2)
+    return np.asarray((guessed + high * steps).argmin(2))
 
 
 def _predicted(learned: Errors, judged: Errors, name: str, relative: bool) -> tuple[Array, Array]:

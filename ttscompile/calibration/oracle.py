@@ -7,11 +7,11 @@ call, for somebody who knows everything afterwards, and for a predictor that kno
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import combinations, islice
 from math import comb
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -63,8 +63,8 @@ class Oracle:
 
 
 def oracle(
-    path: str | os.PathLike[str],
-    trajectories: Sequence[str | os.PathLike[str]],
+    path: Path,
+    trajectories: Sequence[Path],
     budget: int,
     *,
     observation: Mapping[str, Sequence[str]] | None = None,
@@ -142,16 +142,17 @@ def oracle(
             [actions.errors(executor.corrected(each).run(plan, part), part.targets, units=True) for part in parts]
             for each in (*made, None)
         ]
-        for place, error in enumerate(min(answers, key=lambda answer: float(answer[0].mean()))):
-            errors[place].append(error)
+        means = [float(learned.mean()) for learned, _ in answers]
+        for column, error in zip(errors, answers[means.index(min(means))], strict=True):
+            column.append(error)
     progress("schedules", len(placed), len(placed))
-    seen = [_errors(executor, part, columns, draws) for part, columns in zip(parts, errors, strict=True)]
+    learned, judged = (_errors(executor, part, each, draws) for part, each in zip(parts, errors, strict=True))
     computed = np.array([len(one) for one in placed])
     return Oracle(
         budget=budget,
-        choices=tuple(choices(*seen, computed, budget, seed)),
+        choices=tuple(choices(learned, judged, computed, budget, seed)),
         schedules={count: int((computed == count).sum()) for count in counts},
-        calls=(len(seen[1].of), draws),
+        calls=(len(judged.of), draws),
         episodes={"corrections": fitting, "learned": learning, "judged": split.validation},
     )
 
