@@ -14,7 +14,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/installed.stamp
 
 .DELETE_ON_ERROR:
-.PHONY: demo test lint types pytest test-avx2 benchmark docs clean
+.PHONY: demo test lint types pytest test-avx2 test-arm benchmark docs clean
 
 demo: $(READY)
 	$(BIN)/python examples/pusht/demo.py
@@ -49,6 +49,10 @@ test-avx2: export NPY_DISABLE_CPU_FEATURES := X86_V4 AVX512_ICL AVX512_SPR
 test-avx2: export TORCHINDUCTOR_CACHE_DIR := $(CURDIR)/build/inductor-avx2
 test-avx2: $(READY)
 	$(BIN)/pytest -n logical --dist loadfile --benchmark-disable -m "not alone and not soak"
+
+# The runtime on emulated ARM processors; see docs/machines.md. The first time takes half an hour.
+test-arm: $(READY)
+	$(BIN)/python tests/machines/arm.py
 
 benchmark: $(READY)
 	$(BIN)/pytest --benchmark-only

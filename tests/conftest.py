@@ -26,6 +26,11 @@ DEEPER = re.compile(r"model\.decoder\.layers\.[1-9]")
 NO_SHARED = "NO GOLDEN FILES: no folder 'shared' with DESIGN.md and golden/ beside the repository or an ancestor of it"
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Where there is no torch, artifacts come from a machine that has it: ``tests/machines/made.py``."""
+    parser.addoption("--made", type=Path, help="keep what is made once a run in this folder, and use what is there")
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """One thread for each of torch's operations: those of the tests are small, and wait for each other otherwise.
 
@@ -72,6 +77,8 @@ def pusht_checkpoint() -> Path:
 @pytest.fixture(scope="session")
 def once(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Once:
     """Folders that all modules and workers of this run share: read them only."""
+    if (made := request.config.getoption("made")) is not None:
+        return Once(made)
     own = tmp_path_factory.getbasetemp()
     return Once((own.parent if hasattr(request.config, "workerinput") else own) / "once")
 

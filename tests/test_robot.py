@@ -14,6 +14,8 @@ import pytest
 
 import ttscompile
 
+from .source import source_copy
+
 ROOT = Path(__file__).resolve().parents[1]
 COMPILERS_ONLY = ["diffusers", "matplotlib", "onnx", "onnx_ir", "onnxscript", "pydantic", "safetensors", "torch"]
 
@@ -56,21 +58,8 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pip = [sys.executable, "-m", "pip", "--python", str(python), "install", "--quiet", "--disable-pip-version-check"]
     pip.append("--no-compile")  # Python compiles what it imports
     subprocess.run([*pip, "-c", str(ROOT / "constraints.txt"), "numpy", "onnxruntime"], check=True)
-    # Into a copy of the tree: building a wheel leaves its build folder in the tree.
     subprocess.run([*pip, "--no-deps", str(source_copy(folder / "source"))], check=True)
     return python
-
-
-def source_copy(target: Path) -> Path:
-    """What the wheel is built from, without what git ignores."""
-    import shutil
-
-    target.mkdir()
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, target)
-    for name in ("ttscompile", "passes", "runtimes"):
-        shutil.copytree(ROOT / name, target / name, ignore=shutil.ignore_patterns("__pycache__"))
-    return target
 
 
 def act(python: Path | str, artifact: Path, call: Path) -> dict[str, object]:

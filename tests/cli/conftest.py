@@ -6,12 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from tests.once import Once
 from tests.runtimes.toys import toy_program, written_artifact
 
 
 @pytest.fixture(scope="session")
-def toy_compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def toy_compiled(once: Once) -> Path:
     """Five steps, five blocks, an untrained pruner, not calibrated. Copy it before changing it."""
-    directory = tmp_path_factory.mktemp("toy") / "compiled"
-    written_artifact(toy_program(), directory)
-    return directory
+    return once.folder("toy", lambda directory: written_artifact(toy_program(), directory))

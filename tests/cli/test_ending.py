@@ -88,6 +88,18 @@ def test_an_interruption_of_the_imports_is_one_too(monkeypatch: pytest.MonkeyPat
         start()
 
 
+def test_a_signal_while_a_library_is_loaded_is_no_broken_package(failing: Callable[[BaseException], None]) -> None:
+    """On a slow processor onnxruntime takes seconds, and pybind11 tells of any error in it as of an import's."""
+    error = ImportError("initialization failed")
+    error.__cause__ = KeyboardInterrupt()
+    failing(error)
+    result = CliRunner().invoke(main, ["inspect", "an artifact"])
+    assert (result.exit_code, result.stderr) == (Status.INTERRUPTED, "interrupted\n")
+    error.__cause__ = OSError("libpng.so: no such file")
+    failing(error)
+    assert CliRunner().invoke(main, ["inspect", "an artifact"]).exit_code == Status.REFUSED
+
+
 def test_every_status_is_documented() -> None:
     told = " ".join(CliRunner().invoke(main, ["--help"]).stdout.split())
     page = (Path(__file__).parents[2] / "docs" / "reference" / "commands.md").read_text()
@@ -121,6 +133,7 @@ def test_there_is_no_space_for_the_results(words: list[str], toy_compiled: Path)
     assert result.stderr.count("\n") == 1
 
 
+@pytest.mark.compiles
 def test_files_do_not_take_the_place_of_closed_streams(toy_compiled: Path, tmp_path: Path) -> None:
     """A library that prints would print into them."""
     code = "import os, sys; os.closerange(0, 3); os.execv(sys.argv[1], sys.argv[1:])"
@@ -136,7 +149,7 @@ def test_files_do_not_take_the_place_of_closed_streams(toy_compiled: Path, tmp_p
 
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_server_with_its_statistics(sent: int, toy_compiled: Path) -> None:
-    words = [*COMMAND, "serve", str(toy_compiled), "--control-hz", "10", "--port", "0", "--margin-ticks", "0"]
+    words = [*COMMAND, "serve", str(toy_compiled), "--control-hz", "1", "--port", "0", "--margin-ticks", "0"]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
         assert "url" in json.loads(server.stdout.readline())

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.once import Once
 from tests.runtimes.toys import toy_program, written_artifact
 
 from .simulation import workers
@@ -18,6 +19,6 @@ def _no_thread_is_left() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def toy_compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def toy_compiled(once: Once) -> Path:
     """The toy policy as an artifact: two actions a chunk, an observation without history, a pruner."""
-    return written_artifact(toy_program(), tmp_path_factory.mktemp("toy") / "artifact").path
+    return once.folder("toy", lambda directory: written_artifact(toy_program(), directory))

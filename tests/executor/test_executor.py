@@ -326,7 +326,7 @@ def test_a_policys_thread_is_pinned() -> None:
         World(settings=ExecutorSettings(cores=(4096,)))
 
 
-@pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
+@pytest.mark.parametrize("runtime", ["onnxruntime", pytest.param("reference", marks=pytest.mark.compiles)])
 def test_it_runs_the_compiled_policy_on_either_runtime(toy_compiled: Path, runtime: str) -> None:
     """In real time, on a machine that may be busy: deadlines are not what this is about."""
     policy = ttscompile.load(toy_compiled, runtime=runtime, seed=0)

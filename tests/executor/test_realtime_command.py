@@ -49,6 +49,7 @@ def test_jitter_is_measured_and_printed(toy_compiled: Path) -> None:
     assert "beside plan 'dense'" in out
 
 
+@pytest.mark.compiles
 def test_jitter_is_measured_beside_the_plan_that_a_robot_runs(toy_compiled: Path, tmp_path: Path) -> None:
     calibrated = shutil.copytree(toy_compiled, tmp_path / "compiled")
     plans = {"uniform": uniform_plan(5, 5, 1), "schedule": dense_plan(5, 5)}  # the baseline is the faster one

@@ -15,7 +15,6 @@ from ttscompile.artifact.write import write_artifact
 from ttscompile.ir.graph import Argument, Batch, Graph, Node, Ref, TensorType
 from ttscompile.ir.pieces import LoopPiece
 from ttscompile.ir.program import Binding, Block, Pieces, Program
-from ttscompile.lower.program import lower_program
 
 from .literal import Toy
 
@@ -258,5 +257,7 @@ def as_functions(program: Program, obs: npt.NDArray[np.float32], noise: npt.NDAr
 
 
 def written_artifact(program: Program, directory: Path) -> Artifact:
+    from ttscompile.lower.program import lower_program  # needs torch, which programs written by hand do not
+
     write_artifact(program, lower_program(program), directory)
     return load_artifact(directory)

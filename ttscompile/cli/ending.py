@@ -101,12 +101,8 @@ def _told_at_the_end(words: Sequence[str]) -> Iterator[None]:
             _flush()
     except (click.ClickException, click.exceptions.Exit):
         raise  # bad usage, which click tells itself, and an end that is meant
-    except KeyboardInterrupt:
-        told, status = f"interrupted{_resumes(words)}", Status.INTERRUPTED
-    except _EndedError:
-        told, status = f"ended by SIGTERM{_resumes(words)}", Status.ENDED
-    except Exception as error:
-        told, status = _judged(error, words)
+    except (KeyboardInterrupt, _EndedError, Exception) as error:
+        told, status = _judged(_signal_behind(error) or error, words)
     else:
         return
     with suppress(OSError):  # standard error may be full, or nobody's
@@ -115,8 +111,19 @@ def _told_at_the_end(words: Sequence[str]) -> Iterator[None]:
     raise click.exceptions.Exit(status)
 
 
-def _judged(error: Exception, words: Sequence[str]) -> tuple[str, Status]:
+def _signal_behind(error: BaseException) -> BaseException | None:
+    """The signal during which a library was loaded: pybind11 makes every error of that an ImportError."""
+    while isinstance(error, ImportError) and error.__cause__ is not None:
+        error = error.__cause__
+    return error if isinstance(error, KeyboardInterrupt | _EndedError) else None
+
+
+def _judged(error: BaseException, words: Sequence[str]) -> tuple[str, Status]:
     """Message and status of an error."""
+    if isinstance(error, KeyboardInterrupt):
+        return f"interrupted{_resumes(words)}", Status.INTERRUPTED
+    if isinstance(error, _EndedError):
+        return f"ended by SIGTERM{_resumes(words)}", Status.ENDED
     if isinstance(error, CalibrationFailedError):
         return f"failed: {error}", Status.FAILED
     if isinstance(error, TtscompileError):
@@ -134,7 +141,7 @@ def _judged(error: Exception, words: Sequence[str]) -> tuple[str, Status]:
     return _defect(error, words), Status.DEFECT
 
 
-def _defect(error: Exception, words: Sequence[str]) -> str:
+def _defect(error: BaseException, words: Sequence[str]) -> str:
     """What was run, where it ended, and what to do: two lines, below the traceback if that was asked for."""
     own = [frame for frame in traceback.extract_tb(error.__traceback__) if Path(frame.filename).is_relative_to(_HOME)]
     where = f" at {Path(own[-1].filename).name}:{own[-1].lineno} in {own[-1].name}" if own else ""

@@ -1,0 +1,78 @@
+"""What the commands of this folder check, on this machine: the same answers pass, and others do not."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.runtimes.toys import toy_program, written_artifact
+from ttscompile.artifact.write import update_calibration
+from ttscompile.core.lattice import uniform_plan
+from ttscompile.measure.machine import cpuinfo
+
+from . import arm, made, robot
+
+PLANS = ("dense", "uniform")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What ``made.py`` leaves for one policy, without blocks of eight bits: the toy has none."""
+    folder = tmp_path_factory.mktemp("made") / "toy"
+    artifact = written_artifact(toy_program(noise=0.0, pruner=False), folder / "artifact").path
+    update_calibration(artifact, None, {"uniform": uniform_plan(5, 5, 3)}, "uniform", {"strategy": "by hand"})
+    np.savez(folder / "actions.npz", **dict(made.answers(artifact, ("fp32",))))
+    return folder
+
+
+def found(folder: Path) -> list[robot.Check]:
+    return list(robot.compare("toy", folder / "artifact", folder / "actions.npz"))
+
+
+def test_the_machine_that_compiled_agrees_with_itself(folder: Path) -> None:
+    checks = found(folder)
+    assert [check.what for check in checks] == [f"actions toy fp32 {plan}" for plan in PLANS]
+    assert all(check.passed for check in checks)
+
+
+@pytest.mark.parametrize(("off", "passed"), [(0.5e-5, True), (2e-5, False)])
+def test_actions_may_differ_by_a_hundred_thousandth_of_their_range(
+    folder: Path, tmp_path: Path, off: float, passed: bool
+) -> None:
+    other = Path(shutil.copytree(folder, tmp_path / "other"))
+    with np.load(other / "actions.npz") as stored:
+        arrays = dict(stored)
+    reach = np.ptp(np.stack([arrays[f"{call}/action/fp32/dense"] for call in range(made.CALLS)]))
+    arrays["2/action/fp32/dense"][0, 0, 0] += off * reach
+    np.savez(other / "actions.npz", **arrays)
+    assert [check.passed for check in found(other)] == [passed, True]
+
+
+def test_eight_bits_are_judged_by_their_distance_from_fp32() -> None:
+    """0.01 of the range on x86, so 0.02 here; wherever they are from each other."""
+    exact = np.array([0.0, 1.0])
+    assert robot.judged("actions", exact - [0.015, 0], exact, robot.GROWTH * 0.01, 0.025).passed
+    assert not robot.judged("actions", exact - [0.025, 0], exact, robot.GROWTH * 0.01, 0.015).passed
+
+
+def test_beside_the_compiler_nothing_is_proven(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert robot.main(tmp_path, ()) == 2
+    assert "found torch" in capsys.readouterr().out
+
+
+def test_an_emulated_processor_is_what_its_root_says(tmp_path: Path) -> None:
+    root = tmp_path / "a folder" / "root"
+    (root / "usr" / "bin").mkdir(parents=True)
+    script = arm.emulated_python(root, "cortex-a72")
+    assert cpuinfo(root / "proc" / "cpuinfo")["CPU part"] == "0xd08"
+    assert "asimddp" not in cpuinfo(root / "proc" / "cpuinfo")["Features"]
+    emulator = tmp_path / arm.QEMU
+    emulator.write_text('#!/bin/sh\nprintf "%s\\n" "$@"\n')  # tells what it was given
+    emulator.chmod(0o755)
+    told = subprocess.run([script, "-c", "one two"], env={"PATH": str(tmp_path)}, capture_output=True, text=True)
+    words = ["-cpu", "cortex-a72", "-L", str(root), "-E", f"EMULATED_PYTHON={script}", f"{root}/usr/bin/python3.11"]
+    assert told.stdout.splitlines() == [*words, "-c", "one two"]
