@@ -45,7 +45,7 @@ for _command, _what in (
     (bench, "Time calls, beside what they replace."),
     (compare, "Action error against latency, of plans and strategies."),
     (realtime, "Which plans keep up with a control loop on this machine."),
-    (serve, "Drive a robot from another process, over a local WebSocket."),
+    (serve, "Drive a robot from another process, over a WebSocket."),
 ):
     _command.short_help = _what
     main.add_command(_command)
