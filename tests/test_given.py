@@ -167,7 +167,7 @@ def test_arguments_that_count_are_whole(make: Callable[[Any], Any], message: str
     from ttscompile import ChunkSpec, ExecutorSettings, ObservationSpec, flow_matching_table
     from ttscompile.calibration.budget import goal_of
     from ttscompile.frontends.families import LoadOptions
-    from ttscompile.runtimes.executor.server import ServerLimits
+    from ttscompile.runtimes.executor.limits import ServerLimits
 
     given = make(2.5)
     calls: list[Callable[[], Any]] = [

@@ -3,6 +3,10 @@
     ttscompile serve build/pusht/compiled --control-hz 10
     python examples/serve/client.py ws://127.0.0.1:8765/ --seconds 5
 
+Where the server has a token and a certificate:
+
+    python examples/serve/client.py wss://10.0.0.7:8765/ --token-file token --ca certificate.pem
+
 It sends frames in which nothing moves, at the control rate, and prints the actions. The framing is RFC 6455; most
 languages have a library for it.
 """
@@ -12,12 +16,15 @@ from __future__ import annotations
 import argparse
 import base64
 import hashlib
+import ipaddress
 import json
 import os
 import socket
+import ssl
 import struct
 import sys
 import time
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -41,19 +48,32 @@ class Client:
     """One connection; requests are answered in their order.
 
     Args:
-        url: ``ws://127.0.0.1:8765/``.
+        url: ``ws://127.0.0.1:8765/``, or ``wss://`` where the server has a certificate.
         timeout: seconds that an answer may take.
+        token: that the server asks for.
+        ca: file with the certificate that the server's own must come from; None for the authorities of this machine.
+
+    Raises:
+        ConnectionError: the server did not let this client in.
+        ssl.SSLError: it is not the server that the certificate is of.
     """
 
-    def __init__(self, url: str, timeout: float = 35.0) -> None:
+    def __init__(self, url: str, timeout: float = 35.0, token: str | None = None, ca: str | None = None) -> None:
         parts = urlsplit(url)
+        secure = parts.scheme == "wss"
+        if token and not secure and not on_this_machine(parts.hostname or ""):
+            raise ConnectionError(f"a token for {url} could be read on the way. Use wss://.")
         self._socket = socket.create_connection((parts.hostname, parts.port), timeout)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        if secure:  # closes the socket if the certificate is another one
+            context = ssl.create_default_context(cafile=ca)
+            self._socket = context.wrap_socket(self._socket, server_hostname=parts.hostname)
         self._stream = self._socket.makefile("rb")
         key = base64.b64encode(os.urandom(16)).decode()
+        authorization = f"Authorization: Bearer {token}\r\n" if token else ""
         self._socket.sendall(
             f"GET {parts.path or '/'} HTTP/1.1\r\nHost: {parts.netloc}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-            f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
+            f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\n{authorization}\r\n".encode()
         )
         status = self._stream.readline()
         headers = {}
@@ -123,16 +143,30 @@ class Client:
         return data
 
 
+def on_this_machine(host: str) -> bool:
+    """Whether what is sent there does not leave the machine."""
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
 def main() -> None:
     """Observe and act for a while."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("url", nargs="?", default="ws://127.0.0.1:8765/")
     parser.add_argument("--seconds", type=float, default=5.0)
+    parser.add_argument("--token-file", type=Path, help="holds the token; without it, TTSCOMPILE_TOKEN may")
+    parser.add_argument("--ca", help="certificate, in PEM format, that the server's must come from")
     arguments = parser.parse_args()
+    file = arguments.token_file
+    token = file.read_text().strip() if file else os.environ.get("TTSCOMPILE_TOKEN")
     try:
-        call = Client(arguments.url)
+        call = Client(arguments.url, token=token, ca=arguments.ca)
     except ConnectionRefusedError:
         sys.exit(f"error: nobody listens at {arguments.url}: start 'ttscompile serve DIR --control-hz 10' first")
+    except OSError as error:  # also another certificate than the server's
+        sys.exit(f"error: {error}")
     info = call("info")
 
     def zeros(shape: list[int]) -> Any:

@@ -1,24 +1,29 @@
-"""The executor behind a local WebSocket, for programs in other processes and languages.
+"""The executor behind a WebSocket, for programs in other processes and languages.
 
-The socket, its framing, its limits and its handshake are the library ``websockets``'; messages are ``protocol``'s. One
-event loop serves all clients. What a client does wrong is answered to that client: it is told, or its connection is
-closed, and nobody else notices. Only waiting for an action takes a thread, from a pool of a fixed size.
+The socket, its framing, its limits and its handshake are the library ``websockets``'; messages are ``protocol``'s. Who
+may come in is the matter of ``lock`` and ``door``. One event loop serves all clients. What a client does wrong is
+answered to that client: it is told, or its connection is closed, and nobody else notices. Only waiting for an action
+takes a thread, from a pool of a fixed size.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
+import socket
 from collections.abc import Callable, Coroutine
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from contextlib import ExitStack
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any
 
 from ttscompile.core.given import integer
 from ttscompile.errors import ExecutorError, ProtocolError, RuntimeUnavailableError, TtscompileError
 
+from .door import Door, Entrance, Pace
 from .executor import AsyncExecutor
+from .limits import ServerLimits
+from .lock import Lock
 from .protocol import Request, answer, failure, read_frame, read_request
 
 if TYPE_CHECKING:
@@ -31,46 +36,20 @@ WAITS_PER_CLIENT = 4
 """Threads that may wait for an action, a client: one for it, the others for those before it that vanished waiting."""
 
 
-@dataclass(frozen=True)
-class ServerLimits:
-    """What clients may do.
-
-    Attributes:
-        clients: at a time.
-        message_bytes: largest size of a request.
-        handshake_timeout: seconds for the opening handshake.
-        idle_timeout: seconds between two complete requests.
-        send_timeout: seconds that a client may take to read an answer, once its socket's buffers are full.
-        action_timeout: seconds that a client may wait for an action.
-    """
-
-    clients: int = 8
-    message_bytes: int = 1 << 20
-    handshake_timeout: float = 5.0
-    idle_timeout: float = 60.0
-    send_timeout: float = 5.0
-    action_timeout: float = 30.0
-
-    def __post_init__(self) -> None:
-        for name in ("clients", "message_bytes"):
-            object.__setattr__(self, name, integer(getattr(self, name), f"the server's {name}", ExecutorError, 1))
-        for name, value in vars(self).items():
-            if not value > 0:
-                raise ExecutorError(f"the server's {name} must be positive; found {value}.")
-
-
 class ExecutorServer:
     """Serves one executor; it is the caller's, and is not closed here.
 
     Args:
         executor: shared by all clients.
         limits: what clients may do; None for the defaults.
+        lock: who may come in; None lets every program of this machine in, and nobody else.
     """
 
-    def __init__(self, executor: AsyncExecutor, limits: ServerLimits | None = None) -> None:
+    def __init__(self, executor: AsyncExecutor, limits: ServerLimits | None = None, lock: Lock | None = None) -> None:
         self._executor = executor
         self._limits = limits or ServerLimits()
-        self._connected = 0
+        self._lock = lock or Lock()
+        self._door = Door(self._limits)
         waiting = WAITS_PER_CLIENT * self._limits.clients
         self._pool = ThreadPoolExecutor(waiting, thread_name_prefix="ttscompile-serve")
         self._log = logging.getLogger("ttscompile.serve")
@@ -92,7 +71,8 @@ class ExecutorServer:
 
         Raises:
             RuntimeUnavailableError: ``websockets`` is not installed.
-            ExecutorError: the address cannot be had or is none, or the port is none.
+            ExecutorError: the address cannot be had or is none, or the port is none; or others than programs of this
+                machine may reach it, and the lock does not allow that.
         """
         if not host:  # asyncio would listen on every address of the machine
             raise ExecutorError("cannot listen: host is empty. Give 127.0.0.1, or 0.0.0.0 for every address.")
@@ -102,47 +82,80 @@ class ExecutorServer:
         except ModuleNotFoundError as error:
             problem = f"the server needs {error.name}, which is not installed"
             raise RuntimeUnavailableError(f"{problem}. Run: pip install 'ttscompile[serve]'.") from error
-        limits = self._limits
         quiet = logging.getLogger("ttscompile.serve.socket")
         quiet.setLevel(logging.CRITICAL)  # what clients do wrong is told to them
-        try:
-            server = await serve(
+        entrances = await self._listen(host, port)
+        limits, tls = self._limits, self._lock.tls
+        timeouts: dict[str, Any] = {}
+        if tls is not None:
+            timeouts = {"ssl_handshake_timeout": limits.handshake_timeout, "ssl_shutdown_timeout": limits.send_timeout}
+        servers = [
+            await serve(
                 self._client,
-                host,
-                port,
+                sock=entrance,
                 origins=[None],  # no web page may drive the robot: a browser sends the origin of its page
                 compression=None,
                 process_request=self._admit,
+                process_response=self._answered,
                 open_timeout=limits.handshake_timeout,
                 close_timeout=limits.send_timeout,
                 ping_interval=None,  # clients stay simple; the idle timeout finds those that are gone
                 max_size=limits.message_bytes,
                 max_queue=1,
                 logger=quiet,
+                ssl=tls,
+                **timeouts,
             )
-        except (OSError, OverflowError, UnicodeError) as error:  # also a port above 65535, a name that cannot be one
-            remedy = "Choose another port (0 takes any that is free), or an address of this machine."
-            why = getattr(error, "strerror", None) or error
-            shown = ascii(host[:100])[1:-1]
-            raise ExecutorError(f"cannot listen on {shown}:{port}: {why}. {remedy}") from error
+            for entrance in entrances
+        ]
         try:
-            on_start(*next(iter(server.sockets)).getsockname()[:2])
+            on_start(*entrances[0].getsockname()[:2])
             await stop.wait()
         finally:
-            server.close()
-            await server.wait_closed()
+            for server in servers:
+                server.close()
+            for server in servers:
+                await server.wait_closed()
             self._pool.shutdown(wait=False, cancel_futures=True)
 
+    async def _listen(self, host: str, port: int) -> list[Entrance]:
+        """A socket for each address that the host has; two for ``localhost``, where there is IPv6."""
+        loop, made = asyncio.get_running_loop(), list[Entrance]()
+        with ExitStack() as opened:
+            try:
+                for family, *_, address in await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM):
+                    entrance = opened.enter_context(Entrance(self._door, family))
+                    entrance.bind(address)
+                    self._lock.require(entrance.getsockname()[0])
+                    made.append(entrance)
+            except (OSError, OverflowError, UnicodeError) as error:  # also a name that cannot be one
+                remedy = "Choose another port (0 takes any that is free), or an address of this machine."
+                why = getattr(error, "strerror", None) or error
+                shown = ascii(host[:100])[1:-1]
+                raise ExecutorError(f"cannot listen on {shown}:{port}: {why}. {remedy}") from error
+            opened.pop_all()
+        return made
+
     def _admit(self, connection: ServerConnection, request: Handshake) -> Response | None:
-        if self._connected < self._limits.clients:
-            return None
-        message = f"{self._limits.clients} clients are connected, and that is how many may be.\n"
-        return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, message)
+        """Refuse a handshake without the token, then one more client than there may be: strangers learn no more."""
+        given = request.headers.get_all("Authorization")
+        if not self._lock.opens(given[0] if len(given) == 1 else None):
+            response = connection.respond(HTTPStatus.UNAUTHORIZED, "The token is missing or wrong.\n")
+            response.headers["WWW-Authenticate"] = "Bearer"
+            return response
+        if full := self._door.refusal(connection.remote_address):
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{full}\n")
+        return None
+
+    def _answered(self, connection: ServerConnection, _: Handshake, response: Response) -> None:
+        tls = connection.transport.get_extra_info("ssl_object")
+        self._door.answers(connection.remote_address, response.status_code, tls.version() if tls else None)
 
     async def _client(self, connection: ServerConnection) -> None:
         from websockets.exceptions import ConnectionClosed
 
-        self._connected += 1
+        loop, peer = asyncio.get_running_loop(), connection.remote_address
+        pace = Pace(self._limits.requests_per_second, loop.time())
         try:
             while True:
                 try:
@@ -151,6 +164,9 @@ class ExecutorServer:
                 except TimeoutError:
                     await connection.close(1008, f"no complete request for {self._limits.idle_timeout:g} s")
                     return
+                self._door.requested(peer)
+                if wait := pace.wait(loop.time()):
+                    await asyncio.sleep(wait)
                 reply = await self._unless_gone(connection, self._reply(text))
                 try:
                     async with asyncio.timeout(self._limits.send_timeout):
@@ -160,8 +176,6 @@ class ExecutorServer:
                     return
         except ConnectionClosed:
             return
-        finally:
-            self._connected -= 1
 
     async def _unless_gone(self, connection: ServerConnection, reply: Coroutine[Any, Any, str]) -> str:
         """The reply; raises ``ConnectionClosed`` as soon as nobody waits for it any more."""

@@ -17,7 +17,9 @@ import numpy as np
 
 from ttscompile.errors import ExecutorError
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
-from ttscompile.runtimes.executor.server import ExecutorServer, ServerLimits
+from ttscompile.runtimes.executor.limits import ServerLimits
+from ttscompile.runtimes.executor.lock import Lock
+from ttscompile.runtimes.executor.server import ExecutorServer
 
 from .simulation import FakeClock, ScriptedPolicy
 
@@ -30,7 +32,13 @@ spec.loader.exec_module(client)
 Client, ServerError = client.Client, client.ServerError
 
 LIMITS = ServerLimits(
-    clients=4, message_bytes=4096, handshake_timeout=0.3, idle_timeout=0.6, send_timeout=0.3, action_timeout=2.0
+    clients=4,
+    message_bytes=4096,
+    handshake_timeout=0.3,
+    idle_timeout=0.6,
+    send_timeout=0.3,
+    action_timeout=2.0,
+    refusals_per_minute=1000,
 )
 
 SETTINGS = ExecutorSettings(max_hold=1000)
@@ -49,7 +57,10 @@ class Broken(Quick):
 
 @contextmanager
 def serving(
-    policy: type[ScriptedPolicy] = Quick, limits: ServerLimits = LIMITS, settings: ExecutorSettings = SETTINGS
+    policy: type[ScriptedPolicy] = Quick,
+    limits: ServerLimits = LIMITS,
+    settings: ExecutorSettings = SETTINGS,
+    lock: Lock | None = None,
 ) -> Iterator[str]:
     """A server in this process; its url."""
     ready: list[Any] = []
@@ -62,7 +73,7 @@ def serving(
             ready.extend([asyncio.get_running_loop(), stop, port])
             started.set()
 
-        await ExecutorServer(executor, limits).run("127.0.0.1", 0, stop, on_start)
+        await ExecutorServer(executor, limits, lock).run("127.0.0.1", 0, stop, on_start)
 
     executor = AsyncExecutor(policy(FakeClock()), 20, settings, latencies={"dense": 0.01})
     thread = threading.Thread(target=lambda: asyncio.run(run(executor)))
@@ -70,7 +81,7 @@ def serving(
     assert started.wait(10)
     loop, stop, port = ready
     try:
-        yield f"ws://127.0.0.1:{port}/"
+        yield f"{'wss' if lock and lock.tls else 'ws'}://127.0.0.1:{port}/"
     finally:
         loop.call_soon_threadsafe(stop.set)
         thread.join(10)
@@ -82,8 +93,8 @@ def serving(
 
 
 @contextmanager
-def connected(url: str) -> Iterator[Any]:
-    call = Client(url, timeout=5.0)
+def connected(url: str, **key: Any) -> Iterator[Any]:
+    call = Client(url, timeout=5.0, **key)
     try:
         yield call
     finally:
@@ -96,8 +107,8 @@ def vanish(call: Any) -> None:
     call._socket.close()
 
 
-def still_serves(url: str) -> None:
-    with connected(url) as call:
+def still_serves(url: str, **key: Any) -> None:
+    with connected(url, **key) as call:
         assert call("info")["n_obs_steps"] == 2
 
 
@@ -106,11 +117,11 @@ def raw(url: str) -> socket.socket:
     return socket.create_connection(("127.0.0.1", port), 5)
 
 
-def handshake() -> bytes:
+def handshake(*headers: str) -> bytes:
     key = base64.b64encode(b"0123456789abcdef").decode()
     return (
         "GET / HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-        f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\n\r\n"
+        f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\n" + "".join(f"{each}\r\n" for each in (*headers, ""))
     ).encode()
 
 

@@ -21,7 +21,8 @@ import pytest
 
 from ttscompile.errors import ExecutorError, RuntimeUnavailableError
 from ttscompile.runtimes.executor import AsyncExecutor
-from ttscompile.runtimes.executor.server import ExecutorServer, ServerLimits
+from ttscompile.runtimes.executor.limits import ServerLimits
+from ttscompile.runtimes.executor.server import ExecutorServer
 
 from .serving import (
     CLIENT,

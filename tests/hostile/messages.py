@@ -101,7 +101,8 @@ def _server() -> Any:
     from tests.executor.serving import Quick
     from tests.executor.simulation import FakeClock
     from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
-    from ttscompile.runtimes.executor.server import ExecutorServer, ServerLimits
+    from ttscompile.runtimes.executor.limits import ServerLimits
+    from ttscompile.runtimes.executor.server import ExecutorServer
 
     settings = ExecutorSettings(max_hold=1000)
     return ExecutorServer(

@@ -47,7 +47,7 @@ for _command, _what in (
     (compare, "Action error against latency, of plans and strategies."),
     (oracle, "Would it pay to choose a plan for each call?"),
     (realtime, "Which plans keep up with a control loop on this machine."),
-    (serve, "Drive a robot from another process, over a local WebSocket."),
+    (serve, "Drive a robot from another process, over a WebSocket."),
 ):
     _command.short_help = _what
     main.add_command(_command)

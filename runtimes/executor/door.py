@@ -1,0 +1,228 @@
+"""Who is at the server, who may come in, and who came: counted by address from the moment that a socket is accepted.
+
+The library ``websockets`` sees a connection when its handshake begins, which under TLS is late: who never finishes it
+is not seen at all. So the listening socket itself asks the door (``Entrance``), and the socket of a connection says
+when it ends (``Guest``).
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import socket
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from http import HTTPStatus
+from ipaddress import ip_address, ip_network
+from typing import Any
+
+from .limits import ServerLimits
+
+AUDIT = logging.getLogger("ttscompile.serve.audit")
+"""Gets one line of JSON for each connection that is let in or refused, and one when it ends."""
+MINUTE = 60.0
+MOST_ADDRESSES = 4096
+"""Whose refusals are remembered; beyond, those of the address that came first are forgotten."""
+
+
+@dataclass
+class Visit:
+    """A connection, from its socket's acceptance to its end.
+
+    Attributes:
+        number: in the order in which they came.
+        peer: address and port.
+        network: of the address, which limits are counted by.
+        since: time of the door's clock.
+        client: whether its handshake was accepted.
+        answered: whether its handshake was answered, and so told in the audit.
+        requests: that it has sent.
+    """
+
+    number: int
+    peer: str
+    network: str
+    since: float
+    client: bool = False
+    answered: bool = False
+    requests: int = 0
+
+
+class Door:
+    """Counts and limits; used by the server's event loop alone.
+
+    Args:
+        limits: what clients may do.
+        clock: seconds that never go back.
+    """
+
+    def __init__(self, limits: ServerLimits, clock: Callable[[], float] = time.monotonic) -> None:
+        self.limits = limits
+        self._clock = clock
+        self._visits: dict[Any, Visit] = {}
+        self._refusals: dict[str, deque[float]] = {}
+        self._told: dict[str, float] = {}
+        self._count = 0
+
+    def comes(self, peer: tuple[Any, ...]) -> bool:
+        """Whether the handshake of a new connection may begin.
+
+        Args:
+            peer: as ``accept`` gives it.
+        """
+        network, now = network_of(peer[0]), self._clock()
+        waiting = [each.network for each in self._visits.values() if not each.client]
+        if self._refused_lately(network, now) >= self.limits.refusals_per_minute:
+            why = f"{self.limits.refusals_per_minute} of its handshakes failed within a minute"
+        elif len(waiting) >= self.limits.handshakes or waiting.count(network) >= self.limits.handshakes_per_address:
+            why = "too many handshakes are under way"
+        else:
+            self._count += 1
+            self._visits[peer] = Visit(self._count, _shown(peer), network, now)
+            return True
+        if now - self._told.get(network, -MINUTE) >= MINUTE:  # one line: whoever is cut off must not fill the disk
+            self._remember(self._told, network, now)
+            _write("cut off", _shown(peer), why=f"{why}; others of this minute are not written")
+        return False
+
+    def refusal(self, peer: tuple[Any, ...]) -> str:
+        """Why one more client of this address cannot be had now; empty if it can."""
+        clients = Counter(each.network for each in self._visits.values() if each.client)
+        if clients.total() >= self.limits.clients:
+            return f"{self.limits.clients} clients are connected, and that is how many may be."
+        most = self.limits.clients_per_address
+        if most is not None and clients[self._visits[peer].network] >= most:
+            return f"{most} clients of this address are connected, and that is how many may be."
+        return ""
+
+    def answers(self, peer: tuple[Any, ...], status: int, tls: str | None) -> None:
+        """Note how a handshake was answered.
+
+        Args:
+            peer: as above.
+            status: of HTTP; 101 makes it a client.
+            tls: version of TLS, None without.
+        """
+        visit = self._visits[peer]
+        visit.answered, visit.client = True, status == HTTPStatus.SWITCHING_PROTOCOLS
+        if not visit.client and status != HTTPStatus.SERVICE_UNAVAILABLE:  # which is no fault of the client
+            self._refuse(visit.network)
+        event = "let in" if visit.client else "refused"
+        _write(event, visit.peer, connection=visit.number, status=int(status), tls=tls)
+
+    def requested(self, peer: tuple[Any, ...]) -> None:
+        """Count a request."""
+        self._visits[peer].requests += 1
+
+    def leaves(self, peer: tuple[Any, ...]) -> None:
+        """Forget a connection whose socket is closed."""
+        visit = self._visits.pop(peer, None)
+        if visit is None:
+            return
+        seconds = round(self._clock() - visit.since, 3)
+        if visit.client:
+            _write("left", visit.peer, connection=visit.number, requests=visit.requests, seconds=seconds)
+        elif not visit.answered:
+            self._refuse(visit.network)
+            why = "it did not finish its handshake"
+            _write("refused", visit.peer, connection=visit.number, why=why, seconds=seconds)
+
+    def _refuse(self, network: str) -> None:
+        if network not in self._refusals:
+            self._remember(self._refusals, network, deque(maxlen=self.limits.refusals_per_minute))
+        self._refusals[network].append(self._clock())
+
+    def _refused_lately(self, network: str, now: float) -> int:
+        times = self._refusals.get(network, deque())
+        while times and now - times[0] >= MINUTE:
+            times.popleft()
+        return len(times)
+
+    @staticmethod
+    def _remember(table: dict[str, Any], network: str, value: Any) -> None:
+        table.pop(network, None)
+        table[network] = value
+        if len(table) > MOST_ADDRESSES:
+            del table[next(iter(table))]
+
+
+class Entrance(socket.socket):
+    """A listening socket that asks the door about every connection, before a byte of it is read.
+
+    Args:
+        door: is asked.
+        family: of addresses.
+    """
+
+    def __init__(self, door: Door, family: int) -> None:
+        super().__init__(family, socket.SOCK_STREAM)
+        self._door = door
+        self.setblocking(False)
+        if os.name == "posix":  # elsewhere it would let two servers share a port
+            self.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if family == socket.AF_INET6:  # IPv4 has a socket of its own
+            self.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        """As of any socket; a connection that may not begin is closed, as if nobody had come."""
+        accepted, peer = super().accept()
+        if self._door.comes(peer):
+            return Guest(self._door, peer, accepted), peer
+        accepted.close()
+        raise BlockingIOError  # what an event loop expects; it looks after the others before it comes again
+
+
+class Guest(socket.socket):
+    """The socket of a connection, which tells the door when it is closed.
+
+    Args:
+        door: is told.
+        peer: address, as ``accept`` gives it.
+        accepted: whose descriptor this one takes over.
+    """
+
+    def __init__(self, door: Door, peer: Any, accepted: socket.socket) -> None:
+        super().__init__(accepted.family, accepted.type, accepted.proto, fileno=accepted.detach())
+        self._door, self._peer = door, peer
+
+    def close(self) -> None:
+        """As of any socket."""
+        super().close()
+        self._door.leaves(self._peer)
+
+
+class Pace:
+    """How long a client's next request has to wait, so that it has no more than its share of a second.
+
+    Args:
+        per_second: requests; as many may come at once after a quiet second.
+        now: seconds of any clock.
+    """
+
+    def __init__(self, per_second: float, now: float) -> None:
+        self._each = 1 / per_second
+        self._paid = now - 1
+
+    def wait(self, now: float) -> float:
+        """Seconds."""
+        self._paid = max(self._paid, now - 1) + self._each
+        return max(self._paid - now, 0.0)
+
+
+def network_of(address: str) -> str:
+    """What limits are counted by: an IPv4 address, or the network of 64 bits that one household has of IPv6."""
+    ip = ip_address(address.partition("%")[0])
+    return str(ip) if ip.version == 4 else str(ip_network((ip, 64), strict=False))
+
+
+def _shown(peer: tuple[Any, ...]) -> str:
+    return f"[{peer[0]}]:{peer[1]}" if ":" in peer[0] else f"{peer[0]}:{peer[1]}"
+
+
+def _write(event: str, peer: str, **more: Any) -> None:
+    now = datetime.now(UTC).isoformat(timespec="milliseconds")
+    AUDIT.info(json.dumps({"time": now, "event": event, "from": peer, **more}))
