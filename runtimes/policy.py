@@ -157,6 +157,11 @@ class CompiledPolicy:
             prefix_refusal=self._prefix_refusal,
         )
 
+    @property
+    def queued(self) -> int:
+        """How many actions ``select_action`` gives before it computes a chunk; it does at once where there are none."""
+        return self._queues.queued
+
     def reset(self, seed: int | None = None) -> None:
         """Start a new episode: nothing of earlier calls is reused.
 
@@ -232,13 +237,17 @@ class CompiledPolicy:
         with self._turn():
             obs, example = read_observation(batch, self._manifest.spec.observations, others=True)
             frames = self._queues.after(obs)
-            if self._queues.empty:
+            if not self._queues.queued:
                 self._queues.extend(self._chunk(self._queues.observation(frames), noise, plan))
             self._queues.keep(frames)
             return like(self._queues.pop().copy(), example)
 
     def predict_action_chunk(
-        self, batch: Mapping[str, Any], noise: Noise | None = None, plan: str | npt.ArrayLike | None = None
+        self,
+        batch: Mapping[str, Any],
+        noise: Noise | None = None,
+        plan: str | npt.ArrayLike | None = None,
+        prefix: Any = None,
     ) -> Any:
         """A chunk of actions ``[B, Ta, Da]``, as LeRobot's policies give it; the queue of ``select_action`` stays.
 
@@ -248,9 +257,10 @@ class CompiledPolicy:
                 are left alone.
             noise: of the call.
             plan: of the call.
+            prefix: of the call, as ``predict_action`` takes it.
 
         Raises:
-            ObservationError: a window, a frame or noise that does not fit; nothing was executed or kept.
+            ObservationError: a window, a frame, noise or a prefix that does not fit; nothing was executed or kept.
             IllegalPlanError: as ``predict_action``.
             NonFiniteActionsError: as ``predict_action``.
         """
@@ -258,17 +268,19 @@ class CompiledPolicy:
             specs = self._manifest.spec.observations
             obs, example = read_observation(batch, specs, others=True)
             if is_window(obs, specs):
-                chunk = self._chunk(obs, noise, plan)
+                chunk = self._chunk(obs, noise, plan, prefix)
             else:
                 frames = self._queues.after(obs)
-                chunk = self._chunk(self._queues.observation(frames), noise, plan)
+                chunk = self._chunk(self._queues.observation(frames), noise, plan, prefix)
                 self._queues.keep(frames)
             return like(chunk.copy(), example)
 
-    def _chunk(self, obs: Mapping[str, Array], noise: Noise | None, plan: str | npt.ArrayLike | None) -> FloatArray:
+    def _chunk(
+        self, obs: Mapping[str, Array], noise: Noise | None, plan: str | npt.ArrayLike | None, prefix: Any = None
+    ) -> FloatArray:
         """What is executed of a call, ``[B, Ta, Da]``."""
         chunk = self._manifest.spec.chunk
-        return self._predict(obs, noise, plan)[:, chunk.start : chunk.stop]
+        return self._predict(obs, noise, plan, prefix)[:, chunk.start : chunk.stop]
 
     def _predict(
         self, obs: Mapping[str, Array], noise: Noise | None, plan: str | npt.ArrayLike | None, prefix: Any = None

@@ -73,9 +73,9 @@ class Queues:
         }
 
     @property
-    def empty(self) -> bool:
-        """Whether every action was executed."""
-        return not self._actions
+    def queued(self) -> int:
+        """How many actions were not executed yet."""
+        return len(self._actions)
 
     def extend(self, actions: FloatArray) -> None:
         """Add a chunk of actions ``[B, Ta, Da]``."""

@@ -21,7 +21,7 @@ from .core.given import integer
 from .core.paths import require_free_or_path
 from .core.spec import FP32, PolicySpec
 from .errors import ArtifactError, NoResidualBlocksError, PassError, SpecError
-from .frontends import load_checkpoint_policy
+from .frontends import files_beside, load_checkpoint_policy
 from .frontends.encoded import parts
 from .frontends.families import LoadOptions
 from .ir.dataflow import reachable_from
@@ -109,15 +109,8 @@ def convert(
     require_replaceable(directory)
     options = LoadOptions(sampler=sampler, steps=steps, spacing=spacing, task=task, encoders=encoders)
     module, spec = load_checkpoint_policy(checkpoint, format, options)
-    return compile_denoiser(
-        module,
-        spec,
-        directory,
-        prediction_horizon=prediction_horizon,
-        precision=precision,
-        single_file=single_file,
-        explain=explain,
-    )
+    beside = files_beside(checkpoint, spec)
+    return _compile(module, spec, directory, prediction_horizon, precision, single_file, explain, beside)
 
 
 def compile_denoiser(
@@ -150,6 +143,20 @@ def compile_denoiser(
     Raises:
         TtscompileError: it cannot be captured, it has no residual blocks, or the artifact cannot be written.
     """
+    return _compile(module, spec, directory, prediction_horizon, precision, single_file, explain, {})
+
+
+def _compile(
+    module: nn.Module,
+    spec: PolicySpec,
+    directory: str | os.PathLike[str] | None,
+    prediction_horizon: int | None,
+    precision: str,
+    single_file: str | os.PathLike[str] | None,
+    explain: Explain,
+    beside: Mapping[str, bytes],
+) -> Program:
+    """See ``compile_denoiser``; ``beside`` goes into the directory, for other programs."""
     if precision != FP32:
         require_precision(precision)
     if prediction_horizon is not None:
@@ -177,7 +184,7 @@ def compile_denoiser(
     if directory is not None:
         golden = record_original(module, program)
         explain("record_original", (f"{len(golden.steps)} of {spec.sampler.steps} steps, {golden.streams} streams",))
-        manifest = write_artifact(program, models, directory, blocks, golden)
+        manifest = write_artifact(program, models, directory, blocks, golden, beside)
         explain("write", (f"identity {manifest.short_identity}",))
     if whole is not None and single_file is not None:
         _write(Path(single_file), whole)

@@ -311,6 +311,26 @@ def test_released_encoders_need_no_files(tmp_path: Path) -> None:
         load_checkpoint_policy(directory)
 
 
+def test_an_encoder_that_is_named_by_its_whole_path_is_found(tmp_path: Path) -> None:
+    """Policies that were trained with a local CLIP name it so. On another machine its copy has the same last part."""
+    (tmp_path / "trained").mkdir()
+    directory = save_policy(tmp_path / "trained")
+    own = tmp_path / "models" / "clip"
+    own.parent.mkdir()
+    (tmp_path / "trained" / "clip-small").rename(own)
+    names = {"vision_encoder_name": str(own), "text_encoder_name": str(own)}
+    change_json(directory / "config.json", **names)
+    load_checkpoint_policy(directory)
+    own.rename(directory / "clip")  # copied beside the weights
+    load_checkpoint_policy(directory)
+    (directory / "clip" / "config.json").unlink()
+    with pytest.raises(CheckpointError, match=rf"'{own}' is not on this machine"):
+        load_checkpoint_policy(directory)
+    own.mkdir()
+    with pytest.raises(CheckpointError, match=rf"{own}: expected a config.json of CLIP, .*found a directory without"):
+        load_checkpoint_policy(directory)
+
+
 def test_encoders_folder(tmp_path: Path) -> None:
     """The encoder's directory is found beside the policy, in it, and in a folder that is named; else there is help."""
     directory = save_policy(tmp_path)
@@ -321,7 +341,7 @@ def test_encoders_folder(tmp_path: Path) -> None:
         load_checkpoint_policy(directory)
     for folder in (elsewhere, elsewhere / "clip-small"):
         load_checkpoint_policy(directory, options=LoadOptions(encoders=folder))
-    with pytest.raises(CheckpointError, match=r"tokenizer .*is not on this machine.*--encoders"):
+    with pytest.raises(CheckpointError, match=r"tokenizer .*has neither tokenizer.json nor.*--encoders"):
         load_checkpoint_policy(directory, options=LoadOptions(encoders=elsewhere, task="push"))
     (elsewhere / "clip-small").rename(directory / "clip-small")
     load_checkpoint_policy(directory)

@@ -11,7 +11,7 @@ import torch
 from tests.lower.modules import ALL, captured, random_values
 from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile.errors import CaptureError, ObservationError
-from ttscompile.ir.evaluate import Evaluator, bind_batch, evaluate, resolve_op
+from ttscompile.ir.evaluate import Evaluator, bind_batch, evaluate, resolve_op, without_stack_traces
 from ttscompile.ir.graph import Argument, Batch, Enum, Graph, Node, Ref, TensorType
 
 B = Batch()
@@ -181,3 +181,15 @@ def test_graphs_that_hang_in_the_air() -> None:
 def test_a_failing_node_is_named() -> None:
     with pytest.raises(CaptureError, match=r"%y .*user.py:7.* failed for 3 streams"):
         evaluate(one_node("aten.reshape.default", Ref("x"), (B, 5)), {}, {"x": torch.zeros(3, 2)})
+
+
+def test_stack_traces_are_switched_off_where_torch_has_the_switch(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = torch.fx.config
+    assert not config.do_not_emit_stack_traces
+    with without_stack_traces():
+        assert config.do_not_emit_stack_traces
+    assert not config.do_not_emit_stack_traces
+    monkeypatch.delattr(config, "do_not_emit_stack_traces")  # as torch 2.11 is
+    with without_stack_traces():
+        assert not hasattr(config, "do_not_emit_stack_traces")
+    assert not hasattr(config, "do_not_emit_stack_traces")

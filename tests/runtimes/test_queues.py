@@ -68,10 +68,11 @@ def test_frames_are_the_queues_own() -> None:
 
 def test_actions_come_one_by_one() -> None:
     queues = Queues(SPECS)
-    assert queues.empty
+    assert queues.queued == 0
     queues.extend(np.arange(8, dtype=np.float32).reshape(2, 2, 2))
+    assert queues.queued == 2
     assert [queues.pop().tolist() for _ in range(2)] == [[[0, 1], [4, 5]], [[2, 3], [6, 7]]]
-    assert queues.empty
+    assert queues.queued == 0
 
 
 @pytest.mark.parametrize(
@@ -203,10 +204,10 @@ def test_a_call_that_fails_keeps_no_frame(policy: CompiledPolicy, method: str, m
             before = dict(policy._queues._frames)
             with pytest.raises(error):
                 call(obs, **wrong)
-            assert policy._queues._frames == before and policy._queues.empty
+            assert policy._queues._frames == before and not policy.queued
         call(obs, noise=some_noise(), plan="dense")
         assert policy._queues._frames["obs"][-1].tolist() == [[value, value]]
-        while not policy._queues.empty:
+        while policy.queued:
             policy._queues.pop()
 
 
@@ -218,3 +219,11 @@ def test_reset_drops_actions_and_streams(policy: CompiledPolicy) -> None:
     policy.reset()
     action = policy.select_action({"obs": np.zeros((2, 2), np.float32)}, noise=some_noise(2), plan="dense")
     assert action.shape == (2, 2) and policy.last_report is not first
+
+
+def test_a_chunk_of_lerobots_takes_a_prefix(toy_artifact: Artifact) -> None:
+    """As ``predict_action`` does; the toy's sampler has none, which it says in the same words."""
+    policy, obs = load(toy_artifact.path), {"obs": np.zeros((1, 2), np.float32)}
+    for call in (policy.predict_action, policy.predict_action_chunk):
+        with pytest.raises(ObservationError, match="the policy takes no prefix"):
+            call(obs, prefix=np.zeros((1, 1, 2), np.float32))

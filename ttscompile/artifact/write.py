@@ -58,7 +58,12 @@ GOLDEN = "golden.safetensors"
 _STALE = re.compile(
     rf"(pruner-[0-9a-f]+\.(onnx|safetensors)|(golden_)?plans-[0-9a-f]+\.safetensors|\..+{re.escape(PARTIAL)})"
 )
-_OURS = re.compile(rf"manifest\.json|program\.json|[A-Za-z0-9_-]+\.(onnx|safetensors)|{_STALE.pattern}")
+BESIDE = ("config.json", "policy_preprocessor.json", "policy_postprocessor.json")
+"""Files for LeRobot that may stand in an artifact. Nothing here reads them, the manifest does not list them, and no
+identity covers them."""
+
+_BESIDE = "|".join(map(re.escape, BESIDE))
+_OURS = re.compile(rf"manifest\.json|program\.json|{_BESIDE}|[A-Za-z0-9_-]+\.(onnx|safetensors)|{_STALE.pattern}")
 
 
 def write_artifact(
@@ -67,6 +72,7 @@ def write_artifact(
     directory: str | os.PathLike[str],
     blocks: LoweredBlocks | None = None,
     golden: Golden | None = None,
+    beside: Mapping[str, bytes] | None = None,
 ) -> Manifest:
     """Write a compiled program; its default plan is ``dense`` until it is calibrated.
 
@@ -78,6 +84,7 @@ def write_artifact(
         directory: where it goes; its parents are made. An artifact that is there is replaced.
         blocks: residual blocks of another precision, which then is the artifact's; None for fp32.
         golden: what the original network answered; None leaves the artifact without, which then cannot be verified.
+        beside: files for other programs, by name, one of ``BESIDE``.
 
     Returns:
         The manifest.
@@ -93,6 +100,9 @@ def write_artifact(
         recover(target)
         with locked(target) if target.is_dir() else nullcontext(), new_folder(target) as partial:
             manifest = _fill(partial, program, models, blocks, golden)
+            for name, content in (beside or {}).items():
+                assert name in BESIDE
+                write_synced(partial / name, content)
             sync_directory(partial)
             replace_folder(partial, target)
     except OSError as error:

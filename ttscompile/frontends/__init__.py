@@ -36,3 +36,17 @@ def load_checkpoint_policy(
     """
     require_free_or_path(path, CheckpointError, "Give a file or a directory that was trained.")
     return find_family(Path(path), format).load(Path(path), options)
+
+
+def files_beside(path: str | os.PathLike[str], spec: PolicySpec) -> dict[str, bytes]:
+    """Files by which the program that trained a policy takes the compiled one in its place; none where it cannot.
+
+    Args:
+        path: of the checkpoint, which was loaded.
+        spec: what was loaded from it.
+    """
+    if spec.source.get("format") != "lerobot":
+        return {}
+    from .lerobot_files import lerobot_files
+
+    return lerobot_files(Path(path), spec)

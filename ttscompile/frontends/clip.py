@@ -125,15 +125,18 @@ Tower = TypeVar("Tower", bound=TowerConfig)
 def find_encoder(name: str, folders: Sequence[Path]) -> Path | None:
     """The local directory of an encoder: ``name``, or its last part, in one of ``folders``, or one of them itself.
 
-    The name is as the policy's configuration says it, ``openai/clip-vit-base-patch16`` or a path of another machine.
+    The name is as the policy's configuration says it: ``openai/clip-vit-base-patch16``, or a path of the machine that
+    trained it, which may be this one. The folders go first, so that a copy beside the policy is the one that is read.
     """
-    relative = Path(name)
-    if max(map(len, relative.parts), default=0) > _MOST_LETTERS:
+    given = Path(name)
+    if max(map(len, given.parts), default=0) > _MOST_LETTERS:
         return None  # no file system has such a name, and some say so with an error
-    names = [relative.name]
-    if not relative.is_absolute() and ".." not in relative.parts:
+    names, places = [given.name], list(folders)
+    if given.is_absolute():
+        places.append(given)
+    elif ".." not in given.parts:
         names.insert(0, name)
-    for folder in folders:
+    for folder in places:
         for candidate in (*(folder / each for each in names if each), folder):
             path = candidate / "config.json"
             # The policy's own directory has one, too.
@@ -154,11 +157,16 @@ def encoder_config(name: str, part: str, cls: type[Tower], folders: Sequence[Pat
     elif name in RELEASED:
         where, settings = name, dict(RELEASED[name])
     else:
+        if Path(name).is_absolute() and Path(name).is_dir():
+            raise CheckpointError(
+                f"{name}: expected a config.json of CLIP, whose model_type begins with clip; found a directory without"
+                f" one. Copy it there, or give another directory. {NAME_FOLDER}"
+            )
         looked = ", ".join(dict.fromkeys(str(folder) for folder in folders))
         raise CheckpointError(
             f"the observation encoder {name!r} is not on this machine, and nothing is ever downloaded. Looked for a"
-            f" directory {name!r} or {Path(name).name!r} with a config.json in {looked}. Copy it there (and the files"
-            f" of its tokenizer, to compile for one task). {NAME_FOLDER}"
+            f" directory {name!r} or {Path(name).name!r} with a config.json of CLIP in {looked}. Copy it there (and the"
+            f" files of its tokenizer, to compile for one task). {NAME_FOLDER}"
         )
     alone = settings.get("model_type") == f"clip_{part.split('_')[0]}_model"
     inner: Any = settings if alone else settings.get(part)

@@ -92,9 +92,12 @@ class Family:
 
 
 def _is_lerobot(path: Path) -> bool:
-    """Whether a directory is a policy that lerobot saved: a configuration with a type, and more than an adapter."""
+    """Whether a directory is a policy that lerobot saved: a configuration with a type, and more than an adapter.
+
+    A compiled policy has such a configuration as well, and a manifest.
+    """
     config, weights, adapter = (path / name for name in ("config.json", "model.safetensors", "adapter_config.json"))
-    if adapter.is_file() and not weights.is_file():
+    if (adapter.is_file() and not weights.is_file()) or (path / "manifest.json").is_file():
         return False
     return config.is_file() and "type" in read_json(config)
 

@@ -208,8 +208,9 @@ def _tokens(
     name = str(settings.get("tokenizer_name") or config.text_encoder_name)
     found = find_encoder(name, folders)
     if found is None or not any((found / file).is_file() for file in ("tokenizer.json", "vocab.json")):
+        where = "is not on this machine" if found is None else f"has neither tokenizer.json nor vocab.json in {found}"
         raise CheckpointError(
-            f"the tokenizer {name!r:.200} is not on this machine, and nothing is ever downloaded. Put config.json and"
+            f"the tokenizer {name!r:.200} {where}, and nothing is ever downloaded. Put config.json and"
             f" tokenizer.json (or vocab.json and merges.txt) of the text encoder into one folder. {NAME_FOLDER}"
             f" {_NO_TASK}"
         )

@@ -66,8 +66,14 @@ def resolve_op(node: Node) -> Callable[..., Any]:
 
 @contextmanager
 def without_stack_traces() -> Iterator[None]:
-    """While torch traces a graph: it would look up and format Python's stack for every operation."""
-    before = torch.fx.config.do_not_emit_stack_traces
+    """While torch traces a graph: it would look up and format Python's stack for every operation.
+
+    torch 2.11 has no such switch: graphs are the same there, and tracing takes longer.
+    """
+    before = getattr(torch.fx.config, "do_not_emit_stack_traces", None)
+    if before is None:
+        yield
+        return
     torch.fx.config.do_not_emit_stack_traces = True
     try:
         yield

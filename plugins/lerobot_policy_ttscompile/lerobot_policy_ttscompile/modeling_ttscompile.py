@@ -1,0 +1,181 @@
+"""A compiled policy as LeRobot calls it.
+
+The artifact takes what the robot measures and gives what it executes, so nothing is normalised here or in the
+processors that ``ttscompile convert`` writes beside it.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from pathlib import Path
+from typing import Any, NoReturn
+
+import torch
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.policies.pretrained import PreTrainedPolicy
+from torch import Tensor
+
+import ttscompile
+
+from .configuration_ttscompile import TtscompileConfig
+
+logger = logging.getLogger(__name__)
+
+_LANGUAGE = "observation.language."
+
+
+class TtscompilePolicy(PreTrainedPolicy):
+    """A ``PreTrainedPolicy`` around ``ttscompile.load``.
+
+    Noise is drawn from torch's global generator, which LeRobot seeds, and in the order of LeRobot's samplers: with the
+    generator in the same state the original acts alike on a CPU. (Making the original draws its weights, too.)
+
+    Args:
+        config: of the policy.
+        directory: the artifact. None is an error: a compiled policy is not made from its configuration.
+
+    Raises:
+        ValueError: no directory, or one whose artifact observes something else than ``config.json`` says.
+        ttscompile.TtscompileError: the artifact cannot be loaded.
+    """
+
+    config_class = TtscompileConfig
+    name = "ttscompile"
+
+    def __init__(self, config: TtscompileConfig, directory: str | Path | None = None, **_: Any) -> None:
+        super().__init__(config)
+        if directory is None:
+            raise ValueError(
+                "a compiled policy is not made from scratch, and not trained: give --policy.path=DIR, which ttscompile"
+                " convert wrote"
+            )
+        self._directory = Path(directory)
+        self._policy = ttscompile.load(
+            directory, config.runtime, config.threads, plan=config.plan, precision=config.precision
+        )
+        observed = {key for key in self._policy.info.observation if not key.startswith(_LANGUAGE)}
+        if set(config.input_features or {}) != observed:
+            raise ValueError(
+                f"{directory}: config.json says that the policy observes {sorted(config.input_features or {})}, and its"
+                f" artifact observes {sorted(observed)}: convert the checkpoint again"
+            )
+
+    @classmethod
+    def from_pretrained(
+        cls, pretrained_name_or_path: str | Path, *, config: PreTrainedConfig | None = None, **options: Any
+    ) -> TtscompilePolicy:
+        """Load a compiled policy from its directory, or from a repository of the hub.
+
+        Args:
+            pretrained_name_or_path: the directory that ``ttscompile convert`` wrote, or a repository with its files.
+            config: of the policy; None reads its ``config.json``.
+            options: as ``PreTrainedPolicy.from_pretrained`` takes them; those of the hub go to the hub.
+        """
+        hub = {
+            key: options[key]
+            for key in ("cache_dir", "force_download", "local_files_only", "revision", "token")
+            if key in options
+        }
+        if config is None:
+            config = PreTrainedConfig.from_pretrained(pretrained_name_or_path, **hub)
+        directory = Path(pretrained_name_or_path)
+        if not directory.is_dir():
+            from huggingface_hub import snapshot_download
+
+            directory = Path(snapshot_download(str(pretrained_name_or_path), **hub))
+        assert isinstance(config, TtscompileConfig)
+        return cls(config, directory).eval()
+
+    def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
+        """The artifact as it is, with this configuration; there are no weights that could have changed."""
+        shutil.copytree(self._directory, save_directory, dirs_exist_ok=True)
+        self.config._save_pretrained(save_directory)
+
+    def reset(self) -> None:
+        """A new episode."""
+        self._policy.reset()
+
+    def select_action(self, batch: dict[str, Tensor], noise: Tensor | None = None) -> Tensor:
+        """The next action ``[B, Da]``, in the units of the robot.
+
+        Args:
+            batch: one frame of every stream by key, in the units of the robot; keys that are not the policy's are left
+                alone.
+            noise: ``[B, T, D]`` that a chunk starts from, if this call computes one; None draws it.
+        """
+        drawn = None if self._policy.queued else self._noise(batch, noise)
+        return self._policy.select_action(batch, drawn)  # type: ignore[no-any-return]
+
+    def predict_action_chunk(
+        self,
+        batch: dict[str, Tensor],
+        noise: Tensor | None = None,
+        inference_delay: int | None = None,
+        prev_chunk_left_over: Tensor | None = None,
+    ) -> Tensor:
+        """A chunk of actions ``[B, Ta, Da]``, in the units of the robot.
+
+        Args:
+            batch: as ``select_action`` takes it.
+            noise: ``[B, T, D]`` that the chunk starts from; None draws it.
+            inference_delay: actions that the robot executes while this call computes.
+            prev_chunk_left_over: what is left of the chunk before, ``[N, Da]`` or ``[B, N, Da]``, padded with zeros.
+                Its first ``inference_delay`` actions are kept in the new chunk, and the rest of that is inpainted to
+                them (``predict_action(prefix=)``). Those after them have no influence: this is not LeRobot's guidance.
+        """
+        prefix = _committed(inference_delay, prev_chunk_left_over)
+        return self._policy.predict_action_chunk(batch, self._noise(batch, noise), prefix=prefix)  # type: ignore[no-any-return]
+
+    def supports_rtc(self) -> bool:
+        """Whether chunks can be joined to what is executed meanwhile; if not, the log says why."""
+        info = self._policy.info
+        reason = info.prefix_refusal
+        if reason is None and any(spec.frames not in (None, 1) for spec in info.observation.values()):
+            reason = (
+                "it observes several frames, and real-time chunking gives it one a chunk: they would lie too far apart."
+            )
+        if reason is not None:
+            logger.warning("%s: no real-time chunking: %s", self._directory, reason)
+        return reason is None
+
+    def forward(self, batch: dict[str, Tensor]) -> NoReturn:
+        """Compiled policies are not trained.
+
+        Raises:
+            NotImplementedError: always.
+        """
+        raise NotImplementedError("a compiled policy is not trained: train the original, and convert it again")
+
+    def get_optim_params(self) -> NoReturn:
+        """Compiled policies are not trained.
+
+        Raises:
+            NotImplementedError: always.
+        """
+        self.forward({})
+
+    def _noise(self, batch: dict[str, Tensor], initial: Tensor | None) -> ttscompile.Noise:
+        """What LeRobot's samplers draw for a chunk: the sample that it starts from, and then step by step."""
+        info = self._policy.info
+        streams = len(batch[next(iter(info.observation))])
+        (horizon, width), predicted = info.original_sample, info.sample[0]
+        shape = (streams, horizon, width)
+        first = torch.randn(shape) if initial is None else initial.cpu()
+        if not info.stochastic:
+            return ttscompile.Noise(first[:, :predicted].numpy())
+        steps = torch.stack([torch.randn(shape) for _ in range(info.K - 1)] + [torch.zeros(shape)])
+        return ttscompile.Noise(first[:, :predicted].numpy(), steps[:, :, :predicted].numpy())
+
+
+def _committed(delay: int | None, left_over: Tensor | None) -> Tensor | None:
+    """The actions ``[B, N, Da]`` that are executed before a chunk can be; None without any.
+
+    LeRobot fills what is left over with zeros up to a fixed length: zeros at its end are nobody's actions.
+    """
+    if not delay or left_over is None:
+        return None
+    left_over = left_over if left_over.ndim == 3 else left_over[None]
+    there = left_over.abs().amax(dim=(0, 2)).nonzero()
+    kept = left_over[:, : min(delay, int(there.max()) + 1 if len(there) else 0)]
+    return kept if kept.shape[1] else None

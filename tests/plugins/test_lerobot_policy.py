@@ -1,0 +1,150 @@
+"""A compiled policy in LeRobot's own commands, against the original there. Runs where lerobot is installed."""
+
+from __future__ import annotations
+
+import json
+import logging
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import ttscompile
+
+from .lerobot_saved import CAMERA, DA, PIXELS, SETTINGS, STATE, save
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore"),  # lerobot's and its packages' own
+    pytest.mark.skipif(
+        find_spec("lerobot") is None or find_spec("lerobot_policy_ttscompile") is None,
+        reason="lerobot and plugins/lerobot_policy_ttscompile are not installed: run 'make test-lerobot'",
+    ),
+]
+ENVIRONMENT = "observation.environment_state"
+FRAMES_APART = "diffusion"
+"""The case that observes two frames."""
+
+
+@pytest.fixture(scope="module", params=SETTINGS)
+def saved(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path, Path]:
+    """A case, the directory that lerobot saved, and the compiled policy."""
+    folder = tmp_path_factory.mktemp("lerobot")
+    directory = save(request.param, folder)
+    ttscompile.convert(directory, folder / "compiled")
+    return request.param, directory, folder / "compiled"
+
+
+def opened(directory: Path) -> tuple[Any, Any, Any]:
+    """Policy, preprocessor and postprocessor, as lerobot-eval opens ``--policy.path``."""
+    from lerobot.configs.policies import PreTrainedConfig
+    from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    register_third_party_plugins()
+    config = PreTrainedConfig.from_pretrained(directory)
+    policy = get_policy_class(config.type).from_pretrained(directory, config=config).eval()
+    overrides = {"device_processor": {"device": "cpu"}, "rename_observations_processor": {"rename_map": {}}}
+    before, after = make_pre_post_processors(config, str(directory), preprocessor_overrides=overrides)
+    return policy, before, after
+
+
+def frame(tick: int, policy: Any, streams: int = 2) -> dict[str, Any]:
+    """What an environment measures."""
+    rng = np.random.default_rng(tick)
+    task = ["push the block", "pull it"][tick // 10 % 2]
+    found = {STATE: rng.standard_normal((streams, 4)), "task": [task] * streams}
+    if CAMERA in policy.config.input_features:
+        found[CAMERA] = rng.random((streams, 3, PIXELS, PIXELS))
+    if ENVIRONMENT in policy.config.input_features:
+        found[ENVIRONMENT] = rng.standard_normal((streams, 3))
+    return {key: torch.tensor(value, dtype=torch.float32) if key != "task" else value for key, value in found.items()}
+
+
+def driven(directory: Path) -> np.ndarray:
+    """The actions of two episodes of ten ticks, by lerobot-eval's own order of calls."""
+    policy, before, after = opened(directory)
+    torch.manual_seed(0)
+    actions = []
+    for tick in range(20):
+        if tick % 10 == 0:
+            policy.reset()
+        with torch.inference_mode():
+            actions.append(after(policy.select_action(before(frame(tick, policy)))))
+    return torch.stack(actions).numpy()
+
+
+def test_the_compiled_policy_acts_as_the_original_does(saved: tuple[str, Path, Path]) -> None:
+    """From the environment's frames and the same seed, over chunks, episodes, streams and instructions."""
+    _, original, compiled = saved
+    expected, found = driven(original), driven(compiled)
+    assert np.ptp(expected) > 0.3 and found.shape == (20, 2, DA)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5 * np.abs(expected).max())
+
+
+def test_a_chunk_is_the_originals_for_the_same_noise(saved: tuple[str, Path, Path]) -> None:
+    case, original, compiled = saved
+    if "one frame" not in case:
+        pytest.skip("the original takes no noise, or its frames from a queue that select_action alone fills")
+    chunks, noise = [], torch.randn(1, 8, DA, generator=torch.Generator().manual_seed(3))
+    for directory in (original, compiled):
+        policy, before, after = opened(directory)
+        batch = before(frame(1, policy, streams=1))
+        if directory == original:  # which takes windows here
+            batch = {key: value[:, None] if key.startswith("observation.") else value for key, value in batch.items()}
+        torch.manual_seed(7)
+        with torch.inference_mode():
+            chunks.append(after(policy.predict_action_chunk(batch, noise)).numpy())
+    assert chunks[1].shape == (1, 4, DA)
+    np.testing.assert_allclose(chunks[1], chunks[0], rtol=0, atol=1e-5 * np.abs(chunks[0]).max())
+
+
+def test_committed_actions_are_kept_and_padding_is_none(
+    saved: tuple[str, Path, Path], caplog: pytest.LogCaptureFixture
+) -> None:
+    """As lerobot's real-time chunking calls it: what is left of a chunk, cut or padded with zeros to a fixed length."""
+    from lerobot.rollout.inference.rtc import supports_rtc_inference
+
+    case, _, compiled = saved
+    policy, before, _ = opened(compiled)
+    with caplog.at_level(logging.WARNING):
+        assert supports_rtc_inference(policy) == (case != FRAMES_APART)
+    assert ("it observes several frames" in caplog.text) == (case == FRAMES_APART)
+    batch, noise = before(frame(0, policy, streams=1)), torch.randn(1, 8, DA)
+    free = policy.predict_action_chunk(batch, noise)
+    left_over = torch.cat([free[0, 1:] + 0.05, torch.zeros(3, DA)])
+
+    def chunk(delay: int | None, rest: torch.Tensor | None) -> torch.Tensor:
+        torch.manual_seed(0)
+        policy.reset()
+        return policy.predict_action_chunk(batch, noise, inference_delay=delay, prev_chunk_left_over=rest)  # type: ignore[no-any-return]
+
+    without = chunk(None, None)
+    for delay, rest in ((0, left_over), (2, None), (2, left_over[3:])):
+        assert torch.equal(chunk(delay, rest), without), "nothing is committed"
+    joined = chunk(2, left_over)
+    torch.testing.assert_close(joined[0, :2], left_over[:2], rtol=1e-5, atol=1e-5)
+    assert not torch.allclose(joined[0, 2:], without[0, 2:])
+    assert torch.equal(chunk(5, left_over), chunk(3, left_over)), "no more is left over"
+
+
+def test_it_is_saved_as_it_is_and_not_trained(saved: tuple[str, Path, Path], tmp_path: Path) -> None:
+    from lerobot.policies.factory import make_policy_config
+
+    _, _, compiled = saved
+    policy, _, _ = opened(compiled)
+    policy.config.threads = 2
+    policy.save_pretrained(tmp_path / "copy")
+    again, _, _ = opened(tmp_path / "copy")
+    assert again.config.threads == 2 and again._policy.info.identity == policy._policy.info.identity
+    with pytest.raises(NotImplementedError, match="train the original"):
+        policy.forward({})
+    with pytest.raises(ValueError, match=r"not made from scratch.*--policy.path"):
+        type(policy)(make_policy_config("ttscompile", device="cpu"))
+    config = json.loads((tmp_path / "copy" / "config.json").read_text())
+    config["input_features"]["observation.more"] = {"type": "STATE", "shape": [1]}
+    (tmp_path / "copy" / "config.json").write_text(json.dumps(config))
+    with pytest.raises(ValueError, match=r"observes \[.*'observation.more'.*convert the checkpoint again"):
+        opened(tmp_path / "copy")

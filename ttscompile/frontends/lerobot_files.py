@@ -1,0 +1,79 @@
+"""What LeRobot looks for in a policy's directory, for a compiled one: its configuration, and processors.
+
+With these files beside it, an artifact is a policy of the type ``ttscompile``, which the package
+``lerobot_policy_ttscompile`` registers. It takes what the robot measures, so its processors normalise nothing: they
+make batches, and tokens of the instruction where that is an input.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ..core.spec import PolicySpec
+from .lerobot_config import ACTION, CONFIG
+from .lerobot_processors import POSTPROCESSOR, PREPROCESSOR
+from .settings import read_json
+
+LANGUAGE = "observation.language."
+"""Beginning of the keys that LeRobot's tokenizer makes of an instruction."""
+
+_TEXT = {
+    "tokenizer_processor": "tokenizer_processor",
+    "smolvla_new_line_processor": "smolvla_new_line_processor",
+    "pi0_new_line_processor": "smolvla_new_line_processor",
+}
+"""Steps that work on the instruction, by the name that lerobot knows without the modules of their policies."""
+
+
+def lerobot_files(directory: Path, spec: PolicySpec) -> dict[str, bytes]:
+    """The files of a compiled policy by name; the same policy gives the same bytes.
+
+    Args:
+        directory: that lerobot saved the original to, which was read.
+        spec: of the compiled policy.
+    """
+    entries = read_json(directory / CONFIG)
+    steps = read_json(directory / PREPROCESSOR)["steps"]
+    renamed = {
+        new: old
+        for step in steps
+        if step.get("registry_name") == "rename_observations_processor"
+        for old, new in step.get("config", {}).get("rename_map", {}).items()
+    }
+    features = {renamed.get(key, key): feature for key, feature in entries["input_features"].items()}
+    config = {
+        "type": "ttscompile",
+        "n_obs_steps": max(one.frames or 1 for one in spec.observations.values()),
+        "n_action_steps": spec.chunk.stop - spec.chunk.start,
+        "input_features": {key: feature for key, feature in features.items() if key in spec.observations},
+        "output_features": {ACTION: entries["output_features"][ACTION]},
+        "device": "cpu",
+    }
+    tokens = [one.shape[-1] for key, one in spec.observations.items() if key.startswith(LANGUAGE)]
+    before = [_step("rename_observations_processor", rename_map={}), _step("to_batch_processor")]
+    before += [_text_step(step, tokens[0]) for step in steps if tokens and step.get("registry_name") in _TEXT]
+    device = _step("device_processor", device="cpu", float_dtype=None)
+    return {
+        CONFIG: _dump(config),
+        PREPROCESSOR: _dump({"name": "policy_preprocessor", "steps": [*before, device]}),
+        POSTPROCESSOR: _dump({"name": "policy_postprocessor", "steps": [device]}),
+    }
+
+
+def _step(name: str, **config: Any) -> dict[str, Any]:
+    return {"registry_name": name, "config": config}
+
+
+def _text_step(step: Mapping[str, Any], tokens: int) -> dict[str, Any]:
+    """A step on the instruction, as the original has it; the compiled policy takes so many tokens, and no fewer."""
+    name, config = _TEXT[step["registry_name"]], dict(step.get("config", {}))
+    if name == "tokenizer_processor":
+        config |= {"max_length": tokens, "padding": "max_length"}
+    return _step(name, **config)
+
+
+def _dump(document: object) -> bytes:
+    return json.dumps(document, indent=2).encode() + b"\n"
