@@ -14,8 +14,7 @@ import torch
 
 import ttscompile
 from tests.once import Once
-from ttscompile.core.images import fitted
-from ttscompile.core.spec import Noise, PolicySpec
+from ttscompile.core.spec import Noise
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
@@ -23,7 +22,7 @@ from ttscompile.frontends.families import LoadOptions
 
 from ..families.support import record
 from .lerobot_tiny import change_json
-from .vlas import CAMERAS, MASK, STATE, TOKENS, Array, arrays, frame
+from .vlas import CAMERAS, MASK, STATE, TOKENS, Array, arrays, as_given, frame
 
 SIZE = (96, 128)
 """Of the golden images, height and width."""
@@ -65,11 +64,6 @@ def eager(directory: Path, given: Mapping[str, Array], batch: Mapping[str, Array
     module, spec = load_checkpoint_policy(directory, options=options)
     obs = {key: torch.from_numpy(as_given(key, batch, spec)) for key in spec.observations}
     return spec.chunk.unnormalized(eager_policy(module, spec)(obs, Noise(given["noise"])).numpy())
-
-
-def as_given(key: str, batch: Mapping[str, Array], spec: PolicySpec) -> Array:
-    own = spec.observations[key]
-    return fitted(batch[key] if own.frames is None else batch[key][:, None], own)
 
 
 @pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
@@ -179,6 +173,14 @@ def test_a_processor_or_a_language_model_that_is_missing(directory: Path, tmp_pa
     with pytest.raises(CheckpointError, match="language model 'smolvlm-tiny' is not on this machine"):
         ttscompile.convert(policy, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_policy_that_exceeds_the_memory_is_refused_before_work(
+    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ttscompile.frontends.saved_weights.memory_bytes", lambda: 5 * 2**20)
+    with pytest.raises(CheckpointError, match=r"million weights.* takes about 0\.0 GiB .*; this machine has 0\.0 GiB"):
+        ttscompile.convert(directory, tmp_path / "out")
 
 
 def test_a_path_of_this_machine_is_found(directory: Path, tmp_path: Path) -> None:

@@ -8,6 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ttscompile.core.images import fitted
+from ttscompile.core.spec import PolicySpec
+
 STATE = "observation.state"
 TOKENS, MASK = "observation.language.tokens", "observation.language.attention_mask"
 CAMERAS = ("observation.images.front", "observation.images.wrist")
@@ -30,6 +33,12 @@ def frame(given: Mapping[str, Array], size: tuple[int, int]) -> dict[str, Array]
         other = np.random.RandomState(seed).uniform(0, 1, (3, *size)).astype(np.float32)
         found[key] = given[key] if own else other
     return found
+
+
+def as_given(key: str, batch: Mapping[str, Array], spec: PolicySpec) -> Array:
+    """One observation of a batch as the network is given it."""
+    own = spec.observations[key]
+    return fitted(batch[key] if own.frames is None else batch[key][:, None], own)
 
 
 def processed(directory: str, raw: Mapping[str, Any], task: str) -> tuple[dict[str, Any], Callable[[Any], Any]]:

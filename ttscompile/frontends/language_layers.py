@@ -69,7 +69,7 @@ class Attention(nn.Module):
 
     def __init__(self, config: LanguageConfig, source: int | None = None) -> None:
         super().__init__()
-        self.channels, self.repeats = config.channels, config.heads // config.groups
+        self.channels, self.groups, self.repeats = config.channels, config.groups, config.heads // config.groups
         queries, keys = config.heads * config.channels, config.groups * config.channels
         self.q_proj = nn.Linear(config.width, queries, bias=False)
         self.k_proj = nn.Linear(source or config.width, keys, bias=False)
@@ -81,8 +81,8 @@ class Attention(nn.Module):
         return x.reshape(*x.shape[:2], -1, self.channels).transpose(1, 2)
 
     def for_all_heads(self, x: Tensor) -> Tensor:
-        """``[B, groups, T, channels]`` -> ``[B, heads, T, channels]``."""
-        return x if self.repeats == 1 else x.repeat_interleave(self.repeats, dim=1)
+        """``[B, groups, T, channels]`` -> ``[B, heads, T, channels]``; one group is for all heads as it is."""
+        return x if 1 in (self.repeats, self.groups) else x.repeat_interleave(self.repeats, dim=1)
 
     def attend(self, q: Tensor, seen: Seen, mask: Tensor) -> Tensor:
         """``q [B, heads, T, channels]``, and ``mask`` that is added to the scores -> ``[B, T, width]``."""

@@ -25,9 +25,11 @@ PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.
 _RENAME, _TOKENIZE, _NORMALIZE = "rename_observations_processor", "tokenizer_processor", "normalizer_processor"
 _UNNORMALIZE, _BATCH, _DEVICE = "unnormalizer_processor", "to_batch_processor", "device_processor"
 _NEW_LINE = ("smolvla_new_line_processor", "pi0_new_line_processor")
+_PROMPT = "pi05_prepare_state_tokenizer_processor_step"
+_RELATIVE, _ABSOLUTE = "relative_actions_processor", "absolute_actions_processor"
 _KNOWN_STEPS: Mapping[str, frozenset[str]] = {
-    PREPROCESSOR: frozenset({_RENAME, _BATCH, _TOKENIZE, _DEVICE, _NORMALIZE, *_NEW_LINE}),
-    POSTPROCESSOR: frozenset({_BATCH, _DEVICE, _UNNORMALIZE}),
+    PREPROCESSOR: frozenset({_RENAME, _BATCH, _TOKENIZE, _DEVICE, _NORMALIZE, *_NEW_LINE, _PROMPT, _RELATIVE}),
+    POSTPROCESSOR: frozenset({_BATCH, _DEVICE, _UNNORMALIZE, _ABSOLUTE}),
 }
 _ONCE = frozenset({_RENAME, _TOKENIZE, _NORMALIZE, _UNNORMALIZE})
 
@@ -177,6 +179,11 @@ def _steps(directory: Path, name: str) -> list[dict[str, Any]]:
         if registered == _DEVICE and step["config"].get("float_dtype") not in (None, "float32"):
             found = f"{registered}.float_dtype is {step['config']['float_dtype']!r:.80}"
             raise CheckpointError(f"{path}: {found}; expected null or float32, in which the compiled policy computes.")
+        if registered in (_RELATIVE, _ABSOLUTE) and step["config"].get("enabled") is not False:
+            raise CheckpointError(
+                f"{path}: {registered} is enabled: actions are relative to the state, which is not compiled. Expected"
+                " a policy of absolute actions."
+            )
     order = [step["registry_name"] for step in steps]
     twice = sorted(kind for kind in _ONCE if order.count(kind) > 1)
     if twice:

@@ -24,6 +24,7 @@ from .lerobot_policy import read_weights
 from .lerobot_vla import (
     Gathered,
     padded_size,
+    positive_number,
     read_vla_config,
     read_vla_processors,
     require_square,
@@ -120,7 +121,7 @@ def read_config(shared: LeRobotConfig, model: Settings) -> SmolVLAConfig:
     if heads % language.groups or language.channels % 2:
         raise text.error(f"{heads} heads of {language.channels} channels do not fit {language.groups} of keys")
     expert, scale = (
-        expert_of(language, _number(settings, "expert_width_multiplier", 0.75)),
+        expert_of(language, positive_number(settings, "expert_width_multiplier", 0.75)),
         model.number("scale_factor", 2),
     )
     if not 2 <= expert.width <= MOST or expert.width % 2:
@@ -135,7 +136,7 @@ def read_config(shared: LeRobotConfig, model: Settings) -> SmolVLAConfig:
         crosses=_crosses(settings, layers),
         state=padded_size(settings, "max_state_dim", shared.state_dim),
         actions=padded_size(settings, "max_action_dim", shared.action_dim),
-        periods=(_number(settings, "min_period", 4e-3), _number(settings, "max_period", 4.0)),
+        periods=(positive_number(settings, "min_period", 4e-3), positive_number(settings, "max_period", 4.0)),
     )
 
 
@@ -170,13 +171,6 @@ def _crosses(settings: Settings, layers: int) -> tuple[bool, ...]:
     if type(every) is not int:
         raise settings.refusal("self_attn_every_n_layers", "a whole number")
     return tuple(crossing and not (every > 0 and i % every == 0) for i in range(layers))
-
-
-def _number(settings: Settings, name: str, default: float) -> float:
-    value = settings.values.get(name, default)
-    if type(value) not in (int, float) or not 0 < value < 2**31:
-        raise settings.refusal(name, "a positive number", default)
-    return float(value)
 
 
 def _language_model(name: str, folders: list[Path]) -> Settings:

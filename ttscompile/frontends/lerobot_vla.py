@@ -134,6 +134,18 @@ def padded_size(settings: Settings, name: str, own: int) -> int:
     return size
 
 
+def positive_number(settings: Settings, name: str, default: float) -> float:
+    """A positive number.
+
+    Raises:
+        CheckpointError: it is not.
+    """
+    value = settings.values.get(name, default)
+    if type(value) not in (int, float) or not 0 < value < 2**31:
+        raise settings.refusal(name, "a positive number", default)
+    return float(value)
+
+
 class Gathered(nn.Module):
     """What the robot measures to what a prefix reads.
 
@@ -141,30 +153,32 @@ class Gathered(nn.Module):
         config: of the policy.
         processors: its normalisers, and the robot's names of the observations.
         prefix: takes images, tokens, their mask and the state.
-        state: numbers of the state, padded.
+        state: numbers of the state, padded; None where the instruction holds it.
         task: tokens int64 ``[1, L]`` of the one instruction that is compiled in; None where it is an input.
     """
 
     task: Tensor | None
 
     def __init__(
-        self, config: LeRobotConfig, processors: Processors, prefix: nn.Module, state: int, task: Tensor | None
+        self, config: LeRobotConfig, processors: Processors, prefix: nn.Module, state: int | None, task: Tensor | None
     ) -> None:
         super().__init__()
         names = {key: processors.renamed.get(key, key).replace(".", "_") for key in config.features}
         self.images, self.state = [names[key] for key in config.cameras], names[STATE]
         self.normalizer = Normalizer(processors.normalizers.get(STATE))
-        self.prefix, self.missing = prefix, state - config.state_dim
+        self.prefix, self.missing = prefix, None if state is None else state - config.state_dim
         self.register_buffer("task", task, persistent=False)
 
     def forward(self, observations: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
         """Observations ``[B, 1, ...]`` by argument, the instruction without a frame."""
         images = [observations[name][:, -1] * 2 - 1 for name in self.images]
-        state = functional.pad(self.normalizer(observations[self.state])[:, -1], (0, self.missing))
+        state = None
+        if self.missing is not None:
+            state = functional.pad(self.normalizer(observations[self.state])[:, -1], (0, self.missing))
         if self.task is None:
             tokens, mask = (observations[name.replace(".", "_")] for name in (TOKENS, MASK))
         else:
-            tokens = self.task.expand(len(state), -1)
+            tokens = self.task.expand(len(images[0]), -1)
             mask = torch.ones_like(tokens, dtype=torch.bool)
         return self.prefix(images, tokens, mask, state)  # type: ignore[no-any-return]
 
