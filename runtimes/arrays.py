@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ttscompile.core.given import integer, is_tensor, plain
+from ttscompile.core.images import fitted
 from ttscompile.core.spec import FloatArray, Noise, ObservationSpec, PolicySpec
 from ttscompile.core.values import check_numbers, check_values
 from ttscompile.errors import ObservationError, TtscompileError
@@ -49,7 +50,8 @@ def read_observation(
         others: leave keys alone that are not the policy's, rather than refuse them.
 
     Returns:
-        The arrays, not checked; and the first of them that came as a tensor, as it came, or None.
+        The arrays, images resized where the policy does that, and not checked; and the first of them that came as a
+        tensor, as it came, or None.
 
     Raises:
         ObservationError: no mapping, another set of keys, or what ``plain`` refuses.
@@ -65,7 +67,8 @@ def read_observation(
         raise ObservationError(f"expected the observation keys {sorted(specs)}; found {found}. {remedy}")
     example = next((value for value in given.values() if is_tensor(value)), None)
     arrays = {
-        key: plain(value, f"observation {key!r}", ObservationError, specs[key].dtype) for key, value in given.items()
+        key: fitted(plain(value, f"observation {key!r}", ObservationError, specs[key].dtype), specs[key])
+        for key, value in given.items()
     }
     return arrays, example
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -73,6 +73,7 @@ def convert(
     spacing: str | None = None,
     task: str | None = None,
     encoders: str | os.PathLike[str] | None = None,
+    without_cameras: Sequence[str] | None = None,
     prediction_horizon: int | None = None,
     precision: str = FP32,
     single_file: str | os.PathLike[str] | None = None,
@@ -93,8 +94,10 @@ def convert(
             ``trailing``, or ``leading`` for a policy that predicts noise without a bound on the sample.
         task: of a LeRobot policy: the one instruction that is compiled in, so that the robot needs no tokenizer; None
             makes its tokens an observation.
-        encoders: of a LeRobot policy: folder with its CLIP encoders' configurations, where they are neither in nor
-            beside the checkpoint. Nothing is ever downloaded.
+        encoders: of a LeRobot policy: folder with its CLIP encoders' or language model's configuration (and tokenizer,
+            for ``task``), where they are neither in nor beside the checkpoint. Nothing is ever downloaded.
+        without_cameras: of a vision-language-action model: names of cameras that it was trained with and that the robot
+            lacks. None leaves out only those that lerobot calls empty.
         prediction_horizon: predict only the first so many steps of the policy's horizon; see ``compile_denoiser``.
         precision: of the weights of residual blocks: ``fp32`` or ``int8``; see ``compile_denoiser``.
         single_file: where one ONNX file of the whole call goes too, for programs without ttscompile; None for none.
@@ -107,7 +110,9 @@ def convert(
     if precision != FP32:
         require_precision(precision)  # before minutes of work
     require_replaceable(directory)
-    options = LoadOptions(sampler=sampler, steps=steps, spacing=spacing, task=task, encoders=encoders)
+    options = LoadOptions(
+        sampler=sampler, steps=steps, spacing=spacing, task=task, encoders=encoders, without_cameras=without_cameras
+    )
     module, spec = load_checkpoint_policy(checkpoint, format, options)
     beside = files_beside(checkpoint, spec)
     return _compile(module, spec, directory, prediction_horizon, precision, single_file, explain, beside)

@@ -3,6 +3,7 @@
     python examples/benchmark/large.py [--layers 16] [--width 1024] [--output DIR]
     python examples/benchmark/large.py --unet 512,1024,2048 --horizon 64        # LeRobot's U-Net
     python examples/benchmark/large.py --unet 256,512,1024 --horizon 16         # Diffusion Policy's
+    python examples/benchmark/large.py --smolvla                                # LeRobot's SmolVLA, whole
 
 The transformer is an ordinary DiT with adaLN-Zero. Both have 14 actions and an observation vector of 64 numbers, and
 four steps. Converting and running are two processes, so that each has its own peak of resident memory.
@@ -74,6 +75,64 @@ def convert(folder: Path, network: nn.Module, horizon: int) -> None:
         np.save(folder / "expected.npy", eager().numpy())
 
 
+def convert_smolvla(folder: Path) -> None:
+    """Save a SmolVLA of its real size, as lerobot does, and convert it."""
+    import large_smolvla
+
+    import ttscompile
+
+    large_smolvla.save(folder / "smolvla")
+    print(f"{peak():5.2f} GiB before compiling")
+    start = last = time.perf_counter()
+
+    def explain(stage: str, notes: tuple[str, ...]) -> None:
+        nonlocal last
+        now = time.perf_counter()
+        print(f"{now - last:7.1f} s  {peak():5.2f} GiB  {stage}: {notes[0] if notes else ''}", flush=True)
+        last = now
+
+    ttscompile.convert(folder / "smolvla", folder / "compiled", precision="int8", explain=explain)
+    print(f"{time.perf_counter() - start:7.1f} s  {peak():5.2f} GiB  in all")
+
+
+def run_smolvla(folder: Path, rounds: int = 5) -> None:
+    """One call after the other, in turn: eager, dense, with weights of eight bits, and two of ten steps."""
+    import large_smolvla
+    import numpy as np
+    import torch
+
+    import ttscompile
+    from ttscompile.frontends import load_checkpoint_policy
+
+    torch.set_num_threads(1)
+    module, spec = load_checkpoint_policy(folder / "smolvla")
+    eager = large_smolvla.eager(module, spec)
+    policies = {name: ttscompile.load(folder / "compiled", precision=name) for name in ("fp32", "int8")}
+    info = policies["fp32"].info
+    obs, noise = large_smolvla.call(spec)
+    few = np.full((info.K, len(info.blocks)), ttscompile.Source.TIMESTEP, np.int8)
+    few[0] = few[info.K // 2] = ttscompile.Source.COMPUTE
+    calls = {"dense": ("fp32", "dense"), "blocks in int8": ("int8", "dense"), "2 of 10 steps": ("fp32", few)}
+    times: dict[str, list[list[float]]] = {}
+    for _ in range(rounds + 1):  # the first does not count
+        expected, parts = eager()
+        times.setdefault("eager: vision, prefix, loop", []).append(parts)
+        for name, (precision, plan) in calls.items():
+            policy = policies[precision]
+            found = policy.predict_action(obs, noise=noise, plan=plan)["action"]
+            report = policy.last_report
+            times.setdefault(f"{name}: prologue, loop", []).append(
+                [report.timings.prologue / 1e3, report.timings.decode / 1e3]
+            )
+            if name == "dense":
+                error = float(np.abs(found - expected).max())
+    for name, rows in times.items():
+        medians = [statistics.median(each) for each in zip(*rows[1:], strict=True)]
+        total = statistics.median(sum(row) for row in rows[1:])
+        print(f"{total:8.2f} s  {name}: {', '.join(f'{each:.2f}' for each in medians)}")
+    print(f"{error:8.1e}  the dense call from eager; {peak():.2f} GiB at most while three of them were loaded")
+
+
 def run(folder: Path) -> None:
     """Load what was written and run one dense call."""
     import numpy as np
@@ -109,11 +168,14 @@ def main() -> None:
     parser.add_argument("--layers", type=int, default=16)
     parser.add_argument("--width", type=int, default=1024)
     parser.add_argument("--unet", help="channels of the levels of a U-Net, in place of the transformer")
+    parser.add_argument("--smolvla", action="store_true", help="LeRobot's SmolVLA, in place of the transformer")
     parser.add_argument("--horizon", type=int, default=32, help="actions of a chunk")
     parser.add_argument("--output", type=Path, help="a folder to keep the artifact in; a temporary one otherwise")
     parser.add_argument("--only", choices=["convert", "run"], help=argparse.SUPPRESS)
     options = parser.parse_args()
-    if options.only == "convert":
+    if options.smolvla and options.only is not None:
+        (convert_smolvla if options.only == "convert" else run_smolvla)(options.output)
+    elif options.only == "convert":
         from large_networks import transformer, unet
 
         levels = None if options.unet is None else [int(width) for width in options.unet.split(",")]
@@ -127,6 +189,7 @@ def main() -> None:
             folder.mkdir(parents=True, exist_ok=True)
             for part in ("convert", "run"):
                 own = [f"--layers={options.layers}", f"--width={options.width}", f"--horizon={options.horizon}"]
+                own += ["--smolvla"] * options.smolvla
                 own += [] if options.unet is None else [f"--unet={options.unet}"]
                 subprocess.run([sys.executable, __file__, *own, f"--output={folder}", f"--only={part}"], check=True)
 

@@ -260,7 +260,7 @@ def test_missing_statistics_are_said(tmp_path: Path) -> None:
         load_checkpoint_policy(directory)
 
 
-@pytest.mark.parametrize("kind", ["act", "smolvla", "pi0", "groot", "pi0_fast", "something_new"])
+@pytest.mark.parametrize("kind", ["act", "xvla", "groot", "pi0_fast", "something_new"])
 def test_other_policies_are_refused_by_name(tmp_path: Path, kind: str) -> None:
     """Each with what can be done instead."""
     directory = save_policy(tmp_path)

@@ -19,7 +19,7 @@ from ..ir.pieces import OF_ALL_BLOCKS, PRUNER
 from ..ir.program import Binding
 
 FORMAT = "ttscompile artifact"
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 MANIFEST = "manifest.json"
 DENSE = "dense"
 """The plan that computes every cell; every artifact has it without listing it."""

@@ -57,7 +57,16 @@ from ttscompile.report.summary import document
 @click.option(
     "--encoders",
     type=FOLDER,
-    help="LeRobot: folder with the CLIP encoders' config.json, if not in or beside CHECKPOINT. Nothing is downloaded.",
+    help="LeRobot: folder with config.json of CLIP or of the language model (and tokenizer.json, for --task), if not in"
+    " or beside CHECKPOINT. Nothing is downloaded.",
+)
+@click.option(
+    "--without-camera",
+    "without_cameras",
+    type=ANY_TEXT,
+    multiple=True,
+    callback=lambda context, option, given: given or None,
+    help="LeRobot's vision-language-action models: a camera of the checkpoint that the robot lacks; may be repeated.",
 )
 @count_option(
     "--prediction-horizon",

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -177,6 +177,8 @@ class ObservationSpec:
         bounds: the range of the values that random observations are drawn from, low and high, each a number or one for
             each entry of the last axis; None if that is not known. Integers outside it are refused: they are rows of an
             embedding. So are images (``image``). A vector may stray from it. Kept as tuples.
+        fit: of an image: one of another size is resized to this shape with its proportions (``core.images``). What is
+            left is black: ``start``, at the top and the left; ``centre``, on both sides. None: no other size is taken.
     """
 
     shape: tuple[Positive, ...]
@@ -184,6 +186,7 @@ class ObservationSpec:
     dtype: DType = "float32"
     window: bool = True
     bounds: tuple[float | tuple[float, ...], float | tuple[float, ...]] | None = None
+    fit: Literal["start", "centre"] | None = None
 
     def __post_init__(self) -> None:
         sizes = tuple(integer(n, "a size in an observation's shape", SpecError, 1) for n in self.shape)
@@ -202,6 +205,8 @@ class ObservationSpec:
                     f" of {self.shape[-1]}; found {self.bounds}."
                 )
             object.__setattr__(self, "bounds", (tuple(low.tolist()), tuple(high.tolist())))
+        if self.fit is not None and not self.image:
+            raise SpecError(f"fit is for images with bounds; found an observation of shape {self.shape}.")
 
     @property
     def frames(self) -> int | None:

@@ -9,7 +9,7 @@ Source: Radford et al., Learning Transferable Visual Models From Natural Languag
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -24,6 +24,11 @@ from .settings import Settings, read_json
 _MOST = {"num_hidden_layers": 512, "image_size": 4096, "patch_size": 4096}
 _MOST_OTHERWISE = 2**20
 _MOST_LETTERS = 200
+_ACTIVATIONS: Mapping[str, Callable[[torch.Tensor], torch.Tensor]] = {
+    "quick_gelu": lambda x: x * torch.sigmoid(1.702 * x),
+    "gelu": functional.gelu,
+    "gelu_pytorch_tanh": lambda x: functional.gelu(x, approximate="tanh"),
+}
 
 NAME_FOLDER = "Name the folder that has it: encoders= in Python, --encoders on the command line."
 
@@ -37,7 +42,7 @@ class TowerConfig:
         intermediate_size: width inside the feed-forward layers.
         num_hidden_layers: layers.
         num_attention_heads: attention heads.
-        hidden_act: ``quick_gelu`` or ``gelu``.
+        hidden_act: ``quick_gelu``, ``gelu``, or ``gelu_pytorch_tanh``, which approximates it.
         layer_norm_eps: of every layer normalisation.
     """
 
@@ -53,7 +58,7 @@ class TowerConfig:
         for field in fields(self):
             if field.type == "int":
                 settings.number(field.name, most=_MOST.get(field.name, _MOST_OTHERWISE))
-        settings.choice("hidden_act", "quick_gelu", "gelu")
+        settings.choice("hidden_act", *_ACTIVATIONS)
         if self.hidden_size % self.num_attention_heads:
             raise settings.refusal("hidden_size", f"a multiple of num_attention_heads = {self.num_attention_heads}")
         if not isinstance(self.layer_norm_eps, float) or not 0 < self.layer_norm_eps < 1:
@@ -122,11 +127,14 @@ RELEASED: Mapping[str, Mapping[str, Any]] = {
 Tower = TypeVar("Tower", bound=TowerConfig)
 
 
-def find_encoder(name: str, folders: Sequence[Path]) -> Path | None:
+def find_encoder(name: str, folders: Sequence[Path], kind: str = "clip") -> Path | None:
     """The local directory of an encoder: ``name``, or its last part, in one of ``folders``, or one of them itself.
 
-    The name is as the policy's configuration says it: ``openai/clip-vit-base-patch16``, or a path of the machine that
-    trained it, which may be this one. The folders go first, so that a copy beside the policy is the one that is read.
+    Args:
+        name: as the policy's configuration says it: ``openai/clip-vit-base-patch16``, or a path of the machine that
+            trained it, which may be this one.
+        folders: where to look. They go first, so that a copy beside the policy is the one that is read.
+        kind: how the ``model_type`` of its ``config.json`` begins.
     """
     given = Path(name)
     if max(map(len, given.parts), default=0) > _MOST_LETTERS:
@@ -140,7 +148,7 @@ def find_encoder(name: str, folders: Sequence[Path]) -> Path | None:
         for candidate in (*(folder / each for each in names if each), folder):
             path = candidate / "config.json"
             # The policy's own directory has one, too.
-            if path.is_file() and str(read_json(path).get("model_type")).startswith("clip"):
+            if path.is_file() and str(read_json(path).get("model_type")).startswith(kind):
                 return candidate
     return None
 
@@ -199,17 +207,16 @@ class _SelfAttention(nn.Module):
 
 
 class _FeedForward(nn.Module):
-    """With ``quick_gelu``, which is ``x * sigmoid(1.702 x)``, or the exact ``gelu`` between its two layers."""
+    """Two linear layers, and the activation between them."""
 
     def __init__(self, config: TowerConfig) -> None:
         super().__init__()
         self.fc1 = nn.Linear(config.hidden_size, config.intermediate_size)
-        self.quick = config.hidden_act == "quick_gelu"
+        self.activation = config.hidden_act
         self.fc2 = nn.Linear(config.intermediate_size, config.hidden_size)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        x = self.fc1(x)
-        return self.fc2(x * torch.sigmoid(1.702 * x) if self.quick else functional.gelu(x))  # type: ignore[no-any-return]
+        return self.fc2(_ACTIVATIONS[self.activation](self.fc1(x)))  # type: ignore[no-any-return]
 
 
 class _Layer(nn.Module):
@@ -227,7 +234,9 @@ class _Layer(nn.Module):
         return x + self.mlp(self.layer_norm2(x))  # type: ignore[no-any-return]
 
 
-class _Layers(nn.Module):
+class Layers(nn.Module):
+    """A tower's layers, one after the other; SigLIP has the same."""
+
     def __init__(self, config: TowerConfig) -> None:
         super().__init__()
         self.layers = nn.ModuleList(_Layer(config) for _ in range(config.num_hidden_layers))
@@ -264,7 +273,7 @@ class ClipVision(nn.Module):
         self.embeddings = _VisionEmbeddings(config)
         # The names, spelling included, are those of the weights.
         self.pre_layrnorm = nn.LayerNorm(config.hidden_size, eps=config.layer_norm_eps)
-        self.encoder = _Layers(config)
+        self.encoder = Layers(config)
         self.post_layernorm = nn.LayerNorm(config.hidden_size, eps=config.layer_norm_eps)  # of the pooled output
 
     def forward(self, pixels: torch.Tensor) -> torch.Tensor:
@@ -294,7 +303,7 @@ class ClipText(nn.Module):
         super().__init__()
         self.end = config.eos_token_id
         self.embeddings = _TextEmbeddings(config)
-        self.encoder = _Layers(config)
+        self.encoder = Layers(config)
         self.final_layer_norm = nn.LayerNorm(config.hidden_size, eps=config.layer_norm_eps)
 
     def forward(self, tokens: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:

@@ -7,7 +7,7 @@ list formats and samplers, and say what is wrong with a path or an option, befor
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from importlib import import_module
 from pathlib import Path
@@ -42,6 +42,7 @@ class LoadOptions:
     spacing: str | None = None
     task: str | None = None
     encoders: str | os.PathLike[str] | None = None
+    without_cameras: Sequence[str] | None = None
 
     def __post_init__(self) -> None:
         if self.steps is not None:
@@ -110,7 +111,7 @@ FAMILIES = (
         kind="directory",
         detect=_is_lerobot,
         module="lerobot",
-        options=frozenset({"sampler", "steps", "spacing", "task", "encoders"}),
+        options=frozenset({"sampler", "steps", "spacing", "task", "encoders", "without_cameras"}),
     ),
     Family(
         name="diffusion_policy",

@@ -13,7 +13,7 @@ from typing import Any
 from torch import nn
 
 from ..core.spec import PolicySpec
-from . import lerobot_diffusion, lerobot_multi_task_dit
+from . import lerobot_diffusion, lerobot_multi_task_dit, lerobot_pi, lerobot_smolvla
 from .families import LoadOptions
 from .lerobot_config import CONFIG
 from .refusals import LEROBOT, refuse_policy
@@ -22,6 +22,9 @@ from .settings import read_json
 TYPES: Mapping[str, Callable[[Path, Mapping[str, Any], LoadOptions], tuple[nn.Module, PolicySpec]]] = {
     "diffusion": lerobot_diffusion.load,
     "multi_task_dit": lerobot_multi_task_dit.load,
+    "pi0": lerobot_pi.load,
+    "pi05": lerobot_pi.load,
+    "smolvla": lerobot_smolvla.load,
 }
 """By ``type`` of ``config.json``, whose entries they are given."""
 

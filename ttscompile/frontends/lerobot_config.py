@@ -56,7 +56,13 @@ class LeRobotConfig:
 
 
 def read_lerobot_config(
-    directory: Path, entries: Mapping[str, Any], *, horizon: int, n_action_steps: int, environment: bool
+    directory: Path,
+    entries: Mapping[str, Any],
+    *,
+    horizon: int,
+    n_action_steps: int,
+    environment: bool = False,
+    chunked: bool = False,
 ) -> LeRobotConfig:
     """Check what all types have.
 
@@ -66,6 +72,8 @@ def read_lerobot_config(
         horizon: lerobot's default for this type.
         n_action_steps: the same.
         environment: whether this type reads the state of the environment; if not, it is no observation.
+        chunked: whether the horizon is called ``chunk_size``, one frame is observed, and every camera has a shape of
+            its own: vision-language-action models, which resize images themselves.
 
     Raises:
         CheckpointError: it contradicts itself.
@@ -83,7 +91,9 @@ def read_lerobot_config(
         raise settings.error(f"input_features have no vector {STATE!r}, which this policy needs")
     if others and (list(others) != [ENVIRONMENT] or len(others[ENVIRONMENT]) != 1):
         raise settings.error(f"input_features of the environment are {others!s:.300}; expected one, {ENVIRONMENT!r}")
-    if len(set(cameras.values())) > 1 or any(len(shape) != 3 or shape[0] != 3 for shape in cameras.values()):
+    if (len(set(cameras.values())) > 1 and not chunked) or any(
+        len(shape) != 3 or shape[0] != 3 for shape in cameras.values()
+    ):
         raise settings.error(f"cameras have the shapes {cameras!s:.300}; expected the same [3, height, width] of all")
     if len(cameras) > _MOST_CAMERAS or any(max(shape) > MOST_PIXELS for shape in cameras.values()):
         raise settings.error(
@@ -94,12 +104,16 @@ def read_lerobot_config(
         directory=directory,
         settings=settings,
         features={key: features[key] for key in (STATE, *cameras, *others, ACTION)},
-        n_obs_steps=settings.number("n_obs_steps", 2, MOST_STEPS),
-        horizon=settings.number("horizon", horizon, MOST_STEPS),
+        n_obs_steps=1 if chunked else settings.number("n_obs_steps", 2, MOST_STEPS),
+        horizon=settings.number("chunk_size" if chunked else "horizon", horizon, MOST_STEPS),
         n_action_steps=settings.number("n_action_steps", n_action_steps, MOST),
     )
     if config.n_obs_steps > config.horizon:
         raise settings.error(f"n_obs_steps is longer than the horizon, {config.horizon}")
+    if chunked and config.n_action_steps > config.horizon:
+        raise settings.error(
+            f"n_action_steps is {config.n_action_steps}; expected chunk_size = {config.horizon} at most"
+        )
     return config
 
 

@@ -140,11 +140,11 @@ def _network(settings: Settings, shared: LeRobotConfig, frame: int) -> UNetConfi
 def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
     """Rebuild a policy from its directory and the entries of its ``config.json``; see ``Family.load``."""
     config = read_config(directory, entries)
-    for name in ("task", "encoders"):
+    for name in ("task", "encoders", "without_cameras"):
         if getattr(options, name) is not None:
             raise CheckpointError(
-                f"{directory}: the option {name} is for LeRobot's multi_task_dit; this policy, diffusion, is given no"
-                " instruction and has no CLIP. Leave it out."
+                f"{directory}: the option {name} is for LeRobot's multi_task_dit and vision-language-action models;"
+                " this policy, diffusion, is given no instruction, has no CLIP and needs all its cameras. Leave it out."
             )
     processors = read_processors(directory, config.features)
     weights = read_weights(config, _COUNTER)

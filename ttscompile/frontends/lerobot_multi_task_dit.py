@@ -117,6 +117,10 @@ def _network(settings: Settings, shared: LeRobotConfig) -> DiTConfig:
 def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
     """Rebuild a policy from its directory and the entries of its ``config.json``; see ``Family.load``."""
     config = read_config(directory, entries)
+    if options.without_cameras is not None:
+        raise CheckpointError(
+            f"{directory}: multi_task_dit needs all its cameras. Leave the option without_cameras out."
+        )
     processors = read_processors(directory, config.features)
     folders = [*([] if options.encoders is None else [Path(options.encoders)]), directory, directory.resolve().parent]
     text = encoder_config(config.text_encoder_name, "text_config", TextConfig, folders)

@@ -12,7 +12,7 @@ from .families import LoadOptions
 from .image_geometry import ResizeCrop
 from .lerobot_config import ACTION, CONFIG, WEIGHTS, LeRobotConfig
 from .lerobot_processors import Normalizer, Processors
-from .saved_weights import as_float32, read_tensors
+from .saved_weights import as_float32, read_tensors, require_memory
 from .scheduler import configured_sampler
 
 _SCHEDULER_SETTINGS = {
@@ -122,8 +122,9 @@ def read_weights(config: LeRobotConfig, *without: str) -> dict[str, torch.Tensor
         without: ends of the names of what a network does not need.
 
     Raises:
-        CheckpointError: missing, damaged, or no weights.
+        CheckpointError: missing, damaged, no weights, or more than this machine's memory can compile.
     """
     path = config.directory / WEIGHTS
+    require_memory(path, without)
     saved = {name: value for name, value in read_tensors(path).items() if not name.endswith(without)}
     return as_float32(saved, f"{path}: ")

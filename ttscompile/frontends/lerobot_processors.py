@@ -24,9 +24,12 @@ PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.
 
 _RENAME, _TOKENIZE, _NORMALIZE = "rename_observations_processor", "tokenizer_processor", "normalizer_processor"
 _UNNORMALIZE, _BATCH, _DEVICE = "unnormalizer_processor", "to_batch_processor", "device_processor"
+_NEW_LINE = ("smolvla_new_line_processor", "pi0_new_line_processor")
+_PROMPT = "pi05_prepare_state_tokenizer_processor_step"
+_RELATIVE, _ABSOLUTE = "relative_actions_processor", "absolute_actions_processor"
 _KNOWN_STEPS: Mapping[str, frozenset[str]] = {
-    PREPROCESSOR: frozenset({_RENAME, _BATCH, _TOKENIZE, _DEVICE, _NORMALIZE}),
-    POSTPROCESSOR: frozenset({_BATCH, _DEVICE, _UNNORMALIZE}),
+    PREPROCESSOR: frozenset({_RENAME, _BATCH, _TOKENIZE, _DEVICE, _NORMALIZE, *_NEW_LINE, _PROMPT, _RELATIVE}),
+    POSTPROCESSOR: frozenset({_BATCH, _DEVICE, _UNNORMALIZE, _ABSOLUTE}),
 }
 _ONCE = frozenset({_RENAME, _TOKENIZE, _NORMALIZE, _UNNORMALIZE})
 
@@ -127,12 +130,14 @@ class Processors:
         action: of the action; None where it passes as it is.
         renamed: the policy's name of an observation -> the name that the robot gives it, where they differ.
         tokenizer: settings of the tokenizer; none without one.
+        new_line: whether an instruction ends with a new line before it is tokenized.
     """
 
     normalizers: Mapping[str, Statistics]
     action: Statistics | None
     renamed: Mapping[str, str]
     tokenizer: Mapping[str, Any]
+    new_line: bool = False
 
 
 def read_processors(directory: Path, features: Features) -> Processors:
@@ -147,6 +152,7 @@ def read_processors(directory: Path, features: Features) -> Processors:
         normalizers=_statistics(directory, before, _NORMALIZE, features),
         action=_statistics(directory, after, _UNNORMALIZE, features).get("action"),
         tokenizer=next((dict(step["config"]) for step in before if step["registry_name"] == _TOKENIZE), {}),
+        new_line=any(step["registry_name"] in _NEW_LINE for step in before),
     )
 
 
@@ -173,6 +179,11 @@ def _steps(directory: Path, name: str) -> list[dict[str, Any]]:
         if registered == _DEVICE and step["config"].get("float_dtype") not in (None, "float32"):
             found = f"{registered}.float_dtype is {step['config']['float_dtype']!r:.80}"
             raise CheckpointError(f"{path}: {found}; expected null or float32, in which the compiled policy computes.")
+        if registered in (_RELATIVE, _ABSOLUTE) and step["config"].get("enabled") is not False:
+            raise CheckpointError(
+                f"{path}: {registered} is enabled: actions are relative to the state, which is not compiled. Expected"
+                " a policy of absolute actions."
+            )
     order = [step["registry_name"] for step in steps]
     twice = sorted(kind for kind in _ONCE if order.count(kind) > 1)
     if twice:

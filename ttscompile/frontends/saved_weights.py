@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file
 
 from ..errors import CheckpointError
+from ..measure.machine import memory_bytes
+
+TIMES = 5
+"""Memory that compiling takes, as a multiple of the weights in float32: 4.7 for SmolVLA, less for smaller networks of
+the same kind; measured with ``examples/benchmark/large.py``."""
 
 SHOWN = 6
 """Names that a message holds; it counts the others."""
@@ -29,6 +36,33 @@ def read_tensors(path: Path) -> dict[str, torch.Tensor]:
         what = "not a safetensors file, or a truncated one"
         raise CheckpointError(f"{path}: {what}: {error!s:.300}. Copy it again.") from error
     return tensors
+
+
+def require_memory(path: Path, without: tuple[str, ...] = ()) -> None:
+    """Raise unless the machine has the memory that compiling these weights takes; before anything is read.
+
+    Args:
+        path: of a safetensors file.
+        without: ends of the names of weights that are not compiled.
+
+    Raises:
+        CheckpointError: says how much it takes, and how much there is.
+    """
+    if not path.is_file():
+        return
+    try:
+        with safe_open(path, "np") as file:
+            names = [name for name in file.keys() if not name.endswith(without)]  # noqa: SIM118
+            numbers = sum(math.prod(file.get_slice(name).get_shape()) for name in names)
+    except Exception:  # a damaged file, which its reader describes
+        return
+    need, there = TIMES * 4 * numbers, memory_bytes()
+    if need > there:
+        raise CheckpointError(
+            f"{path}: {numbers / 1e6:,.0f} million weights. Compiling them takes about {need / 2**30:.1f} GiB of"
+            f" memory, {TIMES} times what they have in float32; this machine has {there / 2**30:.1f} GiB. Convert on a"
+            " larger one: the artifact takes less than half of that to run."
+        )
 
 
 def names_of(keys: Sequence[str]) -> str:

@@ -9,7 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-CPUINFO = Path("/proc/cpuinfo")
+CPUINFO, CGROUP = Path("/proc/cpuinfo"), Path("/sys/fs/cgroup/memory.max")
 PACKAGES = ("ttscompile", "numpy", "onnxruntime", "torch")
 _DOT_PRODUCTS = ("avx512_vnni", "avx_vnni", "amx_int8")
 X86 = ("x86_64", "amd64", "i386", "i686")
@@ -37,6 +37,14 @@ def fingerprint() -> dict[str, Any]:
         "python": platform.python_version(),
         **versions,
     }
+
+
+def memory_bytes(limit: Path | None = None) -> int:
+    """What this machine has, or what its container may take of it, whichever is less."""
+    whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    with suppress(OSError, ValueError):  # no such file; or it says "max"
+        return min(whole, int((CGROUP if limit is None else limit).read_text()))
+    return whole
 
 
 def has_integer_dot_product() -> bool | None:

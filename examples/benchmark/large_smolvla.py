@@ -1,0 +1,106 @@
+"""SmolVLA at its real size with random weights, for ``large.py``: the checkpoint, and one call of it in its parts."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors.torch import save_file
+from torch import nn
+
+from ttscompile import Noise, PolicySpec
+from ttscompile.frontends.families import AS_SAVED
+from ttscompile.frontends.lerobot_smolvla import RELEASED, read_config
+from ttscompile.frontends.lerobot_vla import read_vla_config
+from ttscompile.frontends.settings import Settings
+from ttscompile.frontends.smolvla import SmolVLA
+
+MODEL = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
+STATE, CAMERAS, ACTION = "observation.state", ("observation.images.front", "observation.images.wrist"), "action"
+
+_FEATURES = {
+    STATE: {"type": "STATE", "shape": [6]},
+    **{key: {"type": "VISUAL", "shape": [3, 480, 640]} for key in CAMERAS},
+    ACTION: {"type": "ACTION", "shape": [6]},
+}
+_MODES = {"VISUAL": "IDENTITY", "STATE": "MEAN_STD", "ACTION": "MEAN_STD"}
+
+
+def save(directory: Path) -> None:
+    """What lerobot's ``save_pretrained`` writes of a SmolVLA with its default configuration."""
+    directory.mkdir(parents=True, exist_ok=True)
+    entries = {
+        "type": "smolvla",
+        "input_features": {key: each for key, each in _FEATURES.items() if key != ACTION},
+        "output_features": {ACTION: _FEATURES[ACTION]},
+        "vlm_model_name": MODEL,
+    }
+    _write(directory / "config.json", entries)
+    statistics = {f"{key}.{name}": torch.full((6,), float(name == "std")) for key in (STATE, ACTION) for name in _NAMES}
+    save_file(statistics, directory / "statistics.safetensors")
+    own = {"config": {"eps": 1e-8, "features": _FEATURES, "norm_map": _MODES}, "state_file": "statistics.safetensors"}
+    for name, kind in (("pre", "normalizer_processor"), ("post", "unnormalizer_processor")):
+        _write(directory / f"policy_{name}processor.json", {"steps": [{"registry_name": kind, **own}]})
+    config = read_config(read_vla_config(directory, entries, AS_SAVED), Settings(RELEASED[MODEL], f"{MODEL}: "))
+    with torch.device("meta"):
+        shapes = SmolVLA(config).state_dict()
+    draw = torch.Generator().manual_seed(0)
+    save_file(
+        {f"model.{name}": _weight(name, value.shape, draw) for name, value in shapes.items()},
+        directory / "model.safetensors",
+    )
+
+
+_NAMES = ("mean", "std")
+
+
+def _weight(name: str, shape: torch.Size, draw: torch.Generator) -> torch.Tensor:
+    """Such that the numbers in the network neither vanish nor explode."""
+    if len(shape) > 1:
+        return torch.randn(shape, generator=draw) * shape[1:].numel() ** -0.5
+    return torch.ones(shape) if "norm" in name and name.endswith("weight") else torch.zeros(shape)
+
+
+def _write(path: Path, content: Any) -> None:
+    path.write_text(json.dumps(content), encoding="utf-8")
+
+
+def call(spec: PolicySpec) -> tuple[dict[str, np.ndarray], Noise]:
+    """One observation, and the noise of a call."""
+    rng = np.random.default_rng(0)
+    noise = Noise(rng.standard_normal((1, *spec.sample), dtype=np.float32))
+    return {key: each.draw(rng) for key, each in spec.observations.items()}, noise
+
+
+def eager(module: nn.Module, spec: PolicySpec) -> Callable[[], tuple[np.ndarray, list[float]]]:
+    """A call in eager PyTorch: the actions, and the seconds of image encoder, rest of the prefix, and loop."""
+    obs, noise = call(spec)
+    given = {spec.arguments[key]: torch.from_numpy(value) for key, value in obs.items()}
+    parts: Any = module
+    took = [0.0]
+
+    def timed(_: nn.Module, __: Any) -> None:
+        took[0] -= perf_counter()
+
+    def done(_: nn.Module, __: Any, ___: Any) -> None:
+        took[0] += perf_counter()
+
+    parts.encoder.prefix.vision_model.register_forward_pre_hook(timed)
+    parts.encoder.prefix.vision_model.register_forward_hook(done)
+
+    @torch.inference_mode()
+    def run() -> tuple[np.ndarray, list[float]]:
+        took[0], start = 0.0, perf_counter()
+        encoded = parts.encoder(given)
+        prefix = perf_counter()
+        x = torch.from_numpy(noise.initial)
+        for t in spec.sampler.timesteps:
+            x = x - parts.denoiser(x, torch.full((1,), float(t)), encoded) / spec.sampler.steps
+        return spec.chunk.unnormalized(x.numpy()), [took[0], prefix - start - took[0], perf_counter() - prefix]
+
+    return run

@@ -1,0 +1,120 @@
+"""Parity with LeRobot 0.6.1's pi0 and pi0.5 at tiny sizes: from raw images, state and tokens to robot actions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+import ttscompile
+from tests.once import Once
+from ttscompile.core.spec import Noise
+from ttscompile.errors import CheckpointError
+from ttscompile.frontends import load_checkpoint_policy
+from ttscompile.frontends.eager import eager_policy
+from ttscompile.frontends.families import AS_SAVED, LoadOptions
+from ttscompile.ir.program import Program
+
+from ..families.support import record
+from . import pis
+from .lerobot_tiny import change_json
+from .vlas import CAMERAS, MASK, STATE, TOKENS, Array, as_given
+
+
+@pytest.fixture(scope="module")
+def golden() -> Mapping[str, Array]:
+    with np.load(Path(__file__).parent / "golden" / "lerobot_pi.npz") as numbers:
+        return dict(numbers)
+
+
+@pytest.fixture(scope="module", params=pis.KINDS)
+def kind(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture
+def directory(kind: str, tmp_path: Path) -> Path:
+    return pis.save(kind, tmp_path / "policy")
+
+
+def eager(directory: Path, call: int, options: LoadOptions = AS_SAVED) -> Array:
+    """The whole chunk of the rebuilt network, not compiled."""
+    module, spec = load_checkpoint_policy(directory, options=options)
+    given = pis.observation(call)
+    obs = {key: torch.from_numpy(as_given(key, given, spec)) for key in spec.observations}
+    return spec.chunk.unnormalized(eager_policy(module, spec)(obs, Noise(pis.noise())).numpy())
+
+
+@pytest.mark.parametrize("call", [0, 1])
+def test_the_rebuilt_network_gives_lerobots_actions(
+    directory: Path, kind: str, golden: Mapping[str, Array], call: int
+) -> None:
+    """Two instructions of other lengths, and two image sizes."""
+    found = eager(directory, call)
+    assert np.abs(found - golden[f"{kind}.{call}"]).max() < 1e-4
+    assert np.abs(found - golden[f"{kind}.{1 - call}"]).max() > 0.01
+
+
+def test_a_camera_that_the_robot_lacks(directory: Path, kind: str, golden: Mapping[str, Array]) -> None:
+    found = eager(directory, 0, LoadOptions(without_cameras=[CAMERAS[1]]))
+    assert np.abs(found - golden[f"{kind}.missing"]).max() < 1e-4
+    assert np.abs(found - golden[f"{kind}.0"]).max() > 0.01
+
+
+@pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
+@pytest.mark.parametrize("kind", ["pi05", pytest.param("pi0", marks=pytest.mark.soak)])
+def test_what_is_compiled_gives_them_too(
+    once: Once, tmp_path: Path, kind: str, golden: Mapping[str, Array], runtime: str
+) -> None:
+    artifact, program = once.compiled(
+        f"whole {kind}", lambda to: ttscompile.convert(pis.save(kind, tmp_path / "policy"), to)
+    )
+    assert_recorded(kind, program)
+    policy = ttscompile.load(artifact, runtime=runtime)
+    assert set(policy.info.observation) == {*CAMERAS, TOKENS, MASK} | ({STATE} if kind == "pi0" else set())
+    for call in (0, 1):
+        found = policy.predict_action_chunk(pis.observation(call), noise=Noise(pis.noise()), plan="dense")
+        assert found.shape == (1, 4, pis.ACTION_DIM)
+        assert np.abs(found - golden[f"{kind}.{call}"][:, :4]).max() < 1e-4
+
+
+def assert_recorded(kind: str, program: Program) -> None:
+    record(
+        f"LeRobot {kind}", "actions that lerobot 0.6.1 gave, raw images and tokens to action, 1e-4", "euler 4", program
+    )
+
+
+def test_other_names_of_the_same_weights(tmp_path: Path) -> None:
+    """As openpi's converter has them, and transformers 4; and the head in place of the embedding."""
+    directory = pis.save("pi0", tmp_path / "policy")
+    before, path = eager(directory, 0), directory / "model.safetensors"
+    renamed = {}
+    for name, value in load_file(path).items():
+        name = name.removeprefix("model.").replace(".vision_tower.", ".vision_tower.vision_model.")
+        renamed[name.replace(".model.language_model.embed_tokens.", ".lm_head.")] = value
+    path.unlink()
+    save_file(renamed, path)
+    assert np.array_equal(eager(directory, 0), before)
+
+
+def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
+    directory = pis.save("pi05", tmp_path / "policy")
+    with pytest.raises(CheckpointError, match="reads its state as part of the instruction"):
+        load_checkpoint_policy(directory, options=LoadOptions(task="go"))
+    change_json(directory / "config.json", use_relative_actions=True)
+    with pytest.raises(CheckpointError, match="use_relative_actions"):
+        load_checkpoint_policy(directory)
+    change_json(directory / "config.json", use_relative_actions=False, image_resolution=[28, 42])
+    with pytest.raises(CheckpointError, match=r"image_resolution.*a square"):
+        load_checkpoint_policy(directory)
+    path = directory / "model.safetensors"
+    weights = load_file(path)
+    path.unlink()
+    save_file({name: value for name, value in weights.items() if "k_proj" not in name}, path)
+    change_json(directory / "config.json", image_resolution=[28, 28])
+    with pytest.raises(CheckpointError, match="k_proj.weight is missing"):
+        load_checkpoint_policy(directory)

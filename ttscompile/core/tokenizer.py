@@ -1,0 +1,67 @@
+"""Text to tokens, with the small ``tokenizers`` wheel; imported when it is used."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from .given import Errors
+
+FILE = "tokenizer.json"
+_MOST_BYTES = 64 * 2**20
+"""Of its file; PaliGemma's has 18 MB."""
+
+
+class Tokenizer:
+    """What ``tokenizer.json`` describes.
+
+    Args:
+        path: of the file, or of the folder that has it.
+        error: class of the errors.
+
+    Raises:
+        TtscompileError: of the class ``error``: no such file, one that is too large or damaged, or no ``tokenizers``.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], error: Errors) -> None:
+        own = Path(path)
+        self._path, self._error = own / FILE if own.is_dir() else own, error
+        self._tokenizer: Any = self._read()
+
+    def _read(self) -> Any:
+        path = self._path
+        if not path.is_file() or path.stat().st_size > _MOST_BYTES:
+            what = "no such file" if not path.is_file() else f"has more than {_MOST_BYTES:,} bytes"
+            raise self._error(f"{path}: {what}; expected the {FILE} of the policy's language model.")
+        try:
+            import tokenizers
+        except ModuleNotFoundError as missing:
+            remedy = "Install 'ttscompile[tokens]', or give tokens in place of text"
+            raise self._error(
+                f"{path}: text needs the package tokenizers, which is not installed. {remedy}."
+            ) from missing
+        try:
+            made = tokenizers.Tokenizer.from_file(str(path))
+        except Exception as damaged:  # of damaged files the package raises plain Exception
+            raise self._error(f"{path}: no tokenizer that can be read: {damaged!s:.200}. Copy it again.") from damaged
+        made.no_padding()
+        made.no_truncation()
+        return made
+
+    def __call__(self, text: str) -> list[int]:
+        """The tokens of a text, all of them, with those that the tokenizer adds.
+
+        Raises:
+            TtscompileError: the tokenizer refuses the text.
+        """
+        try:
+            return list(self._tokenizer.encode(text).ids)
+        except Exception as refused:
+            raise self._error(f"{self._path}: {text!r:.100} has no tokens: {refused!s:.200}.") from refused
+
+
+def find_tokenizer(folder: Path) -> Path | None:
+    """The file in a folder, if it has one."""
+    path = folder / FILE
+    return path if path.is_file() else None

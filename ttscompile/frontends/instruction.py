@@ -1,0 +1,37 @@
+"""An instruction that is compiled in: its tokens, as the tokenizer of the checkpoint makes them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ..core.tokenizer import Tokenizer, find_tokenizer
+from ..errors import CheckpointError
+from .clip import NAME_FOLDER
+
+_NO_TASK = "Or leave the task out: the policy then takes tokens as an observation."
+
+
+def task_tokens(text: str, name: str, folder: Path | None, most: int, vocabulary: int) -> list[int]:
+    """The tokens of an instruction, without padding: nothing reads that.
+
+    Args:
+        text: of the instruction.
+        name: of the tokenizer, for messages.
+        folder: that has its ``tokenizer.json``; None if there is none.
+        most: tokens that the policy reads; what is longer is cut, as lerobot does.
+        vocabulary: tokens that the language model knows.
+
+    Raises:
+        CheckpointError: there is no tokenizer, it cannot be read, or it is of another language model.
+    """
+    path = None if folder is None else find_tokenizer(folder)
+    if path is None:
+        raise CheckpointError(
+            f"the tokenizer {name!r:.200} is not on this machine, and nothing is ever downloaded. Put its"
+            f" tokenizer.json beside config.json of the language model. {NAME_FOLDER} {_NO_TASK}"
+        )
+    tokens = Tokenizer(path, CheckpointError)(text)[:most]
+    if not tokens or max(tokens) >= vocabulary:
+        found = f"token {max(tokens)}; the language model has {vocabulary}" if tokens else "no token at all"
+        raise CheckpointError(f"{path}: it gives {found}. It belongs to another language model.")
+    return tokens

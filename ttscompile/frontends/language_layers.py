@@ -1,0 +1,190 @@
+"""Layers of the language models Llama and Gemma, for a prefix that is read once and an action expert that reads it.
+
+Attribute names are those under which the weights of transformers load. Keys and values are ``[B, heads, tokens,
+channels]`` with every head written out, so that what depends on the prefix alone is repeated once a call.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+HIDDEN = torch.finfo(torch.float32).min
+"""Added to the score of what is not seen."""
+
+
+@dataclass(frozen=True)
+class LanguageConfig:
+    """Sizes of one language model, or of an expert that is built like one.
+
+    Attributes:
+        width: of the stream.
+        hidden: width inside the feed-forward layers.
+        layers: how many.
+        heads: of queries.
+        groups: heads of keys and values.
+        channels: of a head.
+        epsilon: of the norms.
+        gemma: whether it is Gemma's: norms multiply by ``1 + weight``, and the activation is GELU in place of SiLU.
+    """
+
+    width: int
+    hidden: int
+    layers: int
+    heads: int
+    groups: int
+    channels: int
+    epsilon: float = 1e-6
+    gemma: bool = False
+
+
+class Seen(NamedTuple):
+    """Keys and values of one layer, ``[B, heads, tokens, channels]`` each."""
+
+    keys: Tensor
+    values: Tensor
+
+
+class Norm(nn.Module):
+    """Root mean square normalisation."""
+
+    def __init__(self, config: LanguageConfig) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.zeros(config.width))
+        self.epsilon, self.offset = config.epsilon, 1.0 if config.gemma else 0.0
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``[..., width]`` -> the same."""
+        scaled = x * torch.rsqrt(x.pow(2).mean(-1, keepdim=True) + self.epsilon)
+        return scaled * (self.weight + self.offset) if self.offset else scaled * self.weight
+
+
+class Attention(nn.Module):
+    """Projections of grouped attention; ``source`` is the width of what keys and values are made of."""
+
+    def __init__(self, config: LanguageConfig, source: int | None = None) -> None:
+        super().__init__()
+        self.channels, self.groups, self.repeats = config.channels, config.groups, config.heads // config.groups
+        queries, keys = config.heads * config.channels, config.groups * config.channels
+        self.q_proj = nn.Linear(config.width, queries, bias=False)
+        self.k_proj = nn.Linear(source or config.width, keys, bias=False)
+        self.v_proj = nn.Linear(source or config.width, keys, bias=False)
+        self.o_proj = nn.Linear(queries, config.width, bias=False)
+
+    def split(self, x: Tensor) -> Tensor:
+        """``[B, T, heads * channels]`` -> ``[B, heads, T, channels]``."""
+        return x.reshape(*x.shape[:2], -1, self.channels).transpose(1, 2)
+
+    def for_all_heads(self, x: Tensor) -> Tensor:
+        """``[B, groups, T, channels]`` -> ``[B, heads, T, channels]``; one group is for all heads as it is."""
+        return x if 1 in (self.repeats, self.groups) else x.repeat_interleave(self.repeats, dim=1)
+
+    def attend(self, q: Tensor, seen: Seen, mask: Tensor) -> Tensor:
+        """``q [B, heads, T, channels]``, and ``mask`` that is added to the scores -> ``[B, T, width]``."""
+        scores = q @ seen.keys.transpose(2, 3) * self.channels**-0.5 + mask
+        return self.o_proj((scores.softmax(-1) @ seen.values).transpose(1, 2).flatten(2))  # type: ignore[no-any-return]
+
+
+class FeedForward(nn.Module):
+    """Gated by SiLU, or by GELU in Gemma."""
+
+    def __init__(self, config: LanguageConfig) -> None:
+        super().__init__()
+        self.gate_proj = nn.Linear(config.width, config.hidden, bias=False)
+        self.up_proj = nn.Linear(config.width, config.hidden, bias=False)
+        self.down_proj = nn.Linear(config.hidden, config.width, bias=False)
+        self.gemma = config.gemma
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``[..., width]`` -> the same."""
+        gate = self.gate_proj(x)
+        gate = functional.gelu(gate, approximate="tanh") if self.gemma else functional.silu(gate)
+        return self.down_proj(gate * self.up_proj(x))  # type: ignore[no-any-return]
+
+
+class Layer(nn.Module):
+    """One layer of the prefix."""
+
+    def __init__(self, config: LanguageConfig) -> None:
+        super().__init__()
+        self.input_layernorm, self.post_attention_layernorm = Norm(config), Norm(config)
+        self.self_attn, self.mlp = Attention(config), FeedForward(config)
+
+    def forward(self, x: Tensor, turns: Rotation, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The stream after the layer; keys, rotated, and values ``[B, groups, T, channels]``."""
+        attention = self.self_attn
+        normed = self.input_layernorm(x)
+        keys = rotate(attention.split(attention.k_proj(normed)), turns)
+        values = attention.split(attention.v_proj(normed))
+        queries = rotate(attention.split(attention.q_proj(normed)), turns)
+        seen = Seen(attention.for_all_heads(keys), attention.for_all_heads(values))
+        x = x + attention.attend(queries, seen, mask)
+        return x + self.mlp(self.post_attention_layernorm(x)), keys, values
+
+
+def read_prefix(layers: Iterable[nn.Module], x: Tensor, turns: Rotation, mask: Tensor) -> list[Tensor]:
+    """Keys and values of every layer, in turn, ``[B, groups, T, channels]``; what nobody reads is not part of a graph.
+
+    Args:
+        layers: of the language model.
+        x: the tokens, embedded, ``[B, T, width]``.
+        turns: of their positions.
+        mask: added to the scores, ``[B, 1, T, T]``.
+    """
+    found = []
+    for layer in layers:
+        x, keys, values = layer(x, turns, mask)
+        found += [keys, values]
+    return found
+
+
+def prefix_mask(valid: Tensor, late: int = 0) -> Tensor:
+    """What tokens of a prefix see of each other, to be added to scores ``[B, 1, T, T]``.
+
+    Args:
+        valid: bool ``[B, T]``; padding is not seen. What it sees itself nobody reads.
+        late: the last so many tokens are not seen by those before them.
+    """
+    count = valid.shape[1]
+    group = torch.arange(count) >= count - late
+    seen = valid[:, None, None, :] & (group[None, :] <= group[:, None])
+    return added(seen)
+
+
+def added(seen: Tensor) -> Tensor:
+    """A mask, True for what is seen, as a number that is added to scores."""
+    return torch.where(seen, 0.0, HIDDEN)
+
+
+class Rotation(NamedTuple):
+    """Cosine and sine of the rotary embedding's angles, ``[B, 1, T, channels / 2]`` each."""
+
+    cos: Tensor
+    sin: Tensor
+
+
+def rotation(positions: Tensor, channels: int) -> Rotation:
+    """The rotary embedding of positions ``[B, T]``."""
+    rates = 10_000 ** (-2.0 / channels * torch.arange(channels // 2, dtype=torch.float32))
+    angles = (positions[..., None].to(torch.float32) * rates)[:, None]
+    return Rotation(angles.cos(), angles.sin())
+
+
+def rotate(x: Tensor, by: Rotation) -> Tensor:
+    """Rotary embedding of ``[B, heads, T, channels]``; the halves of the channels are the pairs."""
+    left, right = x.chunk(2, -1)
+    cos, sin = by
+    return torch.cat([left * cos - right * sin, right * cos + left * sin], -1)
+
+
+def waves(timestep: Tensor, width: int, shortest: float, longest: float) -> Tensor:
+    """Sine and cosine of a time ``[B]``, ``[B, width]``; periods between the two, evenly spaced in their logarithm."""
+    fraction = torch.linspace(0.0, 1.0, width // 2, dtype=torch.float64)
+    rates = 1.0 / (shortest * (longest / shortest) ** fraction) * 2 * torch.pi
+    angle = rates * timestep[:, None]
+    return torch.cat([angle.sin(), angle.cos()], -1).to(torch.float32)

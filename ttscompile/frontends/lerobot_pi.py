@@ -1,0 +1,161 @@
+"""LeRobot's ``pi0`` and ``pi05``: a directory to module and ``PolicySpec``; cameras, instruction, state to actions.
+
+Sizes are those of the weights. Neither lerobot nor transformers is needed. Source: ``PI0Policy`` and ``PI05Policy`` of
+huggingface/lerobot 0.6.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ..core.spec import PolicySpec
+from ..errors import CheckpointError
+from .clip import find_encoder
+from .encoded import EncodedDenoiser
+from .families import LoadOptions
+from .instruction import task_tokens
+from .language_layers import LanguageConfig
+from .lerobot_config import CONFIG, MOST, MOST_PIXELS, STATE, LeRobotConfig
+from .lerobot_policy import read_weights
+from .lerobot_vla import (
+    Gathered,
+    padded_size,
+    positive_number,
+    read_vla_config,
+    read_vla_processors,
+    require_square,
+    vla_spec,
+)
+from .pi import Expert, Pi, PiConfig, Prefix
+from .saved_weights import require_weights
+from .siglip import SiglipConfig
+
+_VISION = "paligemma_with_expert.paligemma.model.vision_tower."
+_TEXT = "paligemma_with_expert.paligemma.model.language_model."
+_EXPERT = "paligemma_with_expert.gemma_expert.model."
+_HEAD = "paligemma_with_expert.paligemma.lm_head.weight"
+_UNREAD = (".gemma_expert.lm_head.weight", ".language_model.norm.weight", ".embed_tokens.position_ids")
+_VISION_HEADS = 16
+"""Of PaliGemma's SigLIP; the weights do not say."""
+
+
+def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
+    """Rebuild a policy from its directory and the entries of its ``config.json``; see ``Family.load``."""
+    shared = read_vla_config(directory, entries, options)
+    processors, adaptive = read_vla_processors(shared), entries["type"] == "pi05"
+    if adaptive and options.task is not None:
+        raise CheckpointError(
+            f"{directory}: a pi05 policy reads its state as part of the instruction, at every call; no task can be"
+            " compiled in. Leave the task out: the policy takes tokens as an observation."
+        )
+    weights = _weights(shared)
+    try:
+        config = read_config(shared, weights, adaptive)
+        with torch.device("meta"):
+            network = Pi(config)
+        require_weights(network.state_dict(), weights, CONFIG)
+        network.load_state_dict(weights, assign=True)
+    except CheckpointError as error:
+        raise CheckpointError(f"{directory}: {error}") from error
+    length = shared.settings.number("tokenizer_max_length", 200 if adaptive else 48, MOST)
+    sizes = {"actions": config.actions}
+    task = None
+    if options.task is None:
+        sizes |= {"tokens": length, "vocabulary": config.vocabulary}
+    else:
+        name = str(processors.tokenizer.get("tokenizer_name") or "google/paligemma-3b-pt-224")
+        folders = [*([] if options.encoders is None else [Path(options.encoders)]), directory, directory.parent]
+        found = find_encoder(name, folders, "paligemma")
+        text = options.task if options.task.endswith("\n") or not processors.new_line else f"{options.task}\n"
+        task = torch.tensor([task_tokens(text, name, found, length, config.vocabulary)])
+    encoder = Gathered(shared, processors, Prefix(network), config.state, task)
+    side = config.vision.image_size
+    spec = vla_spec(shared, processors, (side, side), "centre", sizes, options)
+    if adaptive:  # the instruction holds it
+        own = processors.renamed.get(STATE, STATE)
+        spec = replace(spec, observations={key: each for key, each in spec.observations.items() if key != own})
+    return EncodedDenoiser(encoder, Expert(network)).eval(), spec
+
+
+def read_config(shared: LeRobotConfig, weights: Mapping[str, Tensor], adaptive: bool) -> PiConfig:
+    """Sizes and variant.
+
+    Raises:
+        CheckpointError: a weight that tells a size is missing, or sizes contradict each other.
+    """
+    settings = shared.settings
+    patch = _shape(weights, f"{_VISION}embeddings.patch_embedding.weight", 4)
+    resolution = settings.size("image_resolution", [224, 224], MOST_PIXELS) or (224, 224)
+    require_square(settings, "image_resolution", resolution, patch[2])
+    width = _shape(weights, f"{_VISION}encoder.layers.0.mlp.fc1.weight", 2)
+    vision = SiglipConfig(
+        hidden_size=patch[0],
+        intermediate_size=width[0],
+        num_hidden_layers=_layers(weights, f"{_VISION}encoder."),
+        num_attention_heads=_VISION_HEADS,
+        image_size=resolution[0],
+        patch_size=patch[2],
+    )
+    text, expert = _language(weights, _TEXT), _language(weights, _EXPERT)
+    if (text.layers, text.heads, text.channels) != (expert.layers, expert.heads, expert.channels):
+        raise CheckpointError("the language model and the expert differ in layers, heads or channels.")
+    return PiConfig(
+        vision=vision,
+        text=text,
+        vocabulary=_shape(weights, f"{_TEXT}embed_tokens.weight", 2)[0],
+        expert=expert,
+        state=None if adaptive else padded_size(settings, "max_state_dim", shared.state_dim),
+        actions=padded_size(settings, "max_action_dim", shared.action_dim),
+        periods=(positive_number(settings, "min_period", 4e-3), positive_number(settings, "max_period", 4.0)),
+    )
+
+
+def _language(weights: Mapping[str, Tensor], start: str) -> LanguageConfig:
+    """A Gemma; all heads of queries share one of keys."""
+    queries, width = _shape(weights, f"{start}layers.0.self_attn.q_proj.weight", 2)
+    channels = _shape(weights, f"{start}layers.0.self_attn.k_proj.weight", 2)[0]
+    if channels % 2 or queries % channels:
+        raise CheckpointError(f"{start}: {queries} numbers of queries do not fit heads of {channels}.")
+    return LanguageConfig(
+        width=width,
+        hidden=_shape(weights, f"{start}layers.0.mlp.gate_proj.weight", 2)[0],
+        layers=_layers(weights, start),
+        heads=queries // channels,
+        groups=1,
+        channels=channels,
+        gemma=True,
+    )
+
+
+def _layers(weights: Mapping[str, Tensor], start: str) -> int:
+    found = re.compile(re.escape(start) + r"layers\.(\d{1,3})\.")
+    return 1 + max((int(match[1]) for name in weights if (match := found.match(name))), default=-1)
+
+
+def _shape(weights: Mapping[str, Tensor], name: str, axes: int) -> tuple[int, ...]:
+    value = weights.get(name)
+    if value is None or value.ndim != axes or not value.numel():
+        raise CheckpointError(
+            f"weight {name} is missing, or has not {axes} axes; expected the weights of a pi0 or pi05."
+        )
+    return tuple(value.shape)
+
+
+def _weights(shared: LeRobotConfig) -> dict[str, Tensor]:
+    """The weights under the names of ``Pi``, whichever transformers saved them, lerobot or openpi's converter."""
+    found = {}
+    for name, value in read_weights(shared, *_UNREAD).items():
+        short = name.removeprefix("model.").replace(".vision_tower.vision_model.", ".vision_tower.")
+        if not short.startswith(f"{_VISION}head."):
+            found[short] = value
+    head = found.pop(_HEAD, None)
+    if head is not None:  # the same numbers as the embedding, of which a file may have either
+        found.setdefault(f"{_TEXT}embed_tokens.weight", head)
+    return found

@@ -1,0 +1,194 @@
+"""LeRobot's ``smolvla``: its directory to module and ``PolicySpec``; cameras, instruction and state to robot actions.
+
+Neither lerobot nor transformers is needed. Source: ``SmolVLAPolicy.predict_action_chunk`` of huggingface/lerobot 0.6.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from ..core.spec import PolicySpec
+from ..errors import CheckpointError
+from .clip import NAME_FOLDER, find_encoder
+from .encoded import EncodedDenoiser
+from .families import LoadOptions
+from .instruction import task_tokens
+from .language_layers import LanguageConfig
+from .lerobot_config import MOST, MOST_PIXELS, LeRobotConfig
+from .lerobot_policy import read_weights
+from .lerobot_vla import (
+    Gathered,
+    padded_size,
+    positive_number,
+    read_vla_config,
+    read_vla_processors,
+    require_square,
+    vla_spec,
+)
+from .saved_weights import require_weights
+from .settings import Settings, read_json
+from .siglip import SiglipConfig
+from .smolvla import Expert, Prefix, SmolVLA, SmolVLAConfig, expert_of
+
+_MODEL = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
+RELEASED: Mapping[str, Mapping[str, Any]] = {
+    _MODEL: {
+        "scale_factor": 4,
+        "vision_config": {"hidden_size": 768, "num_attention_heads": 12, "image_size": 512, "patch_size": 16},
+        "text_config": {
+            "hidden_size": 960,
+            "intermediate_size": 2560,
+            "num_hidden_layers": 32,
+            "num_attention_heads": 15,
+            "num_key_value_heads": 5,
+            "head_dim": 64,
+            "rms_norm_eps": 1e-5,
+            "vocab_size": 49280,
+        },
+    }
+}
+"""Configurations of the released models: with these names nothing but the policy's own weights is needed."""
+
+_MOST_LAYERS, _MOST_VOCABULARY, _MOST_LETTERS = 512, 2**20, 400
+_UNREAD = (".vlm.lm_head.weight", ".text_model.norm.weight")
+"""Weights of what the policy does not compute: the language model's answer."""
+
+
+def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
+    """Rebuild a policy from its directory and the entries of its ``config.json``; see ``Family.load``."""
+    shared = read_vla_config(directory, entries, options)
+    settings, processors = shared.settings, read_vla_processors(shared)
+    folders = [*([] if options.encoders is None else [Path(options.encoders)]), directory, directory.resolve().parent]
+    name = settings.text("vlm_model_name", _MODEL, _MOST_LETTERS)
+    config = read_config(shared, _language_model(name, folders))
+    length = settings.number("tokenizer_max_length", 48, MOST)
+    sizes = {"actions": config.actions}
+    if options.task is None:
+        sizes |= {"tokens": length, "vocabulary": config.vocabulary}
+        task = None
+    else:
+        tokenizer = str(processors.tokenizer.get("tokenizer_name") or name)
+        text = options.task if options.task.endswith("\n") or not processors.new_line else f"{options.task}\n"
+        found = find_encoder(tokenizer, folders, "smolvlm")
+        task = torch.tensor([task_tokens(text, tokenizer, found, length, config.vocabulary)])
+    weights = {name.removeprefix("model."): value for name, value in read_weights(shared, *_UNREAD).items()}
+    try:
+        with torch.device("meta"):  # compared before anything of the configured sizes takes memory
+            network = SmolVLA(config)
+        require_weights(network.state_dict(), weights, "config.json, or the language model's,")
+        network.load_state_dict(weights, assign=True)
+    except CheckpointError as error:
+        raise CheckpointError(f"{directory}: {error}") from error
+    encoder = Gathered(shared, processors, Prefix(network), config.state, task)
+    resize = None if settings.values.get("resize_imgs_with_padding", 0) is None else config.image
+    spec = vla_spec(shared, processors, resize, "start", sizes, options)
+    return EncodedDenoiser(encoder, Expert(network)).eval(), spec
+
+
+def read_config(shared: LeRobotConfig, model: Settings) -> SmolVLAConfig:
+    """Sizes and variant, of the policy's entries and those of its language model.
+
+    Raises:
+        CheckpointError: they contradict each other, or ask for what is not rebuilt here.
+    """
+    settings = shared.settings
+    for entry, expected in (("add_image_special_tokens", False), ("use_delta_joint_actions_aloha", False)):
+        if settings.flag(entry, expected) != expected:
+            raise settings.refusal(entry, f"{expected}: the other is not rebuilt".lower())
+    vision_entries, text = _part(model, "vision_config"), _part(model, "text_config")
+    names = {field for field in SiglipConfig.__dataclass_fields__ if field in vision_entries.values}
+    vision = SiglipConfig(**{name: vision_entries.values[name] for name in names})
+    layers = _layers(settings, text.number("num_hidden_layers", None, _MOST_LAYERS))
+    heads = text.number("num_attention_heads", None, MOST)
+    width = text.number("hidden_size", None, MOST)
+    epsilon = text.values.get("rms_norm_eps", 1e-6)
+    if not isinstance(epsilon, float) or not 0 < epsilon < 1:
+        raise text.refusal("rms_norm_eps", "a small positive number")
+    language = LanguageConfig(
+        width=width,
+        hidden=text.number("intermediate_size", None, MOST),
+        layers=layers,
+        heads=heads,
+        groups=text.number("num_key_value_heads", heads, MOST),
+        channels=text.number("head_dim", width // heads, MOST),
+        epsilon=epsilon,
+    )
+    if heads % language.groups or language.channels % 2:
+        raise text.error(f"{heads} heads of {language.channels} channels do not fit {language.groups} of keys")
+    expert, scale = (
+        expert_of(language, positive_number(settings, "expert_width_multiplier", 0.75)),
+        model.number("scale_factor", 2),
+    )
+    if not 2 <= expert.width <= MOST or expert.width % 2:
+        raise settings.refusal("expert_width_multiplier", f"a share that leaves an even width of {width}", 0.75)
+    return SmolVLAConfig(
+        vision=vision,
+        text=language,
+        vocabulary=text.number("vocab_size", None, _MOST_VOCABULARY),
+        scale=scale,
+        image=_image(shared, vision.patch_size * scale),
+        expert=expert,
+        crosses=_crosses(settings, layers),
+        state=padded_size(settings, "max_state_dim", shared.state_dim),
+        actions=padded_size(settings, "max_action_dim", shared.action_dim),
+        periods=(positive_number(settings, "min_period", 4e-3), positive_number(settings, "max_period", 4.0)),
+    )
+
+
+def _image(shared: LeRobotConfig, multiple: int) -> tuple[int, int]:
+    """What the encoder sees; lerobot saves width before height."""
+    resize = shared.settings.size("resize_imgs_with_padding", [512, 512], MOST_PIXELS)
+    shapes = {shape[1:] for shape in shared.cameras.values()}
+    if resize is None and len(shapes) > 1:
+        raise shared.settings.refusal("resize_imgs_with_padding", "a size: cameras have several")
+    height, width = resize[::-1] if resize is not None else next(iter(shapes))
+    require_square(shared.settings, "resize_imgs_with_padding", (height, width), multiple)
+    return height, width
+
+
+def _layers(settings: Settings, there: int) -> int:
+    """Layers of the language model that are used, and of the expert."""
+    wanted, expert = (
+        settings.values.get(f"num_{name}_layers", default) for name, default in (("vlm", 16), ("expert", -1))
+    )
+    if type(wanted) is not int or type(expert) is not int:
+        raise settings.refusal("num_vlm_layers", "a whole number, as num_expert_layers is")
+    used = min(wanted, there) if wanted > 0 else there
+    if expert > 0 and expert != used:
+        raise settings.refusal("num_expert_layers", f"none, or {used} as the language model has: fewer are not rebuilt")
+    return used
+
+
+def _crosses(settings: Settings, layers: int) -> tuple[bool, ...]:
+    """Which layers of the expert see the prefix alone."""
+    crossing = settings.choice("attention_mode", "self_attn", "cross_attn") == "cross_attn"
+    every = settings.values.get("self_attn_every_n_layers", 2)
+    if type(every) is not int:
+        raise settings.refusal("self_attn_every_n_layers", "a whole number")
+    return tuple(crossing and not (every > 0 and i % every == 0) for i in range(layers))
+
+
+def _language_model(name: str, folders: list[Path]) -> Settings:
+    """The entries of the language model's ``config.json``."""
+    found = find_encoder(name, folders, "smolvlm")
+    if found is not None:
+        return Settings(read_json(found / "config.json"), f"{found / 'config.json'}: ")
+    if name in RELEASED:
+        return Settings(RELEASED[name], f"{name}: ")
+    raise CheckpointError(
+        f"the language model {name!r} is not on this machine, and nothing is ever downloaded. Looked for its"
+        f" config.json in {', '.join(dict.fromkeys(map(str, folders)))}. {NAME_FOLDER}"
+    )
+
+
+def _part(model: Settings, name: str) -> Settings:
+    """One of the two configurations inside."""
+    inner = model.values.get(name)
+    if not isinstance(inner, dict):
+        raise model.refusal(name, "the entries of a SmolVLM model")
+    return Settings(inner, f"{model.where}{name}.")

@@ -1,0 +1,191 @@
+"""What LeRobot's vision-language-action models have in common: cameras, instruction, state, and the loop.
+
+Sources: ``lerobot.policies.common`` of huggingface/lerobot 0.6, and openpi, where it is from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from ..core.spec import ObservationSpec, PolicySpec, SamplerTable
+from ..errors import CheckpointError, SpecError
+from ..samplers.flow import METHODS, flow_matching_table
+from .families import LoadOptions
+from .lerobot_config import MOST, STATE, LeRobotConfig, read_lerobot_config
+from .lerobot_policy import policy_spec
+from .lerobot_processors import Normalizer, Processors, read_processors
+from .scheduler import MOST_STEPS
+from .settings import Settings
+
+TOKENS, MASK = "observation.language.tokens", "observation.language.attention_mask"
+_EMPTY = "observation.images.empty_camera_"
+"""How lerobot calls a camera that the checkpoint knows and no robot has."""
+
+
+def read_vla_config(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> LeRobotConfig:
+    """Check what all of them have; cameras that the robot lacks are left out.
+
+    LeRobot shows the network a black image for such a camera, and masks it: nothing reads it.
+
+    Raises:
+        CheckpointError: it contradicts itself, or an option does.
+    """
+    config = read_lerobot_config(directory, entries, horizon=50, n_action_steps=50, chunked=True)
+    if config.settings.flag("adapt_to_pi_aloha", False) or config.settings.flag("use_relative_actions", False):
+        raise config.settings.error(
+            "adapt_to_pi_aloha or use_relative_actions is set: joints are turned into others, or actions are relative"
+            " to the state, around the policy, which is not compiled; expected false"
+        )
+    without = set(options.without_cameras or ())
+    unknown = sorted(without - set(config.cameras))
+    kept = [key for key in config.cameras if not key.startswith(_EMPTY) and key not in without]
+    if unknown or not kept:
+        told = (
+            f"the cameras are {', '.join(config.cameras) or 'none'}; {', '.join(unknown) or 'all'} cannot be left out"
+        )
+        raise CheckpointError(f"{directory}: {told}. A policy needs a camera that it was trained with.")
+    features = {key: each for key, each in config.features.items() if key in kept or key not in config.cameras}
+    return LeRobotConfig(**{**vars(config), "features": features})
+
+
+def read_vla_processors(config: LeRobotConfig) -> Processors:
+    """The processors of a policy, which leave images alone.
+
+    Raises:
+        CheckpointError: as ``read_processors``; or images are normalised.
+    """
+    processors = read_processors(config.directory, config.features)
+    normalised = sorted(key for key in config.cameras if key in processors.normalizers)
+    if normalised:
+        raise CheckpointError(
+            f"{config.directory}: {', '.join(normalised[:4])} is normalised before it is resized; expected images as"
+            " they are (VISUAL: IDENTITY), which all vision-language-action models of lerobot have."
+        )
+    return processors
+
+
+def vla_spec(
+    config: LeRobotConfig,
+    processors: Processors,
+    image: tuple[int, int] | None,
+    fit: Literal["start", "centre"],
+    sizes: Mapping[str, int],
+    options: LoadOptions,
+) -> PolicySpec:
+    """The specification of a policy.
+
+    Args:
+        config: of the policy.
+        processors: its own.
+        image: height and width that images are resized to; None where they stay.
+        fit: where the rest of a resized image is.
+        sizes: ``actions``, the padded width of the sample; ``tokens`` of the instruction and ``vocabulary``, both
+            absent where it is compiled in.
+        options: of the caller.
+    """
+    language = {}
+    if "tokens" in sizes:
+        shape, last = (sizes["tokens"],), float(sizes["vocabulary"] - 1)
+        language = {
+            TOKENS: ObservationSpec(shape, dtype="int64", window=False, bounds=(0.0, last)),
+            MASK: ObservationSpec(shape, dtype="bool", window=False, bounds=(0.0, 1.0)),
+        }
+    source = {"policy": str(config.settings.values["type"])} | ({} if options.task is None else {"task": options.task})
+    spec = policy_spec(config, processors, _sampler(config.settings, options), source, language)
+    observations = dict(spec.observations)
+    if image is not None:
+        resized = ObservationSpec((1, 3, *image), bounds=(0.0, 1.0), fit=fit)
+        observations |= {processors.renamed.get(key, key): resized for key in config.cameras}
+    sample = (config.horizon, sizes["actions"])
+    return PolicySpec(sample, observations, spec.sampler, spec.chunk, source=spec.source)
+
+
+def _sampler(settings: Settings, options: LoadOptions) -> SamplerTable:
+    """From time 1, noise, to time 0, actions."""
+    name = "num_steps" if "num_steps" in settings.values else "num_inference_steps"
+    count = options.steps if options.steps is not None else settings.values.get(name, 10)
+    if options.spacing is not None:
+        raise SpecError("spacing is of the timesteps of diffusion; this policy's objective is flow matching.")
+    if options.sampler not in (None, *METHODS):
+        raise SpecError(f"sampler {options.sampler!r} is of diffusion; expected {' or '.join(METHODS)} of this policy.")
+    if type(count) is not int or not 1 <= count <= MOST_STEPS:
+        raise SpecError(
+            f"{settings.where}{count!r:.80} steps ({name}, or steps= and --steps); expected 1 to {MOST_STEPS}."
+        )
+    method: Any = options.sampler or "euler"
+    return flow_matching_table(count, method, start=1.0, end=0.0)
+
+
+def padded_size(settings: Settings, name: str, own: int) -> int:
+    """The width that states or actions are padded to, which has to hold the robot's own.
+
+    Raises:
+        CheckpointError: it does not.
+    """
+    size = settings.number(name, 32, MOST)
+    if own > size:
+        raise settings.refusal(name, f"at least the {own} numbers that the robot has", 32)
+    return size
+
+
+def positive_number(settings: Settings, name: str, default: float) -> float:
+    """A positive number.
+
+    Raises:
+        CheckpointError: it is not.
+    """
+    value = settings.values.get(name, default)
+    if type(value) not in (int, float) or not 0 < value < 2**31:
+        raise settings.refusal(name, "a positive number", default)
+    return float(value)
+
+
+class Gathered(nn.Module):
+    """What the robot measures to what a prefix reads.
+
+    Args:
+        config: of the policy.
+        processors: its normalisers, and the robot's names of the observations.
+        prefix: takes images, tokens, their mask and the state.
+        state: numbers of the state, padded; None where the instruction holds it.
+        task: tokens int64 ``[1, L]`` of the one instruction that is compiled in; None where it is an input.
+    """
+
+    task: Tensor | None
+
+    def __init__(
+        self, config: LeRobotConfig, processors: Processors, prefix: nn.Module, state: int | None, task: Tensor | None
+    ) -> None:
+        super().__init__()
+        names = {key: processors.renamed.get(key, key).replace(".", "_") for key in config.features}
+        self.images, self.state = [names[key] for key in config.cameras], names[STATE]
+        self.normalizer = Normalizer(processors.normalizers.get(STATE))
+        self.prefix, self.missing = prefix, None if state is None else state - config.state_dim
+        self.register_buffer("task", task, persistent=False)
+
+    def forward(self, observations: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
+        """Observations ``[B, 1, ...]`` by argument, the instruction without a frame."""
+        images = [observations[name][:, -1] * 2 - 1 for name in self.images]
+        state = None
+        if self.missing is not None:
+            state = functional.pad(self.normalizer(observations[self.state])[:, -1], (0, self.missing))
+        if self.task is None:
+            tokens, mask = (observations[name.replace(".", "_")] for name in (TOKENS, MASK))
+        else:
+            tokens = self.task.expand(len(images[0]), -1)
+            mask = torch.ones_like(tokens, dtype=torch.bool)
+        return self.prefix(images, tokens, mask, state)  # type: ignore[no-any-return]
+
+
+def require_square(settings: Settings, name: str, image: Sequence[int], multiple: int) -> None:
+    """Raise unless images reach the encoder as squares of whole groups of patches."""
+    if image[0] != image[1] or image[0] % multiple:
+        raise settings.error(
+            f"{name}: images reach the encoder as {list(image)}; expected a square of a multiple of {multiple}"
+        )

@@ -1,0 +1,212 @@
+"""The network of pi0 and pi0.5: PaliGemma reads cameras and instruction, and an expert beside it denoises.
+
+Attribute names are those under which lerobot saves the weights. Sources: Black et al., pi0 (arXiv 2410.24164) and pi0.5
+(arXiv 2504.16054); ``lerobot.policies.pi0`` and ``pi05`` of huggingface/lerobot 0.6.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from .language_layers import (
+    Attention,
+    FeedForward,
+    LanguageConfig,
+    Layer,
+    Norm,
+    Rotation,
+    Seen,
+    added,
+    prefix_mask,
+    read_prefix,
+    rotate,
+    rotation,
+    waves,
+)
+from .siglip import Siglip, SiglipConfig
+
+
+@dataclass(frozen=True)
+class PiConfig:
+    """Sizes and variant.
+
+    Attributes:
+        vision: of the image encoder.
+        text: of the language model.
+        vocabulary: tokens that there are.
+        expert: of the action expert.
+        state: numbers of the state, padded; None in pi0.5, whose instruction holds the state.
+        actions: numbers of an action, padded.
+        periods: shortest and longest of the timestep's waves.
+    """
+
+    vision: SiglipConfig
+    text: LanguageConfig
+    vocabulary: int
+    expert: LanguageConfig
+    state: int | None
+    actions: int
+    periods: tuple[float, float]
+
+    @property
+    def adaptive(self) -> bool:
+        """Whether the timestep modulates the expert's norms, as in pi0.5."""
+        return self.state is None
+
+
+class _AdaptiveNorm(nn.Module):
+    """Root mean square normalisation with scale, shift and gate of a condition."""
+
+    def __init__(self, config: LanguageConfig) -> None:
+        super().__init__()
+        self.dense = nn.Linear(config.width, 3 * config.width)
+        self.epsilon = config.epsilon
+
+    def forward(self, x: Tensor, condition: Tensor) -> tuple[Tensor, Tensor]:
+        """``[B, T, width]`` and ``[B, width]`` -> what is normalised, and the gate ``[B, 1, width]``."""
+        scale, shift, gate = self.dense(condition)[:, None].chunk(3, -1)
+        normed = x * torch.rsqrt(x.pow(2).mean(-1, keepdim=True) + self.epsilon)
+        return normed * (1 + scale) + shift, gate
+
+
+class _ExpertLayer(nn.Module):
+    """One layer of the expert, which sees the prefix and itself."""
+
+    def __init__(self, config: PiConfig) -> None:
+        super().__init__()
+        norm: Any = _AdaptiveNorm if config.adaptive else Norm
+        self.adaptive = config.adaptive
+        self.input_layernorm, self.post_attention_layernorm = norm(config.expert), norm(config.expert)
+        self.self_attn, self.mlp = Attention(config.expert), FeedForward(config.expert)
+
+    def forward(self, x: Tensor, prefix: Seen, turns: Rotation, mask: Tensor, condition: Tensor) -> Tensor:
+        attention = self.self_attn
+        normed, gate = self._normed(self.input_layernorm, x, condition)
+        queries = rotate(attention.split(attention.q_proj(normed)), turns)
+        keys = rotate(attention.split(attention.k_proj(normed)), turns)
+        pairs = ((prefix.keys, keys), (prefix.values, attention.split(attention.v_proj(normed))))
+        seen = Seen(*(torch.cat([attention.for_all_heads(each) for each in pair], 2) for pair in pairs))
+        made = attention.attend(queries, seen, mask)
+        x = x + (made if gate is None else made * gate)
+        normed, gate = self._normed(self.post_attention_layernorm, x, condition)
+        made = self.mlp(normed)
+        return x + (made if gate is None else made * gate)  # type: ignore[no-any-return]
+
+    def _normed(self, norm: nn.Module, x: Tensor, condition: Tensor) -> tuple[Tensor, Tensor | None]:
+        return norm(x, condition) if self.adaptive else (norm(x), None)
+
+
+class Pi(nn.Module):
+    """The whole network, under the names of lerobot's ``PI0Pytorch``."""
+
+    paligemma_with_expert: Any
+
+    def __init__(self, config: PiConfig) -> None:
+        super().__init__()
+        self.config, width = config, config.expert.width
+        both: Any = nn.Module()
+        both.paligemma, both.gemma_expert = nn.Module(), nn.Module()
+        both.paligemma.model, both.gemma_expert.model = nn.Module(), nn.Module()
+        side = config.vision.image_size
+        both.paligemma.model.vision_tower = Siglip(config.vision, (side, side))
+        both.paligemma.model.multi_modal_projector = nn.Module()
+        both.paligemma.model.multi_modal_projector.linear = nn.Linear(config.vision.hidden_size, config.text.width)
+        both.paligemma.model.language_model = nn.Module()
+        both.paligemma.model.language_model.embed_tokens = nn.Embedding(config.vocabulary, config.text.width)
+        both.paligemma.model.language_model.layers = nn.ModuleList(
+            Layer(config.text) for _ in range(config.text.layers)
+        )
+        both.gemma_expert.model.layers = nn.ModuleList(_ExpertLayer(config) for _ in range(config.expert.layers))
+        both.gemma_expert.model.norm = _AdaptiveNorm(config.expert) if config.adaptive else Norm(config.expert)
+        self.paligemma_with_expert = both
+        self.action_in_proj, self.action_out_proj = nn.Linear(config.actions, width), nn.Linear(width, config.actions)
+        if config.state is None:
+            self.time_mlp_in, self.time_mlp_out = nn.Linear(width, width), nn.Linear(width, width)
+        else:
+            self.state_proj = nn.Linear(config.state, width)
+            self.action_time_mlp_in = nn.Linear(2 * width, width)
+            self.action_time_mlp_out = nn.Linear(width, width)
+
+
+class Prefix(nn.Module):
+    """What the network reads once a call.
+
+    Args:
+        network: whose parts these are.
+    """
+
+    def __init__(self, network: Pi) -> None:
+        super().__init__()
+        model = network.paligemma_with_expert.paligemma.model
+        self.channels, self.width = network.config.text.channels, network.config.text.width
+        self.vision_model, self.language_model = model.vision_tower, model.language_model
+        self.projector = model.multi_modal_projector.linear
+        self.state_proj: nn.Module | None = None if network.config.adaptive else network.state_proj
+
+    def forward(self, images: list[Tensor], tokens: Tensor, mask: Tensor, state: Tensor | None) -> tuple[Tensor, ...]:
+        """Which tokens count, ``[B, P]``; in pi0 the state's token ``[B, 1, E]``; then keys and values of each layer.
+
+        Args:
+            images: of each camera ``[B, 3, H, W]``, in -1..1.
+            tokens: int64 ``[B, L]``.
+            mask: bool ``[B, L]``.
+            state: padded ``[B, Ds]``; None in pi0.5.
+        """
+        seen = self.projector(self.vision_model(torch.stack(images, 1).flatten(0, 1)))
+        seen = seen.reshape(-1, len(images) * seen.shape[1], self.width)
+        words = self.language_model.embed_tokens(tokens) * math.sqrt(self.width)
+        valid = functional.pad(mask, (seen.shape[1], 0), value=True)
+        turns = rotation(torch.cumsum(valid, 1) - 1, self.channels)
+        x = torch.cat([seen, words], 1)
+        cache = read_prefix(self.language_model.layers, x, turns, prefix_mask(valid))
+        own = [] if self.state_proj is None or state is None else [self.state_proj(state)[:, None]]
+        return (valid, *own, *cache)
+
+
+class Expert(nn.Module):
+    """The denoiser.
+
+    Args:
+        network: whose parts these are.
+    """
+
+    def __init__(self, network: Pi) -> None:
+        super().__init__()
+        model = network.paligemma_with_expert.gemma_expert.model
+        self.config = network.config
+        self.layers, self.norm = model.layers, model.norm
+        self.action_in_proj, self.action_out_proj = network.action_in_proj, network.action_out_proj
+        adaptive = network.config.adaptive
+        self.mlp_in = network.time_mlp_in if adaptive else network.action_time_mlp_in
+        self.mlp_out = network.time_mlp_out if adaptive else network.action_time_mlp_out
+
+    def forward(self, sample: Tensor, timestep: Tensor, encoded: tuple[Tensor, ...]) -> Tensor:
+        """``[B, T, D]``, times ``[B]`` from 1 to 0 and what ``Prefix`` gives -> the velocity ``[B, T, D]``."""
+        valid, *cache = encoded
+        x = self.action_in_proj(sample)
+        time = waves(timestep, self.config.expert.width, *self.config.periods)
+        own = torch.zeros(1, 1)
+        if self.config.adaptive:
+            time = functional.silu(self.mlp_out(functional.silu(self.mlp_in(time))))
+        else:
+            state, *cache = cache
+            x = torch.cat([x, time[:, None].expand_as(x)], 2)
+            x = torch.cat([state, self.mlp_out(functional.silu(self.mlp_in(x)))], 1)
+            # The state does not see the actions.
+            groups = torch.arange(x.shape[1]) > 0
+            own = added(groups[None, :] <= groups[:, None])
+        count = x.shape[1]
+        turns = rotation(valid.sum(-1, keepdim=True) + torch.arange(count)[None], self.config.expert.channels)
+        before = added(valid[:, None, None, :]).expand(-1, -1, count, -1)
+        mask = torch.cat([before, own.expand(len(sample), 1, count, count)], 3)
+        for i, layer in enumerate(self.layers):
+            x = layer(x, Seen(cache[2 * i], cache[2 * i + 1]), turns, mask, time)
+        actions = x[:, -sample.shape[1] :]
+        normed = self.norm(actions, time)[0] if self.config.adaptive else self.norm(actions)
+        return self.action_out_proj(normed)  # type: ignore[no-any-return]

@@ -1,0 +1,82 @@
+"""The image encoder SigLIP, as SmolVLM2 and PaliGemma have it: an image to one feature for each patch.
+
+Its layers are those of CLIP's encoders. Attribute names are those under which the weights of transformers load.
+
+Source: Zhai et al., Sigmoid Loss for Language Image Pre-Training (arXiv 2303.15343).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+
+from .clip import Layers, TowerConfig
+
+
+@dataclass(frozen=True)
+class SiglipConfig(TowerConfig):
+    """The encoder; images have ``image_size`` pixels a side where every patch has its own position.
+
+    Defaults are what transformers takes for an entry that SmolVLM's file leaves out.
+    """
+
+    hidden_size: int = 1152
+    intermediate_size: int = 3072
+    num_hidden_layers: int = 12
+    num_attention_heads: int = 16
+    hidden_act: str = "gelu_pytorch_tanh"
+    layer_norm_eps: float = 1e-6
+    image_size: int = 224
+    patch_size: int = 32
+
+    @property
+    def side(self) -> int:
+        """Patches along a side."""
+        return self.image_size // self.patch_size
+
+
+class _Embeddings(nn.Module):
+    def __init__(self, config: SiglipConfig) -> None:
+        super().__init__()
+        width, patch = config.hidden_size, config.patch_size
+        self.patch_embedding = nn.Conv2d(3, width, patch, stride=patch)
+        self.position_embedding = nn.Embedding(config.side**2, width)
+
+    def forward(self, pixels: torch.Tensor, positions: torch.Tensor) -> torch.Tensor:
+        patches = self.patch_embedding(pixels).flatten(2).transpose(1, 2)
+        return patches + self.position_embedding.weight[positions]  # type: ignore[no-any-return]
+
+
+class Siglip(nn.Module):
+    """Pixels in -1..1 ``[N, 3, H, W]`` to patches ``[N, H/patch * W/patch, width]``, normalised after the last layer.
+
+    Args:
+        config: of the encoder.
+        size: H and W.
+    """
+
+    positions: torch.Tensor
+
+    def __init__(self, config: SiglipConfig, size: tuple[int, int]) -> None:
+        super().__init__()
+        self.embeddings = _Embeddings(config)
+        self.encoder = Layers(config)
+        self.post_layernorm = nn.LayerNorm(config.hidden_size, eps=config.layer_norm_eps)
+        height, width = (_buckets(n // config.patch_size, config.side) for n in size)
+        rows = [row * config.side + column for row in height for column in width]
+        # Made of numbers, so that a network without memory (on the meta device) has them all the same.
+        self.register_buffer("positions", torch.tensor(rows, device="cpu"), persistent=False)
+
+    def forward(self, pixels: torch.Tensor) -> torch.Tensor:
+        """See the class."""
+        return self.post_layernorm(self.encoder(self.embeddings(pixels, self.positions)))  # type: ignore[no-any-return]
+
+
+def _buckets(count: int, side: int) -> list[int]:
+    """Which of ``side`` positions each of ``count`` patches has: by its share of the image, as SmolVLM rounds it."""
+    step = torch.tensor(1.0, device="cpu") / count
+    share = torch.clamp(torch.arange(count, dtype=torch.float32, device="cpu") * step, max=1.0 - 1e-6)
+    boundaries = torch.arange(1 / side, 1.0, 1 / side, device="cpu")
+    return [int(n) for n in torch.bucketize(share, boundaries, right=True)]
