@@ -89,7 +89,8 @@ class _Affine:
 def idle_form(pieces: Pieces, weights: Weights) -> tuple[IdleForm | None, str]:
     """The form of a program with these pieces and values of constants, or None and why it has another."""
     try:
-        return _form(pieces, weights), ""
+        with torch.inference_mode(False), torch.enable_grad():  # whatever the caller's mode
+            return _form(pieces, weights), ""
     except _Declined as reason:
         return None, str(reason)
 
