@@ -62,13 +62,16 @@ class MaskedUpdates:
         self.updates, self._plain = updates.copy(), updates
         self._chunk, self._length = chunk, 0
 
-    def mask(self, length: int) -> None:
-        """Set the length of the prefix."""
+    def mask(self, length: int) -> bool:
+        """Set the length of the prefix; whether it was another."""
+        if length == self._length:
+            return False
         first, last = sorted((self._length, length))
         positions, groups = slice(self._chunk.start + first, self._chunk.start + last), slice(self._chunk.action_dim)
         changed = (slice(None), groups, slice(None), positions)  # with G = 1, the one
         self.updates[changed] = 0 if length > self._length else self._plain[changed]
         self._length = length
+        return True
 
 
 def noise_levels(sampler: SamplerTable) -> Levels | None:

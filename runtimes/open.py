@@ -8,13 +8,31 @@ from typing import Any
 
 from ttscompile.artifact.load import Artifact
 from ttscompile.core.given import integer
+from ttscompile.core.spec import BF16, FP16, FP32
 from ttscompile.errors import RuntimeUnavailableError
 
 from .backend import Backend, fitting
 from .runtime import Runtime
 
+CPU = "cpu"
+
 MOST_THREADS = 1024
 """More than any machine has a use for: onnxruntime tries to make as many as it is told, for minutes."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a runtime is opened.
+
+    Attributes:
+        threads: of arithmetic, one of which is the caller's. The reference runs with torch's own setting.
+        device: where it computes.
+        precision: of the residual blocks, where the runtime makes it of weights in fp32 (``Kind.precisions``).
+    """
+
+    threads: int = 1
+    device: str = CPU
+    precision: str = FP32
 
 
 @dataclass(frozen=True)
@@ -22,31 +40,41 @@ class Kind:
     """One kind of runtime.
 
     Attributes:
-        make: its backend on an artifact, with so many threads of arithmetic; imports what it needs when it is called.
+        make: its backend on an artifact; imports what it needs when it is called.
         install: what pip has to install where its packages are missing.
-        fp32_only: whether it computes residual blocks in fp32 alone, whatever other precision the artifact holds.
+        precisions: those of residual blocks that it makes of the weights in fp32, which every artifact holds; empty
+            where it computes in those that the artifact holds.
+        devices: whether it computes anywhere else than on the CPU.
     """
 
-    make: Callable[[Artifact, int], Backend[Any]]
+    make: Callable[[Artifact, Options], Backend[Any]]
     install: str
-    fp32_only: bool = False
+    precisions: tuple[str, ...] = ()
+    devices: bool = False
 
 
-def _onnxruntime(artifact: Artifact, threads: int) -> Backend[Any]:
+def _onnxruntime(artifact: Artifact, options: Options) -> Backend[Any]:
     from .onnxruntime.backend import OnnxBackend
 
-    return OnnxBackend(artifact, threads)
+    return OnnxBackend(artifact, options.threads)
 
 
-def _reference(artifact: Artifact, threads: int) -> Backend[Any]:
+def _reference(artifact: Artifact, options: Options) -> Backend[Any]:
     from .reference.backend import ReferenceBackend
 
-    return ReferenceBackend(artifact)  # torch has its own setting of threads
+    return ReferenceBackend(artifact)
+
+
+def _torch(artifact: Artifact, options: Options) -> Backend[Any]:
+    from .torch.backend import TorchBackend
+
+    return TorchBackend(artifact, options.threads, options.device, options.precision)
 
 
 RUNTIMES = {
     "onnxruntime": Kind(_onnxruntime, install="onnxruntime"),
-    "reference": Kind(_reference, install="ttscompile[compile]", fp32_only=True),
+    "torch": Kind(_torch, install="ttscompile[compile]", precisions=(FP32, BF16, FP16), devices=True),
+    "reference": Kind(_reference, install="ttscompile[compile]", precisions=(FP32,)),
 }
 
 
@@ -61,23 +89,34 @@ def kind_of(runtime: str) -> Kind:
     return RUNTIMES[runtime]
 
 
-def open_runtime(artifact: Artifact, runtime: str = "onnxruntime", threads: int = 1) -> Runtime:
+def open_runtime(
+    artifact: Artifact, runtime: str = "onnxruntime", threads: int = 1, device: str | None = None, precision: str = FP32
+) -> Runtime:
     """Make a runtime for an artifact.
 
     Args:
         artifact: loaded and checked.
         runtime: a name in ``RUNTIMES``.
-        threads: threads of arithmetic, one of which is the caller's. The reference runs with torch's own setting.
+        threads: see ``Options``.
+        device: see ``Options``; None for the CPU.
+        precision: see ``Options``.
 
     Raises:
-        RuntimeUnavailableError: no runtime of this name, its packages are missing, or the threads cannot be had.
+        RuntimeUnavailableError: no runtime of this name, its packages are missing, or threads, device or precision
+            cannot be had.
         ArtifactError: the parts of the artifact do not fit each other.
     """
     threads = integer(threads, "threads", RuntimeUnavailableError, 1, MOST_THREADS)
     kind = kind_of(runtime)
+    if device is not None and not isinstance(device, str):
+        raise RuntimeUnavailableError(f"expected the name of a device, 'cpu' or 'cuda'; found {device!r}.")
+    if device not in (None, CPU) and not kind.devices:
+        able = ", ".join(repr(name) for name, each in RUNTIMES.items() if each.devices)
+        problem = f"runtime {runtime!r} computes on the CPU alone; found device {device!r}"
+        raise RuntimeUnavailableError(f"{problem}. Use runtime={able}.")
     try:
         with artifact.reading(), fitting(artifact):  # a backend reads arrays that are mapped from the files
-            return Runtime(artifact, kind.make(artifact, threads))
+            return Runtime(artifact, kind.make(artifact, Options(threads, device or CPU, precision)))
     except ModuleNotFoundError as error:
         problem = f"runtime {runtime!r} needs {error.name!r}, which is not installed"
         raise RuntimeUnavailableError(f"{problem}. Run: pip install '{kind.install}'.") from error

@@ -45,20 +45,24 @@ def load(
     *,
     precision: str | None = None,
     plan: str | None = None,
+    device: str | None = None,
 ) -> CompiledPolicy:
     """Load a compiled policy.
 
     Args:
         path: the directory that ``convert`` wrote, or the same zipped.
-        runtime: ``onnxruntime``; or ``reference``, which is slow and needs torch.
+        runtime: ``onnxruntime``; ``torch``, which needs torch and computes on any device that it has; or ``reference``,
+            which is slow and needs torch.
         threads: threads of arithmetic, of this policy alone. 1 computes on the caller's thread and makes none. With
             more, ``threads - 1`` of them look for work for 50 us after each block, and then sleep: a loaded policy that
             is not called takes no processor time.
         seed: of the noise that is drawn when none is given; None for another sequence every time.
-        precision: of the weights of residual blocks: ``fp32``, which every artifact holds; None for what it was
-            converted with. The reference runtime computes in fp32 alone.
+        precision: of the residual blocks. ``fp32`` is what every artifact holds; None for what it was converted with.
+            Torch computes the products of the blocks in ``fp32``, which is what None means there, ``bf16`` or
+            ``fp16``; the reference in fp32 alone.
         plan: that ``predict_action`` uses when it is given none: ``dense`` or the name of a plan of the artifact; None
             for the artifact's default.
+        device: where torch computes: ``cpu``, ``cuda``, ``cuda:1``, ``mps``. None for the CPU.
 
     Raises:
         IllegalPlanError: the artifact has no plan of this name.
@@ -70,24 +74,33 @@ def load(
     seed = check_seed(seed)
     for _ in range(TRIES - 1):
         with suppress(ArtifactChangedError):
-            return _load(path, runtime, threads, seed, precision, plan)
-    return _load(path, runtime, threads, seed, precision, plan)
+            return _load(path, runtime, threads, seed, precision, plan, device)
+    return _load(path, runtime, threads, seed, precision, plan, device)
 
 
 def _load(
-    path: str | Path, runtime: str, threads: int, seed: int | None, precision: str | None, plan: str | None
+    path: str | Path,
+    runtime: str,
+    threads: int,
+    seed: int | None,
+    precision: str | None,
+    plan: str | None,
+    device: str | None,
 ) -> CompiledPolicy:
-    artifact = load_artifact(path)
-    if kind_of(runtime).fp32_only:
-        if precision not in (None, FP32):
-            problem = f"runtime {runtime!r} computes in {FP32!r} alone; found precision {precision!r}"
+    artifact, made = load_artifact(path), kind_of(runtime).precisions
+    own = FP32
+    if made:
+        if precision is not None and precision not in made:
+            those = ", ".join(map(repr, made))
+            problem = f"runtime {runtime!r} computes in {those} alone; found precision {precision!r}"
             raise RuntimeUnavailableError(f"{problem}. Leave it out.")
-        precision = FP32
+        own, precision = precision or FP32, FP32
     if precision is not None:
         artifact = artifact.at_precision(precision)
     if plan is not None:
         _require_plan(artifact, plan)  # before the sessions are opened
-    return CompiledPolicy(artifact, open_runtime(artifact, runtime, threads), seed, plan)
+    opened = open_runtime(artifact, runtime, threads, device, own)
+    return CompiledPolicy(artifact, opened, seed, plan, own if made else None)
 
 
 class CompiledPolicy:
@@ -101,13 +114,22 @@ class CompiledPolicy:
         runtime: opened on the same artifact.
         seed: of the noise that is drawn when none is given.
         plan: see ``load``.
+        precision: of the residual blocks; None for the artifact's.
 
     Raises:
         IllegalPlanError: the artifact has no plan of this name.
     """
 
-    def __init__(self, artifact: Artifact, runtime: Runtime, seed: int | None = None, plan: str | None = None) -> None:
+    def __init__(
+        self,
+        artifact: Artifact,
+        runtime: Runtime,
+        seed: int | None = None,
+        plan: str | None = None,
+        precision: str | None = None,
+    ) -> None:
         self._artifact, self._runtime = artifact, runtime
+        self._precision = precision or artifact.manifest.precision_name
         self._manifest = artifact.manifest
         self._default = artifact.manifest.default_plan if plan is None else plan
         _require_plan(artifact, self._default)
@@ -152,7 +174,7 @@ class CompiledPolicy:
             model_identity=manifest.model_identity,
             plans=(DENSE, *manifest.plans),
             default_plan=self._default,
-            precision=manifest.precision_name,
+            precision=self._precision,
             rollout=rollout_needs(self._artifact),
             prefix_refusal=self._prefix_refusal,
         )

@@ -58,9 +58,11 @@ COMPILES = (
     "ttscompile.driver",
     "ttscompile.frontends",
     "ttscompile.ir.evaluate",
+    "ttscompile.ir.idle_form",
     "ttscompile.lower",
     "ttscompile.passes",
     "ttscompile.runtimes.reference",
+    "ttscompile.runtimes.torch",
     "ttscompile.samplers",
     "ttscompile.verification.record_golden",
 )

@@ -17,8 +17,8 @@ from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.cli.timing import Contestant, Measurement
 from ttscompile.core.lattice import PlanArray, plan_flops
 from ttscompile.ir.pieces import block_name
+from ttscompile.runtimes.instructions import instructions_of
 from ttscompile.runtimes.onnxruntime.idle_steps import WORTH
-from ttscompile.runtimes.onnxruntime.instructions import instructions_of
 from ttscompile.runtimes.onnxruntime.sessions import Bound, open_sessions
 from ttscompile.runtimes.onnxruntime.workspace import Workspace
 from ttscompile.runtimes.random_calls import random_calls

@@ -13,10 +13,10 @@ from ttscompile.artifact.load import Artifact
 from ttscompile.core.lattice import PlanArray
 from ttscompile.core.spec import FloatArray, Noise
 from ttscompile.runtimes.backend import Call
+from ttscompile.runtimes.instructions import Instructions, instructions_of
 from ttscompile.runtimes.liveness import readable_rollout
 
 from .decode import decode_first, decode_rest
-from .instructions import Instructions, instructions_of
 from .sessions import open_blocks, open_sessions
 from .workspace import Workspace
 

@@ -8,9 +8,9 @@ from itertools import islice
 import numpy as np
 
 from ttscompile.core.lattice import BoolArray
+from ttscompile.runtimes.instructions import Instructions
 
 from .idle_steps import WORTH, IdleSteps
-from .instructions import Instructions
 from .sessions import Array
 from .workspace import Workspace
 

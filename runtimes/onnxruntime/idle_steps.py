@@ -1,4 +1,4 @@
-"""Steps without a computed block, in numpy, where the network allows it (``lower.idle`` says what is computed).
+"""Steps without a computed block, in numpy, where the network allows it (``ir.idle_form`` says what is computed).
 
 A step's arrays have the size of the sample, and a call of numpy on them takes half a microsecond; the same step through
 the session of ``advance`` takes 37 us at Push-T's size, and 14 us so. Sample, prediction and what else the update reads

@@ -21,6 +21,7 @@ from ttscompile.errors import ArtifactError, ObservationError
 from ttscompile.ir import pieces
 from ttscompile.ir.graph import TensorType
 from ttscompile.ir.pieces import ADVANCE, CONTEXT, DENSE_STEP, IDLE, PRUNER, STEM, STREAM, block_name
+from ttscompile.runtimes.call_inputs import fill_initial, fill_offset, hold_known
 from ttscompile.runtimes.inpainting import Known, MaskedUpdates
 
 from .contexts import BoundBlock, ContextValues
@@ -96,26 +97,18 @@ class Workspace:
         self, obs: Mapping[str, FloatArray], noise: Noise, correction: Correction | None, known: Known | None = None
     ) -> None:
         """Take in what a call is given, and run what decides before the loop."""
-        np.copyto(self._initial, noise.initial)
-        if known is not None:
-            self._initial[:, known.positions, known.channels] = known.values[0]
+        fill_initial(self._initial, noise, known)
         np.copyto(self.sample[0], self._initial.transpose(2, 0, 1))
         self._advance = self.advances_with(correction or self._no_correction, known)
         self._history.fill(0)
         if self._memory:
             self._memory[0].fill(0)
-        if self._sampler.stochastic and noise.steps is not None:
-            column = self._sampler.noise_to_next[:, None, None, None]
-            np.multiply(noise.steps.transpose(0, 3, 1, 2), column, out=self._offset)
-        else:
-            self._offset.fill(0)
+        fill_offset(self._offset, self._sampler, noise, correction)
         self._contexts.fill(obs)
-        if correction is not None:
-            self._offset += correction.bias
-            if correction.reads:
-                self._offset += correction.from_condition(self._contexts.condition())
+        if correction is not None and correction.reads:
+            self._offset += correction.from_condition(self._contexts.condition())
         if known is not None:
-            self._offset[:, known.channels, :, known.positions] = known.values[1:].transpose(0, 3, 1, 2)
+            hold_known(self._offset, known)
 
     def begin(self) -> None:
         """The residual stream of step 0; fills ``fresh``."""

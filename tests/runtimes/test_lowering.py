@@ -13,8 +13,8 @@ from tests.rounding import assert_equal_but_for_rounding
 from ttscompile import Source
 from ttscompile.core.lattice import PlanArray, dense_plan, uniform_plan
 from ttscompile.errors import IllegalPlanError
+from ttscompile.runtimes.instructions import Instructions, instructions_of
 from ttscompile.runtimes.onnxruntime.decode import decode_first, decode_rest
-from ttscompile.runtimes.onnxruntime.instructions import Instructions, instructions_of
 from ttscompile.runtimes.onnxruntime.workspace import RolloutStore
 from ttscompile.runtimes.settle import LoweringCache
 

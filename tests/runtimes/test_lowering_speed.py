@@ -9,7 +9,7 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from ttscompile.core.lattice import Source, uniform_plan
-from ttscompile.runtimes.onnxruntime.instructions import instructions_of
+from ttscompile.runtimes.instructions import instructions_of
 from ttscompile.runtimes.settle import LoweringCache
 
 from .plans import random_plan

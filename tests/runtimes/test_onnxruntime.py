@@ -19,7 +19,7 @@ from ttscompile.core.lattice import PlanArray, dense_plan, legalize, uniform_pla
 from ttscompile.errors import ArtifactError, IllegalPlanError, ObservationError, RuntimeUnavailableError
 from ttscompile.ir.program import Binding
 from ttscompile.runtimes import Runtime, open_runtime
-from ttscompile.runtimes.onnxruntime.instructions import Instructions, instructions_of
+from ttscompile.runtimes.instructions import Instructions, instructions_of
 from ttscompile.runtimes.onnxruntime.workspace import Workspace
 from ttscompile.runtimes.policy import load
 

@@ -19,9 +19,9 @@ from .rules import DType, Positive
 
 FloatArray = npt.NDArray[np.float32]
 
-FP32, INT8 = "fp32", "int8"
+FP32, INT8, BF16, FP16 = "fp32", "int8", "bf16", "fp16"
 PRECISIONS = (FP32, INT8)
-"""Names of what the weights of residual blocks can be asked for in."""
+"""Names of what an artifact can hold the weights of residual blocks in."""
 
 LARGEST = 1e6
 """No number that goes into the network, normalised, is larger, either way; what is cannot be from training. A range

@@ -185,7 +185,7 @@ class Evaluator:
             multiple = argument.multiple
             return None, lambda frame, streams: multiple * streams
         if isinstance(argument, Enum):
-            return self._enum(node, argument), None
+            return resolve_enum(node, argument, self._device), None
         if isinstance(argument, tuple):
             both = [self._argument(node, item) for item in argument]
             fixed, changing = [value for value, _ in both], [(i, g) for i, (_, g) in enumerate(both) if g is not None]
@@ -201,14 +201,19 @@ class Evaluator:
             return None, build
         return argument, None
 
-    def _enum(self, node: Node, argument: Enum) -> Any:
-        """The torch object that an enumeration names."""
-        if argument.kind == "device":
-            return self._device
-        value = getattr(torch, argument.name, None)
-        if argument.kind not in _ENUM_TYPES or not isinstance(value, _ENUM_TYPES[argument.kind]):
-            raise CaptureError(f"{_where(node)} has the argument {argument}; torch has no such {argument.kind}.")
-        return value
+
+def resolve_enum(node: Node, argument: Enum, device: torch.device) -> Any:
+    """The torch object that an enumeration among the arguments of a node names; a device is ``device``.
+
+    Raises:
+        CaptureError: torch has no such object.
+    """
+    if argument.kind == "device":
+        return device
+    value = getattr(torch, argument.name, None)
+    if argument.kind not in _ENUM_TYPES or not isinstance(value, _ENUM_TYPES[argument.kind]):
+        raise CaptureError(f"{_where(node)} has the argument {argument}; torch has no such {argument.kind}.")
+    return value
 
 
 def bind_batch(types: Mapping[str, TensorType], values: Mapping[str, torch.Tensor]) -> int:

@@ -38,7 +38,7 @@ DENSE_STEP = "dense_step"
 """All blocks, one after the other (``ir.joint``)."""
 
 IDLE = "idle"
-"""What steps need of the sum that they add where they compute no block (``lower.idle``); not every network has it."""
+"""What steps need of the sum that they add where they compute no block (``ir.idle_form``); not every network has it."""
 
 LAYERS: Final = "layers"
 """The results of the layers of a network that is one block (``ir.layers``); ``verify`` alone opens it."""
@@ -100,7 +100,7 @@ TOTAL = "total"
 BASE, PRODUCT, SHIFT = "base", "product", "shift"
 IDLE_OUTPUTS = (BASE, PRODUCT, SHIFT)
 """``base [2 D + 1, B, T]``, what is added to ``product [2 D + 1, D] @ x``: rows of y, then those of the numerator; and
-``shift [D, 1, T]``, what is added to the quotient. The last two depend on nothing. ``lower.idle`` says what y is."""
+``shift [D, 1, T]``, what is added to the quotient. The last two depend on nothing. ``ir.idle_form`` says what y is."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""A plan to matrices that a loop can multiply with, in ONNX: what ``onnxruntime.instructions`` does in numpy.
+"""A plan to matrices that a loop can multiply with, in ONNX: what ``runtimes.instructions`` does in numpy.
 
 Blocks that are reused between two computed ones make a *gap*; what a gap adds is a row of coefficients times residuals
 that are there when the step begins (``from_table``, ``from_rollout``), plus FORWARD reads of residuals computed in the

@@ -1,0 +1,177 @@
+"""A call as one straight line of torch: any device, CUDA graphs where there is one.
+
+What the line computes is in ``loop``; between which tensors, in ``workspace``; whether it is captured, in ``capture``.
+It shares no loop with the reference, which stays slow and literal: each is the other's test.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+
+import numpy as np
+import torch
+
+from ttscompile.artifact.load import Artifact
+from ttscompile.core.correction import Correction
+from ttscompile.core.lattice import BoolArray, PlanArray, dense_plan
+from ttscompile.core.spec import FloatArray
+from ttscompile.runtimes.backend import Call, fitting
+from ttscompile.runtimes.inpainting import MaskedUpdates
+from ttscompile.runtimes.instructions import Instructions, instructions_of
+from ttscompile.runtimes.liveness import readable_rollout
+
+from .capture import Capture, Line, Lines, cuda_graphs
+from .devices import device_of, narrow_type
+from .network import Parts
+from .sampler import Advance
+from .workspace import Workspace
+
+
+class TorchBackend:
+    """A ``Backend`` on torch.
+
+    Args:
+        artifact: loaded and checked.
+        threads: of arithmetic on the CPU, during calls alone: torch's setting is as it was between them.
+        device: ``cpu``, ``cuda``, ``cuda:1``, ``mps``; as torch calls it.
+        precision: of the products in residual blocks: ``fp32``, ``bf16``, ``fp16``.
+        capture: how lines are captured; None for CUDA graphs on CUDA, and not at all elsewhere.
+
+    Attributes:
+        keeps: entries of the rollout cache that some plan of the artifact can read.
+        workspace: of the batch size under way.
+
+    Raises:
+        RuntimeUnavailableError: torch does not have the device, or the device not the precision.
+    """
+
+    def __init__(
+        self,
+        artifact: Artifact,
+        threads: int = 1,
+        device: str = "cpu",
+        precision: str = "fp32",
+        capture: Capture | None = None,
+    ) -> None:
+        self._artifact, self._manifest, self._threads = artifact, artifact.manifest, threads
+        self.device = device_of(device)
+        if capture is None and self.device.type == "cuda":
+            capture = cuda_graphs()
+        self._lines = Lines(capture)
+        groups = self._manifest.groups
+        dense = dense_plan(self._manifest.steps, len(groups))
+        self._own = {plan.tobytes(): instructions_of(plan, groups) for plan in (dense, *artifact.schedules.values())}
+        self._named = set(self._own.values())
+        self.keeps = readable_rollout(artifact)
+        self._advances: dict[tuple[Correction | None, bool], tuple[Advance, MaskedUpdates | None]] = {}
+        with self._settings():
+            self._parts = Parts(artifact, self.device, narrow_type(precision, self.device))
+            self.workspace = Workspace(self._parts, 1)
+        self._some: dict[int, Workspace] = {}  # for streams of a batch that follow a plan of their own
+        self._whole = False
+
+    def lower(self, plan: PlanArray) -> Instructions:
+        """See ``Backend.lower``."""
+        return self._own.get(plan.tobytes()) or instructions_of(plan, self._manifest.groups)
+
+    def prepare(self, streams: int, plans: Sequence[Instructions] | None) -> None:
+        """Make the workspace of a batch size."""
+        self._pruned = plans is None
+        self._whole = plans is not None and self._lines.captures and len(set(plans)) == 1 and plans[0] in self._named
+        if self.workspace.streams == streams:
+            return
+        self._lines.forget()
+        self._some.clear()
+        with self._settings():
+            self.workspace = Workspace(self._parts, streams)
+
+    def start(self, call: Call) -> None:
+        """See ``Backend.start``."""
+        self._call = call
+        with self._settings():
+            self.workspace.load(call)
+            self._advance = self._advance_of(call)
+            if not self._whole:
+                self._lines.run("prologue", self.workspace.network.prologue)
+
+    def logits(self) -> FloatArray:
+        """See ``Backend.logits``."""
+        with self._settings():
+            return np.asarray(self.workspace.network.logits().float().cpu().numpy(), dtype=np.float32)
+
+    def first_step(self) -> None:
+        """Nothing: the line begins with it."""
+
+    def other_steps(self, plans: Sequence[Instructions]) -> FloatArray:
+        """See ``Backend.other_steps``."""
+        with self._settings():
+            streams: dict[Instructions, list[int]] = {}
+            for s, plan in enumerate(plans):
+                streams.setdefault(plan, []).append(s)
+            if len(streams) == 1:
+                self._run(self.workspace, plans[0], self._whole)
+            else:
+                self._apart(streams)
+            return np.asarray(self.workspace.result.cpu().numpy()).copy()
+
+    def _apart(self, streams: dict[Instructions, list[int]]) -> None:
+        """Streams of one plan are a batch of their own."""
+        whole = self.workspace
+        for plan, some in streams.items():
+            if len(some) not in self._some:
+                self._some[len(some)] = Workspace(self._parts, len(some))
+            work, index = self._some[len(some)], torch.tensor(some, device=self.device)
+            work.take(whole, index, plan)
+            self._run(work, plan, False)
+            work.give(whole, index, _kept(plan, self._call.keep))
+
+    def _run(self, work: Workspace, plan: Instructions, whole: bool) -> None:
+        """The loop on a workspace; the whole call where its plan was known before it began."""
+        keep = self._call.keep
+        for cell in (*np.flatnonzero(plan.rollout).tolist(), *_kept(plan, keep)):
+            work.entry(cell)
+        line = partial(work.call, plan, keep, self._advance)
+        key = work.streams, whole, plan, keep.tobytes(), self._advance
+        matrix = not self._pruned and plan not in self._named
+        self._lines.run(None if matrix else key, partial(_after, work.network.prologue, line) if whole else line)
+
+    def _advance_of(self, call: Call) -> Advance:
+        """The sampler's steps with the correction of a call; made once for each, and once for its prefixes."""
+        key = call.correction, call.known is not None
+        if key not in self._advances:
+            advance = Advance(self._manifest.spec, call.correction, self.device)
+            masked = None if call.known is None else MaskedUpdates(advance.updates, self._manifest.spec.chunk)
+            self._advances[key] = advance, masked
+        advance, masked = self._advances[key]
+        if masked is not None and call.known is not None and masked.mask(call.known.values.shape[2]):
+            advance.write(masked.updates)
+        return advance
+
+    @contextmanager
+    def _settings(self) -> Iterator[None]:
+        """The settings of torch that a call needs, which are the process's: as they were after it."""
+        before, exact = torch.get_num_threads(), torch.backends.cudnn.allow_tf32
+        try:
+            if before != self._threads:
+                torch.set_num_threads(self._threads)
+            torch.backends.cudnn.allow_tf32 = False
+            with fitting(self._artifact), torch.inference_mode():
+                yield
+        finally:
+            torch.backends.cudnn.allow_tf32 = exact
+            if before != self._threads:
+                torch.set_num_threads(before)
+
+
+def _after(first: Line, then: Line) -> None:
+    """Both, one after the other."""
+    first()
+    then()
+
+
+def _kept(plan: Instructions, keep: BoolArray) -> list[int]:
+    """Computed cells whose residual goes into the rollout cache."""
+    kept: list[int] = np.flatnonzero(plan.computed & keep).tolist()
+    return kept

@@ -1,0 +1,129 @@
+"""The denoising loop of one plan: a straight line of pure functions, the same for every batch, device and compiler.
+
+Nothing here is written in place and nothing is read back, so a call can be captured in a CUDA graph, or exported.
+Sample and what belongs to it have the action dimensions first, ``[D, B, T]``, as ``core.update`` wants them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from ttscompile.core.lattice import BoolArray
+from ttscompile.runtimes.instructions import Instructions
+
+from .idle_steps import IdleSteps
+from .sampler import Advance, begin
+
+
+class Network(Protocol):
+    """The pieces of the loop, for the observation at hand.
+
+    Attributes:
+        idle: for steps without a computed block; None if the network is of another form.
+    """
+
+    idle: IdleSteps | None
+
+    def stem(self, sample: Tensor, k: int) -> Tensor:
+        """The residual stream of step k from the sample ``[B, T, D]``."""
+
+    def block(self, b: int, k: int, stream: Tensor) -> Tensor:
+        """The residual of block b at step k."""
+
+    def tail(self, stream: Tensor, k: int) -> Tensor:
+        """The prediction ``[B, T, D]`` of step k from the stream after the last block."""
+
+
+@dataclass(frozen=True)
+class Denoised:
+    """Result of a call.
+
+    Attributes:
+        sample: ``[B, T, D]``.
+        residuals: those that were to be kept, by flat index ``k * blocks + b``.
+    """
+
+    sample: Tensor
+    residuals: Mapping[int, Tensor]
+
+
+def denoise(
+    network: Network,
+    plan: Instructions,
+    keep: BoolArray,
+    advance: Advance,
+    initial: Tensor,
+    offset: Sequence[Tensor],
+    rollout: Mapping[int, Tensor],
+) -> Denoised:
+    """All steps of a call in which every stream follows one plan.
+
+    Args:
+        network: of the call.
+        plan: lowered.
+        keep: bool ``[K, blocks]``; computed residuals that the result holds.
+        advance: the sampler.
+        initial: the sample at step 0, ``[B, T, D]``.
+        offset: what each step adds to the sample, K of ``[D, B, (1 + S) T]``.
+        rollout: entries of the rollout cache that the plan reads, by flat index.
+    """
+    steps, blocks = keep.shape
+    state, residuals = begin(initial, advance), dict[int, Tensor]()
+    lane, cells, k = _Lane(plan, blocks, rollout), iter(plan.cells), 0
+    while k < steps:
+        if network.idle is not None and plan.idle[k]:
+            count = plan.alike[k]
+            known = network.idle.prepare(lane.total(count))
+            for step in range(k, k + count):
+                state = advance(state, network.idle.predict(known, state.sample), step, offset[step])
+            k += count
+            continue
+        stream, reached = network.stem(state.sample.permute(1, 2, 0), k), 0
+        for cell in islice(cells, plan.counts[k]):
+            b = cell - k * blocks
+            if b != reached:
+                stream = stream + lane.total()
+            residual = lane.current[b] = network.block(b, k, stream)
+            stream, reached = stream + residual, b + 1
+            if keep[k, b]:
+                residuals[cell] = residual
+        if reached != blocks:
+            stream = stream + lane.total()
+        prediction = network.tail(stream, k).permute(2, 0, 1)
+        state = advance(state, prediction, k, offset[k])
+        k += 1
+    return Denoised(state.sample.permute(1, 2, 0), residuals)
+
+
+class _Lane:
+    """The residuals that the instructions of a plan work on.
+
+    Attributes:
+        current: what each block computed last.
+    """
+
+    def __init__(self, plan: Instructions, blocks: int, rollout: Mapping[int, Tensor]) -> None:
+        nothing = torch.zeros(0)  # step 0 computes all blocks before anything is read
+        self.current, self._table = [nothing] * blocks, [nothing] * blocks
+        self._summed = self._table if plan.table else self.current
+        self._sums = [nothing] * plan.slots
+        self._gaps, self._loads = iter(plan.gaps), zip(plan.load_rows, plan.load_from, strict=True)
+        self._rollout = rollout
+
+    def total(self, alike: int = 1) -> Tensor:
+        """The sum of the next gaps, so many of which add the same one; it is made first if it is new."""
+        slot, start, stop, loads = next(self._gaps)
+        for _ in islice(self._gaps, alike - 1):
+            pass
+        if start != stop:
+            for row, source in islice(self._loads, loads):
+                self._table[row] = self.current[~source] if source < 0 else self._rollout[source]
+            several = self._summed[start:stop]
+            self._sums[slot] = torch.stack(several).sum(0) if len(several) > 1 else several[0]
+        return self._sums[slot]

@@ -1,0 +1,98 @@
+"""One step of the sampler and its correction as one product of matrices (``core.update`` has the formula)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ttscompile.core.correction import HISTORY, Correction, no_correction
+from ttscompile.core.spec import FloatArray, PolicySpec
+from ttscompile.core.update import clips, matrices
+
+
+class State(NamedTuple):
+    """What the loop carries from one step to the next.
+
+    Attributes:
+        sample: ``[D, B, T]``, contiguous.
+        history: of the correction, ``[D, B, 4 T]``.
+        memory: the sampler's S memories, ``[D, B, S T]``.
+    """
+
+    sample: Tensor
+    history: Tensor
+    memory: Tensor
+
+
+class Advance:
+    """The steps of a policy's sampler with one correction.
+
+    Args:
+        spec: of the policy.
+        correction: of the sampler's steps; None for none.
+        device: where to compute.
+
+    Attributes:
+        horizon: T.
+        memories: S.
+        reading: ``[N, F]``, what the correction reads of the condition; None if it reads nothing.
+        observed: ``[F, K D T]``, what that adds; None if it reads nothing.
+    """
+
+    def __init__(self, spec: PolicySpec, correction: Correction | None, device: torch.device) -> None:
+        table, (self.horizon, dimensions) = spec.sampler, spec.sample
+        self.memories, self.steps = table.memories, table.steps
+        used = correction or no_correction(table.steps, spec.sample)
+        self._anchors: list[bool] = used.anchors.tolist()
+        self._plain = torch.from_numpy(matrices(table, used)).to(device)
+        self._of_step = [one.expand(dimensions, -1, -1) for one in self._plain]
+        self._clip = table.clip if clips(table) else None
+        self._to_clean = list(zip(table.sample_to_x0.tolist(), table.out_to_x0.tolist(), strict=True))
+        self.reading = self.observed = None
+        if correction is not None and correction.reads:
+            self.reading = torch.from_numpy(correction.reading.copy()).to(device)
+            self.observed = torch.from_numpy(correction.observed.reshape(correction.reads, -1).copy()).to(device)
+
+    @property
+    def updates(self) -> FloatArray:
+        """The matrices, float32 ``[K, G, R, (1 + S) T]``."""
+        return np.asarray(self._plain.cpu().numpy(), dtype=np.float32)
+
+    def write(self, updates: FloatArray) -> None:
+        """Put other matrices in the place of these."""
+        self._plain.copy_(torch.from_numpy(updates))
+
+    def __call__(self, state: State, prediction: Tensor, k: int, offset: Tensor) -> State:
+        """What is carried to step k + 1.
+
+        Args:
+            state: at step k.
+            prediction: the network's output, ``[D, B, T]``.
+            k: step.
+            offset: what the step adds beside, ``[D, B, (1 + S) T]``.
+        """
+        sample, history, memory = state
+        read = [sample, prediction, history]
+        if self._clip is not None:
+            of_sample, of_prediction = self._to_clean[k]
+            clean = (sample * of_sample).add_(prediction, alpha=of_prediction)
+            read.append(clean.clamp_(-self._clip, self._clip))
+        if self.memories:
+            read.append(memory)
+        following = torch.baddbmm(offset, torch.cat(read, 2), self._of_step[k])
+        if self.memories:
+            memory, following = following[..., self.horizon :], following[..., : self.horizon].contiguous()
+        if self._anchors[k]:
+            history = torch.cat([sample, prediction, history[..., : 2 * self.horizon]], 2)
+        return State(following, history, memory)
+
+
+def begin(initial: Tensor, advance: Advance) -> State:
+    """What is carried to step 0: the sample ``[B, T, D]``, and zeros."""
+    sample = initial.permute(2, 0, 1).contiguous()
+    dimensions, streams, horizon = sample.shape
+    history = sample.new_zeros(dimensions, streams, HISTORY * horizon)
+    return State(sample, history, sample.new_zeros(dimensions, streams, advance.memories * horizon))

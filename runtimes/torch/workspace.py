@@ -1,0 +1,144 @@
+"""The tensors of one number of streams that stay where they are from call to call, and the call between them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from ttscompile.core.lattice import BoolArray
+from ttscompile.core.spec import FloatArray
+from ttscompile.errors import ObservationError
+from ttscompile.runtimes.backend import Call
+from ttscompile.runtimes.call_inputs import fill_initial, fill_offset, hold_known
+from ttscompile.runtimes.instructions import Instructions
+
+from .loop import denoise
+from .network import Parts, StreamsNetwork
+from .sampler import Advance
+
+
+class Inlet:
+    """A tensor of the device that the host writes to once a call.
+
+    Args:
+        shape: of it.
+        dtype: of it, by numpy's name.
+        device: of it.
+
+    Attributes:
+        array: what to write to; on the CPU the memory of the tensor itself.
+        tensor: what the call reads.
+    """
+
+    def __init__(self, shape: tuple[int, ...], dtype: str, device: torch.device) -> None:
+        self.tensor = torch.zeros(shape, dtype=getattr(torch, dtype), device=device)
+        self._host = self.tensor
+        if device.type != "cpu":
+            self._host = torch.zeros(shape, dtype=self.tensor.dtype, pin_memory=device.type == "cuda")
+        self.array: npt.NDArray[np.generic] = self._host.numpy()
+
+    def send(self) -> None:
+        """Copy what was written."""
+        if self._host is not self.tensor:
+            self.tensor.copy_(self._host, non_blocking=True)
+
+
+class Workspace:
+    """Tensors for B streams.
+
+    Args:
+        parts: of the artifact.
+        streams: B.
+
+    Attributes:
+        streams: B.
+        network: for B streams.
+        result: the denoised sample of the last call, ``[B, T, D]``.
+        rollout: entries of the rollout cache by flat index ``k * blocks + b``; taken when they are first kept.
+    """
+
+    def __init__(self, parts: Parts, streams: int) -> None:
+        spec, device = parts.manifest.spec, parts.device
+        self._kind = parts.manifest.blocks[0].type
+        if self._kind.batch_axis is None and streams > 1:
+            problem = f"this policy's residual stream has type {self._kind}, without an axis for the streams"
+            raise ObservationError(f"{problem}; found {streams} streams. Call it with one stream at a time.")
+        self._parts, self.streams, self._sampler = parts, streams, spec.sampler
+        (horizon, dimensions), steps = spec.sample, spec.sampler.steps
+        self._horizon = horizon
+        self._obs = {key: Inlet((streams, *one.shape), one.dtype, device) for key, one in spec.observations.items()}
+        self._initial = Inlet((streams, horizon, dimensions), "float32", device)
+        columns = (1 + spec.sampler.memories) * horizon
+        self._offset = Inlet((steps, dimensions, streams, columns), "float32", device)
+        self._free = Inlet((dimensions, 1, horizon), "float32", device)
+        self.network = StreamsNetwork(parts, {key: inlet.tensor for key, inlet in self._obs.items()}, streams)
+        self.result = torch.zeros((streams, horizon, dimensions), device=device)
+        self.rollout: dict[int, Tensor] = {}
+
+    def entry(self, cell: int) -> Tensor:
+        """An entry of the rollout cache; a new one holds zeros."""
+        if cell not in self.rollout:
+            self.rollout[cell] = self._parts.tensor(self._kind, self.streams)
+        return self.rollout[cell]
+
+    def load(self, call: Call) -> None:
+        """Take in what a call is given."""
+        known = call.known
+        for key, inlet in self._obs.items():
+            np.copyto(inlet.array, call.obs[key])
+        fill_initial(_floats(self._initial), call.noise, known)
+        offset, free = _floats(self._offset)[..., : self._horizon], _floats(self._free)
+        fill_offset(offset, self._sampler, call.noise, call.correction)
+        free.fill(1)
+        if known is not None:
+            hold_known(offset, known)
+            free[known.channels, :, known.positions] = 0
+        for inlet in (*self._obs.values(), self._initial, self._offset, self._free):
+            inlet.send()
+
+    def call(self, plan: Instructions, keep: BoolArray, advance: Advance) -> None:
+        """The loop, from what was loaded and the prologue made to ``result`` and the rollout cache."""
+        offset = self._offset.tensor
+        if advance.reading is not None and advance.observed is not None:
+            added = (self.network.condition() @ advance.reading) @ advance.observed
+            dimensions, _, horizon = self._free.tensor.shape
+            shaped = added.reshape(self.streams, -1, dimensions, horizon).permute(1, 2, 0, 3) * self._free.tensor
+            rest = offset[..., horizon:]
+            offset = torch.cat([offset[..., :horizon] + shaped, rest], 3)
+        read = np.flatnonzero(plan.rollout).tolist()
+        made = denoise(
+            self.network,
+            plan,
+            keep,
+            advance,
+            self._initial.tensor,
+            offset.unbind(),
+            {cell: self.rollout[cell] for cell in read},
+        )
+        self.result.copy_(made.sample)
+        for cell, residual in made.residuals.items():
+            self.rollout[cell].copy_(residual)
+
+    def take(self, whole: Workspace, index: Tensor, plan: Instructions) -> None:
+        """What some streams of a batch have before the loop: inputs, contexts, and residuals that a plan reads."""
+        self.network.take(whole.network, index)
+        self._initial.tensor.copy_(whole._initial.tensor[index])
+        self._offset.tensor.copy_(whole._offset.tensor[:, :, index])
+        self._free.tensor.copy_(whole._free.tensor)
+        for cell in np.flatnonzero(plan.rollout).tolist():
+            self.entry(cell).copy_(whole.rollout[cell].index_select(self._kind.batch_axis or 0, index))
+
+    def give(self, whole: Workspace, index: Tensor, cells: Iterable[int]) -> None:
+        """Put the result of some streams, and their residuals of these cells, into those of the batch."""
+        whole.result[index] = self.result
+        for cell in cells:
+            whole.entry(cell).index_copy_(self._kind.batch_axis or 0, index, self.rollout[cell])
+
+
+def _floats(inlet: Inlet) -> FloatArray:
+    array: FloatArray = inlet.array  # type: ignore[assignment]  # it was made of float32
+    return array
