@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import DENSE
+from ttscompile.core.paths import on_hub
 from ttscompile.core.spec import FP32, FloatArray, Noise
 from ttscompile.errors import (
     ArtifactChangedError,
@@ -22,6 +23,7 @@ from ttscompile.errors import (
     RuntimeUnavailableError,
     TtscompileError,
 )
+from ttscompile.hub import fetch_artifact
 from ttscompile.measure.process import LONGEST_WAIT, Process
 
 from .arrays import Array, check_observation, check_seed, like, read_observation
@@ -49,7 +51,8 @@ def load(
     """Load a compiled policy.
 
     Args:
-        path: the directory that ``convert`` wrote, or the same zipped.
+        path: the directory that ``convert`` wrote, or the same zipped; or ``hf://org/name[@revision][/folder]``, which
+            ``huggingface_hub`` downloads, once. Give a commit as the revision, and it is the same artifact for ever.
         runtime: ``onnxruntime``; or ``reference``, which is slow and needs torch.
         threads: threads of arithmetic, of this policy alone. 1 computes on the caller's thread and makes none. With
             more, ``threads - 1`` of them look for work for 50 us after each block, and then sleep: a loaded policy that
@@ -64,18 +67,29 @@ def load(
         IllegalPlanError: the artifact has no plan of this name.
         ArtifactChangedError: the artifact was replaced while it was loaded, and again whenever it was tried again.
         ArtifactError: the artifact is missing, damaged, of another version, or without blocks of this precision.
-        RuntimeUnavailableError: the runtime cannot be had on this machine.
+        RuntimeUnavailableError: the runtime, or ``huggingface_hub``, cannot be had on this machine.
+        HubError: the repository cannot be had, or holds no artifact.
         TtscompileError: the seed is no whole number of at least 0.
     """
     seed = check_seed(seed)
+    origin = None
+    if on_hub(path):
+        fetched = fetch_artifact(str(path))
+        path, origin = fetched.path, fetched.origin
     for _ in range(TRIES - 1):
         with suppress(ArtifactChangedError):
-            return _load(path, runtime, threads, seed, precision, plan)
-    return _load(path, runtime, threads, seed, precision, plan)
+            return _load(path, runtime, threads, seed, precision, plan, origin)
+    return _load(path, runtime, threads, seed, precision, plan, origin)
 
 
 def _load(
-    path: str | Path, runtime: str, threads: int, seed: int | None, precision: str | None, plan: str | None
+    path: str | Path,
+    runtime: str,
+    threads: int,
+    seed: int | None,
+    precision: str | None,
+    plan: str | None,
+    origin: str | None,
 ) -> CompiledPolicy:
     artifact = load_artifact(path)
     if kind_of(runtime).fp32_only:
@@ -87,7 +101,7 @@ def _load(
         artifact = artifact.at_precision(precision)
     if plan is not None:
         _require_plan(artifact, plan)  # before the sessions are opened
-    return CompiledPolicy(artifact, open_runtime(artifact, runtime, threads), seed, plan)
+    return CompiledPolicy(artifact, open_runtime(artifact, runtime, threads), seed, plan, origin)
 
 
 class CompiledPolicy:
@@ -101,12 +115,21 @@ class CompiledPolicy:
         runtime: opened on the same artifact.
         seed: of the noise that is drawn when none is given.
         plan: see ``load``.
+        origin: ``hf://org/name@commit`` of an artifact from the hub; None for another.
 
     Raises:
         IllegalPlanError: the artifact has no plan of this name.
     """
 
-    def __init__(self, artifact: Artifact, runtime: Runtime, seed: int | None = None, plan: str | None = None) -> None:
+    def __init__(
+        self,
+        artifact: Artifact,
+        runtime: Runtime,
+        seed: int | None = None,
+        plan: str | None = None,
+        origin: str | None = None,
+    ) -> None:
+        self.origin = origin
         self._artifact, self._runtime = artifact, runtime
         self._manifest = artifact.manifest
         self._default = artifact.manifest.default_plan if plan is None else plan

@@ -42,6 +42,7 @@ NEEDED = {
     "convert": ("policy.ckpt", "-o", "out"),
     "doctor": ("A",),
     "inspect": ("A",),
+    "push": ("A", "org/name", "--dry-run", "--runs", "1"),
     "realtime": ("A", "--control-hz", "1", "--runs", "1"),
     "report": ("A", "-o", "out.html", "--runs", "1"),
     "serve": ("A", "--control-hz", "1", "--port", "0", "--margin-ticks", "0"),

@@ -16,6 +16,7 @@ from ttscompile.cli.convert import convert
 from ttscompile.cli.doctor import doctor
 from ttscompile.cli.ending import TRACEBACK, Commands
 from ttscompile.cli.inspect import inspect
+from ttscompile.cli.push import push
 from ttscompile.cli.realtime import realtime
 from ttscompile.cli.report import report
 from ttscompile.cli.serve import serve
@@ -45,6 +46,7 @@ for _command, _what in (
     (bench, "Time calls, beside what they replace."),
     (compare, "Action error against latency, of plans and strategies."),
     (realtime, "Which plans keep up with a control loop on this machine."),
+    (push, "Upload an artifact with a model card to the hub."),
     (serve, "Drive a robot from another process, over a WebSocket."),
 ):
     _command.short_help = _what
