@@ -14,7 +14,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/installed.stamp
 
 .DELETE_ON_ERROR:
-.PHONY: demo test lint types pytest test-avx2 benchmark docs clean
+.PHONY: demo test lint types pytest test-avx2 benchmark docs release clean
 
 demo: $(READY)
 	$(BIN)/python examples/pusht/demo.py
@@ -56,6 +56,10 @@ benchmark: $(READY)
 # The site, into build/site.
 docs: $(READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+# An sdist and a wheel in build/release, checked as the index does, and tried in empty environments. Nothing is uploaded.
+release: $(READY)
+	$(BIN)/python tests/release.py build/release
 
 clean:
 	rm -rf $(VENV) build ttscompile.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
