@@ -8,6 +8,7 @@ artifact that is compiled here; the one for compiling converts a small policy, a
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
@@ -37,9 +38,16 @@ def build(image: str, options: list[str]) -> None:
     _run([*words, *options, "-f", str(file), "-t", f"ttscompile-{image}", str(ROOT)])
 
 
-def run(image: str, folder: Path, *words: str) -> str:
-    """What a command prints in a container, with a folder of this machine as ``/work``."""
-    shared = ["-v", f"{folder}:/work"]
+def run(image: str, folder: Path, *words: str, own: bool = False) -> str:
+    """What a command prints in a container, with a folder of this machine as ``/work``.
+
+    Args:
+        image: ``robot`` or ``compile``.
+        folder: on this machine.
+        *words: the command.
+        own: as the user who runs this, whose files are then readable and what is made is theirs.
+    """
+    shared = ["-v", f"{folder}:/work", *(["--user", f"{os.getuid()}:{os.getgid()}"] if own else [])]
     if tool() == "docker":
         return _run(["docker", "run", "--rm", *shared, "--entrypoint", words[0], f"ttscompile-{image}", *words[1:]])
     container = _run(["buildah", "from", "--pull-never", f"ttscompile-{image}"]).strip()
@@ -68,7 +76,7 @@ def main(options: list[str]) -> None:
 
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        folder.chmod(0o777)  # noqa: S103: the container's user is another
+        folder.chmod(0o777)  # the container's user is another
         written_artifact(toy_program(), folder / "artifact")
         save_policy(folder)
         build("robot", options)
@@ -77,7 +85,7 @@ def main(options: list[str]) -> None:
         print("robot: an artifact that was made here runs there; the user is", run("robot", folder, "whoami"))
         build("compile", options)
         words = ("convert", "/work/policy", "--encoders", "/work/clip-small", "-o", "/work/made", "--steps", "2")
-        run("compile", folder, "ttscompile", *words)
+        run("compile", folder, "ttscompile", *words, own=True)
         policy = ttscompile.load(folder / "made", seed=0)
         obs = {key: np.zeros((1, *spec.shape), spec.dtype) for key, spec in policy.info.observation.items()}
         assert np.isfinite(policy.predict_action(obs)["action"]).all()

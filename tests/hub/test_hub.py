@@ -103,8 +103,12 @@ def test_without_a_network_there_is_what_was_downloaded(
 ) -> None:
     commit = hub.commit("org/name", toy_files)
     first = ttscompile.load("hf://org/name").origin
+    before = len(hub.asked)
+    assert ttscompile.load("hf://org/name").origin == first
+    assert hub.asked[before:] == ["GET /api/models/org/name/revision/main"]
     hub.commit("org/name", {"README.md": b"another"})  # main goes on; the commit stays what it was
     assert ttscompile.load(f"hf://org/name@{commit}").origin == first
+    assert len(hub.asked) == before + 1
     from huggingface_hub import constants
 
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
