@@ -8,13 +8,14 @@
 
 PYTHON ?= python3.11
 PIP_FLAGS ?=
+BUILD_FLAGS ?=
 EXTRAS ?= dev
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/installed.stamp
 
 .DELETE_ON_ERROR:
-.PHONY: demo test lint types pytest test-avx2 test-arm benchmark docs clean
+.PHONY: demo test lint types pytest test-avx2 test-arm benchmark docs release containers clean
 
 demo: $(READY)
 	$(BIN)/python examples/pusht/demo.py
@@ -60,6 +61,14 @@ benchmark: $(READY)
 # The site, into build/site.
 docs: $(READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+# An sdist and a wheel in build/release, checked as the index does, and tried in empty environments. Nothing is uploaded.
+release: $(READY)
+	$(BIN)/python tests/release.py build/release
+
+# Both images of containers/, with docker or buildah, and what they are for done in them.
+containers: $(READY)
+	$(BIN)/python tests/containers.py $(BUILD_FLAGS)
 
 clean:
 	rm -rf $(VENV) build ttscompile.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis

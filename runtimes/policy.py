@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import DENSE
+from ttscompile.core.paths import on_hub
 from ttscompile.core.spec import FP32, FloatArray, Noise
 from ttscompile.errors import (
     ArtifactChangedError,
@@ -22,6 +23,7 @@ from ttscompile.errors import (
     RuntimeUnavailableError,
     TtscompileError,
 )
+from ttscompile.hub import fetch_artifact
 from ttscompile.measure.process import LONGEST_WAIT, Process
 
 from .arrays import Array, check_observation, check_seed, like, read_observation
@@ -50,7 +52,8 @@ def load(
     """Load a compiled policy.
 
     Args:
-        path: the directory that ``convert`` wrote, or the same zipped.
+        path: the directory that ``convert`` wrote, or the same zipped; or ``hf://org/name[@revision][/folder]``, which
+            ``huggingface_hub`` downloads, once. Give a commit as the revision, and it is the same artifact for ever.
         runtime: ``onnxruntime``; ``torch``, which needs torch and computes on any device that it has; or ``reference``,
             which is slow and needs torch.
         threads: threads of arithmetic, of this policy alone. 1 computes on the caller's thread and makes none. With
@@ -68,14 +71,19 @@ def load(
         IllegalPlanError: the artifact has no plan of this name.
         ArtifactChangedError: the artifact was replaced while it was loaded, and again whenever it was tried again.
         ArtifactError: the artifact is missing, damaged, of another version, or without blocks of this precision.
-        RuntimeUnavailableError: the runtime cannot be had on this machine.
+        RuntimeUnavailableError: the runtime, or ``huggingface_hub``, cannot be had on this machine.
+        HubError: the repository cannot be had, or holds no artifact.
         TtscompileError: the seed is no whole number of at least 0.
     """
     seed = check_seed(seed)
+    origin = None
+    if on_hub(path):
+        fetched = fetch_artifact(str(path))
+        path, origin = fetched.path, fetched.origin
     for _ in range(TRIES - 1):
         with suppress(ArtifactChangedError):
-            return _load(path, runtime, threads, seed, precision, plan, device)
-    return _load(path, runtime, threads, seed, precision, plan, device)
+            return _load(path, runtime, threads, seed, precision, plan, device, origin)
+    return _load(path, runtime, threads, seed, precision, plan, device, origin)
 
 
 def _load(
@@ -86,6 +94,7 @@ def _load(
     precision: str | None,
     plan: str | None,
     device: str | None,
+    origin: str | None,
 ) -> CompiledPolicy:
     artifact, made = load_artifact(path), kind_of(runtime).precisions
     own = FP32
@@ -100,7 +109,7 @@ def _load(
     if plan is not None:
         _require_plan(artifact, plan)  # before the sessions are opened
     opened = open_runtime(artifact, runtime, threads, device, own)
-    return CompiledPolicy(artifact, opened, seed, plan, own if made else None)
+    return CompiledPolicy(artifact, opened, seed, plan, own if made else None, origin)
 
 
 class CompiledPolicy:
@@ -115,6 +124,7 @@ class CompiledPolicy:
         seed: of the noise that is drawn when none is given.
         plan: see ``load``.
         precision: of the residual blocks; None for the artifact's.
+        origin: ``hf://org/name@commit`` of an artifact from the hub; None for another.
 
     Raises:
         IllegalPlanError: the artifact has no plan of this name.
@@ -127,7 +137,9 @@ class CompiledPolicy:
         seed: int | None = None,
         plan: str | None = None,
         precision: str | None = None,
+        origin: str | None = None,
     ) -> None:
+        self.origin = origin
         self._artifact, self._runtime = artifact, runtime
         self._precision = precision or artifact.manifest.precision_name
         self._manifest = artifact.manifest

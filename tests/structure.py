@@ -19,7 +19,7 @@ from tests.imports import home, imports, modules  # noqa: E402
 FLOORS = (
     ("errors",),
     ("core", "measure"),
-    ("ir", "plots", "samplers", "trajectories"),
+    ("hub", "ir", "plots", "samplers", "trajectories"),
     ("artifact", "frontends", "lower", "passes"),
     ("capture", "runtimes"),
     ("doctor", "verification"),

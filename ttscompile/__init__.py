@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from .driver import compile_denoiser as compile_denoiser
     from .driver import convert as convert
     from .errors import TtscompileError as TtscompileError
+    from .report.push import push as push
     from .runtimes.executor import AsyncExecutor as AsyncExecutor
     from .runtimes.executor import ExecutorSettings as ExecutorSettings
     from .runtimes.executor import GuardLimits as GuardLimits
@@ -46,6 +47,7 @@ _HOMES = {
         "core.spec": ("Affine", "ChunkSpec", "Noise", "ObservationSpec", "PolicySpec", "SamplerTable"),
         "driver": ("compile_denoiser", "convert"),
         "errors": ("TtscompileError",),
+        "report.push": ("push",),
         "runtimes.report": ("CallReport",),
         "runtimes.executor": ("AsyncExecutor", "ExecutorSettings", "GuardLimits"),
         "runtimes.info": ("PolicyInfo",),

@@ -18,12 +18,13 @@ from .artifact.write import require_replaceable, write_artifact
 from .capture.export import capture
 from .capture.narrow import narrow, unneeded
 from .core.given import integer
-from .core.paths import require_free_or_path
+from .core.paths import on_hub, require_free_or_path
 from .core.spec import FP32, PolicySpec
 from .errors import ArtifactError, NoResidualBlocksError, PassError, SpecError
 from .frontends import files_beside, load_checkpoint_policy
 from .frontends.encoded import parts
 from .frontends.families import LoadOptions
+from .hub import fetch_checkpoint
 from .ir.dataflow import reachable_from
 from .ir.flops import graph_flops, node_flops
 from .ir.graph import Graph
@@ -82,7 +83,8 @@ def convert(
     """Compile a trained policy and write the artifact; its plan is dense until it is calibrated.
 
     Args:
-        checkpoint: a file or directory that the training code saved.
+        checkpoint: a file or directory that the training code saved; or ``hf://org/name[@revision][/path]``, which
+            ``huggingface_hub`` downloads, once. The artifact says from which commit it is, and under which licence.
         directory: where the artifact goes; an artifact that is there is replaced, anything else is left alone.
         format: name of the policy's family, ``diffusion_policy`` or ``lerobot``; ``auto`` tells by what is there.
         sampler: ``ddpm``, ``ddim`` or ``dpmsolver++`` in place of a diffusion policy's own, ``euler`` or ``rk4`` in
@@ -110,10 +112,17 @@ def convert(
     if precision != FP32:
         require_precision(precision)  # before minutes of work
     require_replaceable(directory)
+    base: dict[str, str] = {}
+    if on_hub(checkpoint):
+        fetched = fetch_checkpoint(str(checkpoint))
+        checkpoint, base = fetched.path, {"base": fetched.origin}
+        if fetched.licence is not None:
+            base["base_licence"] = fetched.licence
     options = LoadOptions(
         sampler=sampler, steps=steps, spacing=spacing, task=task, encoders=encoders, without_cameras=without_cameras
     )
     module, spec = load_checkpoint_policy(checkpoint, format, options)
+    spec = replace(spec, source={**spec.source, **base})
     beside = files_beside(checkpoint, spec)
     return _compile(module, spec, directory, prediction_horizon, precision, single_file, explain, beside)
 

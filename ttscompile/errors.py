@@ -71,6 +71,10 @@ class OutputError(TtscompileError):
     """A result that cannot be written where it was asked for."""
 
 
+class HubError(TtscompileError):
+    """A repository of the hub that cannot be had or written, or does not hold what was asked for."""
+
+
 class ReportError(TtscompileError):
     """What a report was asked to show cannot be read."""
 

@@ -115,8 +115,9 @@ class Door:
         _write(event, visit.peer, connection=visit.number, status=int(status), tls=tls)
 
     def requested(self, peer: tuple[Any, ...]) -> None:
-        """Count a request."""
-        self._visits[peer].requests += 1
+        """Count a request; of a connection that was cut off meanwhile one may still be read."""
+        if (visit := self._visits.get(peer)) is not None:
+            visit.requests += 1
 
     def leaves(self, peer: tuple[Any, ...]) -> None:
         """Forget a connection whose socket is closed."""

@@ -43,6 +43,7 @@ NEEDED = {
     "doctor": ("A",),
     "inspect": ("A",),
     "oracle": ("A", "--trajectories", "calls.npz", "--calls", "2"),
+    "push": ("A", "org/name", "--dry-run", "--runs", "1"),
     "realtime": ("A", "--control-hz", "1", "--runs", "1"),
     "report": ("A", "-o", "out.html", "--runs", "1"),
     "serve": ("A", "--control-hz", "1", "--port", "0", "--margin-ticks", "0"),

@@ -17,6 +17,7 @@ from ttscompile.cli.doctor import doctor
 from ttscompile.cli.ending import TRACEBACK, Commands
 from ttscompile.cli.inspect import inspect
 from ttscompile.cli.oracle import oracle
+from ttscompile.cli.push import push
 from ttscompile.cli.realtime import realtime
 from ttscompile.cli.report import report
 from ttscompile.cli.serve import serve
@@ -47,6 +48,7 @@ for _command, _what in (
     (compare, "Action error against latency, of plans and strategies."),
     (oracle, "Would it pay to choose a plan for each call?"),
     (realtime, "Which plans keep up with a control loop on this machine."),
+    (push, "Upload an artifact with a model card to the hub."),
     (serve, "Drive a robot from another process, over a WebSocket."),
 ):
     _command.short_help = _what

@@ -14,8 +14,8 @@ from ttscompile.artifact.write import require_replaceable
 from ttscompile.cli.options import count_option, json_option
 from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results, say
 from ttscompile.cli.summary import print_summary
-from ttscompile.cli.types import ANY_TEXT, FOLDER, NEW_FILE, PATH
-from ttscompile.core.paths import require_path
+from ttscompile.cli.types import ANY_TEXT, FOLDER, NEW_FILE, PATH, PATH_OR_HUB
+from ttscompile.core.paths import on_hub, require_path
 from ttscompile.core.spec import FP32, PRECISIONS
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends.families import FAMILIES, FORMATS, SAMPLERS, SPACINGS
@@ -23,7 +23,7 @@ from ttscompile.report.summary import document
 
 
 @click.command()
-@click.argument("checkpoint", type=PATH)
+@click.argument("checkpoint", type=PATH_OR_HUB)
 @click.option("-o", "--output", "directory", required=True, type=PATH, help="The artifact.")
 @click.option(
     "--format",
@@ -89,7 +89,7 @@ from ttscompile.report.summary import document
 @click.option("--explain", is_flag=True, help="Say on standard error what each pass did.")
 @json_option
 def convert(
-    checkpoint: Path,
+    checkpoint: Path | str,
     directory: Path,
     prediction_horizon: int | None,
     precision: str,
@@ -100,10 +100,13 @@ def convert(
 ) -> None:
     """Compile CHECKPOINT, a trained policy of one of the formats below. Nothing in it is executed.
 
+    It is a path, or hf://ORGANISATION/NAME[@REVISION][/PATH] on the Hugging Face hub.
+
     The artifact computes everything until 'ttscompile calibrate' gives it a plan.
     """
     # Told now: importing the compiler, and with it torch, takes seconds.
-    require_path(checkpoint, CheckpointError, f"Give {' or '.join(each.reads for each in FAMILIES)}.")
+    if not on_hub(checkpoint):
+        require_path(checkpoint, CheckpointError, f"Give {' or '.join(each.reads for each in FAMILIES)}.")
     require_replaceable(directory)
     stages: list[dict[str, Any]] = []
     console = progress()

@@ -14,6 +14,7 @@ from typing import Any
 
 import click
 
+from ttscompile.core.paths import on_hub
 from ttscompile.errors import OutputError
 from ttscompile.plots.figure import require_picture_name
 
@@ -95,7 +96,16 @@ class PathName(click.Path):
         return found
 
 
+class PathOrHub(PathName):
+    """The same, or ``hf://org/name`` and what may follow, which stays text."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """See ``click.ParamType``."""
+        return TEXT.convert(value, param, ctx) if on_hub(value) else super().convert(value, param, ctx)
+
+
 PATH = PathName()
+PATH_OR_HUB = PathOrHub()
 FILE = PathName(exists=True, dir_okay=False)
 NEW_FILE = PathName(dir_okay=False)
 FOLDER = PathName(file_okay=False)

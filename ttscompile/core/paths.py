@@ -8,12 +8,20 @@ from pathlib import Path
 
 from ..errors import TtscompileError
 
+HUB = "hf://"
+"""How a name begins that is no path: that of a repository of the Hugging Face hub. ``ttscompile.hub`` reads it."""
+
 _KINDS = (
     (stat.S_ISFIFO, "a pipe"),
     (stat.S_ISSOCK, "a socket"),
     (stat.S_ISCHR, "a device"),
     (stat.S_ISBLK, "a device"),
 )
+
+
+def on_hub(path: str | os.PathLike[str]) -> bool:
+    """Whether this names a repository of the hub, in place of a path."""
+    return isinstance(path, str) and path.startswith(HUB)
 
 
 def require_path(path: str | os.PathLike[str], error: type[TtscompileError], give: str) -> None:

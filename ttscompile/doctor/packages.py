@@ -20,6 +20,7 @@ ENABLES = {
     "lerobot": "convert --task of LeRobot policies",
     "recordings": "recordings in zarr, HDF5 and LeRobot's format",
     "serve": "serve",
+    "hub": "hf:// names, push",
     "pusht": "examples/pusht",
     "examples": "Meta-World and Fetch in examples/evaluation",
     "ray": "examples/ray_serve",

@@ -1,0 +1,20 @@
+# For compiling: ttscompile with PyTorch's small CPU build. docs/howto/containers.md has the commands.
+FROM debian:bookworm-slim
+RUN apt-get update \
+    && apt-get install -y --no-install-recommends ca-certificates python3 python3-venv \
+    && rm -rf /var/lib/apt/lists/* \
+    && useradd --create-home compiler
+WORKDIR /source
+COPY CHANGELOG.md LICENSE MANIFEST.in README.md constraints.txt pyproject.toml ./
+COPY ttscompile ttscompile
+COPY passes passes
+COPY runtimes runtimes
+ARG PIP_FLAGS="--extra-index-url https://download.pytorch.org/whl/cpu"
+RUN python3 -m venv /opt/ttscompile \
+    && /opt/ttscompile/bin/python -m pip install --no-cache-dir $PIP_FLAGS -c constraints.txt \
+       '.[compile,hub,lerobot,recordings]'
+ENV PATH=/opt/ttscompile/bin:/usr/local/bin:/usr/bin:/bin
+USER compiler
+WORKDIR /home/compiler
+ENTRYPOINT ["ttscompile"]
+CMD ["doctor"]

@@ -1,0 +1,201 @@
+"""Download what an artifact or a checkpoint is made of, and nothing else that a repository has.
+
+The library downloads into its cache, checks sizes, and gives the folder of one commit. A second time, and where there
+is no network, that folder is all that is read. Nothing of a repository is executed, here or later: an artifact is
+checked by ``load`` as any other, and a checkpoint read by ``convert`` as any other.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..core.untrusted_json import parse_json
+from ..errors import HubError, RuntimeUnavailableError, TtscompileError
+from .name import HubName, plain, read_name
+
+MANIFEST = "manifest.json"
+CARD = "README.md"
+_ABOUT = (CARD, "LICENSE", "LICENSE.md", "LICENSE.txt")
+_CONFIG, _WEIGHTS = "config.json", "model.safetensors"
+_OF_LEROBOT = re.compile(
+    rf"{_CONFIG}|policy_(pre|post)processor\.json|[^/]+\.safetensors"
+    r"|[^/]+/(config|vocab|tokenizer|tokenizer_config|special_tokens_map|added_tokens)\.json|[^/]+/merges\.txt"
+)
+"""What ``convert`` reads of a directory that lerobot saved, whose processors name the files of their statistics as they
+like, and of a folder of its encoders in it."""
+_CHECKPOINT = ".ckpt"
+MOST_FILES = 1000
+MOST_MANIFEST_BYTES = 32 << 20
+MOST_CARD_BYTES = 1 << 20
+_ENDS = (".json", ".onnx", ".safetensors", ".txt", _CHECKPOINT)
+"""Of the names of an artifact's and a checkpoint's files: nothing that Python imports or unpickles."""
+_LICENCE = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._+-]{0,99}")
+
+
+@dataclass(frozen=True)
+class Fetched:
+    """What was downloaded, or was there already.
+
+    Attributes:
+        path: of the file or folder that was asked for, in the library's cache.
+        origin: ``hf://org/name@commit``, which means the same for ever.
+        licence: of the repository, as its card says it; None where it says none.
+    """
+
+    path: Path
+    origin: str
+    licence: str | None
+
+
+def fetch_artifact(text: str) -> Fetched:
+    """An artifact: its manifest, and the files that the manifest lists.
+
+    Args:
+        text: ``hf://org/name[@revision][/folder]``.
+
+    Raises:
+        HubError: there is no such repository, no artifact in it, or no network and nothing in the cache.
+        RuntimeUnavailableError: ``huggingface_hub`` is not installed.
+    """
+    name, hub = read_name(text), library()
+    inside = f"{name.inside}/" if name.inside else ""
+    with told(text):
+        folder = _snapshot(hub, name.repository, name.revision, [*_ABOUT, inside + MANIFEST])
+        manifest = folder / name.inside / MANIFEST
+        if not manifest.is_file():
+            raise HubError(f"{text}: there is no {MANIFEST} in it, so it is no artifact.")
+        chosen = [inside + each for each in _listed(manifest, text)]
+        return _fetched(hub, name, text, folder.name, chosen)
+
+
+def fetch_checkpoint(text: str) -> Fetched:
+    """A checkpoint: a directory of LeRobot, or one ``.ckpt`` file.
+
+    Args:
+        text: ``hf://org/name[@revision][/path]``.
+
+    Raises:
+        HubError: there is no such repository, no checkpoint in it or several, or no network and nothing in the cache.
+        RuntimeUnavailableError: ``huggingface_hub`` is not installed.
+    """
+    name, hub = read_name(text), library()
+    with told(text):
+        folder = _snapshot(hub, name.repository, name.revision, list(_ABOUT))
+        if name.inside.endswith(_CHECKPOINT):
+            return _fetched(hub, name, text, folder.name, [name.inside])
+        try:
+            files = _listing(hub, name.repository, folder.name)
+        except Exception as error:  # no network, of whichever library: what was downloaded before may be enough
+            try:
+                return _fetched(hub, name, text, folder.name, _of_checkpoint(name, text, _kept(folder)))
+            except HubError:
+                raise error from None
+        return _fetched(hub, name, text, folder.name, _of_checkpoint(name, text, files))
+
+
+def _of_checkpoint(name: HubName, text: str, files: list[str]) -> list[str]:
+    """Of the files of a repository those that a checkpoint in it is made of."""
+    inside = f"{name.inside}/" if name.inside else ""
+    below = [each.removeprefix(inside) for each in files if each.startswith(inside)]
+    if {_CONFIG, _WEIGHTS} <= set(below):
+        return [inside + each for each in below if _OF_LEROBOT.fullmatch(each)]
+    found = [inside + each for each in below if each.endswith(_CHECKPOINT)]
+    if len(found) == 1:
+        return found
+    if found:
+        raise HubError(f"{text}: it has {len(found)} checkpoints. Say which: {name.at('REVISION')}/{found[0]}")
+    has = ", ".join(each for each in files[:4] if plain(each)) or "nothing"
+    expected = f"expected {_CONFIG} and {_WEIGHTS} of LeRobot, or one file {_CHECKPOINT} of Diffusion Policy"
+    raise HubError(f"{text}: there is no checkpoint in it; {expected}; found {has}.")
+
+
+def _fetched(hub: Any, name: HubName, text: str, commit: str, chosen: list[str]) -> Fetched:
+    """Download these files, and nothing of another kind."""
+    if len(chosen) > MOST_FILES:
+        raise HubError(f"{text}: it lists {len(chosen)} files; expected {MOST_FILES} at most.")
+    for each in chosen:
+        if not plain(each) or not each.endswith(_ENDS):
+            raise HubError(f"{text}: {each!r:.200} is no file of an artifact or a checkpoint.")
+    # Patterns that are plain names match themselves, and nothing else.
+    folder = _snapshot(hub, name.repository, commit, [*_ABOUT, *chosen])
+    if missing := [each for each in chosen if not (folder / each).is_file()]:
+        raise HubError(f"{text}: {missing[0]} is not there: the repository is not whole.")
+    single = len(chosen) == 1 and chosen[0].endswith(_CHECKPOINT)
+    return Fetched(folder / (chosen[0] if single else name.inside), name.at(commit), _licence(folder / CARD))
+
+
+def _snapshot(hub: Any, repository: str, revision: str | None, files: list[str]) -> Path:
+    """The folder of a commit in the cache, which has its name, with these files of those that there are."""
+    return Path(hub.snapshot_download(repository, revision=revision, allow_patterns=files))
+
+
+def _listing(hub: Any, repository: str, commit: str) -> list[str]:
+    """Files of a repository."""
+    tree = hub.HfApi().list_repo_tree(repository, revision=commit, recursive=True)
+    return [each.path for each in tree if isinstance(each, hub.hf_api.RepoFile)]
+
+
+def _kept(folder: Path) -> list[str]:
+    """Files of it that the cache has."""
+    return [each.relative_to(folder).as_posix() for each in folder.rglob("*") if each.is_file()]
+
+
+def _listed(manifest: Path, text: str) -> list[str]:
+    """The manifest, and the files that it lists; whether it is one is ``load``'s matter."""
+    try:
+        if manifest.stat().st_size > MOST_MANIFEST_BYTES:
+            raise HubError(f"{text}: {MANIFEST} has more than {MOST_MANIFEST_BYTES:,} bytes, so it is no artifact's.")
+        files = parse_json(manifest.read_bytes(), MOST_MANIFEST_BYTES)["files"]
+        return [MANIFEST, *map(str, dict(files))]
+    except (ValueError, KeyError, TypeError, OSError) as error:
+        raise HubError(f"{text}: {MANIFEST} lists no files, so it is no artifact's.") from error
+
+
+def _licence(card: Path) -> str | None:
+    """Of the head of a card, which is YAML between two lines of hyphens."""
+    try:
+        if card.stat().st_size > MOST_CARD_BYTES:
+            return None
+        from huggingface_hub import metadata_load
+
+        told = (metadata_load(card) or {}).get("license")
+    except Exception:  # of whatever stands there: a card without a head that can be read says no licence
+        return None
+    return told if isinstance(told, str) and _LICENCE.fullmatch(told) else None
+
+
+def library() -> Any:
+    """The package ``huggingface_hub``.
+
+    Raises:
+        RuntimeUnavailableError: it is not installed.
+    """
+    try:
+        import huggingface_hub
+        import huggingface_hub.errors
+        import huggingface_hub.hf_api
+    except ModuleNotFoundError as error:
+        problem = f"names that begin with hf:// need {error.name}, which is not installed"
+        raise RuntimeUnavailableError(f"{problem}. Run: pip install 'ttscompile[hub]'.") from error
+    return huggingface_hub
+
+
+@contextmanager
+def told(text: str) -> Iterator[None]:
+    """Make one ``HubError`` of whatever the library raises; it begins with what was asked for."""
+    try:
+        yield
+    except TtscompileError:
+        raise
+    except Exception as error:  # of HTTP, of the file system, of a server's answers
+        last: BaseException = error
+        while last.__cause__ is not None:
+            last = last.__cause__
+        kind, first = type(last).__name__, f"{last}".strip().split("\n")[0].rstrip(".")
+        remedy = "Is the name right, is there a network, and for a private repository a login (hf auth login)?"
+        raise HubError(f"{text:.200}: {kind}: {first:.300}. {remedy}") from error

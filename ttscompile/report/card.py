@@ -1,0 +1,246 @@
+"""The model card of an artifact: what somebody who finds it on the hub has to know, as Markdown."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..artifact.load import Artifact
+from ..artifact.manifest import Manifest
+from ..core.untrusted_json import parse_json
+from ..errors import ReportError
+from ..hub.name import HubName, read_name
+from ..measure.machine import fingerprint, one_line
+from ..measure.units import flops, ms, share
+from . import facts
+from .measure import Latency
+from .page import Section, Table
+
+BASE, BASE_LICENCE = "base", "base_licence"
+"""Entries of ``PolicySpec.source`` that ``convert`` writes of a checkpoint from the hub."""
+_MOST_BYTES = 64 << 20
+_SPECIAL = re.compile(r"([\\`*_\[\]<>|#~])")
+
+
+@dataclass(frozen=True)
+class Success:
+    """How one plan of the artifact did on a task.
+
+    Attributes:
+        environment: the task.
+        variant: artifact and plan, as the evaluation calls them.
+        episodes: their number.
+        figures: mean and 95 % interval by name: ``success`` and ``score``.
+        machine: that ran the episodes.
+    """
+
+    environment: str
+    variant: str
+    episodes: int
+    figures: Mapping[str, tuple[float, float, float]]
+    machine: str
+
+
+def read_success(path: Path, identity: str) -> list[Success]:
+    """Of a document of ``examples/evaluation/evaluate.py --json``, what is of this artifact.
+
+    Args:
+        path: of the document.
+        identity: of the artifact.
+
+    Raises:
+        ReportError: it is no such document, or not of this artifact.
+    """
+    expected = "expected what examples/evaluation/evaluate.py --json printed"
+    try:
+        document = parse_json(path.read_bytes(), _MOST_BYTES)
+        machine = one_line(document["machine"])
+        own = [each for each in document["variants"] if each["identity"] == identity]
+        found = [
+            Success(
+                environment=str(document["environment"]),
+                variant=Path(str(each["label"])).name,
+                episodes=len(each["episodes"]),
+                figures={name: _interval(each[name]) for name in ("success", "score")},
+                machine=machine,
+            )
+            for each in own
+        ]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ReportError(f"{path}: {expected}; found {type(error).__name__}: {error!s:.200}.") from error
+    if not found:
+        raise ReportError(f"{path}: no variant in it has the identity {identity[:12]}. Evaluate this artifact again.")
+    return found
+
+
+def _interval(value: Mapping[str, Any]) -> tuple[float, float, float]:
+    return float(value["mean"]), float(value["low"]), float(value["high"])
+
+
+def licence_of(manifest: Manifest, given: str | None) -> str | None:
+    """The licence of the base, which the artifact is under too; of a base that says none the one that was given.
+
+    Raises:
+        ReportError: both say one, and not the same.
+    """
+    own = manifest.spec.source.get(BASE_LICENCE)
+    if own is not None and given is not None and own.lower() != given.lower():
+        raise ReportError(f"the base is under the licence {own}, which was passed on; found {given}. Leave it out.")
+    return own or given
+
+
+def card(
+    artifact: Artifact, repository: str, latencies: Sequence[Latency], success: Sequence[Success], licence: str | None
+) -> str:
+    """The text of ``README.md``.
+
+    Args:
+        artifact: loaded.
+        repository: ``org/name``.
+        latencies: of calls with its default plan and with the dense one, measured now.
+        success: what was evaluated; may be empty.
+        licence: from ``licence_of``.
+    """
+    manifest = artifact.manifest
+    base = _base(manifest)
+    head = {
+        **({} if licence is None else {"license": licence}),
+        **({} if base is None else {"base_model": base.repository, "base_model_relation": "quantized"}),
+        "library_name": "ttscompile",
+        "pipeline_tag": "robotics",
+        "tags": ["robotics", "diffusion-policy", "ttscompile"],
+    }
+    lines = ["---", *(f"{key}: {json.dumps(value)}" for key, value in head.items()), "---", ""]
+    lines += [f"# {_plain(repository.partition('/')[2])}", ""]
+    of = "a policy" if base is None else f"[{base.repository}](https://huggingface.co/{base.repository})"
+    lines += [f"This is {of}, compiled by ttscompile: it runs in real time with numpy and onnxruntime alone.", ""]
+    lines += ["```python", "import ttscompile", "", f'policy = ttscompile.load("hf://{repository}", threads=1)', "```"]
+    for section in (
+        _what(manifest, base, licence),
+        _errors(manifest),
+        _success(success),
+        _speed(latencies, manifest),
+        _made(manifest, base),
+        facts.limits(artifact),
+    ):
+        lines += ["", *_markdown(section)]
+    return "\n".join(lines) + "\n"
+
+
+def _base(manifest: Manifest) -> HubName | None:
+    told = manifest.spec.source.get(BASE)
+    return None if told is None else read_name(told)
+
+
+def _what(manifest: Manifest, base: HubName | None, licence: str | None) -> Section:
+    spec, plan = manifest.spec, facts.plans_of(manifest)[manifest.default_plan]
+    sampler = spec.sampler
+    first, last = sampler.timesteps[0], sampler.timesteps[-1]
+    source = ", ".join(f"{k} {v}" for k, v in spec.source.items() if k not in (BASE, BASE_LICENCE))
+    rows = (
+        ("base model", "not from the hub" if base is None else f"{base.repository}, commit {base.revision}"),
+        ("licence", licence or "not known: ask who trained the base"),
+        ("policy", source or "a module"),
+        ("sampler", f"{sampler.name}, K = {sampler.steps}, timesteps {first:g}..{last:g}"),
+        ("default plan", f"{manifest.default_plan}, {plan.kind}"),
+        ("sparsity", f"{share(plan.sparsity)} of the cells are reused, {share(plan.flops_sparsity)} of their FLOPs"),
+        ("precision of the blocks", manifest.precision_name),
+        ("identity", manifest.identity),
+    )
+    return Section("What it is", (), (Table(("", ""), rows),))
+
+
+def _errors(manifest: Manifest) -> Section:
+    record = manifest.calibration
+    if record is None or not facts.scores(record):
+        return Section("Error", ("It was not calibrated: every call is dense, and does what the base does.",))
+    calls, episodes = record.get("calls"), record.get("episodes")
+    held = calls.get("validation") if isinstance(calls, Mapping) else None
+    of = episodes.get("validation") if isinstance(episodes, Mapping) else None
+    told = f" ({held} calls of {len(of)} episodes)" if isinstance(held, int) and isinstance(of, list) else ""
+    text = (
+        f"Of the actions, in their units, on recorded episodes that nothing was learned from{told}, against the dense"
+        " policy with the same noise: the mean over calls, and the 90th percentile."
+    )
+    return Section("Error", (text, *facts.other_noise(record)), (facts.score_table(record),))
+
+
+def _success(found: Sequence[Success]) -> Section:
+    if not found:
+        return Section(
+            "Success", ("No success figures were given. Evaluate it on your own task before a robot moves.",)
+        )
+    rows = tuple(
+        (each.environment, each.variant, str(each.episodes), *(_shown(each.figures[k]) for k in ("success", "score")))
+        for each in found
+    )
+    head = ("task", "plan", "episodes", "success [95 % interval]", "score [95 % interval]")
+    text = f"Intervals are of the bootstrap over episodes. The episodes ran on {found[0].machine}."
+    return Section("Success", (text,), (Table(head, rows),))
+
+
+def _shown(figure: tuple[float, float, float]) -> str:
+    return "{:.3f} [{:.3f}, {:.3f}]".format(*figure)
+
+
+def _speed(latencies: Sequence[Latency], manifest: Manifest) -> Section:
+    rows = tuple(
+        (
+            one.plan + " (default)" * (one.plan == manifest.default_plan),
+            ms(one.total),
+            "..".join(map(ms, one.quartiles)),
+            flops(one.flops),
+            share(one.flops / manifest.flops.dense),
+        )
+        for one in latencies
+    )
+    head = ("plan", "ms a call", "quartiles", "FLOPs a call", "of the captured policy")
+    text = f"Medians of calls of one stream on one thread of {one_line(fingerprint())}. Yours is another machine."
+    return Section("Speed", (text,), (Table(head, rows),))
+
+
+def _made(manifest: Manifest, base: HubName | None) -> Section:
+    sampler, record = manifest.spec.sampler, manifest.calibration
+    steps = sampler.steps // 4 if sampler.name == "rk4" else sampler.steps  # which evaluates four times a step
+    checkpoint = "CHECKPOINT" if base is None else base.at(str(base.revision))
+    precision = "" if manifest.precision is None else f" --precision {manifest.precision_name}"
+    lines = [f"ttscompile convert {checkpoint} -o DIR --sampler {sampler.name} --steps {steps}{precision}"]
+    if record is not None:
+        options = [("strategy", "strategy"), ("seed", "seed")]
+        told = {name: record[key] for name, key in options if isinstance(record.get(key), str | int)}
+        budget = record.get("budget")
+        goals = ("target_sparsity", "target_flops", "latency_ms", "max_action_error")
+        asked = {k: budget[k] for k in goals if isinstance(budget, Mapping) and isinstance(budget.get(k), int | float)}
+        words = " ".join(f"--{k.replace('_', '-')} {_word(v)}" for k, v in (asked | told).items())
+        lines.append(f"ttscompile calibrate DIR --trajectories CALLS {words}")
+    lines.append("ttscompile verify DIR")
+    text = (
+        f"With ttscompile {manifest.ttscompile_version}, by commands like these, from what the artifact records;"
+        " it keeps no paths."
+    )
+    return Section("How it was made", (text,), points=tuple(f"`{line}`" for line in lines))
+
+
+def _word(value: object) -> str:
+    return re.sub(r"[^A-Za-z0-9._+-]", "", str(value))[:40]
+
+
+def _markdown(section: Section) -> list[str]:
+    lines = [f"## {section.title}", ""]
+    for text in section.text:
+        lines += [_plain(text), ""]
+    for table in section.tables:
+        rows = [table.head, tuple("---" for _ in table.head), *table.rows]
+        lines += ["| " + " | ".join(cell if cell == "---" else _plain(cell) for cell in row) + " |" for row in rows]
+        lines.append("")
+    lines += [f"- {point if point.startswith('`') else _plain(point)}" for point in section.points]
+    return lines if lines[-1] else lines[:-1]
+
+
+def _plain(text: str) -> str:
+    """Without what Markdown or HTML would take for a mark: names in an artifact are whoever made it's."""
+    return _SPECIAL.sub(r"\\\1", " ".join(text.split()))
