@@ -63,6 +63,8 @@ NOT_RUN = {
     ".venv/bin/ruff": "make lint",
     "ttscompile serve": "has no end; tests/executor/test_serve.py starts it",
     "ttscompile convert outputs/train": "a LeRobot policy: tests/frontends/test_lerobot_golden.py converts two",
+    "lerobot-": "a command of LeRobot: tests/plugins runs it, where lerobot is installed",
+    "python -m lerobot_policy_ttscompile": "the same",
     "ttscompile convert pretrained_model": "a LeRobot policy, with --task: tests/frontends/test_lerobot.py",
     "ttscompile calibrate compiled/ --trajectories lerobot": "of LeRobot: tests/trajectories/test_recordings.py",
 }

@@ -7,8 +7,11 @@ from typing import Any
 
 import torch
 
-STATE, CAMERA, DA = "observation.state", "observation.image", 2
-PIXELS = 24
+STATE, ENVIRONMENT = "observation.state", "observation.environment_state"
+DS, DA, PIXELS = 2, 2, 96
+"""As Push-T has them."""
+CAMERAS = {"diffusion": "observation.image", "multi_task_dit": "observation.images.top"}
+"""By case; that of Push-T, and that of ``still_robot``."""
 
 CLIP = {"hidden_size": 8, "intermediate_size": 12, "num_hidden_layers": 1, "num_attention_heads": 2}
 
@@ -54,11 +57,11 @@ def save(case: str, folder: Path) -> Path:
     from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
 
     kind, settings = case.partition(",")[0], dict(SETTINGS[case])
-    inputs = {STATE: PolicyFeature(FeatureType.STATE, (4,))}
-    if "one frame" not in case:
-        inputs[CAMERA] = PolicyFeature(FeatureType.VISUAL, (3, PIXELS, PIXELS))
+    inputs = {STATE: PolicyFeature(FeatureType.STATE, (DS,))}
+    if case in CAMERAS:
+        inputs[CAMERAS[case]] = PolicyFeature(FeatureType.VISUAL, (3, PIXELS, PIXELS))
     else:
-        inputs["observation.environment_state"] = PolicyFeature(FeatureType.ENV, (3,))
+        inputs[ENVIRONMENT] = PolicyFeature(FeatureType.ENV, (3,))
     if kind == "multi_task_dit":
         settings |= dict.fromkeys(("vision_encoder_name", "text_encoder_name"), str(_clip(folder / "clip")))
     outputs = {"action": PolicyFeature(FeatureType.ACTION, (DA,))}
