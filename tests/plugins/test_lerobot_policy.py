@@ -192,10 +192,13 @@ def test_lerobot_rollout_runs_it(saved: tuple[str, Path, Path], tmp_path: Path, 
     assert len(actions) > 5 and actions.shape[1] == DA and np.isfinite(actions).all()
 
 
-def test_the_policy_server_takes_it(saved: tuple[str, Path, Path]) -> None:
+def test_the_policy_server_takes_it(
+    saved: tuple[str, Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What a client sends first, and then the work on its observations."""
     if find_spec("grpc") is None:
         pytest.skip("lerobot's server takes grpc: lerobot[async]")
+    monkeypatch.chdir(tmp_path)  # where it makes a folder logs
     from lerobot.async_inference import policy_server
     from lerobot.async_inference.configs import PolicyServerConfig
     from lerobot.async_inference.helpers import RemotePolicyConfig
