@@ -10,12 +10,13 @@ PYTHON ?= python3.11
 PIP_FLAGS ?=
 BUILD_FLAGS ?=
 EXTRAS ?= dev
+LEROBOT_PYTHON ?= python3.12
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/installed.stamp
 
 .DELETE_ON_ERROR:
-.PHONY: demo test lint types pytest test-avx2 test-arm benchmark docs release containers clean
+.PHONY: demo test lint types pytest test-avx2 test-arm benchmark docs release containers test-lerobot clean
 
 demo: $(READY)
 	$(BIN)/python examples/pusht/demo.py
@@ -54,6 +55,18 @@ test-avx2: $(READY)
 # The runtime on emulated ARM processors; see docs/machines.md. The first time takes half an hour.
 test-arm: $(READY)
 	$(BIN)/python tests/machines/arm.py
+
+# Compiled policies in LeRobot itself, with lerobot's own pins (torch below 2.12), in an environment of its own. Not a part
+# of make test: it installs lerobot. Where pip's own index has PyTorch's CUDA build only, see PIP_FLAGS above.
+#
+#   make LEROBOT_PYTHON=python3.13 test-lerobot
+LEROBOT := build/lerobot
+test-lerobot:
+	test -x $(LEROBOT)/bin/python || $(LEROBOT_PYTHON) -m venv $(LEROBOT)
+	$(LEROBOT)/bin/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) \
+		'lerobot[async,diffusion,multi_task_dit,pusht]==0.6.1' -e '.[compile,videos]' -e plugins/lerobot_policy_ttscompile \
+		hypothesis pytest pytest-benchmark
+	$(LEROBOT)/bin/python -m pytest tests/plugins tests/test_capture.py tests/frontends/test_lerobot.py tests/trajectories
 
 benchmark: $(READY)
 	$(BIN)/pytest --benchmark-only

@@ -66,6 +66,8 @@ NOT_RUN = {
     "ttscompile convert hf://": "from the hub: tests/hub",
     "ttscompile push compiled/ org/compiled-policy --private": "to the hub: tests/hub",
     "ttscompile convert outputs/train": "a LeRobot policy: tests/frontends/test_lerobot_golden.py converts two",
+    "lerobot-": "a command of LeRobot: tests/plugins runs it, where lerobot is installed",
+    "python -m lerobot_policy_ttscompile": "the same",
     "ttscompile convert pretrained_model": "a LeRobot policy, with --task: tests/frontends/test_lerobot.py",
     "ttscompile calibrate compiled/ --trajectories lerobot": "of LeRobot: tests/trajectories/test_recordings.py",
 }

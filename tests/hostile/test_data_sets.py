@@ -79,7 +79,7 @@ def test_the_limits_of_the_process_hold(tmp_path: Path) -> None:
     code = f"""
 import resource
 from ttscompile.trajectories.apart import limit
-limit(3 << 20)
+limit(3 << 20, 3 << 20)
 try:
     bytearray(3 << 29)
 except MemoryError:

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import json
 import logging
+import os
+import pickle
+import subprocess
+import sys
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,7 +19,7 @@ import torch
 
 import ttscompile
 
-from .lerobot_saved import CAMERA, DA, PIXELS, SETTINGS, STATE, save
+from .lerobot_saved import DA, DS, ENVIRONMENT, PIXELS, SETTINGS, STATE, save
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore"),  # lerobot's and its packages' own
@@ -23,7 +28,7 @@ pytestmark = [
         reason="lerobot and plugins/lerobot_policy_ttscompile are not installed: run 'make test-lerobot'",
     ),
 ]
-ENVIRONMENT = "observation.environment_state"
+ROOT = Path(__file__).resolve().parents[2]
 FRAMES_APART = "diffusion"
 """The case that observes two frames."""
 
@@ -55,12 +60,14 @@ def frame(tick: int, policy: Any, streams: int = 2) -> dict[str, Any]:
     """What an environment measures."""
     rng = np.random.default_rng(tick)
     task = ["push the block", "pull it"][tick // 10 % 2]
-    found = {STATE: rng.standard_normal((streams, 4)), "task": [task] * streams}
-    if CAMERA in policy.config.input_features:
-        found[CAMERA] = rng.random((streams, 3, PIXELS, PIXELS))
-    if ENVIRONMENT in policy.config.input_features:
-        found[ENVIRONMENT] = rng.standard_normal((streams, 3))
-    return {key: torch.tensor(value, dtype=torch.float32) if key != "task" else value for key, value in found.items()}
+    shapes = {STATE: (DS,), ENVIRONMENT: (3,)}
+    found: dict[str, Any] = {"task": [task] * streams}
+    for key in policy.config.input_features:
+        drawn = (
+            rng.standard_normal((streams, *shapes[key])) if key in shapes else rng.random((streams, 3, PIXELS, PIXELS))
+        )
+        found[key] = torch.tensor(drawn, dtype=torch.float32)
+    return found
 
 
 def driven(directory: Path) -> np.ndarray:
@@ -148,3 +155,62 @@ def test_it_is_saved_as_it_is_and_not_trained(saved: tuple[str, Path, Path], tmp
     (tmp_path / "copy" / "config.json").write_text(json.dumps(config))
     with pytest.raises(ValueError, match=r"observes \[.*'observation.more'.*convert the checkpoint again"):
         opened(tmp_path / "copy")
+
+
+def command(name: str, *options: str) -> subprocess.CompletedProcess[str]:
+    """Run one of lerobot's commands, as a shell would."""
+    words = [sys.executable, "-W", "ignore", "-m", name, *options]
+    env = {**os.environ, "SDL_VIDEODRIVER": "dummy", "HF_HUB_OFFLINE": "1"}
+    return subprocess.run(words, capture_output=True, text=True, env=env, cwd=ROOT, timeout=600)
+
+
+def test_lerobot_eval_runs_it(saved: tuple[str, Path, Path], tmp_path: Path) -> None:
+    case, _, compiled = saved
+    if case != "diffusion" or find_spec("gym_pusht") is None:
+        pytest.skip("Push-T takes the policy that observes its image and state")
+    run = ["--env.episode_length=10", "--eval.n_episodes=2", "--eval.batch_size=2", "--eval.use_async_envs=false"]
+    options = [f"--policy.path={compiled}/", "--env.type=pusht", *run, f"--output_dir={tmp_path / 'out'}"]
+    result = command("lerobot.scripts.lerobot_eval", *options, "--policy.threads=2")
+    assert result.returncode == 0, result.stderr
+    assert json.loads((tmp_path / "out" / "eval_info.json").read_text())["overall"]["n_episodes"] == 2
+
+
+@pytest.mark.parametrize("inference", ["sync", "rtc"])
+def test_lerobot_rollout_runs_it(saved: tuple[str, Path, Path], tmp_path: Path, inference: str) -> None:
+    """On a robot that writes down what it is sent."""
+    case, _, compiled = saved
+    if case != "multi_task_dit":
+        pytest.skip("the robot measures what the other policy observes")
+    sent = tmp_path / "sent.txt"
+    robot = ["--robot.type=still_robot", f"--robot.log={sent}", "--return_to_initial_position=false"]
+    run = ["--task=push the block", "--fps=10", "--duration=2", f"--inference.type={inference}", "--play_sounds=false"]
+    if inference == "rtc":
+        run += ["--inference.queue_threshold=2", "--inference.rtc.execution_horizon=4"]
+    result = command("tests.plugins.still_robot", f"--policy.path={compiled}", *robot, *run)
+    assert result.returncode == 0, result.stderr
+    actions = np.loadtxt(sent, ndmin=2)
+    assert len(actions) > 5 and actions.shape[1] == DA and np.isfinite(actions).all()
+
+
+def test_the_policy_server_takes_it(
+    saved: tuple[str, Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a client sends first, and then the work on its observations."""
+    if find_spec("grpc") is None:
+        pytest.skip("lerobot's server takes grpc: lerobot[async]")
+    monkeypatch.chdir(tmp_path)  # where it makes a folder logs
+    from lerobot.async_inference import policy_server
+    from lerobot.async_inference.configs import PolicyServerConfig
+    from lerobot.async_inference.helpers import RemotePolicyConfig
+    from lerobot.transport import services_pb2
+    from lerobot_policy_ttscompile.policy_server import allow
+
+    allow()
+    _, _, compiled = saved
+    server = policy_server.PolicyServer(PolicyServerConfig())
+    server.shutdown_event.clear()
+    context = SimpleNamespace(peer=lambda: "robot")
+    specs = RemotePolicyConfig("ttscompile", str(compiled), {}, actions_per_chunk=3)
+    server.SendPolicyInstructions(services_pb2.PolicySetup(data=pickle.dumps(specs)), context)
+    batch = server.preprocessor(frame(0, server.policy, streams=1))
+    assert server._get_action_chunk(batch).shape == (1, 3, DA)

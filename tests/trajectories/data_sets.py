@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import shutil
 from collections.abc import Iterator, Mapping
@@ -24,6 +25,7 @@ LOW = {"obs": ObservationSpec((2, 8))}
 IMAGES = {"image": ObservationSpec((2, 3, 5, 4)), "state": ObservationSpec((2, 5))}
 SOURCES = {"obs": ("keypoint", "state:2")}
 ENDS = [5, 9]
+FPS = 10
 
 
 @contextmanager
@@ -91,9 +93,48 @@ def as_lerobot(path: Path, features: dict[str, Any] | None = None) -> Path:
             "img": [{"bytes": png(held["img"][i]), "path": None} for i in rows],
             "episode_index": [number] * len(rows),
             "frame_index": [i - 5 * number for i in rows],
+            "timestamp": np.array([(i - 5 * number) / FPS for i in rows], np.float32),
             "task_name": ["push"] * len(rows),
         }
         file = root / "data" / "chunk-000" / f"file-{number:03d}.parquet"
         file.parent.mkdir(parents=True, exist_ok=True)
         parquet.write_table(pa.table(table), file)
     return root
+
+
+def as_lerobot_with_videos(path: Path, version: int = 3, codec: str = "libx264") -> Path:
+    """The same with a camera ``top``: version 3 has both episodes in one file, version 2 a file for each."""
+    feature = {"dtype": "video", "shape": [16, 32, 3], "names": ["height", "width", "channels"]}
+    root = as_lerobot(path, {"top": feature})
+    info = json.loads((root / "meta" / "info.json").read_text()) | {"fps": FPS}
+    (root / "meta" / "info.json").write_text(json.dumps(info))
+    parts = [*itertools.pairwise((0, *ENDS))]
+    if version == 2:
+        for number, (begin, end) in enumerate(parts):
+            write_video(root / "videos" / "chunk-000" / "top" / f"episode_{number:06d}.mp4", begin, end, codec)
+        return root
+    write_video(root / "videos" / "top" / "chunk-000" / "file-000.mp4", 0, ENDS[-1], codec)
+    places = {"chunk_index": [0, 0], "file_index": [0, 0], "from_timestamp": [begin / FPS for begin, _ in parts]}
+    table = {"episode_index": [0, 1]} | {f"videos/top/{of}": values for of, values in places.items()}
+    (root / "meta" / "episodes").mkdir()
+    parquet.write_table(pa.table(table), root / "meta" / "episodes" / "file-000.parquet")
+    return root
+
+
+def write_video(file: Path, begin: int, end: int, codec: str = "libx264") -> None:
+    """Frames of one colour each, which ``shade`` gives."""
+    import av
+
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(file), "w") as container:
+        stream = container.add_stream(codec, rate=FPS)
+        stream.width, stream.height, stream.pix_fmt = 32, 16, "yuv420p"
+        for i in range(begin, end):
+            frame = av.VideoFrame.from_ndarray(np.full((16, 32, 3), shade(i), np.uint8), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
+def shade(frame: int) -> list[int]:
+    """The colour of a frame: each has its own."""
+    return [20 + 20 * frame, 220 - 20 * frame, 120]

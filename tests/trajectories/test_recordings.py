@@ -14,7 +14,6 @@ import pytest
 import zarr
 
 from tests.hostile.pickles import Runs
-from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import TrajectoryError
 from ttscompile.trajectories import Episode, apart, load_trajectories
 from ttscompile.trajectories import frames as trajectories_frames
@@ -129,12 +128,6 @@ def test_data_of_other_files_is_not_read(tmp_path: Path) -> None:
         file["data/demo_2/obs/state"] = h5py.ExternalLink("other.hdf5", "/state")
     with pytest.raises(TrajectoryError, match="is a link, maybe to another file"):
         load_trajectories([path], LOW, 3, SOURCES)
-
-
-def test_videos_are_refused_by_name(tmp_path: Path) -> None:
-    root = as_lerobot(tmp_path, {"top": {"dtype": "video", "shape": [3, 5, 4]}})
-    with pytest.raises(TrajectoryError, match="'top' is a video, which is not decoded. Save its frames as images"):
-        load_trajectories([root], {"image": ObservationSpec((2, 3, 5, 4))}, 2, {"image": ("top",)})
 
 
 @pytest.mark.parametrize(("part", "message"), [("task_name", "is string; expected numbers"), ("nested", "no array")])

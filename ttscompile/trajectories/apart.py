@@ -23,7 +23,7 @@ from typing import IO, Any, BinaryIO
 import numpy as np
 
 from ..errors import TrajectoryError
-from .frames import AS_NPZ, Array, Frames, Recording, bytes_of, one_error, require_proportion
+from .frames import AS_NPZ, Array, Frames, Recording, bytes_of, one_error, require_proportion, worth_of
 from .hdf5_file import hdf5_recording
 from .lerobot_dataset import lerobot_recording
 from .zarr_buffer import zarr_recording
@@ -77,7 +77,7 @@ def reader(request: Mapping[str, Any]) -> Iterator[IO[bytes]]:
     ) as process:
         assert process.stdin is not None
         assert process.stdout is not None
-        seconds = 60 + 10 * _seconds(bytes_of(Path(request["path"])))
+        seconds = 60 + 10 * _seconds(worth_of(Path(request["path"])))
         timer = threading.Timer(seconds, process.kill)  # waits for something that does not come
         timer.start()
         try:
@@ -137,10 +137,10 @@ def serve_alone(request: Mapping[str, Any]) -> None:
     out = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what a library prints is no answer
     path = Path(request["path"])
-    for package in IMPORTS[request["kind"]]:
+    for package in [*IMPORTS[request["kind"]], *(["av"] if (path / "videos").is_dir() else [])]:
         with suppress(ModuleNotFoundError):  # the reader says so
             importlib.import_module(package)
-    limit(bytes_of(path))
+    limit(bytes_of(path), worth_of(path))
     serve(request, out)
     out.flush()
     os._exit(0)  # threads of a library need not be waited for
@@ -171,7 +171,7 @@ def _send_array(path: Path, out: BinaryIO, head: Mapping[str, str], rows: int, b
         if first is None:
             first = block[:0].copy()
             row = first.dtype.itemsize * int(np.prod(first.shape[1:], dtype=object))
-            require_proportion(path, row * rows, bytes_of(path))
+            require_proportion(path, row * rows, worth_of(path))
             if first.dtype.kind not in "biuf":
                 raise TrajectoryError(f"{path}: {name!r} is {first.dtype}; expected numbers.")
             _send(out, **head, dtype=first.dtype.str, shape=[rows, *first.shape[1:]])
@@ -192,18 +192,19 @@ def _send(out: BinaryIO, **line: Any) -> None:
     out.write(json.dumps(line).encode() + b"\n")
 
 
-def limit(size: int) -> None:
+def limit(size: int, worth: int) -> None:
     """Limit this process, where its system can.
 
     Args:
-        size: bytes of the files that are read; time and memory grow with it, not with what they declare.
+        size: bytes of the files that are read; memory grows with it, not with what they declare.
+        worth: the same for time, see ``worth_of``.
     """
     try:
         import resource
     except ModuleNotFoundError:  # Windows
         return
     limits = {resource.RLIMIT_CORE: 0, resource.RLIMIT_FSIZE: 0}
-    limits[resource.RLIMIT_CPU] = int(time.process_time()) + 1 + _seconds(size)
+    limits[resource.RLIMIT_CPU] = int(time.process_time()) + 1 + _seconds(worth)
     statm = Path("/proc/self/statm")
     if statm.exists():
         held = int(statm.read_text().split()[5]) * resource.getpagesize()

@@ -1,9 +1,12 @@
-"""A LeRobot data set directory, version 2 or 3: ``meta/info.json`` and tables ``data/**/*.parquet``, a row a frame."""
+"""A LeRobot data set directory, version 2 or 3: ``meta/info.json`` and tables ``data/**/*.parquet``, a row a frame.
+
+Images are in the tables, or in videos (``lerobot_video``).
+"""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +14,10 @@ import numpy as np
 
 from ..core.untrusted_json import parse_json
 from ..errors import TrajectoryError
-from .frames import AS_NPZ, Array, Recording, missing_package, one_error, require_files, require_proportion
+from .frames import Array, Recording, missing_package, one_error, require_files, require_proportion
+from .lerobot_video import video_frames
 
-EPISODE, FRAME = "episode_index", "frame_index"
+EPISODE, FRAME, TIME = "episode_index", "frame_index", "timestamp"
 MAX_INFO = 64 * 2**20
 """Bytes of ``meta/info.json``."""
 ROWS, IMAGES = 4096, 8
@@ -38,8 +42,8 @@ def lerobot_recording(path: Path) -> Recording:
     size = sum(file.stat().st_size for file in files)
     hint = "; expected a LeRobot data set, whose features it names"
     with one_error(f"{path}: meta/info.json cannot be read", hint):
-        features = parse_json((path / "meta" / "info.json").read_bytes(), MAX_INFO)["features"]
-        videos = [name for name, feature in features.items() if feature.get("dtype") == "video"]
+        info = parse_json((path / "meta" / "info.json").read_bytes(), MAX_INFO)
+        videos = [name for name, feature in info["features"].items() if feature.get("dtype") == "video"]
     hint = f"; expected tables with the columns {EPISODE} and {FRAME}"
     with one_error(f"{path}: cannot be read as a LeRobot data set", hint):
         tables = [parquet.ParquetFile(file) for file in files]
@@ -52,9 +56,12 @@ def lerobot_recording(path: Path) -> Recording:
 
     def read(name: str) -> tuple[int, Iterator[Array]]:
         if name in videos:
-            told = f"{path}: {name!r} is a video, which is not decoded. Save its frames as images (LeRobot records a"
-            raise TrajectoryError(f"{told} data set so with --dataset.video=false), or {AS_NPZ}")
+            times = np.concatenate([np.zeros(0, np.float32), *_column(path, tables, TIME, size)])
+            return len(order), video_frames(path, name, info, episodes, times, columns)
         return len(order), _column(path, tables, name, size)
+
+    def columns(files: Sequence[Path], name: str) -> Array:
+        return np.concatenate(list(_column(path, [parquet.ParquetFile(file) for file in files], name, size)))
 
     sorted_already = bool((order == np.arange(len(order))).all())
     return Recording([*names, *videos], read, ends, None if sorted_already else order)
