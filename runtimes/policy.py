@@ -27,6 +27,7 @@ from ttscompile.measure.process import LONGEST_WAIT, Process
 from .arrays import Array, check_observation, check_seed, like, read_observation
 from .info import BlockInfo, PolicyInfo
 from .inpainting import check_prefix, prefix_refusal
+from .instruct import Instruct
 from .liveness import rollout_needs
 from .open import kind_of, open_runtime
 from .queues import Queues, is_window
@@ -45,6 +46,7 @@ def load(
     *,
     precision: str | None = None,
     plan: str | None = None,
+    tokenizer: str | Path | None = None,
 ) -> CompiledPolicy:
     """Load a compiled policy.
 
@@ -59,9 +61,12 @@ def load(
             converted with. The reference runtime computes in fp32 alone.
         plan: that ``predict_action`` uses when it is given none: ``dense`` or the name of a plan of the artifact; None
             for the artifact's default.
+        tokenizer: ``tokenizer.json`` of the policy's language model, or its folder: observations may then have the text
+            ``task`` in place of tokens. Needs the package tokenizers. None: the caller gives tokens.
 
     Raises:
         IllegalPlanError: the artifact has no plan of this name.
+        ObservationError: the tokenizer cannot be had, or the policy has no use for it.
         ArtifactChangedError: the artifact was replaced while it was loaded, and again whenever it was tried again.
         ArtifactError: the artifact is missing, damaged, of another version, or without blocks of this precision.
         RuntimeUnavailableError: the runtime cannot be had on this machine.
@@ -70,12 +75,18 @@ def load(
     seed = check_seed(seed)
     for _ in range(TRIES - 1):
         with suppress(ArtifactChangedError):
-            return _load(path, runtime, threads, seed, precision, plan)
-    return _load(path, runtime, threads, seed, precision, plan)
+            return _load(path, runtime, threads, seed, precision, plan, tokenizer)
+    return _load(path, runtime, threads, seed, precision, plan, tokenizer)
 
 
 def _load(
-    path: str | Path, runtime: str, threads: int, seed: int | None, precision: str | None, plan: str | None
+    path: str | Path,
+    runtime: str,
+    threads: int,
+    seed: int | None,
+    precision: str | None,
+    plan: str | None,
+    tokenizer: str | Path | None,
 ) -> CompiledPolicy:
     artifact = load_artifact(path)
     if kind_of(runtime).fp32_only:
@@ -87,7 +98,8 @@ def _load(
         artifact = artifact.at_precision(precision)
     if plan is not None:
         _require_plan(artifact, plan)  # before the sessions are opened
-    return CompiledPolicy(artifact, open_runtime(artifact, runtime, threads), seed, plan)
+    instruct = None if tokenizer is None else Instruct(artifact.manifest.spec, tokenizer)
+    return CompiledPolicy(artifact, open_runtime(artifact, runtime, threads), seed, plan, instruct)
 
 
 class CompiledPolicy:
@@ -101,13 +113,21 @@ class CompiledPolicy:
         runtime: opened on the same artifact.
         seed: of the noise that is drawn when none is given.
         plan: see ``load``.
+        instruct: puts tokens in the place of a task's text; None for none.
 
     Raises:
         IllegalPlanError: the artifact has no plan of this name.
     """
 
-    def __init__(self, artifact: Artifact, runtime: Runtime, seed: int | None = None, plan: str | None = None) -> None:
-        self._artifact, self._runtime = artifact, runtime
+    def __init__(
+        self,
+        artifact: Artifact,
+        runtime: Runtime,
+        seed: int | None = None,
+        plan: str | None = None,
+        instruct: Instruct | None = None,
+    ) -> None:
+        self._artifact, self._runtime, self._instruct = artifact, runtime, instruct
         self._manifest = artifact.manifest
         self._default = artifact.manifest.default_plan if plan is None else plan
         _require_plan(artifact, self._default)
@@ -205,7 +225,7 @@ class CompiledPolicy:
         """
         with self._turn():
             spec = self._manifest.spec
-            obs, example = read_observation(obs_dict, spec.observations)
+            obs, example = self._read(obs_dict)
             predicted, chunk = self._predict(obs, noise, plan, prefix), spec.chunk
             executed = predicted[:, chunk.start : chunk.stop]
             return {"action": like(executed.copy(), example), "action_pred": like(predicted.copy(), example)}
@@ -230,7 +250,7 @@ class CompiledPolicy:
             NonFiniteActionsError: as ``predict_action``.
         """
         with self._turn():
-            obs, example = read_observation(batch, self._manifest.spec.observations, others=True)
+            obs, example = self._read(batch, others=True)
             frames = self._queues.after(obs)
             if self._queues.empty:
                 self._queues.extend(self._chunk(self._queues.observation(frames), noise, plan))
@@ -256,7 +276,7 @@ class CompiledPolicy:
         """
         with self._turn():
             specs = self._manifest.spec.observations
-            obs, example = read_observation(batch, specs, others=True)
+            obs, example = self._read(batch, others=True)
             if is_window(obs, specs):
                 chunk = self._chunk(obs, noise, plan)
             else:
@@ -264,6 +284,11 @@ class CompiledPolicy:
                 chunk = self._chunk(self._queues.observation(frames), noise, plan)
                 self._queues.keep(frames)
             return like(chunk.copy(), example)
+
+    def _read(self, given: Mapping[str, Any], others: bool = False) -> tuple[dict[str, Array], Any]:
+        """The caller's observation, a text in it turned into tokens; see ``read_observation``."""
+        given = given if self._instruct is None else self._instruct(given)
+        return read_observation(given, self._manifest.spec.observations, others)
 
     def _chunk(self, obs: Mapping[str, Array], noise: Noise | None, plan: str | npt.ArrayLike | None) -> FloatArray:
         """What is executed of a call, ``[B, Ta, Da]``."""
