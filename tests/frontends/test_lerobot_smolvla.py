@@ -22,6 +22,7 @@ from ttscompile.frontends.encoded import parts
 from ttscompile.frontends.families import LoadOptions
 
 from ..families.support import record
+from ..verification.broken import edited
 from .lerobot_tiny import change_json
 from .vlas import CAMERAS, MASK, STATE, TOKENS, Array, arrays, as_given, frame
 
@@ -109,6 +110,16 @@ def test_the_text_of_a_task_in_place_of_its_tokens(
         policy.predict_action_chunk(batch | {"task": 3})
     with pytest.raises(ObservationError, match="no such file; expected the tokenizer.json"):
         ttscompile.load(compiled, tokenizer=compiled)
+
+
+def test_verify_names_a_broken_layer(compiled: Path, tmp_path: Path) -> None:
+    shutil.copytree(compiled, tmp_path / "compiled")
+    with edited(tmp_path / "compiled", "weights") as arrays:
+        arrays["denoiser.layers.1.mlp.down_proj.weight"] *= 1.05
+    found = ttscompile.verify(tmp_path / "compiled", calls=1).first_failure
+    assert found is not None
+    assert (found.name, found.blocks) == ("block", (3,))
+    assert "block 3 (feed_forward)" in found.told
 
 
 def test_a_camera_that_the_robot_lacks(
