@@ -29,6 +29,7 @@ from ttscompile.measure.process import LONGEST_WAIT, Process
 from .arrays import Array, check_observation, check_seed, like, read_observation
 from .info import BlockInfo, PolicyInfo
 from .inpainting import check_prefix, prefix_refusal
+from .instruct import Instruct
 from .liveness import rollout_needs
 from .open import kind_of, open_runtime
 from .queues import Queues, is_window
@@ -48,6 +49,7 @@ def load(
     precision: str | None = None,
     plan: str | None = None,
     device: str | None = None,
+    tokenizer: str | Path | None = None,
 ) -> CompiledPolicy:
     """Load a compiled policy.
 
@@ -66,9 +68,12 @@ def load(
         plan: that ``predict_action`` uses when it is given none: ``dense`` or the name of a plan of the artifact; None
             for the artifact's default.
         device: where torch computes: ``cpu``, ``cuda``, ``cuda:1``, ``mps``. None for the CPU.
+        tokenizer: ``tokenizer.json`` of the policy's language model, or its folder: observations may then have the text
+            ``task`` in place of tokens. Needs the package tokenizers. None: the caller gives tokens.
 
     Raises:
         IllegalPlanError: the artifact has no plan of this name.
+        ObservationError: the tokenizer cannot be had, or the policy has no use for it.
         ArtifactChangedError: the artifact was replaced while it was loaded, and again whenever it was tried again.
         ArtifactError: the artifact is missing, damaged, of another version, or without blocks of this precision.
         RuntimeUnavailableError: the runtime, or ``huggingface_hub``, cannot be had on this machine.
@@ -82,8 +87,8 @@ def load(
         path, origin = fetched.path, fetched.origin
     for _ in range(TRIES - 1):
         with suppress(ArtifactChangedError):
-            return _load(path, runtime, threads, seed, precision, plan, device, origin)
-    return _load(path, runtime, threads, seed, precision, plan, device, origin)
+            return _load(path, runtime, threads, seed, precision, plan, device, tokenizer, origin)
+    return _load(path, runtime, threads, seed, precision, plan, device, tokenizer, origin)
 
 
 def _load(
@@ -94,6 +99,7 @@ def _load(
     precision: str | None,
     plan: str | None,
     device: str | None,
+    tokenizer: str | Path | None,
     origin: str | None,
 ) -> CompiledPolicy:
     artifact, made = load_artifact(path), kind_of(runtime).precisions
@@ -109,7 +115,8 @@ def _load(
     if plan is not None:
         _require_plan(artifact, plan)  # before the sessions are opened
     opened = open_runtime(artifact, runtime, threads, device, own)
-    return CompiledPolicy(artifact, opened, seed, plan, own if made else None, origin)
+    instruct = None if tokenizer is None else Instruct(artifact.manifest.spec, tokenizer)
+    return CompiledPolicy(artifact, opened, seed, plan, own if made else None, origin, instruct)
 
 
 class CompiledPolicy:
@@ -125,6 +132,7 @@ class CompiledPolicy:
         plan: see ``load``.
         precision: of the residual blocks; None for the artifact's.
         origin: ``hf://org/name@commit`` of an artifact from the hub; None for another.
+        instruct: puts tokens in the place of a task's text; None for none.
 
     Raises:
         IllegalPlanError: the artifact has no plan of this name.
@@ -138,9 +146,10 @@ class CompiledPolicy:
         plan: str | None = None,
         precision: str | None = None,
         origin: str | None = None,
+        instruct: Instruct | None = None,
     ) -> None:
         self.origin = origin
-        self._artifact, self._runtime = artifact, runtime
+        self._artifact, self._runtime, self._instruct = artifact, runtime, instruct
         self._precision = precision or artifact.manifest.precision_name
         self._manifest = artifact.manifest
         self._default = artifact.manifest.default_plan if plan is None else plan
@@ -244,7 +253,7 @@ class CompiledPolicy:
         """
         with self._turn():
             spec = self._manifest.spec
-            obs, example = read_observation(obs_dict, spec.observations)
+            obs, example = self._read(obs_dict)
             predicted, chunk = self._predict(obs, noise, plan, prefix), spec.chunk
             executed = predicted[:, chunk.start : chunk.stop]
             return {"action": like(executed.copy(), example), "action_pred": like(predicted.copy(), example)}
@@ -269,7 +278,7 @@ class CompiledPolicy:
             NonFiniteActionsError: as ``predict_action``.
         """
         with self._turn():
-            obs, example = read_observation(batch, self._manifest.spec.observations, others=True)
+            obs, example = self._read(batch, others=True)
             frames = self._queues.after(obs)
             if not self._queues.queued:
                 self._queues.extend(self._chunk(self._queues.observation(frames), noise, plan))
@@ -300,7 +309,7 @@ class CompiledPolicy:
         """
         with self._turn():
             specs = self._manifest.spec.observations
-            obs, example = read_observation(batch, specs, others=True)
+            obs, example = self._read(batch, others=True)
             if is_window(obs, specs):
                 chunk = self._chunk(obs, noise, plan, prefix)
             else:
@@ -308,6 +317,11 @@ class CompiledPolicy:
                 chunk = self._chunk(self._queues.observation(frames), noise, plan, prefix)
                 self._queues.keep(frames)
             return like(chunk.copy(), example)
+
+    def _read(self, given: Mapping[str, Any], others: bool = False) -> tuple[dict[str, Array], Any]:
+        """The caller's observation, a text in it turned into tokens; see ``read_observation``."""
+        given = given if self._instruct is None else self._instruct(given)
+        return read_observation(given, self._manifest.spec.observations, others)
 
     def _chunk(
         self, obs: Mapping[str, Array], noise: Noise | None, plan: str | npt.ArrayLike | None, prefix: Any = None

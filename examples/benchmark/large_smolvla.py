@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from time import perf_counter
+from time import process_time
 from typing import Any
 
 import numpy as np
@@ -78,29 +78,29 @@ def call(spec: PolicySpec) -> tuple[dict[str, np.ndarray], Noise]:
 
 
 def eager(module: nn.Module, spec: PolicySpec) -> Callable[[], tuple[np.ndarray, list[float]]]:
-    """A call in eager PyTorch: the actions, and the seconds of image encoder, rest of the prefix, and loop."""
+    """A call in eager PyTorch: the actions; and the seconds, of the processor, of image encoder, prefix and loop."""
     obs, noise = call(spec)
     given = {spec.arguments[key]: torch.from_numpy(value) for key, value in obs.items()}
     parts: Any = module
     took = [0.0]
 
     def timed(_: nn.Module, __: Any) -> None:
-        took[0] -= perf_counter()
+        took[0] -= process_time()
 
     def done(_: nn.Module, __: Any, ___: Any) -> None:
-        took[0] += perf_counter()
+        took[0] += process_time()
 
     parts.encoder.prefix.vision_model.register_forward_pre_hook(timed)
     parts.encoder.prefix.vision_model.register_forward_hook(done)
 
     @torch.inference_mode()
     def run() -> tuple[np.ndarray, list[float]]:
-        took[0], start = 0.0, perf_counter()
+        took[0], start = 0.0, process_time()
         encoded = parts.encoder(given)
-        prefix = perf_counter()
+        prefix = process_time()
         x = torch.from_numpy(noise.initial)
         for t in spec.sampler.timesteps:
             x = x - parts.denoiser(x, torch.full((1,), float(t)), encoded) / spec.sampler.steps
-        return spec.chunk.unnormalized(x.numpy()), [took[0], prefix - start - took[0], perf_counter() - prefix]
+        return spec.chunk.unnormalized(x.numpy()), [took[0], prefix - start - took[0], process_time() - prefix]
 
     return run

@@ -260,7 +260,9 @@ def test_missing_statistics_are_said(tmp_path: Path) -> None:
         load_checkpoint_policy(directory)
 
 
-@pytest.mark.parametrize("kind", ["act", "xvla", "groot", "pi0_fast", "something_new"])
+@pytest.mark.parametrize(
+    "kind", ["act", "groot", "xvla", "evo1", "vla_jepa", "wall_x", "eo1", "molmoact2", "pi0_fast", "something_new"]
+)
 def test_other_policies_are_refused_by_name(tmp_path: Path, kind: str) -> None:
     """Each with what can be done instead."""
     directory = save_policy(tmp_path)

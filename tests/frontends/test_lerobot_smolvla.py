@@ -15,12 +15,14 @@ import torch
 import ttscompile
 from tests.once import Once
 from ttscompile.core.spec import Noise
-from ttscompile.errors import CheckpointError
+from ttscompile.errors import CheckpointError, ObservationError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
+from ttscompile.frontends.encoded import parts
 from ttscompile.frontends.families import LoadOptions
 
 from ..families.support import record
+from ..verification.broken import edited
 from .lerobot_tiny import change_json
 from .vlas import CAMERAS, MASK, STATE, TOKENS, Array, arrays, as_given, frame
 
@@ -92,6 +94,34 @@ def test_select_action_over_twenty_ticks(compiled: Path, golden: Mapping[str, Ar
     assert np.abs(torch.stack(found, 1).numpy() - golden["call0.action"][:, :20]).max() < 1e-4
 
 
+def test_the_text_of_a_task_in_place_of_its_tokens(
+    compiled: Path, directory: Path, golden: Mapping[str, Array]
+) -> None:
+    """With a tokenizer on the robot; of two episodes the instructions differ."""
+    policy = ttscompile.load(compiled, tokenizer=directory.parent / "smolvlm-tiny")
+    for call in (0, 1):
+        given = arrays(golden, call)
+        batch = {key: value for key, value in observed(given).items() if key not in (TOKENS, MASK)}
+        for task in (str(given["task"]), [str(given["task"])]):
+            policy.reset()
+            found = policy.predict_action_chunk(batch | {"task": task}, noise=Noise(given["noise"]), plan="dense")
+            assert np.abs(found - golden[f"call{call}.action"]).max() < 1e-4
+    with pytest.raises(ObservationError, match="the task is 3; expected a text"):
+        policy.predict_action_chunk(batch | {"task": 3})
+    with pytest.raises(ObservationError, match="no such file; expected the tokenizer.json"):
+        ttscompile.load(compiled, tokenizer=compiled)
+
+
+def test_verify_names_a_broken_layer(compiled: Path, tmp_path: Path) -> None:
+    shutil.copytree(compiled, tmp_path / "compiled")
+    with edited(tmp_path / "compiled", "weights") as arrays:
+        arrays["module.denoiser.layers.1.mlp.down_proj.weight"] *= 1.05
+    found = ttscompile.verify(tmp_path / "compiled", calls=1).first_failure
+    assert found is not None
+    assert (found.name, found.blocks) == ("block", (3,))
+    assert "block 3 (feed_forward)" in found.told
+
+
 def test_a_camera_that_the_robot_lacks(
     directory: Path, golden: Mapping[str, Array], others: Mapping[str, Array]
 ) -> None:
@@ -101,6 +131,18 @@ def test_a_camera_that_the_robot_lacks(
     found = eager(directory, given, observed(given), without)
     assert np.abs(found - others["missing"]).max() < 1e-4
     assert np.abs(found - golden["call0.action"]).max() > 0.01
+
+
+def test_what_a_configuration_leaves_out_is_lerobots_default(directory: Path, tmp_path: Path) -> None:
+    policy = copy(directory, tmp_path)
+    entries = json.loads((policy / "config.json").read_text())
+    for name in ("attention_mode", "self_attn_every_n_layers", "expert_width_multiplier", "min_period", "max_period"):
+        del entries[name]
+    (policy / "config.json").write_text(json.dumps(entries))
+    found: Any = parts(load_checkpoint_policy(policy)[0]).denoiser
+    expected: Any = parts(load_checkpoint_policy(directory)[0]).denoiser
+    assert found.config == expected.config
+    assert [layer.crosses for layer in found.layers] == [False, True, False, True]
 
 
 def test_cameras_that_lerobot_calls_empty_are_no_observation(directory: Path, tmp_path: Path) -> None:

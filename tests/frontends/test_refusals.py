@@ -83,7 +83,8 @@ def test_other_policies(payload: Callable[..., Any], save: Callable[..., Path], 
         load_checkpoint_policy(save(built))
 
 
-LEROBOT_TYPES = ["act", "vqbet", "pi0_fast", "tdmpc", "sac", "smolvla", "wall_x", "something_new"]
+LEROBOT_TYPES = ["act", "vqbet", "pi0_fast", "tdmpc", "sac", "groot", "xvla", "evo1", "vla_jepa", "wall_x"]
+LEROBOT_TYPES += ["molmoact2", "fastwam", "something_new"]
 
 DIRECTORY_FILES: list[tuple[list[str], str]] = [
     (["adapter_config.json", "adapter_model.safetensors"], "PEFT adapter.*adapter_config.json.*Merge"),

@@ -159,3 +159,15 @@ def test_arrays_out_of_proportion_are_refused(format: str, tmp_path: Path, monke
     monkeypatch.setattr(trajectories_frames, "MAX_RATIO", 0)
     with pytest.raises(TrajectoryError, match="in proportion"):
         load_trajectories([WRITERS[format](tmp_path)], LOW, 3, SOURCES)
+
+
+def test_images_of_another_size_are_resized_where_the_policy_does_that(tmp_path: Path) -> None:
+    """Bytes with channels last, as cameras give them; the rest is black, at the top and the left."""
+    image = np.full((3, 4, 8, 3), 255, np.uint8)
+    path = tmp_path / "calls.npz"
+    np.savez(path, top=image, episode_ends=np.array([3]), meta=np.array('{"frames": true}'))
+    specs = {"top": ObservationSpec((1, 3, 4, 4), bounds=(0.0, 1.0), fit="start")}
+    (episode,) = load_trajectories([path], specs, 1)
+    expected = np.zeros((3, 1, 3, 4, 4), np.float32)
+    expected[..., 2:, :] = 1
+    np.testing.assert_array_equal(episode.observations["top"], expected)

@@ -252,6 +252,21 @@ class ObservationSpec:
 
 
 @dataclass(frozen=True)
+class Instruction:
+    """How the text of a task becomes two observations, where somebody has the tokenizer.
+
+    Attributes:
+        tokens: key of the tokens, int64 ``[B, L]``, padded at the end.
+        mask: key of what says which of them count, bool ``[B, L]``.
+        new_line: whether the text ends with a new line before it is tokenized.
+    """
+
+    tokens: str
+    mask: str
+    new_line: bool
+
+
+@dataclass(frozen=True)
 class ChunkSpec:
     """What of the denoised sample ``[T, D]`` is action, and what of the actions is executed.
 
@@ -296,6 +311,7 @@ class PolicySpec:
         timestep_argument: name of the module's timestep argument (a ``[B]`` tensor).
         source: what this was compiled from, for people: format and variant, no path.
         left_out: steps that the original predicts after the last one of the sample (``ttscompile.capture.narrow``).
+        instruction: of a policy that is told its task in words, which a text alone gives; None for all others.
     """
 
     sample: tuple[Positive, Positive]
@@ -306,6 +322,7 @@ class PolicySpec:
     timestep_argument: str = "timestep"
     source: Mapping[str, str] = field(default_factory=dict)
     left_out: int = 0
+    instruction: Instruction | None = None
 
     def __post_init__(self) -> None:
         sizes = tuple(integer(n, "a size in the sample's shape", SpecError, 1) for n in self.sample)
@@ -327,6 +344,9 @@ class PolicySpec:
         if self.chunk.stop > horizon or self.chunk.action_dim > channels:
             told = f"chunk [{self.chunk.start}:{self.chunk.stop}] of {self.chunk.action_dim} channels does not fit a"
             raise SpecError(f"{told} sample of {horizon} steps and {channels} channels.")
+        words = self.instruction
+        if words is not None and not {words.tokens, words.mask} <= self.observations.keys():
+            raise SpecError(f"the instruction's keys {words.tokens!r} and {words.mask!r} must be observations.")
         normalizer = self.chunk.normalizer
         if normalizer is not None and len(normalizer.scale) != self.chunk.action_dim:
             found = len(normalizer.scale)

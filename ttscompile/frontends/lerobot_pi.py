@@ -80,7 +80,8 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     spec = vla_spec(shared, processors, (side, side), "centre", sizes, options)
     if adaptive:  # the instruction holds it
         own = processors.renamed.get(STATE, STATE)
-        spec = replace(spec, observations={key: each for key, each in spec.observations.items() if key != own})
+        others = {key: each for key, each in spec.observations.items() if key != own}
+        spec = replace(spec, observations=others, instruction=None)
     return EncodedDenoiser(encoder, Expert(network)).eval(), spec
 
 

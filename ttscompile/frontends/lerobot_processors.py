@@ -131,6 +131,7 @@ class Processors:
         renamed: the policy's name of an observation -> the name that the robot gives it, where they differ.
         tokenizer: settings of the tokenizer; none without one.
         new_line: whether an instruction ends with a new line before it is tokenized.
+        state_in_prompt: whether it holds the state too, as numbers in words.
     """
 
     normalizers: Mapping[str, Statistics]
@@ -138,6 +139,7 @@ class Processors:
     renamed: Mapping[str, str]
     tokenizer: Mapping[str, Any]
     new_line: bool = False
+    state_in_prompt: bool = False
 
 
 def read_processors(directory: Path, features: Features) -> Processors:
@@ -153,6 +155,7 @@ def read_processors(directory: Path, features: Features) -> Processors:
         action=_statistics(directory, after, _UNNORMALIZE, features).get("action"),
         tokenizer=next((dict(step["config"]) for step in before if step["registry_name"] == _TOKENIZE), {}),
         new_line=any(step["registry_name"] in _NEW_LINE for step in before),
+        state_in_prompt=any(step["registry_name"] == _PROMPT for step in before),
     )
 
 

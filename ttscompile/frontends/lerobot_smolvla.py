@@ -166,7 +166,7 @@ def _layers(settings: Settings, there: int) -> int:
 
 def _crosses(settings: Settings, layers: int) -> tuple[bool, ...]:
     """Which layers of the expert see the prefix alone."""
-    crossing = settings.choice("attention_mode", "self_attn", "cross_attn") == "cross_attn"
+    crossing = settings.choice("attention_mode", "cross_attn", "self_attn") == "cross_attn"
     every = settings.values.get("self_attn_every_n_layers", 2)
     if type(every) is not int:
         raise settings.refusal("self_attn_every_n_layers", "a whole number")

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ..core.spec import ObservationSpec, PolicySpec, SamplerTable
+from ..core.spec import Instruction, ObservationSpec, PolicySpec, SamplerTable
 from ..errors import CheckpointError, SpecError
 from ..samplers.flow import METHODS, flow_matching_table
 from .families import LoadOptions
@@ -102,8 +102,11 @@ def vla_spec(
     if image is not None:
         resized = ObservationSpec((1, 3, *image), bounds=(0.0, 1.0), fit=fit)
         observations |= {processors.renamed.get(key, key): resized for key in config.cameras}
+    # The instruction of pi05 holds its state too, which only lerobot's processor can put there.
+    plain = language and not processors.state_in_prompt
+    told = Instruction(TOKENS, MASK, processors.new_line) if plain else None
     sample = (config.horizon, sizes["actions"])
-    return PolicySpec(sample, observations, spec.sampler, spec.chunk, source=spec.source)
+    return PolicySpec(sample, observations, spec.sampler, spec.chunk, source=spec.source, instruction=told)
 
 
 def _sampler(settings: Settings, options: LoadOptions) -> SamplerTable:

@@ -90,8 +90,22 @@ LEROBOT = (
     Refusal(r"^(vqbet|pi0_fast)$", "autoregressive over codes of actions", _NO_LOOP),
     Refusal(r"^tdmpc$", "a world model with a planner", _NO_LOOP),
     Refusal(r"^sac$", "an actor of reinforcement learning", _NO_LOOP),
-    Refusal(r"^(smolvla|pi0|pi05|groot|xvla|wall_x)$", "a vision-language model with an action head", _HEAD),
-    Refusal(r"", "not known", f"Expected diffusion or multi_task_dit. If it denoises: {_BUILD}."),
+    Refusal(r"^groot$", "a GR00T whose backbone, Qwen3-VL, is not rebuilt here", _HEAD),
+    Refusal(r"^xvla$", "a policy whose backbone, Florence-2, is not rebuilt here", _HEAD),
+    Refusal(r"^evo1$", "a policy whose backbone, InternVL3, is not rebuilt here", _HEAD),
+    Refusal(r"^vla_jepa$", "a policy whose backbone, Qwen3-VL with V-JEPA, is not rebuilt here", _HEAD),
+    Refusal(
+        r"^(wall_x|eo1)$",
+        "a policy that denoises inside its language model, Qwen2.5-VL, which is not rebuilt here",
+        f"{_BUILD}: one step of the model over a cached prefix is the module.",
+    ),
+    Refusal(r"^molmoact2$", "a policy whose backbone, Molmo, is not rebuilt here", _HEAD),
+    Refusal(
+        r"^(fastwam|lingbot_va)$",
+        "a world model that denoises video beside actions, Wan2.2, which is not rebuilt here",
+        "No module of it was compiled yet.",
+    ),
+    Refusal(r"", "not known", f"Expected diffusion, multi_task_dit, smolvla, pi0 or pi05. If it denoises: {_BUILD}."),
 )
 """By the type of a LeRobot policy, in lower case."""
 
@@ -206,8 +220,8 @@ def refuse_directory(path: Path) -> NoReturn:
             raise _refused(path, row.what, how, row.remedy)
     raise CheckpointError(
         f"{path} is a directory without a policy that is read: found {', '.join(names[:6]) or 'nothing'}; expected the"
-        " config.json and model.safetensors of LeRobot's diffusion or multi_task_dit, or give a .ckpt file of Diffusion"
-        f" Policy. Otherwise: {_BUILD}."
+        " config.json and model.safetensors of LeRobot's diffusion, multi_task_dit, smolvla, pi0 or pi05, or give a"
+        f" .ckpt file of Diffusion Policy. Otherwise: {_BUILD}."
     )
 
 

@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.given import integer
+from ..core.images import fitted
 from ..core.paths import require_path
 from ..core.spec import ObservationSpec
 from ..core.untrusted_json import parse_json
@@ -216,6 +217,8 @@ def _checked(path: Path, key: str, array: Array, spec: ObservationSpec, frames: 
     """The array in the specification's dtype, of its shape, and finite."""
     frames = frames and spec.frames is not None
     shape, what = (spec.shape[1:], "[F, *frame]") if frames else (spec.shape, "[N, *shape]")
+    if array.dtype.kind == "f" and spec.fit is not None:
+        array = fitted(array.astype(np.float32), spec)
     if array.shape[1:] != shape:
         told = f"{path}: {key!r} has shape {list(array.shape)}; expected {what} = [.., {', '.join(map(str, shape))}]."
         if array.shape[1:] == spec.shape[1:] and not frames:

@@ -84,7 +84,7 @@ def observation_frames(
         parts = sources.get(key, (key,))
         arrays = [_part(path, frames, key, part) for part in parts]
         if len(arrays) == 1 and ":" not in parts[0]:
-            found[key] = _as_image(arrays[0], spec.shape[1:] if spec.frames is not None else spec.shape)
+            found[key] = _as_image(arrays[0], spec if spec.frames is None else spec.one_frame)
             continue
         if len({array.shape[:1] for array in arrays}) != 1:
             shapes = {part: list(array.shape) for part, array in zip(parts, arrays, strict=True)}
@@ -124,9 +124,17 @@ def _flat(path: Path, name: str, array: Array) -> Array:
     return array.reshape(len(array), -1)
 
 
-def _as_image(array: Array, frame: tuple[int, ...]) -> Array:
-    """Channels first and in 0..1 where the policy takes images so, and the recording has them last and in 0..255."""
-    if array.ndim != 4 or len(frame) != 3 or array.shape[1:] == frame or array.shape[1:] != (*frame[1:], frame[0]):
+def _as_image(array: Array, spec: ObservationSpec) -> Array:
+    """Channels first and in 0..1 where the policy takes images so, and the recording has them last and in 0..255.
+
+    Args:
+        array: ``[F, ...]``.
+        spec: of one frame.
+    """
+    frame = spec.shape
+    if array.ndim != 4 or len(frame) != 3 or array.shape[1:] == frame or array.shape[-1] != frame[0]:
+        return array
+    if array.shape[1:3] != frame[1:] and (spec.fit is None or array.shape[1] == frame[0]):
         return array
     whole = array.dtype.kind in "iu" or bool(array.size and array.max() > 1.5)
     turned = np.moveaxis(array, -1, 1)

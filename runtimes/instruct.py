@@ -1,0 +1,65 @@
+"""The text of a task in place of its tokens, for a robot that has the policy's tokenizer. Imports no torch."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ttscompile.core.spec import PolicySpec
+from ttscompile.core.tokenizer import Tokenizer
+from ttscompile.errors import ObservationError
+
+TASK = "task"
+"""The key of the text, as LeRobot has it."""
+
+
+class Instruct:
+    """Puts the tokens of a task into an observation.
+
+    Args:
+        spec: of the policy.
+        path: of ``tokenizer.json``, or of the folder that has it.
+
+    Raises:
+        ObservationError: the policy is not told its task in words alone, or there is no such tokenizer.
+    """
+
+    def __init__(self, spec: PolicySpec, path: str | os.PathLike[str]) -> None:
+        if spec.instruction is None:
+            remedy = "Leave the tokenizer out."
+            raise ObservationError(f"{path}: this policy takes no text that alone would give its tokens. {remedy}")
+        self._told = spec.instruction
+        self._length = spec.observations[spec.instruction.tokens].shape[0]
+        self._tokenizer = Tokenizer(path, ObservationError)
+        self._made: dict[str, list[int]] = {}
+
+    def __call__(self, obs: Mapping[str, Any]) -> Mapping[str, Any]:
+        """The observation with tokens and mask of its ``task``, a text or one for each stream; or as it is.
+
+        Raises:
+            ObservationError: the task is no text, or has no tokens.
+        """
+        if not isinstance(obs, Mapping) or TASK not in obs or self._told.tokens in obs:
+            return obs
+        rest = {key: value for key, value in obs.items() if key != TASK}
+        task = obs[TASK]
+        streams = next((len(value) for value in rest.values() if hasattr(value, "shape")), 1)
+        texts = [task] * streams if isinstance(task, str) else task
+        if not isinstance(texts, list | tuple) or not all(isinstance(text, str) for text in texts):
+            raise ObservationError(f"the task is {task!r:.80}; expected a text, or one for each stream.")
+        tokens = np.zeros((len(texts), self._length), np.int64)
+        mask = np.zeros((len(texts), self._length), np.bool_)
+        for i, text in enumerate(texts):
+            own = self._tokens(text)[: self._length]  # what is longer is cut, as lerobot does
+            tokens[i, : len(own)], mask[i, : len(own)] = own, True
+        return {**rest, self._told.tokens: tokens, self._told.mask: mask}
+
+    def _tokens(self, text: str) -> list[int]:
+        """Of one text; the last is kept, since an episode has one."""
+        if text not in self._made:
+            line = text if text.endswith("\n") or not self._told.new_line else f"{text}\n"
+            self._made = {text: self._tokenizer(line)}
+        return self._made[text]

@@ -1,0 +1,40 @@
+"""Images of any size are resized with their proportions, as torch and openpi do it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch.nn import functional
+
+from ttscompile import ObservationSpec
+from ttscompile.core.images import fitted
+from ttscompile.errors import SpecError
+
+
+@pytest.mark.parametrize("size", [(30, 50), (50, 30), (7, 9), (16, 16), (1, 40)])
+@pytest.mark.parametrize("fit", ["start", "centre"])
+def test_it_is_torchs_bilinear_with_a_black_rest(size: tuple[int, int], fit: str) -> None:
+    spec = ObservationSpec((1, 3, 20, 24), bounds=(0.0, 1.0), fit=fit)  # type: ignore[arg-type]
+    image = np.random.RandomState(0).uniform(0, 1, (2, 1, 3, *size)).astype(np.float32)
+    ratio = max(size[1] / 24, size[0] / 20)
+    small = max(int(size[0] / ratio), 1), max(int(size[1] / ratio), 1)
+    resized = functional.interpolate(torch.from_numpy(image[:, 0]), small, mode="bilinear", align_corners=False)
+    up, left = 20 - small[0], 24 - small[1]
+    before = (left, up) if fit == "start" else (left // 2, up // 2)
+    expected = functional.pad(resized, (before[0], left - before[0], before[1], up - before[1]))[:, None]
+    np.testing.assert_allclose(fitted(image, spec), expected.numpy(), atol=1e-5)
+
+
+def test_only_images_of_another_size_change() -> None:
+    spec = ObservationSpec((1, 3, 4, 4), bounds=(0.0, 1.0), fit="start")
+    whole, bytes_ = np.ones((1, 1, 3, 4, 4), np.float32), np.ones((1, 1, 3, 8, 8), np.uint8)
+    last = np.ones((1, 1, 8, 8, 3), np.float32)
+    for array in (whole, bytes_, last):
+        assert fitted(array, spec) is array
+    assert fitted(np.ones((1, 1, 3, 8, 8), np.float32), ObservationSpec((1, 3, 4, 4))).shape[-1] == 8
+
+
+def test_only_images_fit() -> None:
+    with pytest.raises(SpecError, match="fit is for images with bounds"):
+        ObservationSpec((4,), fit="start")
