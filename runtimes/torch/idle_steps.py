@@ -10,6 +10,8 @@ from torch import Tensor
 
 from ttscompile.ir.idle_form import IdleForm
 
+from . import devices
+
 
 class Prepared(NamedTuple):
     """What the total of idle steps decides.
@@ -35,7 +37,7 @@ class IdleSteps:
 
     def __init__(self, form: IdleForm, device: torch.device) -> None:
         def there(array: object) -> Tensor:
-            return torch.from_numpy(np.asarray(array, np.float32)).to(device)
+            return devices.placed(np.asarray(array, np.float32), device)
 
         self._turned, self._norm = form.turned, form.norm
         self._constant, self._head, self._shift = there(form.constant), there(form.head), there(form.shift)

@@ -12,6 +12,8 @@ from ttscompile.core.correction import HISTORY, Correction, no_correction
 from ttscompile.core.spec import FloatArray, PolicySpec
 from ttscompile.core.update import clips, matrices
 
+from . import devices
+
 
 class State(NamedTuple):
     """What the loop carries from one step to the next.
@@ -47,19 +49,19 @@ class Advance:
         self.memories, self.steps = table.memories, table.steps
         used = correction or no_correction(table.steps, spec.sample)
         self._anchors: list[bool] = used.anchors.tolist()
-        self._plain = torch.from_numpy(matrices(table, used)).to(device)
+        self._plain = devices.placed(matrices(table, used), device)
         self._of_step = [one.expand(dimensions, -1, -1) for one in self._plain]
         self._clip = table.clip if clips(table) else None
         self._to_clean = list(zip(table.sample_to_x0.tolist(), table.out_to_x0.tolist(), strict=True))
         self.reading = self.observed = None
         if correction is not None and correction.reads:
-            self.reading = torch.from_numpy(correction.reading.copy()).to(device)
-            self.observed = torch.from_numpy(correction.observed.reshape(correction.reads, -1).copy()).to(device)
+            self.reading = devices.placed(correction.reading, device)
+            self.observed = devices.placed(correction.observed.reshape(correction.reads, -1), device)
 
     @property
     def updates(self) -> FloatArray:
-        """The matrices, float32 ``[K, G, R, (1 + S) T]``."""
-        return np.asarray(self._plain.cpu().numpy(), dtype=np.float32)
+        """The matrices, float32 ``[K, G, R, (1 + S) T]``, a copy."""
+        return np.array(self._plain.cpu().numpy(), dtype=np.float32)
 
     def write(self, updates: FloatArray) -> None:
         """Put other matrices in the place of these."""
