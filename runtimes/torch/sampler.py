@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from copy import copy
 from typing import NamedTuple
 
 import numpy as np
@@ -66,6 +68,30 @@ class Advance:
     def write(self, updates: FloatArray) -> None:
         """Put other matrices in the place of these."""
         self._plain.copy_(torch.from_numpy(updates))
+
+    def on(self, tensors: Mapping[str, Tensor]) -> Advance:
+        """The same with other tensors in the place of ``tensors()``."""
+        other = copy(self)
+        other._plain = tensors["updates"]
+        other._of_step = [one.expand(len(each), -1, -1) for one, each in zip(other._plain, self._of_step, strict=True)]
+        other.reading, other.observed = tensors.get("reading"), tensors.get("observed")
+        return other
+
+    def tensors(self) -> dict[str, Tensor]:
+        """What it computes with, by name."""
+        named = {"updates": self._plain, "reading": self.reading, "observed": self.observed}
+        return {name: tensor for name, tensor in named.items() if tensor is not None}
+
+    def of_condition(self, condition: Tensor) -> Tensor | None:
+        """What the observation adds to the sample of every step, ``[K, D, B, T]``; None if nothing.
+
+        Args:
+            condition: ``[B, N]``.
+        """
+        if self.reading is None or self.observed is None:
+            return None
+        added = (condition @ self.reading) @ self.observed
+        return added.reshape(len(condition), self.steps, -1, self.horizon).permute(1, 2, 0, 3)
 
     def __call__(self, state: State, prediction: Tensor, k: int, offset: Tensor) -> State:
         """What is carried to step k + 1.
