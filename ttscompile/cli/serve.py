@@ -12,7 +12,7 @@ from typing import Any
 import click
 
 import ttscompile
-from ttscompile.cli.options import artifact_argument, count_option, loop_options, seed_option
+from ttscompile.cli.options import artifact_argument, count_option, loop_options, runtime_options, seed_option
 from ttscompile.cli.output import progress, say
 from ttscompile.cli.types import ADDRESS, TEXT
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
@@ -26,6 +26,7 @@ MOST_CLIENTS = 128
 @click.command()
 @artifact_argument
 @loop_options
+@runtime_options
 @click.option(
     "--host",
     type=ADDRESS,
@@ -74,6 +75,8 @@ def serve(
     host: str,
     port: int,
     threads: int,
+    runtime: str,
+    device: str | None,
     tiers: tuple[str, ...],
     max_clients: int,
     max_message_bytes: int,
@@ -87,7 +90,7 @@ def serve(
     """
     console = progress()
     with console.status("loading and measuring"):
-        policy = ttscompile.load(directory, threads=threads, seed=seed)
+        policy = ttscompile.load(directory, runtime, threads, seed, device=device)
         executor = AsyncExecutor(policy, control_hz, ExecutorSettings(tiers=tiers or None, **settings))
     limits = ServerLimits(clients=max_clients, message_bytes=max_message_bytes)
     if host != "localhost" and not ip_address(host).is_loopback:
