@@ -3,6 +3,8 @@
 - ``runtime``: what all of them do alike; ``backend``: what each of them has to provide; ``open``: which there are.
 - ``reference``: torch, plain, differentiable; the definition of reuse.
 - ``onnxruntime``: numpy and onnxruntime only; what runs on the robot.
+- ``torch``: a call as one straight line, on any device that torch has.
+- ``instructions``, ``call_inputs``: what several of them make of a plan, and of what a call is given.
 - ``policy``: the object that users hold, around any of them.
 """
 

@@ -102,8 +102,22 @@ def _load(
     tokenizer: str | Path | None,
     origin: str | None,
 ) -> CompiledPolicy:
-    artifact, made = load_artifact(path), kind_of(runtime).precisions
-    own = FP32
+    return open_policy(load_artifact(path), runtime, threads, seed, precision, plan, device, tokenizer, origin)
+
+
+def open_policy(
+    artifact: Artifact,
+    runtime: str = "onnxruntime",
+    threads: int = 1,
+    seed: int | None = None,
+    precision: str | None = None,
+    plan: str | None = None,
+    device: str | None = None,
+    tokenizer: str | Path | None = None,
+    origin: str | None = None,
+) -> CompiledPolicy:
+    """The policy of an artifact that is loaded; see ``load`` and ``CompiledPolicy``."""
+    made, own = kind_of(runtime).precisions, FP32
     if made:
         if precision is not None and precision not in made:
             those = ", ".join(map(repr, made))

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from .runtimes.policy import CompiledPolicy as CompiledPolicy
     from .runtimes.policy import load as load
     from .runtimes.report import CallReport as CallReport
+    from .runtimes.torch.module import to_module as to_module
     from .samplers.edm import EDMDenoiser as EDMDenoiser
     from .samplers.edm import edm_table as edm_table
     from .samplers.flow import flow_matching_table as flow_matching_table
@@ -52,6 +53,7 @@ _HOMES = {
         "runtimes.executor": ("AsyncExecutor", "ExecutorSettings", "GuardLimits"),
         "runtimes.info": ("PolicyInfo",),
         "runtimes.policy": ("CompiledPolicy", "load"),
+        "runtimes.torch.module": ("to_module",),
         "samplers.edm": ("EDMDenoiser", "edm_table"),
         "samplers.flow": ("flow_matching_table",),
         "verification": ("Verification", "verify"),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -78,8 +79,10 @@ class ReferenceModel:
         types: type of each block's residual.
         groups: FORWARD group of each block.
         weights: value of every constant of the pieces.
+        device: where the pieces compute. Samples, and what the sampler does with them, are on the CPU wherever that is.
 
     Attributes:
+        device: where the pieces compute.
         steps: K.
         blocks: number of residual blocks.
         groups: FORWARD group of each block.
@@ -94,15 +97,18 @@ class ReferenceModel:
         types: Sequence[TensorType],
         groups: Sequence[int],
         weights: Mapping[str, npt.NDArray[np.generic]],
+        device: torch.device | None = None,
     ) -> None:
+        self.device = torch.device("cpu") if device is None else device
         self._pieces, self._types, self.sampler = pieces, tuple(types), TorchSampler(spec.sampler)
-        self._weights = {name: _tensor(value) for name, value in weights.items()}
-        self._tables = {name: _tensor(value) for name, value in self._pieces.tables.items()}
-        self._condition = Evaluator(pieces.condition, self._weights)
-        self._step = Evaluator(pieces.step, self._weights) if pieces.step is not None else None
-        self._stem = Evaluator(pieces.stem.graph, self._weights)
-        self._blocks = tuple(Evaluator(piece.graph, self._weights) for piece in pieces.blocks)
-        self._tail = Evaluator(pieces.tail.graph, self._weights)
+        self._weights = {name: _tensor(value).to(self.device) for name, value in weights.items()}
+        self._tables = {name: _tensor(value).to(self.device) for name, value in self._pieces.tables.items()}
+        evaluator = partial(Evaluator, weights=self._weights, device=self.device)
+        self._condition = evaluator(pieces.condition)
+        self._step = evaluator(pieces.step) if pieces.step is not None else None
+        self._stem = evaluator(pieces.stem.graph)
+        self._blocks = tuple(evaluator(piece.graph) for piece in pieces.blocks)
+        self._tail = evaluator(pieces.tail.graph)
         self.steps = spec.sampler.steps
         self.blocks = len(self._pieces.blocks)
         self.groups = tuple(groups)
@@ -114,8 +120,8 @@ class ReferenceModel:
         return cls(program.pieces, program.spec, types, groups, program.weights)
 
     @classmethod
-    def from_artifact(cls, artifact: Artifact) -> ReferenceModel:
-        """The model of an artifact.
+    def from_artifact(cls, artifact: Artifact, device: torch.device | None = None) -> ReferenceModel:
+        """The model of an artifact, on a device; None for the CPU.
 
         Raises:
             ArtifactError: its graphs cannot be read.
@@ -123,7 +129,7 @@ class ReferenceModel:
         manifest = artifact.manifest
         weights = {**artifact.weights, **artifact.pruner}
         types = [block.type for block in manifest.blocks]
-        return cls(artifact.pieces, manifest.spec, types, manifest.groups, weights)
+        return cls(artifact.pieces, manifest.spec, types, manifest.groups, weights, device)
 
     @property
     def pruner_weights(self) -> dict[str, Tensor]:
@@ -136,9 +142,13 @@ class ReferenceModel:
 
         Args:
             obs: normalised observations by key, ``[B, ...]`` each.
+
+        Returns:
+            Tensors of the device.
         """
         graph = self._pieces.condition
-        condition = dict(zip(graph.outputs, self._condition(obs), strict=True))
+        there = {key: value.to(self.device) for key, value in obs.items()}
+        condition = dict(zip(graph.outputs, self._condition(there), strict=True))
         streams = len(next(iter(obs.values())))
         contexts = Contexts(streams, condition, ({},) * self.steps)
         if self._pieces.step is None or self._step is None:
@@ -150,7 +160,8 @@ class ReferenceModel:
     def condition(self, contexts: Contexts) -> Tensor:
         """What a correction reads of the observation: the pruner's features, one row a stream, ``[B, N]``."""
         types = self._pieces.condition.types()
-        rows = [contexts.condition[name].movedim(types[name].batch_axis or 0, 0) for name in self._pieces.features]
+        own = [contexts.condition[name].cpu() for name in self._pieces.features]
+        rows = [one.movedim(types[n].batch_axis or 0, 0) for one, n in zip(own, self._pieces.features, strict=True)]
         return torch.cat([torch.zeros(contexts.streams, 0), *(row.reshape(contexts.streams, -1) for row in rows)], 1)
 
     def logits(self, contexts: Contexts, weights: Mapping[str, Tensor] | None = None) -> Tensor:
@@ -166,11 +177,12 @@ class ReferenceModel:
         pruner = self._pieces.pruner
         if pruner is None:
             raise IllegalPlanError("the program has no pruner: run insert_pruner, or give a plan.")
-        return Evaluator(pruner, {**self._weights, **(weights or {})})(contexts.condition)[0]
+        given = {name: value.to(self.device) for name, value in (weights or {}).items()}
+        return Evaluator(pruner, {**self._weights, **given}, self.device)(contexts.condition)[0].cpu()
 
     def stem(self, sample: Tensor, k: int, contexts: Contexts) -> Tensor:
-        """The residual stream of step k from the sample ``[B, T, D]``."""
-        return self._stem(self._bind(self._pieces.stem, sample, k, contexts))[0]
+        """The residual stream of step k, on the device, from the sample ``[B, T, D]``."""
+        return self._stem(self._bind(self._pieces.stem, sample.to(self.device), k, contexts))[0]
 
     def block(self, b: int, k: int, stream: Tensor, contexts: Contexts, streams: Sequence[int] | None = None) -> Tensor:
         """The residual of block b at step k: what is added to the stream, not the sum.
@@ -185,8 +197,8 @@ class ReferenceModel:
         return self._blocks[b](self._bind(self._pieces.blocks[b], stream, k, contexts, streams))[0]
 
     def tail(self, stream: Tensor, k: int, contexts: Contexts) -> Tensor:
-        """The network's output ``[B, T, D]`` at step k from the residual stream after the last block."""
-        return self._tail(self._bind(self._pieces.tail, stream, k, contexts))[0]
+        """The network's output ``[B, T, D]`` at step k, on the CPU, from the residual stream after the last block."""
+        return self._tail(self._bind(self._pieces.tail, stream, k, contexts))[0].cpu()
 
     def predict(self, sample: Tensor, k: int, contexts: Contexts, blocks: Blocks) -> Tensor:
         """The network's output ``[B, T, D]`` at step k, from the sample ``[B, T, D]``."""
@@ -259,6 +271,7 @@ class ReferenceModel:
         """
         cache = cache if cache is not None else self.empty_cache(contexts.streams)
         one_hot, plan = self._gates(gates, contexts.streams)
+        one_hot = one_hot.to(self.device)
         require_legal(plan, self.groups, cache.written)
         caches = Caches(rollout=dict(cache.residuals))
 
@@ -284,10 +297,10 @@ class ReferenceModel:
         if cell.trains:
             with torch.no_grad():
                 part = self.block(cell.b, cell.k, stream, contexts, others)
-            whole = whole.index_copy(axis, torch.tensor(others), part)
+            whole = whole.index_copy(axis, torch.tensor(others, device=whole.device), part)
         if takers:
             part = self.block(cell.b, cell.k, stream, contexts, takers)
-            whole = whole.index_copy(axis, torch.tensor(takers), part)
+            whole = whole.index_copy(axis, torch.tensor(takers, device=whole.device), part)
         return whole
 
     def _gates(self, gates: Tensor | PlanArray, streams: int) -> tuple[Tensor, PlanArray]:
@@ -302,7 +315,7 @@ class ReferenceModel:
         if not bool((((values == 0) | (values == 1)).all(-1) & (values.sum(-1) == 1)).all()):
             remedy = "use straight-through gates, hard in the forward pass"
             raise IllegalPlanError(f"gates must be one-hot over their last axis: {remedy}.")
-        return gates, values.argmax(-1).numpy().astype(np.int8)
+        return gates, values.argmax(-1).cpu().numpy().astype(np.int8)
 
     def _bind(
         self, piece: LoopPiece, value: Tensor, k: int, contexts: Contexts, streams: Sequence[int] | None = None
@@ -342,4 +355,4 @@ def _select(value: Tensor, kind: TensorType, streams: Sequence[int] | None) -> T
     """The part of a value that belongs to these streams."""
     if streams is None or kind.batch_axis is None:
         return value
-    return value.index_select(kind.batch_axis, torch.tensor(streams))
+    return value.index_select(kind.batch_axis, torch.tensor(streams, device=value.device))

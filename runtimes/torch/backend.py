@@ -15,7 +15,7 @@ import torch
 
 from ttscompile.artifact.load import Artifact
 from ttscompile.core.correction import Correction
-from ttscompile.core.lattice import BoolArray, PlanArray, dense_plan
+from ttscompile.core.lattice import BoolArray, PlanArray, dense_plan, without_illegal_reads
 from ttscompile.core.spec import FloatArray
 from ttscompile.runtimes.backend import Call, fitting
 from ttscompile.runtimes.inpainting import MaskedUpdates
@@ -62,7 +62,10 @@ class TorchBackend:
         self._lines = Lines(capture)
         groups = self._manifest.groups
         dense = dense_plan(self._manifest.steps, len(groups))
-        self._own = {plan.tobytes(): instructions_of(plan, groups) for plan in (dense, *artifact.schedules.values())}
+        nothing = np.zeros(dense.shape, np.bool_)  # the first call of an episode is repaired
+        plans = (dense, *artifact.schedules.values())
+        known = {plan.tobytes(): plan for each in plans for plan in (each, without_illegal_reads(each, nothing))}
+        self._own = {key: instructions_of(plan, groups) for key, plan in known.items()}
         self._named = set(self._own.values())
         self.keeps = readable_rollout(artifact)
         self._advances: dict[tuple[Correction | None, bool], tuple[Advance, MaskedUpdates | None]] = {}

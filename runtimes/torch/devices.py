@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
+import numpy.typing as npt
 import torch
+from torch import Tensor
 
 from ttscompile.core.spec import BF16, FP16, FP32
 from ttscompile.errors import RuntimeUnavailableError
@@ -26,6 +29,11 @@ def device_of(name: str) -> torch.device:
         remedy = "Use device='cpu', or install the build of torch that has it: https://pytorch.org/get-started."
         raise RuntimeUnavailableError(f"{problem}. {remedy}") from error
     return device
+
+
+def placed(array: npt.NDArray[np.generic], device: torch.device) -> Tensor:
+    """A copy of an array as a tensor of a device."""
+    return torch.tensor(array).to(device)
 
 
 def narrow_type(precision: str, device: torch.device) -> torch.dtype | None:

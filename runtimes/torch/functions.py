@@ -29,7 +29,7 @@ from ttscompile.errors import CaptureError
 from ttscompile.ir.evaluate import resolve_enum, resolve_op
 from ttscompile.ir.graph import Argument, Batch, Enum, Graph, Node, Ref
 
-from .packed import GELU, LINEAR, gelu_kind, packed_linear, packed_weight, packs
+from .packed import GELU, LINEAR, PACKED_LINEAR, gelu_kind, packed_weight, packs
 
 Function = Callable[..., tuple[Tensor, ...]]
 """Takes the graph's inputs in order, and gives its outputs in order."""
@@ -137,7 +137,7 @@ class _Writer:
         packed = self._packed(node)
         if packed is not None:
             node = self._packed_nodes[node.name] = packed
-        function = packed_linear if packed is not None else _OWN.get(node.op, resolved)
+        function = _OWN.get(node.op, resolved) if packed is None or PACKED_LINEAR is None else PACKED_LINEAR
         args = [self._value(node, argument) for argument in node.args]
         kwargs = {name: self._value(node, argument) for name, argument in node.kwargs}
         value = function(*args, **kwargs)
@@ -160,10 +160,10 @@ class _Writer:
             self._owners.setdefault(_storage(value), (name, value))
 
     def _packed(self, node: Node) -> Node | None:
-        """A node in whose place ``packed_linear`` does the same with these arguments; None if it is no such node."""
+        """A node in whose place ``PACKED_LINEAR`` does the same with its arguments; None if it is no such node."""
         before = self._packed_nodes.get(next(node.refs(), ""))
         if node.op == GELU and before is not None and before.args[3] == "none" and self._readers[before.name] == 1:
-            return replace(before, name=node.name, args=(*before.args[:3], "gelu", gelu_kind(node)))
+            return replace(before, name=node.name, args=(*before.args[:3], "gelu", (), gelu_kind(node)))
         if node.op != LINEAR or node.kwargs or not isinstance(node.args[0], Ref) or not isinstance(node.args[1], Ref):
             return None
         value, weight = (self._values[each.name] for each in node.args[:2] if isinstance(each, Ref))
@@ -172,7 +172,7 @@ class _Writer:
             return None
         name = f"{node.name}.packed"
         self.fix(name, packed_weight(value, weight))
-        return replace(node, args=(node.args[0], Ref(name), (*node.args, None)[2], "none", ""))
+        return replace(node, args=(node.args[0], Ref(name), (*node.args, None)[2], "none", (), ""))
 
     def function(self, outputs: Sequence[str]) -> Function:
         """The function with these results."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from copy import copy
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +11,8 @@ import torch
 from torch import Tensor
 
 from ttscompile.ir.idle_form import IdleForm
+
+from . import devices
 
 
 class Prepared(NamedTuple):
@@ -35,7 +39,7 @@ class IdleSteps:
 
     def __init__(self, form: IdleForm, device: torch.device) -> None:
         def there(array: object) -> Tensor:
-            return torch.from_numpy(np.asarray(array, np.float32)).to(device)
+            return devices.placed(np.asarray(array, np.float32), device)
 
         self._turned, self._norm = form.turned, form.norm
         self._constant, self._head, self._shift = there(form.constant), there(form.head), there(form.shift)
@@ -44,6 +48,18 @@ class IdleSteps:
         self._along, self._across = product[: self._dimensions + 1], product[self._dimensions + 1 :]
         self._held = not form.product.any()  # the prediction is the total's, whatever the sample is
         self._basis = None if form.norm is None else there(form.norm.basis)
+
+    def on(self, tensors: Mapping[str, Tensor]) -> IdleSteps:
+        """The same with other tensors in the place of ``tensors()``."""
+        other = copy(self)
+        for name in self.tensors():
+            setattr(other, f"_{name}", tensors[name])
+        return other
+
+    def tensors(self) -> dict[str, Tensor]:
+        """What it computes with, by name."""
+        names = ("constant", "head", "shift", "along", "across", "basis")
+        return {name: value for name in names if isinstance(value := getattr(self, f"_{name}"), Tensor)}
 
     def prepare(self, total: Tensor) -> Prepared:
         """What is known as soon as the total is."""

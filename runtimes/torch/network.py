@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,6 +15,7 @@ from ttscompile.ir.idle_form import idle_form
 from ttscompile.ir.pieces import LoopPiece
 from ttscompile.ir.program import Binding
 
+from . import devices
 from .functions import Function, write_function
 from .idle_steps import IdleSteps
 
@@ -33,7 +33,7 @@ class Parts:
         self.manifest, self.pieces = artifact.manifest, artifact.pieces
         self.device, self.narrow = device, narrow
         values = {**artifact.weights, **artifact.pruner}
-        self.weights = {name: torch.from_numpy(np.array(value)).to(device) for name, value in values.items()}
+        self.weights = {name: devices.placed(value, device) for name, value in values.items()}
         form, _ = idle_form(self.pieces, values)
         self.idle = None if form is None else IdleSteps(form, device)
 
@@ -64,7 +64,7 @@ class StreamsNetwork:
             before = () if context.binding is Binding.CONDITION else (self._steps,)
             self.values[name] = parts.tensor(context.type, streams, *before)
             if context.binding is Binding.TABLE:  # one row of a batch of one, for all streams
-                self.values[name].copy_(torch.from_numpy(np.array(pieces.tables[name])))
+                self.values[name].copy_(devices.placed(pieces.tables[name], parts.device))
         self._condition = self._written(pieces.condition, list(obs.values()), streams, order=list(obs))
         self._step: Function | None = None
         self.prologue()

@@ -15,16 +15,17 @@ from torch import Tensor
 
 from ttscompile.ir.graph import Node
 
-_APPLY: Callable[..., Any] | None = None
+PACKED_LINEAR: Callable[..., Any] | None = None
+"""``linear`` of x, a packed weight and a bias, then "none" or "gelu", no scalars, and how gelu is approximated."""
 if torch._C._has_mkldnn and hasattr(torch.ops.mkldnn, "_linear_pointwise"):
-    _APPLY = torch.ops.mkldnn._linear_pointwise.default
+    PACKED_LINEAR = torch.ops.mkldnn._linear_pointwise.default._op  # without a frame of Python's around it
 
 LINEAR, GELU = "aten.linear.default", "aten.gelu.default"
 
 
 def packs(value: Any, weight: Any) -> bool:
     """Whether a linear layer on this value, with this constant weight, can be packed."""
-    there = _APPLY is not None and hasattr(torch.ops.mkldnn, "_reorder_linear_weight")
+    there = PACKED_LINEAR is not None and hasattr(torch.ops.mkldnn, "_reorder_linear_weight")
     fits = all(isinstance(t, Tensor) and t.device.type == "cpu" and t.dtype == torch.float32 for t in (value, weight))
     return there and fits and weight.ndim == 2 and value.ndim > 1 and value.numel() > 0 < weight.numel()
 
@@ -32,13 +33,6 @@ def packs(value: Any, weight: Any) -> bool:
 def packed_weight(value: Tensor, weight: Tensor) -> Tensor:
     """A weight as it is read for every value of this shape."""
     result: Tensor = torch.ops.mkldnn._reorder_linear_weight(weight, value.numel() // value.shape[-1])
-    return result
-
-
-def packed_linear(x: Tensor, weight: Tensor, bias: Tensor | None, then: str, approximate: str) -> Tensor:
-    """``linear`` with a packed weight, ``then`` nothing ("none") or "gelu" with an ``approximate`` of its own."""
-    assert _APPLY is not None  # ``packs``
-    result: Tensor = _APPLY(x, weight, bias, then, [], approximate)
     return result
 
 

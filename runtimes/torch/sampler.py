@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from copy import copy
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +13,8 @@ from torch import Tensor
 from ttscompile.core.correction import HISTORY, Correction, no_correction
 from ttscompile.core.spec import FloatArray, PolicySpec
 from ttscompile.core.update import clips, matrices
+
+from . import devices
 
 
 class State(NamedTuple):
@@ -47,23 +51,47 @@ class Advance:
         self.memories, self.steps = table.memories, table.steps
         used = correction or no_correction(table.steps, spec.sample)
         self._anchors: list[bool] = used.anchors.tolist()
-        self._plain = torch.from_numpy(matrices(table, used)).to(device)
+        self._plain = devices.placed(matrices(table, used), device)
         self._of_step = [one.expand(dimensions, -1, -1) for one in self._plain]
         self._clip = table.clip if clips(table) else None
         self._to_clean = list(zip(table.sample_to_x0.tolist(), table.out_to_x0.tolist(), strict=True))
         self.reading = self.observed = None
         if correction is not None and correction.reads:
-            self.reading = torch.from_numpy(correction.reading.copy()).to(device)
-            self.observed = torch.from_numpy(correction.observed.reshape(correction.reads, -1).copy()).to(device)
+            self.reading = devices.placed(correction.reading, device)
+            self.observed = devices.placed(correction.observed.reshape(correction.reads, -1), device)
 
     @property
     def updates(self) -> FloatArray:
-        """The matrices, float32 ``[K, G, R, (1 + S) T]``."""
-        return np.asarray(self._plain.cpu().numpy(), dtype=np.float32)
+        """The matrices, float32 ``[K, G, R, (1 + S) T]``, a copy."""
+        return np.array(self._plain.cpu().numpy(), dtype=np.float32)
 
     def write(self, updates: FloatArray) -> None:
         """Put other matrices in the place of these."""
         self._plain.copy_(torch.from_numpy(updates))
+
+    def on(self, tensors: Mapping[str, Tensor]) -> Advance:
+        """The same with other tensors in the place of ``tensors()``."""
+        other = copy(self)
+        other._plain = tensors["updates"]
+        other._of_step = [one.expand(len(each), -1, -1) for one, each in zip(other._plain, self._of_step, strict=True)]
+        other.reading, other.observed = tensors.get("reading"), tensors.get("observed")
+        return other
+
+    def tensors(self) -> dict[str, Tensor]:
+        """What it computes with, by name."""
+        named = {"updates": self._plain, "reading": self.reading, "observed": self.observed}
+        return {name: tensor for name, tensor in named.items() if tensor is not None}
+
+    def of_condition(self, condition: Tensor) -> Tensor | None:
+        """What the observation adds to the sample of every step, ``[K, D, B, T]``; None if nothing.
+
+        Args:
+            condition: ``[B, N]``.
+        """
+        if self.reading is None or self.observed is None:
+            return None
+        added = (condition @ self.reading) @ self.observed
+        return added.reshape(len(condition), self.steps, -1, self.horizon).permute(1, 2, 0, 3)
 
     def __call__(self, state: State, prediction: Tensor, k: int, offset: Tensor) -> State:
         """What is carried to step k + 1.

@@ -103,12 +103,10 @@ class Workspace:
     def call(self, plan: Instructions, keep: BoolArray, advance: Advance) -> None:
         """The loop, from what was loaded and the prologue made to ``result`` and the rollout cache."""
         offset = self._offset.tensor
-        if advance.reading is not None and advance.observed is not None:
-            added = (self.network.condition() @ advance.reading) @ advance.observed
-            dimensions, _, horizon = self._free.tensor.shape
-            shaped = added.reshape(self.streams, -1, dimensions, horizon).permute(1, 2, 0, 3) * self._free.tensor
-            rest = offset[..., horizon:]
-            offset = torch.cat([offset[..., :horizon] + shaped, rest], 3)
+        added = None if advance.reading is None else advance.of_condition(self.network.condition())
+        if added is not None:
+            own, rest = offset[..., : self._horizon], offset[..., self._horizon :]
+            offset = torch.cat([own + added * self._free.tensor, rest], 3)
         read = np.flatnonzero(plan.rollout).tolist()
         made = denoise(
             self.network,

@@ -14,7 +14,7 @@ import ttscompile
 from ttscompile import Noise
 from ttscompile.artifact.load import load_artifact
 from ttscompile.cli import main
-from ttscompile.cli.timing import contestants
+from ttscompile.cli.timing import Compiled, contestants
 from ttscompile.runtimes.random_calls import random_calls
 
 STEPS = 4
@@ -86,7 +86,7 @@ def test_bench_times_the_rival_in_fp32_and_names_the_precision(converted: tuple[
     result = run("bench", converted[0], "--runs", 2, "--plan", "dense", "--json")
     labels = [contestant["label"] for contestant in json.loads(result.stdout)["contestants"]]
     assert labels == ["compiled, int8", "dense onnxruntime"]
-    entered = contestants(load_artifact(converted[0]), 1, "dense", ["onnxruntime-dense"], None)
+    entered = contestants(load_artifact(converted[0]), Compiled(), "dense", ["onnxruntime-dense"], None)
     ((obs, noise),) = random_calls(entered[0].spec, 1, 0)
     answers = [one.call(obs, noise)["action"] for one in entered]  # type: ignore[index]
     expected = ttscompile.load(converted[0], precision="fp32").predict_action(obs, noise=noise, plan="dense")["action"]

@@ -23,6 +23,7 @@ from ttscompile.runtimes import Runtime, open_runtime
 from ttscompile.runtimes.onnxruntime.backend import OnnxBackend
 from ttscompile.runtimes.onnxruntime.workspace import Workspace
 from ttscompile.runtimes.reference.model import ReferenceModel
+from ttscompile.runtimes.torch.network import StreamsNetwork
 
 from .agreement import call_terms, random_inputs
 from .conftest import MakeArtifact
@@ -124,7 +125,7 @@ def test_a_failure_on_either_thread_comes_to_the_caller_and_ends_the_episode(
     assert np.array_equal(call(runtime, pruned, 0), first)
 
 
-@pytest.mark.parametrize("name", ["onnxruntime", "reference"])
+@pytest.mark.parametrize("name", ["onnxruntime", "torch", "reference"])
 def test_a_prologue_that_fails_ends_the_episode(
     toy_artifact: Artifact, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
@@ -142,6 +143,7 @@ def test_a_prologue_that_fails_ends_the_episode(
     with monkeypatch.context() as patched:
         patched.setattr(Workspace, "start", fail)
         patched.setattr(ReferenceModel, "prologue", fail)
+        patched.setattr(StreamsNetwork, "prologue", fail)
         with pytest.raises((Failure, ArtifactError)) as caught:
             call(runtime, toy_artifact, 0, dense)
     assert isinstance(caught.value, Failure) or isinstance(caught.value.__cause__, Failure)

@@ -1,4 +1,4 @@
-"""Corrections in both runtimes, and which plans get them."""
+"""Corrections in all runtimes, and which plans get them."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from .plans import random_plan
 
 
 @pytest.mark.parametrize("streams", [1, 3])
-def test_both_runtimes_agree_on_random_corrections(toy_artifact: Artifact, streams: int) -> None:
+def test_runtimes_agree_on_random_corrections(toy_artifact: Artifact, streams: int) -> None:
     rng = np.random.default_rng(streams)
-    runtimes = [open_runtime(toy_artifact, name) for name in ("onnxruntime", "reference")]
+    runtimes = [open_runtime(toy_artifact, name) for name in ("onnxruntime", "torch", "reference")]
     manifest = toy_artifact.manifest
     written = np.zeros((streams, manifest.steps, len(manifest.groups)), np.bool_)
     # A correction adds six numbers for each action of the chunk: sample and prediction, now and at two anchors.
@@ -35,12 +35,13 @@ def test_both_runtimes_agree_on_random_corrections(toy_artifact: Artifact, strea
         plans = np.stack([random_plan(rng, manifest.steps, manifest.groups, cells) for cells in written])
         obs, noise = random_inputs(toy_artifact, rng, streams)
         correction = random_correction(toy_artifact, rng)
-        ours, theirs = (r.predict(obs, noise, plans, correction=correction)[0] for r in runtimes)
-        assert_equal_but_for_rounding(ours, theirs, terms)
+        *ours, theirs = (r.predict(obs, noise, plans, correction=correction)[0] for r in runtimes)
+        for each in ours:
+            assert_equal_but_for_rounding(each, theirs, terms)
         written |= plans == Source.COMPUTE
 
 
-@pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
+@pytest.mark.parametrize("runtime", ["onnxruntime", "torch", "reference"])
 def test_what_it_reads_of_the_observation_is_each_streams_own(toy_artifact: Artifact, runtime: str) -> None:
     """Every step adds what the observation says; with another observation in one stream the others stay."""
     rng, made = np.random.default_rng(0), open_runtime(toy_artifact, runtime)
@@ -84,7 +85,7 @@ def corrected(own_artifact: Artifact) -> tuple[Path, Correction, np.ndarray]:
     return own_artifact.path, correction, plan
 
 
-@pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
+@pytest.mark.parametrize("runtime", ["onnxruntime", "torch", "reference"])
 def test_it_belongs_to_the_plan_of_its_name(corrected: tuple[Path, Correction, np.ndarray], runtime: str) -> None:
     path, correction, plan = corrected
     artifact = load_artifact(path)

@@ -132,10 +132,10 @@ def test_a_table_without_noise_levels_is_seen(made: Callable[[], SamplerTable]) 
 
 @pytest.mark.parametrize("streams", [1, 3])
 @pytest.mark.parametrize("name", ["ddpm", "ddim"])
-def test_both_runtimes_agree_on_prefixes(artifacts: dict[str, Artifact], name: str, streams: int) -> None:
+def test_runtimes_agree_on_prefixes(artifacts: dict[str, Artifact], name: str, streams: int) -> None:
     """Lengths go up and down, with calls without a prefix and corrections in between."""
     artifact = artifacts[name]
-    runtimes = [open_runtime(artifact, name) for name in ("onnxruntime", "reference")]
+    runtimes = [open_runtime(artifact, name) for name in ("onnxruntime", "torch", "reference")]
     rng = np.random.default_rng(streams)
     corrections = [None, random_correction(artifact, rng), random_correction(artifact, rng)]
     written = np.zeros((streams, STEPS, BLOCKS), np.bool_)
@@ -145,10 +145,11 @@ def test_both_runtimes_agree_on_prefixes(artifacts: dict[str, Artifact], name: s
         obs, noise = random_inputs(artifact, rng, streams)
         prefix = None if length is None else rng.uniform(-1, 1, (streams, length, 2)).astype(np.float32)
         correction = corrections[call % 3]
-        ours, theirs = (r.predict(obs, noise, plans, correction=correction, prefix=prefix)[0] for r in runtimes)
-        assert_equal_but_for_rounding(ours, theirs, terms)
-        if prefix is not None:
-            np.testing.assert_array_equal(ours[:, START : START + prefix.shape[1]], prefix)
+        *ours, theirs = (r.predict(obs, noise, plans, correction=correction, prefix=prefix)[0] for r in runtimes)
+        for each in ours:
+            assert_equal_but_for_rounding(each, theirs, terms)
+            if prefix is not None:
+                np.testing.assert_array_equal(each[:, START : START + prefix.shape[1]], prefix)
         written |= plans == Source.COMPUTE
 
 

@@ -31,12 +31,12 @@ from .toys import f32, pencil_program, toy_program
 C, T, R = Source.COMPUTE, Source.TIMESTEP, Source.ROLLOUT
 
 
-@pytest.fixture(params=["onnxruntime", "reference"])
+@pytest.fixture(params=["onnxruntime", "torch", "reference"])
 def runtime(request: pytest.FixtureRequest, toy_artifact: Artifact) -> Runtime:
     return open_runtime(toy_artifact, request.param)
 
 
-@pytest.mark.parametrize("name", ["onnxruntime", "reference"])
+@pytest.mark.parametrize("name", ["onnxruntime", "torch", "reference"])
 def test_reuse_gives_41_and_compute_gives_44(pencil_artifact: Artifact, name: str) -> None:
     runtime = open_runtime(pencil_artifact, name)
 
@@ -86,7 +86,7 @@ def test_a_value_of_the_step_may_be_one_number(make_artifact: MakeArtifact) -> N
         bindings={**pieces.bindings, "time": Binding.TABLE},
     )
     artifact = make_artifact(replace(program, pieces=pieces))
-    for name in ("onnxruntime", "reference"):
+    for name in ("onnxruntime", "torch", "reference"):
         noise = Noise(np.array([[[35]], [[33]]], np.float32))
         obs = {"obs": np.zeros((2, 1), np.float32)}
         sample, _ = open_runtime(artifact, name).predict(obs, noise, np.array([[C], [C]]))
@@ -229,7 +229,7 @@ def test_what_a_call_gave_stays_as_it_was(runtime: Runtime, toy_artifact: Artifa
     assert np.array_equal(report.plan, plan)
 
 
-@pytest.mark.parametrize("name", ["onnxruntime", "reference"])
+@pytest.mark.parametrize("name", ["onnxruntime", "torch", "reference"])
 def test_a_sample_of_one_dimension_stays_as_it_was(pencil_artifact: Artifact, name: str) -> None:
     """Its transposition moves nothing in memory."""
     runtime = open_runtime(pencil_artifact, name)
@@ -261,7 +261,7 @@ def test_a_call_that_fails_half_way_ends_the_episode(toy_artifact: Artifact, mon
 
 def test_without_a_pruner_a_plan_is_needed(make_artifact: MakeArtifact) -> None:
     artifact = make_artifact(toy_program(pruner=False))
-    for name in ("onnxruntime", "reference"):
+    for name in ("onnxruntime", "torch", "reference"):
         runtime = open_runtime(artifact, name)
         with pytest.raises(IllegalPlanError, match="no pruner"):
             runtime.predict(*random_inputs(artifact, np.random.default_rng(0), 1))
@@ -271,7 +271,7 @@ def test_a_pruner_that_gives_nan_is_refused(make_artifact: MakeArtifact) -> None
     program = toy_program()
     program.weights["pruner.b"][-1] = np.nan
     artifact = make_artifact(program)
-    for name in ("onnxruntime", "reference"):
+    for name in ("onnxruntime", "torch", "reference"):
         with pytest.raises(IllegalPlanError, match="NaN"):
             open_runtime(artifact, name).predict(*random_inputs(artifact, np.random.default_rng(0), 1))
 
@@ -285,7 +285,9 @@ def test_what_cannot_be_had_is_refused(toy_artifact: Artifact, runtime_name: str
         open_runtime(toy_artifact, runtime_name, threads)
 
 
-@pytest.mark.parametrize(("name", "package"), [("onnxruntime", "onnxruntime"), ("reference", "torch")])
+@pytest.mark.parametrize(
+    ("name", "package"), [("onnxruntime", "onnxruntime"), ("reference", "torch"), ("torch", "torch")]
+)
 def test_a_missing_package_is_named(toy_artifact: Artifact, name: str, package: str) -> None:
     code = f"""
 import sys

@@ -33,7 +33,7 @@ FAMILIES = {
     "inpainting": "the same, with the observation in the sample",
     "bert": "the same, encoder only",
 }
-RUNTIMES = ("onnxruntime", "reference")
+RUNTIMES = ("onnxruntime", "torch", "reference")
 
 Compiled = Callable[[str], Path]
 

@@ -31,7 +31,7 @@ R = Source.ROLLOUT
 OBS = np.array([[0.3, -1.2], [0.7, 0.1]], np.float32)
 
 
-@pytest.fixture(params=["onnxruntime", "reference"])
+@pytest.fixture(params=["onnxruntime", "torch", "reference"])
 def policy(request: pytest.FixtureRequest, toy_artifact: Artifact) -> CompiledPolicy:
     return load(toy_artifact.path, runtime=request.param, seed=0)
 
@@ -90,7 +90,7 @@ def test_plans_of_the_artifact_by_name(own_artifact: Artifact) -> None:
     mixed = uniform_plan(5, 5, 2)
     mixed[1] = R
     update_calibration(own_artifact.path, dict(own_artifact.pruner), {"mixed": mixed}, "tts", {"strategy": "tts"})
-    for runtime in ("onnxruntime", "reference"):
+    for runtime in ("onnxruntime", "torch", "reference"):
         policy = load(own_artifact.path, runtime)
         assert set(policy.info.plans) == {"dense", "mixed", "tts"}
         assert policy.info.default_plan == "tts"
@@ -140,7 +140,7 @@ def test_plans_that_are_no_matrix_are_refused(policy: CompiledPolicy) -> None:
             policy.predict_action({"obs": OBS}, plan=plan)
 
 
-@pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
+@pytest.mark.parametrize("runtime", ["onnxruntime", "torch", "reference"])
 def test_a_stochastic_sampler_needs_its_draws(toy_artifact: Artifact, runtime: str) -> None:
     with pytest.raises(ObservationError, match=r"noise.steps is missing.*\[K, B, T, D\] = \(5, 2, 3, 2\)"):
         open_runtime(toy_artifact, runtime).predict({"obs": OBS}, Noise(some_noise().initial), dense_plan(5, 5))

@@ -60,10 +60,10 @@ Swap = Callable[[], object]
 def around_sessions(monkeypatch: pytest.MonkeyPatch, before: Swap, after: Swap = lambda: None) -> Iterator[None]:
     """Something happens between the checks and the opening of what was checked, and right after."""
 
-    def opened(artifact: object, runtime: str, threads: int) -> object:
+    def opened(artifact: object, *options: object) -> object:
         before()
         try:
-            return opening.open_runtime(artifact, runtime, threads)  # type: ignore[arg-type]
+            return opening.open_runtime(artifact, *options)  # type: ignore[arg-type]
         finally:
             after()
 
@@ -72,7 +72,7 @@ def around_sessions(monkeypatch: pytest.MonkeyPatch, before: Swap, after: Swap =
         yield
 
 
-@pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
+@pytest.mark.parametrize("runtime", ["onnxruntime", "torch", "reference"])
 @pytest.mark.parametrize("there_and_back", [False, True])
 def test_exchanged_between_check_and_use(
     places: tuple[Path, Path],
@@ -103,7 +103,7 @@ def _observation(path: Path) -> dict[str, np.ndarray]:
     return {key: np.zeros((1, *spec.shape), spec.dtype) for key, spec in specs.items()}
 
 
-@pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
+@pytest.mark.parametrize("runtime", ["onnxruntime", "torch", "reference"])
 def test_converted_again_between_check_and_use_gives_the_new_one(
     places: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, runtime: str
 ) -> None:
@@ -205,7 +205,7 @@ def test_a_calibration_while_the_artifact_is_loaded(places: tuple[Path, Path], m
         assert ttscompile.load(places[0]).info.default_plan == "second"
 
 
-@pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
+@pytest.mark.parametrize("runtime", ["onnxruntime", "torch", "reference"])
 def test_without_proc_exchanged_there_and_back_is_seen(
     places: tuple[Path, Path], expected: dict[str, bytes], monkeypatch: pytest.MonkeyPatch, runtime: str
 ) -> None:

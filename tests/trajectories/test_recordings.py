@@ -14,6 +14,7 @@ import pytest
 import zarr
 
 from tests.hostile.pickles import Runs
+from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import TrajectoryError
 from ttscompile.trajectories import Episode, apart, load_trajectories
 from ttscompile.trajectories import frames as trajectories_frames

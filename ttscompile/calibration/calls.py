@@ -99,6 +99,11 @@ class Calls:
         return len(self.initial)
 
     @property
+    def device(self) -> torch.device:
+        """Where the contexts are; samples and noise are on the CPU."""
+        return next((each.device for each in self.contexts.condition.values()), self.initial.device)
+
+    @property
     def targets(self) -> Tensor:
         """The denoised sample of the dense policy, ``[N, T, D]``."""
         assert self.path is not None

@@ -35,6 +35,8 @@ class Executor:
 
     Args:
         artifact: the policy.
+        device: where the network computes; None for the CPU. Samples are on the CPU, and so is all that is returned but
+            streams and residuals.
 
     Attributes:
         correction: of the sampler's steps, for all that is run but ``run_dense``; None for none.
@@ -45,9 +47,9 @@ class Executor:
         pruner_graph: the pruner; None if the artifact has none.
     """
 
-    def __init__(self, artifact: Artifact) -> None:
+    def __init__(self, artifact: Artifact, device: torch.device | None = None) -> None:
         blocks = artifact.manifest.blocks
-        self.model = ReferenceModel.from_artifact(artifact)
+        self.model = ReferenceModel.from_artifact(artifact, device)
         pieces = artifact.pieces
         read = [graph for graph in (pieces.condition, pieces.step) if graph is not None]
         types = {name: graph.types()[name] for graph in read for name in graph.outputs}
@@ -68,9 +70,10 @@ class Executor:
     def select(self, calls: Calls, streams: Sequence[int] | IntArray) -> Calls:
         """These calls, in this order; a call may be taken several times."""
         index, contexts = torch.as_tensor(np.asarray(streams, dtype=np.int64)), calls.contexts
+        there = index.to(self.model.device)
 
         def take(values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-            chosen = {name: values[name].index_select(self._axes[name], index) for name in self._axes.keys() & values}
+            chosen = {name: values[name].index_select(self._axes[name], there) for name in self._axes.keys() & values}
             return {**values, **chosen}
 
         steps = tuple(map(take, contexts.steps)) if contexts.steps[0] else contexts.steps
@@ -171,7 +174,7 @@ class Executor:
             else:
                 residual = state.reused(b, group, forwarding, axis)
                 if computing.any():
-                    streams = _numbers(computing)
+                    streams = _numbers(computing, stream)
                     part = self.model.block(b, k, stream, calls.contexts, streams.tolist())
                     residual = residual.index_copy(axis, streams, part)
                     state.write(b, group, axis, streams, part)
@@ -198,7 +201,7 @@ class State:
             return own
         if forwarding.all():
             return other
-        streams = _numbers(forwarding)
+        streams = _numbers(forwarding, own)
         return own.index_copy(axis, streams, other.index_select(axis, streams))
 
     def write(self, b: int, group: int, axis: int, streams: Tensor, residual: Tensor) -> None:
@@ -212,9 +215,9 @@ def last(samples: Iterable[Tensor]) -> Tensor:
     return deque(samples, maxlen=1).pop()
 
 
-def _numbers(streams: BoolArray) -> Tensor:
-    """Numbers of those streams that are True."""
-    return torch.from_numpy(np.flatnonzero(streams))
+def _numbers(streams: BoolArray, beside: Tensor) -> Tensor:
+    """Numbers of those streams that are True, on the device of a tensor."""
+    return torch.from_numpy(np.flatnonzero(streams)).to(beside.device)
 
 
 @contextmanager

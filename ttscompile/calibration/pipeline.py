@@ -21,6 +21,7 @@ from ..core.given import integer
 from ..core.lattice import sparsity
 from ..errors import CalibrationError
 from ..ir.pieces import PRUNER
+from ..runtimes.torch.devices import device_of
 from ..trajectories.episodes import Episode
 from ..verification.record_golden import record_plans
 from .budget import ERROR, LATENCY, Budget, Goal, cells_of, goal_of, measure_budget
@@ -78,6 +79,7 @@ def calibrate(
     observation: Mapping[str, Sequence[str]] | None = None,
     max_intervals: int | None = None,
     correct: bool = False,
+    device: str | None = None,
     progress: bool = True,
 ) -> CalibrationResult:
     """Learn which residuals an artifact can reuse, from a few recorded episodes, and write the plans into it.
@@ -110,6 +112,8 @@ def calibrate(
         observation: by key, the arrays of a recording that it is made of, where they are called otherwise.
         correct: fit a correction of the sampler to the schedule of a strategy that fits none itself, and keep it if it
             is better on calls that it was not fitted on.
+        device: where the calls compute that are made to learn from, as torch calls it, ``cuda``; None for the CPU. The
+            results differ from those of the CPU by rounding. ``latency_ms`` is of onnxruntime, on the CPU.
         max_intervals: an end that does not depend on the machine's speed; None for the strategy's own.
         progress: show a bar on standard error.
 
@@ -122,11 +126,13 @@ def calibrate(
         CalibrationError: the arguments cannot be satisfied, or there is nothing to resume with these.
         TrajectoryError: the recordings do not fit the policy.
         ArtifactError: no artifact, one that another process is changing, or it cannot be written.
+        RuntimeUnavailableError: torch does not have the device.
     """
     begun = time.monotonic()
     seed = integer(seed, "seed", CalibrationError)
     if max_intervals is not None:
         max_intervals = integer(max_intervals, "max_intervals", CalibrationError)
+    there = None if device is None else device_of(device)
     asked = (target_sparsity, target_flops, latency_ms, max_action_error, threads)
     goal_of(*asked)  # what cannot be is refused before anything is read
     if not Path(path).is_dir():
@@ -165,7 +171,7 @@ def calibrate(
         clock = Clock(60 * max_minutes, float(state.progress.get("seconds", 0.0)), begun)
         if goal.kind == LATENCY:
             budget = _timed_budget(artifact, goal, chosen, state, clock)
-        executor = Executor(artifact)
+        executor = Executor(artifact, there)
         sets = draw_calls(executor, spec, episodes, split, limit, min(JUDGED, limit // 2), seed)
         with Bar(progress) as bar:
             if (warning := few_steps(artifact.manifest)) is not None:

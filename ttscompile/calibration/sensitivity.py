@@ -41,7 +41,7 @@ def sensitivity(
         figure: a number, of the denoised samples ``[copies * N, T, D]``.
 
     Returns:
-        By the number of a cell, ``k * blocks + b``: what its block computes there, or would, for each call
+        On the CPU, by the number of a cell, ``k * blocks + b``: what its block computes there, or would, for each call
         (``[N, size]``), and the gradient of the figure in what the cell adds, for each stream (``[copies * N, size]``).
     """
     model, count = executor.model, calls.count
@@ -79,5 +79,5 @@ def sensitivity(
 
 
 def _rows(values: Tensor, axis: int) -> Tensor:
-    """One row a stream."""
-    return values.movedim(axis, 0).flatten(1)
+    """One row a stream, on the CPU."""
+    return values.movedim(axis, 0).flatten(1).cpu()

@@ -12,17 +12,20 @@ from ttscompile.cli.options import (
     json_option,
     names_option,
     runs_option,
+    runtime_options,
     seed_option,
     threads_option,
 )
 from ttscompile.cli.output import print_identity, print_json, progress, results, say, table
-from ttscompile.cli.timing import Measurement, contestants, measure
+from ttscompile.cli.timing import Compiled, Measurement, contestants, measure
 from ttscompile.cli.types import PATH, TEXT
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.units import ms, share
+from ttscompile.runtimes.open import CPU
 
-RIVALS = ("original", "eager", "onnxruntime-dense")
-"""The checkpoint with the sampler it was saved with; with the artifact's; and the artifact computed in full."""
+RIVALS = ("original", "eager", "onnxruntime-dense", "onnxruntime")
+"""The checkpoint with the sampler it was saved with; with the artifact's; the artifact computed in full; and the same
+plan of it on the CPU, for --runtime torch."""
 
 
 @click.command()
@@ -30,6 +33,10 @@ RIVALS = ("original", "eager", "onnxruntime-dense")
 @threads_option("Threads that each contestant computes with.")
 @runs_option("Calls of each contestant that are counted.")
 @click.option("--plan", type=TEXT, help="Plan of the compiled policy. Without this option its default plan runs.")
+@runtime_options
+@click.option(
+    "--precision", type=TEXT, help="Of the residual blocks. Without this option it is that of the artifact, or fp32."
+)
 @names_option(
     "--against",
     RIVALS,
@@ -49,6 +56,9 @@ def bench(
     threads: int,
     runs: int,
     plan: str | None,
+    runtime: str,
+    device: str | None,
+    precision: str | None,
     against: tuple[str, ...],
     checkpoint: Path | None,
     seed: int,
@@ -63,13 +73,15 @@ def bench(
     console, artifact = progress(), load_artifact(directory)
     identity = artifact.manifest.identity
     with console.status("loading"):
-        entered = contestants(artifact, threads, plan, against, checkpoint)
+        own = Compiled(runtime, device, precision, threads)
+        entered = contestants(artifact, own, plan, against, checkpoint)
     if entered[0].plan == "dense":
         say(console, f"warning: {directory} runs dense: it is not calibrated, or --plan dense was given.")
     with console.status("timing") as status:
         measured = measure(entered, runs, seed, lambda done, total: status.update(f"timing: round {done} of {total}"))
     if as_json:
-        of = {"identity": identity, "machine": fingerprint(), "threads": threads, "runs": runs}
+        of = {"identity": identity, "machine": fingerprint(), "threads": threads, "runs": runs, "runtime": runtime}
+        of |= {"device": device or CPU}
         print_json(of | {"contestants": [m.to_json() for m in measured]})
         return
     output, head = results(), ("", "ms a call", "quartiles", "calls/s", "speed-up", "GFLOP", "reused")

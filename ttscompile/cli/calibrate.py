@@ -14,7 +14,7 @@ from ttscompile.cli.options import artifact_argument, json_option, seed_option, 
 from ttscompile.cli.output import manifest_of, only_results_on_stdout, print_json, results
 from ttscompile.cli.recordings import FilesCommand, Sources, require_recordings, trajectories_options
 from ttscompile.cli.summary import print_summary
-from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE
+from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT
 from ttscompile.report.summary import document
 
 
@@ -62,6 +62,11 @@ from ttscompile.report.summary import document
     default=15.0,
     show_default=True,
     help="All in all, about: the best plan found by then is taken. Also decides how many calls are used.",
+)
+@click.option(
+    "--device",
+    type=TEXT,
+    help="Device that the calls to learn from compute on, as torch calls it: cuda, mps. Without this option the CPU.",
 )
 @click.option("--resume", is_flag=True, help="Go on where a calibration that was interrupted stopped.")
 @json_option

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from ttscompile.cli.types import ANY_TEXT, PATH, RATE
+from ttscompile.cli.types import ANY_TEXT, PATH, RATE, TEXT
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
@@ -42,6 +42,30 @@ def runs_option(help: str, default: int = 20) -> Decorator:
     return count_option("--runs", help, default=default, most=MOST_RUNS)
 
 
+def together(*options: Decorator) -> Decorator:
+    """All of these options, in this order."""
+
+    def with_options(command: Callable[..., Any]) -> Callable[..., Any]:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return with_options
+
+
+runtime_options = together(
+    click.option(
+        "--runtime",
+        type=click.Choice(["onnxruntime", "torch"]),
+        default="onnxruntime",
+        show_default=True,
+        help="What executes the policy. torch needs the extra 'compile'.",
+    ),
+    click.option("--device", type=TEXT, help="Device that --runtime torch computes on, as torch calls it: cpu, cuda."),
+)
+"""Of commands that run an artifact in a runtime of choice."""
+
+
 def seed_option(help: str, default: int | None = 0) -> Decorator:
     """``--seed``."""
     return count_option("--seed", help, default=default, least=0, most=MOST_SEED)
@@ -57,17 +81,6 @@ def names_option(name: str, known: Sequence[str], *, default: str, help: str) ->
         return names
 
     return click.option(name, type=ANY_TEXT, default=default, show_default=True, callback=parsed, help=help)
-
-
-def together(*options: Decorator) -> Decorator:
-    """All of these options, in this order."""
-
-    def with_options(command: Callable[..., Any]) -> Callable[..., Any]:
-        for option in reversed(options):
-            command = option(command)
-        return command
-
-    return with_options
 
 
 loop_options = together(

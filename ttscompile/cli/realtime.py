@@ -11,7 +11,7 @@ import numpy as np
 
 import ttscompile
 from ttscompile.artifact.manifest import UNIFORM, marked
-from ttscompile.cli.options import artifact_argument, json_option, loop_options, runs_option
+from ttscompile.cli.options import artifact_argument, json_option, loop_options, runs_option, runtime_options
 from ttscompile.cli.output import print_identity, print_json, progress, results, say, table
 from ttscompile.cli.types import SECONDS, TEXT
 from ttscompile.errors import DeadlineMissedError
@@ -29,6 +29,7 @@ JITTER_HZ = 200
 @click.command()
 @artifact_argument
 @loop_options
+@runtime_options
 @click.option(
     "--plan",
     "names",
@@ -53,6 +54,8 @@ def realtime(
     control_hz: float,
     names: tuple[str, ...],
     threads: int,
+    runtime: str,
+    device: str | None,
     runs: int,
     jitter_seconds: float | None,
     as_json: bool,
@@ -63,7 +66,7 @@ def realtime(
     The exit status is 1 if none does.
     """
     console = progress()
-    policy = ttscompile.load(directory, threads=threads)
+    policy = ttscompile.load(directory, runtime, threads, device=device)
     settings = ExecutorSettings(measured_calls=runs, tiers=names or policy.info.plans, **loop)
     resolved = resolve(settings, policy.info, control_hz)
     with console.status("timing"):

@@ -9,7 +9,7 @@ import click
 import ttscompile
 from ttscompile.artifact.files import replace_file
 from ttscompile.artifact.load import load_artifact
-from ttscompile.cli.options import artifact_argument, count_option, runs_option, threads_option
+from ttscompile.cli.options import artifact_argument, count_option, runs_option, runtime_options, threads_option
 from ttscompile.cli.output import only_results_on_stdout, progress, results, say
 from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
 from ttscompile.cli.types import FILE, NEW_FILE
@@ -18,8 +18,7 @@ from ttscompile.report import Given, Section, build, render, verified
 from ttscompile.report.comparison import read_comparison
 from ttscompile.report.page import require_packages
 from ttscompile.report.verified import NOT_RUN
-from ttscompile.runtimes.open import open_runtime
-from ttscompile.runtimes.policy import CompiledPolicy
+from ttscompile.runtimes.policy import open_policy
 from ttscompile.trajectories import load_trajectories
 
 
@@ -37,6 +36,7 @@ from ttscompile.trajectories import load_trajectories
     "--verify", "verifies", is_flag=True, help="Also run the checks of 'ttscompile verify', which take minutes."
 )
 @threads_option("Threads that the timed calls compute with.")
+@runtime_options
 @runs_option("Calls of each plan that are counted.", default=10)
 @click.pass_context
 def report(
@@ -49,6 +49,8 @@ def report(
     comparison: Path | None,
     verifies: bool,
     threads: int,
+    runtime: str,
+    device: str | None,
     runs: int,
 ) -> None:
     """Write a page about the artifact DIRECTORY: what it is, its plans, its times now, its errors, its limits.
@@ -92,7 +94,7 @@ def report(
             except ArtifactError as error:  # it has nothing to check against, and so fails nothing
                 section = Section("Verification", (f"Could not be run: {error}",))
         given = Given(chosen, compared, section, threads, runs)
-        policy = CompiledPolicy(artifact, open_runtime(artifact, threads=threads), seed=0)
+        policy = open_policy(artifact, runtime, threads, seed=0, device=device)
         page = render(build(artifact, policy, given, status.update))
     try:
         replace_file(output, page.encode())

@@ -16,7 +16,7 @@ from typing import Any
 import click
 
 import ttscompile
-from ttscompile.cli.options import artifact_argument, count_option, loop_options, seed_option
+from ttscompile.cli.options import artifact_argument, count_option, loop_options, runtime_options, seed_option
 from ttscompile.cli.output import progress, say
 from ttscompile.cli.types import ADDRESS, FILE, NEW_FILE, TEXT
 from ttscompile.core.paths import require_free_or_path
@@ -37,6 +37,7 @@ TOKEN_VARIABLE = "TTSCOMPILE_TOKEN"  # noqa: S105
 @click.command()
 @artifact_argument
 @loop_options
+@runtime_options
 @click.option(
     "--host",
     type=ADDRESS,
@@ -115,6 +116,8 @@ def serve(
     host: str,
     port: int,
     threads: int,
+    runtime: str,
+    device: str | None,
     tiers: tuple[str, ...],
     token_file: Path | None,
     tls_certificate: Path | None,
@@ -150,7 +153,7 @@ def serve(
     )
     with _audited(audit_file):
         with console.status("loading and measuring"):
-            policy = ttscompile.load(directory, threads=threads, seed=seed)
+            policy = ttscompile.load(directory, runtime, threads, seed, device=device)
             executor = AsyncExecutor(policy, control_hz, ExecutorSettings(tiers=tiers or None, **settings))
         if insecure and lock.missing():
             say(console, f"warning: there is {lock.missing()}: whoever reaches {host} can drive the robot.")

@@ -15,8 +15,7 @@ from ttscompile.core.lattice import Source
 from ttscompile.core.spec import FP32, Affine, Noise, PolicySpec
 from ttscompile.errors import RuntimeUnavailableError, SpecError
 from ttscompile.measure.timer import Timer, Times
-from ttscompile.runtimes.open import open_runtime
-from ttscompile.runtimes.policy import CompiledPolicy
+from ttscompile.runtimes.policy import CompiledPolicy, open_policy
 from ttscompile.runtimes.random_calls import Observation, normalized, random_call
 
 if TYPE_CHECKING:
@@ -89,39 +88,62 @@ class Measurement:
         return asdict(self) | {"median_ms": self.median_ms, "quartiles_ms": self.quartiles_ms}
 
 
+@dataclass(frozen=True)
+class Compiled:
+    """How the compiled policy runs.
+
+    Attributes:
+        runtime: ``onnxruntime`` or ``torch``.
+        device: that torch computes on; None for the CPU.
+        precision: of the residual blocks; None for the runtime's own, see ``runtimes.policy.load``.
+        threads: that it, and each of its rivals, computes with.
+    """
+
+    runtime: str = "onnxruntime"
+    device: str | None = None
+    precision: str | None = None
+    threads: int = 1
+
+
 def contestants(
-    artifact: Artifact, threads: int, plan: str | None, against: Sequence[str], checkpoint: Path | None
+    artifact: Artifact, own: Compiled, plan: str | None, against: Sequence[str], checkpoint: Path | None
 ) -> list[Contestant]:
     """The compiled policy first, then its rivals, in fp32; each with a policy, and caches, of its own.
 
     Args:
         artifact: of all that run it.
-        threads: threads that each computes with.
+        own: how the compiled policy runs.
         plan: of the compiled policy; None for the artifact's default.
-        against: ``original``, ``eager``, ``onnxruntime-dense``.
+        against: ``original``, ``eager``, ``onnxruntime-dense``, ``onnxruntime``.
         checkpoint: for ``original`` and ``eager``.
 
     Raises:
         ArtifactError: it cannot be run.
-        RuntimeUnavailableError: ``eager`` without torch.
+        RuntimeUnavailableError: ``eager`` without torch; or runtime, device or precision cannot be had.
         SpecError: the checkpoint is of another policy.
     """
-    manifest = artifact.manifest
-    own = manifest.precision_name
+    manifest, threads = artifact.manifest, own.threads
+    chosen = plan or manifest.default_plan
 
-    def compiled(label: str, plan: str, precision: str) -> Contestant:
-        chosen = artifact.at_precision(precision)
-        policy = CompiledPolicy(chosen, open_runtime(chosen, threads=threads))
+    def compiled(label: str, plan: str, how: Compiled) -> Contestant:
+        policy = open_policy(artifact, how.runtime, threads, precision=how.precision, device=how.device)
         policy.reset()
-        return plan_contestant(label, policy, plan, manifest.spec)
+        found = policy.info.precision
+        return plan_contestant(label + f", {found}" * (found != FP32), policy, plan, manifest.spec)
 
-    made = [compiled("compiled" + f", {own}" * (own != FP32), plan or manifest.default_plan, own)]
+    made = [compiled("compiled" if own.runtime == "onnxruntime" else _where(own), chosen, own)]
     for rival in against:
         if rival == "onnxruntime-dense":
-            made.append(compiled("dense onnxruntime", "dense", FP32))
+            made.append(compiled("dense onnxruntime", "dense", Compiled(precision=FP32)))
+        elif rival == "onnxruntime":
+            made.append(compiled("onnxruntime", chosen, Compiled()))
         elif checkpoint is not None:
             made.append(_eager(checkpoint, threads, manifest, rival == "original"))
     return made
+
+
+def _where(own: Compiled) -> str:
+    return f"compiled, {own.runtime}" + f" on {own.device}" * (own.device is not None)
 
 
 def measure(

@@ -16,7 +16,7 @@ from .finding import Finding, Level
 PYTHON = (3, 11)
 PROJECT = "ttscompile"
 ENABLES = {
-    "compile": "convert, calibrate, compare, report, pictures, runtime='reference'",
+    "compile": "convert, calibrate, compare, report, pictures, runtime='torch' and 'reference'",
     "lerobot": "convert --task of LeRobot policies",
     "recordings": "recordings in zarr, HDF5 and LeRobot's format",
     "serve": "serve",
@@ -44,7 +44,7 @@ class Requirement(NamedTuple):
 
 def package_findings() -> list[Finding]:
     """Python, required packages, extras, and onnxruntime's providers."""
-    return [*_python(), *_packages(requirements()), *_providers()]
+    return [*_python(), *_packages(requirements()), *_providers(), *_devices()]
 
 
 def requirements() -> list[Requirement]:
@@ -138,3 +138,17 @@ def _providers() -> list[Finding]:
         remedy = "They overwrite each other's files. Run: pip uninstall onnxruntime-gpu, and onnxruntime again."
         found.append(Finding(part, "builds", " and ".join(builds), Level.WARNING, remedy))
     return found
+
+
+def _devices() -> list[Finding]:
+    """Where the runtime on torch can compute; nothing where torch is not installed."""
+    if not _installed(Requirement("torch", "", ""))[1]:
+        return []
+    try:
+        torch = importlib.import_module("torch")
+        found = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
+        found += ["mps"] if torch.backends.mps.is_available() else []
+    except Exception as error:  # a broken installation: its shared libraries, or numpy's
+        remedy = "Install it again: pip install --force-reinstall torch. Only what needs torch fails."
+        return [Finding("torch", "import", f"fails: {type(error).__name__}: {error}", Level.WARNING, remedy)]
+    return [Finding("torch", "devices", ", ".join(["cpu", *found]))]

@@ -186,7 +186,7 @@ def head_features(pruner: Graph, calls: Calls) -> Matrix:
     layer = next(node for node in pruner.nodes if "pruner.hidden.weight" in node.refs())
     source = layer.args[0]
     assert isinstance(source, Ref)
-    values = Evaluator(backward_slice(pruner, (source.name,), {}), {})(calls.contexts.condition)[0]
+    values = Evaluator(backward_slice(pruner, (source.name,), {}), {}, calls.device)(calls.contexts.condition)[0].cpu()
     return np.asarray(values.numpy(), dtype=np.float32)
 
 

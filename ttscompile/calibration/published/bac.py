@@ -160,8 +160,8 @@ def dense_statistics(executor: Executor, calls: Calls) -> tuple[Scores, Scores]:
     similarity, change = [], []
     for rows in residuals:  # [N, K, size]
         unit = torch.nn.functional.normalize(rows, dim=-1)
-        similarity.append((unit @ unit.transpose(1, 2)).mean(0).double().numpy())
-        change.append(float(torch.cdist(rows, rows, p=1).mean()) / rows.shape[-1])
+        similarity.append((unit @ unit.transpose(1, 2)).mean(0).cpu().double().numpy())
+        change.append(float(torch.cdist(rows, rows, p=1).mean().cpu()) / rows.shape[-1])
     return np.stack(similarity), np.array(change)
 
 

@@ -180,7 +180,7 @@ def decide(executor: Executor, criterion: Criterion, calls: Calls) -> Decided:
     def blocks(k: int, stem: Tensor) -> Tensor:
         stream = executor.step(computed, k, stem, calls, state, first)
         feature = torch.stack([state.timestep[b] for b in first]).sum(0) if first else stem
-        rows.append(decisions.decide(k, np.ascontiguousarray(feature.movedim(executor.axes[0], 0).numpy())))
+        rows.append(decisions.decide(k, np.ascontiguousarray(feature.movedim(executor.axes[0], 0).cpu().numpy())))
         return executor.step(rows[-1], k, stream, calls, state, others)
 
     with torch.no_grad():

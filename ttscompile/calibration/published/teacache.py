@@ -51,7 +51,7 @@ def dense_changes(executor: Executor, calls: Calls) -> tuple[Array, Array]:
     """
     seen = []
     for stem, residuals in executor.dense_steps(calls):
-        seen.append([value.movedim(executor.axes[0], 0).numpy() for value in (stem, sum(residuals, stem))])
+        seen.append([value.movedim(executor.axes[0], 0).cpu().numpy() for value in (stem, sum(residuals, stem))])
     changes = [[relative_change(b, a) for a, b in zip(*pair, strict=True)] for pair in pairwise(seen)]
     before, after = (np.concatenate([pair[i] for pair in changes]) for i in range(2))
     return before, after

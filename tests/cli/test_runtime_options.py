@@ -1,0 +1,55 @@
+"""The runtime and its device, as commands take them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from ttscompile.cli import main
+
+
+def run(*arguments: object) -> Any:
+    return CliRunner().invoke(main, [str(a) for a in arguments], catch_exceptions=False)
+
+
+def test_bench_times_torch_beside_the_same_plan_in_onnxruntime(toy_compiled: Path) -> None:
+    options = ("--runtime", "torch", "--device", "cpu", "--precision", "bf16", "--against", "onnxruntime")
+    result = run("bench", toy_compiled, *options, "--runs", 2, "--plan", "dense", "--json")
+    assert result.exit_code == 0, result.stderr
+    told = json.loads(result.stdout)
+    assert (told["runtime"], told["device"]) == ("torch", "cpu")
+    contestants = [(each["label"], each["plan"]) for each in told["contestants"]]
+    assert contestants == [("compiled, torch on cpu, bf16", "dense"), ("onnxruntime", "dense")]
+
+
+def test_realtime_measures_on_torch(toy_compiled: Path) -> None:
+    result = run("realtime", toy_compiled, "--control-hz", 10, "--runs", 1, "--plan", "dense", "--runtime", "torch")
+    assert result.exit_code in (0, 1), result.stderr  # the machine may be busy
+    assert "dense" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("bench", "--device", "cuda"), "runtime 'onnxruntime' computes on the CPU alone; found device 'cuda'"),
+        (("bench", "--runtime", "torch", "--device", "abacus"), "device 'abacus' cannot be had"),
+        (("bench", "--runtime", "torch", "--precision", "int8"), "found precision 'int8'"),
+        (("bench", "--runtime", "tensorrt"), "'tensorrt' is not one of"),
+        (("calibrate", "--trajectories", "CALLS", "--device", "abacus"), "device 'abacus' cannot be had"),
+        (("realtime", "--control-hz", "10", "--runtime", "torch", "--device", "abacus"), "device 'abacus'"),
+    ],
+)
+def test_what_cannot_be_had_is_bad_usage(
+    toy_compiled: Path, tmp_path: Path, words: tuple[str, ...], message: str
+) -> None:
+    calls = tmp_path / "calls.npz"
+    calls.write_bytes(b"")
+    command, *options = (str(calls) if word == "CALLS" else word for word in words)
+    result = run(command, toy_compiled, *options)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert message in " ".join(result.stderr.split())
+    assert "Traceback" not in result.stderr

@@ -1,0 +1,335 @@
+"""The runtime on torch: it agrees with the reference, and its calls can be captured."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch.fx.experimental.proxy_tensor import make_fx
+
+import ttscompile
+from tests.rounding import assert_equal_but_for_rounding, bound
+from ttscompile import Source
+from ttscompile.artifact import Artifact, load_artifact
+from ttscompile.artifact.manifest import DENSE
+from ttscompile.artifact.write import update_calibration
+from ttscompile.core.lattice import uniform_plan
+from ttscompile.errors import CaptureError, RuntimeUnavailableError
+from ttscompile.ir.evaluate import evaluate
+from ttscompile.ir.graph import Enum, Graph, Ref
+from ttscompile.runtimes import Runtime, open_runtime
+from ttscompile.runtimes.instructions import instructions_of
+from ttscompile.runtimes.torch.backend import TorchBackend
+from ttscompile.runtimes.torch.capture import Line, Lines
+from ttscompile.runtimes.torch.functions import write_function
+from ttscompile.runtimes.torch.loop import denoise
+from ttscompile.runtimes.torch.network import Parts, StreamsNetwork
+from ttscompile.runtimes.torch.sampler import Advance
+
+from .agreement import call_terms, largest_difference, random_inputs
+from .conftest import MakeArtifact
+from .plans import random_correction, random_plan
+from .toys import B, f32, node, toy_program
+
+VARIANTS = [
+    {},
+    {"sequence_first": True},
+    {"noise": 0.0, "steps": 8},
+    {"steps": 1},
+    {"blocks": 1},
+    {"normed": True},
+    {"normed": True, "sequence_first": True},
+]
+
+
+def replaying(lines: list[Line]) -> Callable[[Line], Line]:
+    """A capture as CUDA makes it, on the CPU: the operations are recorded once, between the tensors of the moment.
+
+    What a line takes from anywhere else than from these tensors stays as it was when it was recorded, and so does
+    every decision. Each recording is added to ``lines``.
+    """
+
+    def capture(line: Line) -> Line:
+        line()  # as the runs before a capture
+        recorded = make_fx(lambda: line())()
+        lines.append(recorded)
+        return recorded
+
+    return capture
+
+
+@pytest.mark.parametrize("variant", VARIANTS, ids=str)
+def test_it_agrees_with_the_reference(make_artifact: MakeArtifact, variant: dict[str, int]) -> None:
+    """Batches of one to four streams, each with a plan of its own or all with the same."""
+    artifact = make_artifact(toy_program(**variant, pruner=False))
+    runtimes = open_runtime(artifact, "torch"), open_runtime(artifact, "reference")
+    allowed = bound(call_terms(artifact))
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        assert largest_difference(artifact, *runtimes, rng, streams=1 + seed % 4, calls=4) < allowed
+
+
+def test_streams_with_one_plan_are_a_batch(make_artifact: MakeArtifact) -> None:
+    """Two streams follow one plan and the third another: residuals of an earlier call stay with their stream."""
+    artifact = make_artifact(toy_program(normed=True, pruner=False))
+    manifest, rng = artifact.manifest, np.random.default_rng(0)
+    runtimes = [open_runtime(artifact, name) for name in ("torch", "reference")]
+    written = np.zeros((3, manifest.steps, len(manifest.groups)), np.bool_)
+    for _ in range(4):
+        one, other = (random_plan(rng, manifest.steps, manifest.groups, written.all(axis=0)) for _ in range(2))
+        plans = np.stack([one, other, one])
+        obs, noise = random_inputs(artifact, rng, 3)
+        ours, theirs = (runtime.predict(obs, noise, plans)[0] for runtime in runtimes)
+        assert_equal_but_for_rounding(ours, theirs, call_terms(artifact))
+        written |= plans == Source.COMPUTE
+    assert isinstance(runtimes[0].backend, TorchBackend)
+    assert sorted(runtimes[0].backend._some) == [1, 2]
+
+
+@pytest.fixture
+def calibrated(make_artifact: MakeArtifact) -> Artifact:
+    """The toy with two schedules, one of which reads the rollout cache, and has a correction; and with its pruner."""
+    artifact = make_artifact(toy_program(normed=True))
+    manifest, rng = artifact.manifest, np.random.default_rng(3)
+    evenly = uniform_plan(manifest.steps, len(manifest.groups), 2)
+    mixed = random_plan(rng, manifest.steps, manifest.groups, np.ones_like(evenly, np.bool_))
+    assert (mixed == Source.ROLLOUT).any()
+    corrections = {"mixed": random_correction(artifact, rng)}
+    plans = {"evenly": evenly, "mixed": mixed}
+    update_calibration(artifact.path, dict(artifact.pruner), plans, "evenly", {}, corrections=corrections)
+    return load_artifact(artifact.path)
+
+
+def both(artifact: Artifact, lines: list[Line]) -> list[Runtime]:
+    captured = TorchBackend(artifact, capture=replaying(lines))
+    return [Runtime(artifact, captured), open_runtime(artifact, "reference")]
+
+
+@pytest.mark.parametrize("name", ["evenly", "mixed", DENSE])
+@pytest.mark.parametrize("streams", [1, 3])
+def test_a_call_is_captured_once_and_replayed_on_other_inputs(calibrated: Artifact, name: str, streams: int) -> None:
+    lines: list[Line] = []
+    runtimes, rng = both(calibrated, lines), np.random.default_rng(0)
+    for called in (DENSE, name, name, name):
+        plan, correction = calibrated.schedule(called), calibrated.corrections.get(called)
+        obs, noise = random_inputs(calibrated, rng, streams)
+        given = {"plan_name": called, "repair": True, "correction": correction}
+        ours, theirs = (runtime.predict(obs, noise, plan, **given)[0] for runtime in runtimes)
+        assert_equal_but_for_rounding(ours, theirs, 2 * call_terms(calibrated))
+    assert len(lines) == (1 if name == DENSE else 2)
+
+
+def test_the_first_call_of_an_episode_is_captured_too(calibrated: Artifact) -> None:
+    """Its plan is the one that was repaired, since nothing was computed before."""
+    lines: list[Line] = []
+    runtimes, rng = both(calibrated, lines), np.random.default_rng(0)
+    plan = calibrated.schedule("mixed")
+    for _ in range(2):
+        obs, noise = random_inputs(calibrated, rng, 1)
+        samples = []
+        for runtime in runtimes:
+            runtime.reset()
+            samples.append(runtime.predict(obs, noise, plan, plan_name="mixed", repair=True)[0])
+        assert_equal_but_for_rounding(*samples, call_terms(calibrated))
+    assert len(lines) == 1
+
+
+def test_what_a_pruner_decides_selects_among_captured_calls_and_a_matrix_runs_as_it_is(calibrated: Artifact) -> None:
+    lines: list[Line] = []
+    runtimes, rng = both(calibrated, lines), np.random.default_rng(1)
+    seen = set()
+    for _ in range(3):
+        obs, noise = random_inputs(calibrated, rng, 1)
+        ours, report = runtimes[0].predict(obs, noise)
+        theirs, _ = runtimes[1].predict(obs, noise, report.plan)
+        assert_equal_but_for_rounding(ours, theirs, call_terms(calibrated))
+        seen.add(report.plan.tobytes())
+    assert len(lines) == 1 + len(seen)  # the prologue is a line of its own, since the pruner reads it
+    matrix = random_plan(rng, 5, calibrated.manifest.groups, np.zeros((5, 5), np.bool_))
+    obs, noise = random_inputs(calibrated, rng, 1)
+    ours, theirs = (runtime.predict(obs, noise, matrix)[0] for runtime in runtimes)
+    assert_equal_but_for_rounding(ours, theirs, call_terms(calibrated))
+    assert len(lines) == 1 + len(seen)
+
+
+def test_another_batch_size_is_captured_anew(calibrated: Artifact) -> None:
+    lines: list[Line] = []
+    runtimes, rng = both(calibrated, lines), np.random.default_rng(1)
+    plan = calibrated.schedule("evenly")
+    for streams in (1, 1, 2, 2, 1):
+        obs, noise = random_inputs(calibrated, rng, streams)
+        ours, theirs = (runtime.predict(obs, noise, plan, plan_name="evenly")[0] for runtime in runtimes)
+        assert_equal_but_for_rounding(ours, theirs, call_terms(calibrated))
+        for runtime in runtimes:
+            runtime.reset()
+    assert len(lines) == 3
+
+
+def test_a_recording_shows_what_a_line_takes_from_elsewhere() -> None:
+    """The comparison can fail: a value that is read when a line is recorded stays."""
+    tensor, result, number = torch.ones(1), torch.zeros(1), [1.0]
+
+    def line() -> None:
+        result.copy_(tensor * number[0])
+
+    lines = Lines(replaying([]))
+    lines.run("key", line)
+    tensor.fill_(3.0)
+    number[0] = 2.0
+    lines.run("key", line)
+    assert result.item() == 3.0
+
+
+def test_lines_that_were_captured_long_ago_are_let_go() -> None:
+    captured: list[int] = []
+    lines = Lines(lambda line: captured.append(1) or line)  # type: ignore[func-returns-value]
+    for key in [*range(70), 69, 0]:
+        lines.run(key, lambda: None)
+    assert len(captured) == 71
+
+
+@pytest.mark.parametrize("precision", ["bf16", "fp16"])
+def test_products_in_fewer_bits_are_near_those_in_fp32(make_artifact: MakeArtifact, precision: str) -> None:
+    artifact = make_artifact(toy_program(normed=True))
+    rng = np.random.default_rng(0)
+    obs, noise = random_inputs(artifact, rng, 2)
+    plan = uniform_plan(5, 5, 3)
+    exact = open_runtime(artifact, "torch").predict(obs, noise, plan)[0]
+    narrow = open_runtime(artifact, "torch", precision=precision).predict(obs, noise, plan)[0]
+    unit = {"bf16": 2.0**-8, "fp16": 2.0**-11}[precision]
+    difference = np.abs(narrow - exact).max() / np.abs(exact).max()
+    assert bound(1) < difference < bound(call_terms(artifact), unit=unit)
+
+
+def test_weights_of_products_are_kept_in_fewer_bits(toy_artifact: Artifact) -> None:
+    graph = toy_artifact.pieces.blocks[0].graph
+    weights = {name: torch.from_numpy(np.array(value)) for name, value in toy_artifact.weights.items()}
+    examples = [torch.randn(kind.at(1)) for kind in graph.inputs.values()]
+    with torch.autocast("cpu", torch.bfloat16):
+        function = write_function(graph, weights, examples, 1, torch.bfloat16)
+    kept = [each for each in function.__globals__.values() if isinstance(each, torch.Tensor)]
+    assert {each.dtype for each in kept} == {torch.bfloat16}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"device": "abacus"}, "device 'abacus' cannot be had"),
+        ({"device": "cuda:97"}, "device 'cuda:97' cannot be had"),
+        ({"device": 3}, "expected the name of a device"),
+        ({"precision": "int8"}, "runtime 'torch' computes in 'fp32', 'bf16', 'fp16' alone"),
+        (
+            {"runtime": "onnxruntime", "device": "cuda"},
+            "on the CPU alone; found device 'cuda'. Use runtime='torch'",
+        ),
+        ({"runtime": "reference", "precision": "bf16"}, "computes in 'fp32' alone"),
+    ],
+)
+def test_what_cannot_be_had_is_refused(toy_artifact: Artifact, options: dict[str, object], message: str) -> None:
+    with pytest.raises(RuntimeUnavailableError, match=message):
+        ttscompile.load(toy_artifact.path, **({"runtime": "torch"} | options))
+
+
+def test_the_precision_is_told(toy_artifact: Artifact) -> None:
+    precisions = [ttscompile.load(toy_artifact.path, "torch", precision=p).info.precision for p in (None, "bf16")]
+    assert precisions == ["fp32", "bf16"]
+
+
+def test_settings_of_torch_are_as_they_were_after_a_call(toy_artifact: Artifact) -> None:
+    torch.set_num_threads(2)
+    policy = ttscompile.load(toy_artifact.path, "torch", threads=1, seed=0)
+    assert torch.get_num_threads() == 2
+    during: list[int] = []
+    backend = policy._runtime.backend
+    original = backend._lines.run
+    backend._lines.run = lambda key, line: (during.append(torch.get_num_threads()), original(key, line))
+    policy.predict_action({"obs": np.zeros((1, 2), np.float32)}, plan="dense")
+    assert (set(during), torch.get_num_threads()) == ({1}, 2)
+    assert torch.is_grad_enabled() and not torch.is_inference_mode_enabled()
+
+
+def attention(streams_first: bool) -> Graph:
+    """Products, moves of all sorts that change how memory is seen, and constants that can be computed ahead."""
+    x, wide, heads = f32(B, 3, 4), f32(B, 3, 8), f32(B, 2, 3, 4)
+    nodes = (
+        node("t", "transpose.int", f32(4, 8), Ref("w"), 0, 1),
+        node("tt", "transpose.int", f32(8, 4), Ref("t"), 0, 1),
+        node("y", "linear.default", wide, Ref("x"), Ref("tt"), Ref("b")),
+        node("g", "gelu.default", wide, Ref("y")),
+        node("v", "reshape.default", f32(B, 3, 2, 4), Ref("g"), (B, 3, 2, 4)),
+        node("h", "transpose.int", heads, Ref("v"), 1, 2),
+        node("s", "select.int", f32(B, 3, 4), Ref("h"), 1, 1),
+        node("u", "unsqueeze.default", f32(B, 1, 3, 4), Ref("s"), 1),
+        node("a", "add.Tensor", heads, Ref("h"), Ref("u")),
+        node("p", "permute.default", f32(3, B, 4, 2), Ref("a"), (2, 0, 3, 1)),
+        node("c", "reshape.default", f32(3, B, 8), Ref("p"), (3, B, 8)),
+        node("z", "sum.dim_IntList", x if streams_first else f32(3, B), Ref("c"), (2,)),
+    )
+    return Graph({"x": x}, {"w": f32(8, 4), "b": f32(8)}, nodes, ("z", "h", "x"))
+
+
+def test_a_function_computes_what_its_graph_says_with_fewer_operations() -> None:
+    graph, rng = attention(False), torch.Generator().manual_seed(0)
+    weights = {name: torch.randn(kind.at(1), generator=rng) for name, kind in graph.constants.items()}
+    for streams in (1, 3):
+        function = write_function(graph, weights, [torch.zeros(streams, 3, 4)], streams, None)
+        for _ in range(2):
+            x = torch.randn(streams, 3, 4, generator=rng)
+            found, expected = function(x), evaluate(graph, weights, {"x": x})
+            assert found[2] is x
+            for one, other in zip(found, expected, strict=True):
+                assert_equal_but_for_rounding(one, other, 40)
+        names = function.__code__.co_varnames
+        assert len(names) - 1 < len(graph.nodes) - 3, names  # transpositions of the weight, moves, and the gelu
+
+
+def test_a_function_reads_weights_where_nothing_can_be_packed() -> None:
+    """Types and ranks that oneDNN's kernels are not made for are computed as they stand."""
+    kind = replace(f32(B, 4), dtype="float64")
+    weight = replace(f32(2, 4), dtype="float64")
+    nodes = (node("y", "linear.default", replace(f32(B, 2), dtype="float64"), Ref("x"), Ref("w")),)
+    graph, x = Graph({"x": kind}, {"w": weight}, nodes, ("y",)), torch.randn(3, 4, dtype=torch.float64)
+    weights = {"w": torch.randn(2, 4, dtype=torch.float64)}
+    (found,) = write_function(graph, weights, [x], 3, None)(x)
+    assert torch.equal(found, x @ weights["w"].T)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"op": "aten.from_file.default"}, "not a pure function|reads files|does not exist"),
+        ({"args": (Ref("x"), Enum("dtype", "Tensor"))}, "no such dtype"),
+    ],
+)
+def test_a_graph_that_cannot_be_written_is_refused(change: dict[str, object], message: str) -> None:
+    one = replace(node("y", "tanh.default", f32(B, 4), Ref("x")), **change)
+    with pytest.raises(CaptureError, match=message):
+        write_function(Graph({"x": f32(B, 4)}, {}, (one,), ("y",)), {}, [torch.zeros(1, 4)], 1, None)
+
+
+@pytest.mark.parametrize("variant", [{}, {"normed": True, "sequence_first": True}], ids=str)
+def test_everything_of_a_call_is_on_its_device(make_artifact: MakeArtifact, variant: dict[str, bool]) -> None:
+    """On torch's device of tensors without numbers, which most operations refuse to mix with the CPU's."""
+    artifact = make_artifact(toy_program(**variant))
+    manifest, device, rng = artifact.manifest, torch.device("meta"), np.random.default_rng(0)
+    with pytest.raises(RuntimeError, match="device"):
+        torch.zeros(2, device=device) + torch.zeros(2)
+    (horizon, channels), groups = manifest.spec.sample, manifest.groups
+    plan = random_plan(rng, manifest.steps, groups, np.ones((5, 5), np.bool_), computed=0.4)
+    lowered = instructions_of(plan, groups)
+    assert lowered.rollout.any()
+    parts = Parts(artifact, device, None)
+    network = StreamsNetwork(parts, {"obs": torch.zeros((2, 2), device=device)}, 2)
+    advance = Advance(manifest.spec, random_correction(artifact, rng), device)
+    network.prologue()
+    initial = torch.zeros((2, horizon, channels), device=device)
+    offset = torch.zeros((5, channels, 2, horizon), device=device).unbind()
+    entry = parts.tensor(manifest.blocks[0].type, 2)
+    rollout = dict.fromkeys(np.flatnonzero(lowered.rollout).tolist(), entry)
+    made = denoise(network, lowered, np.ones((5, 5), np.bool_), advance, initial, offset, rollout)
+    results = [made.sample, network.logits(), network.condition(), *made.residuals.values()]
+    assert len(results) == 3 + np.count_nonzero(plan == Source.COMPUTE)
+    assert {each.device.type for each in results} == {"meta"}

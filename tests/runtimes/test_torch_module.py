@@ -1,0 +1,165 @@
+"""The sparse call as a module: the same actions as the policy, exported and compiled too."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import ttscompile
+from tests.rounding import assert_equal_but_for_rounding
+from ttscompile import Noise, Source
+from ttscompile.artifact import Artifact, load_artifact
+from ttscompile.artifact.write import update_calibration
+from ttscompile.core.lattice import uniform_plan
+from ttscompile.errors import ArtifactError, IllegalPlanError, ObservationError, RuntimeUnavailableError
+
+from .agreement import call_terms
+from .conftest import MakeArtifact
+from .plans import random_correction, random_plan
+from .toys import toy_program
+
+NO_COMPILER = "NO C++ COMPILER: the exported module was not compiled; install g++"
+
+
+def calibrated(artifact: Artifact) -> Artifact:
+    """With a schedule that reads residuals of this call alone and has a correction, one that does not, and a pruner."""
+    manifest, rng = artifact.manifest, np.random.default_rng(0)
+    shape = (manifest.steps, len(manifest.groups))
+    plans = {
+        "evenly": uniform_plan(*shape, 2),
+        "mixed": random_plan(rng, shape[0], manifest.groups, np.zeros(shape, np.bool_), 0.3),
+        "rollout": np.where(np.arange(shape[0])[:, None] == 0, Source.COMPUTE, Source.ROLLOUT) + np.zeros(shape),
+    }
+    schedules = {name: plan.astype(np.int8) for name, plan in plans.items()}
+    corrections = {"mixed": random_correction(artifact, rng)}
+    update_calibration(artifact.path, dict(artifact.pruner), schedules, "evenly", {}, corrections=corrections)
+    return load_artifact(artifact.path)
+
+
+@pytest.fixture(scope="module")
+def artifact(tmp_path_factory: pytest.TempPathFactory) -> Artifact:
+    from .toys import written_artifact
+
+    return calibrated(written_artifact(toy_program(normed=True), tmp_path_factory.mktemp("module") / "artifact"))
+
+
+Inputs = tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor]
+
+
+def inputs(streams: int, seed: int = 0) -> Inputs:
+    rng = np.random.default_rng(seed)
+    shapes = (streams, 2), (streams, 3, 2), (5, streams, 3, 2)
+    obs, initial, steps = (torch.from_numpy(rng.standard_normal(shape, dtype=np.float32)) for shape in shapes)
+    return {"obs": obs}, initial, steps
+
+
+def expected(artifact: Artifact, given: Inputs, plan: str) -> np.ndarray:
+    policy = ttscompile.load(artifact.path, "reference")
+    obs, initial, steps = given
+    noise = Noise(initial.numpy(), steps.numpy())
+    return np.asarray(policy.predict_action({"obs": obs["obs"].numpy()}, noise=noise, plan=plan)["action_pred"])
+
+
+def terms(artifact: Artifact) -> float:
+    """Those of a call; the actions are divided by a scale of a half at least, so they may be twice as far off."""
+    return 4 * call_terms(artifact)
+
+
+@pytest.mark.parametrize("plan", ["evenly", "mixed", "dense"])
+@pytest.mark.parametrize("streams", [1, 3])
+def test_it_gives_the_actions_of_the_policy(artifact: Artifact, plan: str, streams: int) -> None:
+    module = ttscompile.to_module(artifact.path, plan)
+    assert not module.training and not list(module.parameters())
+    given = inputs(streams)
+    assert_equal_but_for_rounding(module(*given), expected(artifact, given, plan), terms(artifact))
+
+
+def test_the_default_plan_is_the_artifacts(artifact: Artifact) -> None:
+    given = inputs(1)
+    found, named = (ttscompile.to_module(artifact.path, plan)(*given) for plan in (None, "evenly"))
+    assert torch.equal(found, named)
+
+
+@pytest.mark.parametrize("variant", [{"sequence_first": True}, {"noise": 0.0}, {"blocks": 1}], ids=str)
+def test_other_forms_of_networks(make_artifact: MakeArtifact, variant: dict[str, bool]) -> None:
+    made = make_artifact(toy_program(**variant))
+    given = inputs(2)
+    found = ttscompile.to_module(made.path, "dense")(*given[: 2 if variant == {"noise": 0.0} else 3])
+    assert_equal_but_for_rounding(found, expected(made, given, "dense"), terms(made))
+
+
+def test_it_can_be_exported_and_what_is_exported_computes_the_same(artifact: Artifact) -> None:
+    module = ttscompile.to_module(artifact.path, "mixed")
+    with torch.no_grad():
+        exported = torch.export.export(module, inputs(2))
+    other = inputs(2, seed=1)
+    found = exported.module()(*other)
+    assert_equal_but_for_rounding(found.detach(), expected(artifact, other, "mixed"), terms(artifact))
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")  # of torch's compiler, about itself
+def test_what_is_exported_can_be_compiled_and_run_without_python(artifact: Artifact, tmp_path: Path) -> None:
+    if shutil.which("g++") is None:
+        pytest.skip(NO_COMPILER)
+    module = ttscompile.to_module(artifact.path, "evenly")
+    with torch.no_grad():
+        exported = torch.export.export(module, inputs(1))
+    package = torch._inductor.aoti_compile_and_package(exported, package_path=str(tmp_path / "call.pt2"))
+    compiled = torch._inductor.aoti_load_package(package)
+    for seed in (1, 2):
+        given = inputs(1, seed)
+        assert_equal_but_for_rounding(compiled(*given), expected(artifact, given, "evenly"), terms(artifact))
+
+
+def test_moving_it_moves_everything(artifact: Artifact) -> None:
+    """On the device of tensors without numbers, which most operations refuse to mix with the CPU's."""
+    module = ttscompile.to_module(artifact.path, "mixed").to("meta")
+    obs, initial, steps = inputs(2)
+    result = module({key: value.to("meta") for key, value in obs.items()}, initial.to("meta"), steps.to("meta"))
+    assert (result.device.type, tuple(result.shape)) == ("meta", (2, 3, 2))
+
+
+@pytest.mark.parametrize(
+    ("plan", "message"),
+    [("rollout", "keeps nothing between calls"), ("pruner", "which decides for each observation")],
+)
+def test_a_plan_that_a_module_cannot_have_is_refused(artifact: Artifact, plan: str, message: str) -> None:
+    with pytest.raises(IllegalPlanError, match=message):
+        ttscompile.to_module(artifact.path, plan)
+
+
+def test_an_unknown_plan_is_refused(artifact: Artifact) -> None:
+    with pytest.raises(ArtifactError, match="no schedule 'best'"):
+        ttscompile.to_module(artifact.path, "best")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda obs, initial, steps: (obs, initial[:, :2], steps), r"initial must be float32 .*found .*\[1, 2, 2\]"),
+        (lambda obs, initial, steps: (obs, initial.double(), steps), "float64"),
+        (lambda obs, initial, steps: (obs, initial), "steps must be .* found none"),
+        (lambda obs, initial, steps: (obs, initial, steps[1:]), "steps must be"),
+        (lambda obs, initial, steps: ({}, initial, steps), r"'obs' must be float32 \[1, 2\]; found none"),
+        (lambda obs, initial, steps: ({"obs": obs["obs"][:, :1]}, initial, steps), r"found torch.float32 \[1, 1\]"),
+        (lambda obs, initial, steps: ({"obs": obs["obs"].long()}, initial, steps), "found torch.int64"),
+    ],
+)
+def test_inputs_that_do_not_fit_are_refused(artifact: Artifact, change: object, message: str) -> None:
+    module = ttscompile.to_module(artifact.path)
+    with pytest.raises(ObservationError, match=message):
+        module(*change(*inputs(1)))  # type: ignore[operator]
+
+
+def test_without_torch_it_says_what_to_install(artifact: Artifact, monkeypatch: pytest.MonkeyPatch) -> None:
+    import sys
+
+    monkeypatch.delitem(vars(ttscompile), "to_module", raising=False)
+    monkeypatch.delitem(sys.modules, "ttscompile.runtimes.torch.module", raising=False)
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(RuntimeUnavailableError, match="to_module needs torch, which is not installed"):
+        ttscompile.to_module(artifact.path)
