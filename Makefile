@@ -14,7 +14,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/installed.stamp
 
 .DELETE_ON_ERROR:
-.PHONY: demo test lint types pytest test-avx2 test-arm benchmark docs clean
+.PHONY: demo test lint types pytest test-avx2 test-arm test-matrix benchmark docs clean
 
 demo: $(READY)
 	$(BIN)/python examples/pusht/demo.py
@@ -53,6 +53,10 @@ test-avx2: $(READY)
 # The runtime on emulated ARM processors; see docs/machines.md. The first time takes half an hour.
 test-arm: $(READY)
 	$(BIN)/python tests/machines/arm.py
+
+# Python 3.11 to 3.13, one core, AVX2 alone, as far as they are here; see docs/machines.md.
+test-matrix: $(READY)
+	$(BIN)/python tests/machines/matrix.py
 
 benchmark: $(READY)
 	$(BIN)/pytest --benchmark-only
