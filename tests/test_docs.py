@@ -64,6 +64,8 @@ NOT_RUN = {
     "ttscompile serve": "has no end; tests/executor/test_serve.py starts it",
     "ttscompile convert outputs/train": "a LeRobot policy: tests/frontends/test_lerobot_golden.py converts two",
     "ttscompile convert pretrained_model": "a LeRobot policy, with --task: tests/frontends/test_lerobot.py",
+    "ttscompile calibrate compiled/ --trajectories calls.npz --ray": "of Ray: tests/calibration/test_pool.py",
+    "ttscompile compare compiled/ --trajectories calls.npz --ray": "of Ray: tests/calibration/test_pool.py",
     "ttscompile calibrate compiled/ --trajectories lerobot": "of LeRobot: tests/trajectories/test_recordings.py",
 }
 """How the commands begin that are not run here, and why. Every other one is run; of these the options are checked."""

@@ -37,6 +37,7 @@ class Executor:
         artifact: the policy.
 
     Attributes:
+        artifact: the policy.
         correction: of the sampler's steps, for all that is run but ``run_dense``; None for none.
         model: of the policy.
         types: of each block's residual.
@@ -47,6 +48,7 @@ class Executor:
 
     def __init__(self, artifact: Artifact) -> None:
         blocks = artifact.manifest.blocks
+        self.artifact = artifact
         self.model = ReferenceModel.from_artifact(artifact)
         pieces = artifact.pieces
         read = [graph for graph in (pieces.condition, pieces.step) if graph is not None]
