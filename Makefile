@@ -16,7 +16,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/installed.stamp
 
 .DELETE_ON_ERROR:
-.PHONY: demo test lint types pytest test-avx2 test-arm benchmark docs release containers test-lerobot clean
+.PHONY: demo test lint types pytest test-avx2 test-arm test-matrix benchmark docs release containers test-lerobot clean
 
 demo: $(READY)
 	$(BIN)/python examples/pusht/demo.py
@@ -67,6 +67,10 @@ test-lerobot:
 		'lerobot[async,diffusion,multi_task_dit,pusht]==0.6.1' -e '.[compile,videos]' -e plugins/lerobot_policy_ttscompile \
 		hypothesis pytest pytest-benchmark
 	$(LEROBOT)/bin/python -m pytest tests/plugins tests/test_capture.py tests/frontends/test_lerobot.py tests/trajectories
+
+# Python 3.11 to 3.13, one core, AVX2 alone, as far as they are here; see docs/machines.md.
+test-matrix: $(READY)
+	$(BIN)/python tests/machines/matrix.py
 
 benchmark: $(READY)
 	$(BIN)/pytest --benchmark-only

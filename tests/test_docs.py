@@ -70,6 +70,8 @@ NOT_RUN = {
     "python -m lerobot_policy_ttscompile": "the same",
     "ttscompile convert pretrained_model": "a LeRobot policy, with --task: tests/frontends/test_lerobot.py",
     "python examples/vla/drive.py": "of a LeRobot policy: tests/examples/test_vla_drive.py runs it",
+    "ttscompile calibrate compiled/ --trajectories calls.npz --ray": "of Ray: tests/calibration/test_pool.py",
+    "ttscompile compare compiled/ --trajectories calls.npz --ray": "of Ray: tests/calibration/test_pool.py",
     "ttscompile calibrate compiled/ --trajectories lerobot": "of LeRobot: tests/trajectories/test_recordings.py",
 }
 """How the commands begin that are not run here, and why. Every other one is run; of these the options are checked."""

@@ -67,6 +67,10 @@ class CalibrationFailedError(CalibrationError):
     """Calibration ran, and its plan is not what was asked for; a failed check (exit status 1), not bad input."""
 
 
+class ClusterError(TtscompileError):
+    """The machines that the work was given to are gone, or were never there."""
+
+
 class OutputError(TtscompileError):
     """A result that cannot be written where it was asked for."""
 

@@ -21,7 +21,7 @@ import numpy as np
 from bootstrap import Estimate, estimate, paired_difference
 from environments import Environment, environment_class, environment_option
 from episodes import Episodes
-from jobs import fill_cache
+from jobs import Processes, fill_cache
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
@@ -39,6 +39,8 @@ from variants import (
 )
 
 from ttscompile.artifact.manifest import abbreviated
+from ttscompile.calibration.pool import RayPool
+from ttscompile.cli.options import ray_option
 from ttscompile.cli.output import identity_of
 from ttscompile.measure.machine import fingerprint, one_line
 
@@ -210,6 +212,7 @@ def task_table(evaluations: Sequence[Evaluation]) -> Table:
 @cache_option
 @click.option("--no-cache", is_flag=True, help="Run all episodes, and keep none.")
 @click.option("--jobs", default=1, show_default=True, type=click.IntRange(1), help="Processes that run episodes.")
+@ray_option
 @click.option(
     "--plot",
     "picture",
@@ -228,12 +231,15 @@ def main(
     cache: Path | None,
     no_cache: bool,
     jobs: int,
+    ray: str | None,
     picture: Path | None,
     as_json: bool,
 ) -> None:
     """Compare artifacts and plans: DIR takes the artifact's own plan, DIR:dense computes everything."""
-    if jobs > 1 and no_cache:
-        raise click.UsageError("--jobs hands episodes over through the cache: leave out --no-cache.")
+    if (jobs > 1 or ray) and no_cache:
+        raise click.UsageError("--jobs and --ray hand episodes over through the cache: leave out --no-cache.")
+    if jobs > 1 and ray:
+        raise click.UsageError("--jobs is for this machine, and --ray for a cluster: give one of them.")
     make = environment_class(environment)
     cache = cache or Path("build", environment, "episodes")
     opened = [open_variant(text, runtime, threads) for text in variants]
@@ -246,7 +252,10 @@ def main(
             progress.update(tasks[label], completed=count)
 
         if jobs > 1:
-            fill_cache(environment, variants, seeds, batch, runtime, cache, jobs, finished)
+            fill_cache(environment, variants, seeds, batch, runtime, cache, Processes(jobs), finished)
+        elif ray is not None:
+            with RayPool(ray) as pool:
+                fill_cache(environment, variants, seeds, batch, runtime, cache, pool, finished)
         evaluations = evaluate(make, opened, seeds, batch, finished, caches)
     timed = [] if picture is None else time_calls(opened, evaluations[0].rollout.episodes[0].windows, TIMED_CALLS)
     machine = fingerprint()

@@ -36,7 +36,7 @@ from delays_world import Driven, Setup, drive
 from environments.pusht import PushT
 from episodes import Episodes
 from evaluate import Evaluation, summarise
-from jobs import fill_cache
+from jobs import Processes, fill_cache
 from rollout import Rollout, run_episodes
 from variants import cache_option, first_seed_option, open_variant, results_console, run, runtime_option
 
@@ -218,7 +218,7 @@ def main(
         def waited(_: str, count: int) -> None:
             progress.update(waiting, completed=count)
 
-        fill_cache("pusht", [variant], seeds, SEEDS_A_JOB, runtime, cache, jobs, waited)
+        fill_cache("pusht", [variant], seeds, SEEDS_A_JOB, runtime, cache, Processes(jobs), waited)
         kept = Episodes(cache, "pusht", opened, runtime)
         rollout = run_episodes(PushT, opened, seeds, SEEDS_A_JOB, cache=kept)
         driven = drive_all(variant, runtime, setups, seeds, jobs, lambda n: progress.update(going, completed=n))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from bootstrap import Estimate
 from episodes import Episodes
-from jobs import fill_cache
+from jobs import Processes, fill_cache
 from score_plot import Timed, plot_scores, time_calls
 from variants import NoiseShape, Variant, open_variant
 
@@ -67,9 +67,7 @@ def test_processes_fill_the_cache_with_the_episodes_of_one(compiled_pusht, tmp_p
 
     def fill():
         cache = tmp_path / "cache"
-        fill_cache(
-            "pusht", [text], [7, 8], 1, "onnxruntime", cache, 2, lambda label, count: told.append((label, count))
-        )
+        fill_cache("pusht", [text], [7, 8], 1, "onnxruntime", cache, Processes(2), lambda *shown: told.append(shown))
 
     fill()
     assert told == [(text, 0), (text, 1), (text, 2)]

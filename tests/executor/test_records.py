@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 from dataclasses import FrozenInstanceError, fields
 from pathlib import Path
@@ -44,7 +45,7 @@ def test_every_count_has_its_place_in_the_statistics() -> None:
     made = statistics("plan", Recorder(4).copy())
     assert json.loads(json.dumps(made.to_json(), allow_nan=False))["plan"] == "plan"
     for name in names:
-        assert f"        {name}: " in str(ExecutorStatistics.__doc__)
+        assert f"\n    {name}: " in str(inspect.getdoc(ExecutorStatistics))
 
 
 def test_what_a_user_gets_cannot_be_changed() -> None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -43,7 +44,10 @@ PROCESSORS = {
 integers, the first has none, and onnxruntime has other kernels for each."""
 
 # Python's own children run in the emulator as well: they are started by the name of the script that started it.
-CUSTOMIZE = "import os, sys\nsys.executable = sys._base_executable = os.environ['EMULATED_PYTHON']\n"
+CUSTOMIZE = """import os, sys
+if "EMULATED_PYTHON" in os.environ:
+    sys.executable = sys._base_executable = os.environ["EMULATED_PYTHON"]
+"""
 
 
 def main(processors: Sequence[str], options: Sequence[str]) -> int:
@@ -144,8 +148,13 @@ def emulated_python(root: Path, processor: str) -> Path:
     (root / "proc").mkdir(exist_ok=True)
     (root / "proc/cpuinfo").write_text(cores)
     script = root.parent / f"python-{processor}"
-    emulator = f"exec {QEMU} -cpu {processor} -L '{root}' -E EMULATED_PYTHON='{script}' '{root}/usr/bin/{PYTHON}'"
-    script.write_text(f'#!/bin/sh\n{emulator} "$@"\n')
+    return written_script(script, (QEMU, "-cpu", processor, "-L", root), root / "usr" / "bin" / PYTHON)
+
+
+def written_script(script: Path, emulator: Sequence[object], python: Path) -> Path:
+    """A program that starts Python in an emulator; ``CUSTOMIZE`` lets it know by which name."""
+    words = [*emulator, "-E", f"EMULATED_PYTHON={script}", python]
+    script.write_text(f'#!/bin/sh\nexec {shlex.join(map(str, words))} "$@"\n')
     script.chmod(0o755)
     return script
 

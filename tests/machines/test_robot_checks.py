@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from ttscompile.artifact.write import update_calibration
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.measure.machine import cpuinfo
 
-from . import arm, made, robot
+from . import arm, made, matrix, robot
 
 PLANS = ("dense", "uniform")
 
@@ -76,3 +77,27 @@ def test_an_emulated_processor_is_what_its_root_says(tmp_path: Path) -> None:
     told = subprocess.run([script, "-c", "one two"], env={"PATH": str(tmp_path)}, capture_output=True, text=True)
     words = ["-cpu", "cortex-a72", "-L", str(root), "-E", f"EMULATED_PYTHON={script}", f"{root}/usr/bin/python3.11"]
     assert told.stdout.splitlines() == [*words, "-c", "one two"]
+
+
+def test_the_matrix_has_a_row_for_what_is_not_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without pyenv, PATH, and the emulator there is this Python, in an environment, and one core of it."""
+    monkeypatch.setattr(matrix, "environment", lambda version, interpreter: tmp_path / version / "bin" / "python")
+    monkeypatch.setattr(matrix, "PLACE", tmp_path)
+    monkeypatch.setattr(Path, "home", lambda: tmp_path)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(matrix, "PYTHONS", (f"{sys.version_info.major}.{sys.version_info.minor}", "3.99"))
+    here, absent, core, emulated = matrix.rows(tmp_path)
+    assert not here.absent and not core.absent
+    assert core.words[: len(matrix.ONE_CORE)] == matrix.ONE_CORE
+    assert "no python3.99" in absent.absent
+    assert "qemu-user-static" in emulated.absent
+    pyenv = tmp_path / ".pyenv" / "versions"
+    for name in ("3.99.2", "3.99.10"):
+        (pyenv / name / "bin").mkdir(parents=True)
+        (pyenv / name / "bin" / "python").touch()
+    assert matrix.find_python("3.99") == pyenv / "3.99.10" / "bin" / "python"
+
+
+@pytest.mark.parametrize(("program", "told"), [("true", "passed"), ("false", "FAILED")])
+def test_a_row_is_judged_by_its_exit_status(program: str, told: str) -> None:
+    assert matrix.outcome([program]) == told

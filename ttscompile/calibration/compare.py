@@ -33,8 +33,9 @@ from ..runtimes.policy import CompiledPolicy
 from ..runtimes.random_calls import random_noise
 from ..trajectories.episodes import Episode
 from .budget import cells_of, goal_of, with_plans
-from .calls import LARGEST, Split, load_episodes, sample_calls, split_episodes
+from .calls import LARGEST, Calls, Split, load_episodes, sample_calls, split_episodes
 from .execute import Executor
+from .pool import Pool, Work, artifact_elsewhere, opened_pool, place_of
 from .search import plan_of
 from .strategies import strategy_of
 from .targets import dense_rounds, draw_calls
@@ -88,6 +89,7 @@ def compare(
     max_minutes: float = 3.0,
     correct: bool = False,
     progress: Progress = lambda what, done, total: None,
+    ray: str | None = None,
 ) -> Comparison:
     """Measure plans against each other. Nothing is written.
 
@@ -108,8 +110,11 @@ def compare(
         correct: let the plans of strategies that fit no correction take part a second time, with one that is fitted to
             them, where that is better. Their series are called ``STRATEGY, corrected``.
         progress: told how far it is.
+        ray: address of a Ray cluster that answers the dense calls and does the searches, or ``local``, see
+            ``ttscompile.calibrate``; held-out calls are timed in this process. None does everything here.
 
     Raises:
+        ClusterError: the cluster cannot be reached, or is gone.
         CalibrationError: an unknown strategy, a sparsity that nothing reaches, or an artifact of another policy.
         TrajectoryError: the recordings do not fit the policy.
         ArtifactError: an artifact cannot be opened.
@@ -134,26 +139,23 @@ def compare(
     skipped: dict[str, str] = {}
     found: dict[tuple[str, float], Found] = {}
     cut: list[str] = []
+    how = (intervals, 60 * max_minutes, correct)
     if wished:
-        task = _task(artifact, episodes, split, learned, seed, progress)
-    for number, (strategy, sparsity) in enumerate(wished):
-        name = f"{strategy} {sparsity:g}"
-        progress(f"search: {name}", number, len(wished))
-        try:
-            one, short = plan_of(strategy, replace(task, budget=budgets[sparsity]), intervals, 60 * max_minutes)
-        except CalibrationError as error:
-            skipped[name] = str(error)
-        else:
-            found[strategy, sparsity] = one
-            cut += [name] * short
-            if correct and not strategy_of(strategy).fits_correction:
-                series = f"{strategy}, corrected"
-                try:
-                    found[series, sparsity] = task.corrected(one)
-                except CalibrationError as error:
-                    skipped[f"{series} {sparsity:g}"] = str(error)
-    if wished:
-        progress("search", len(wished), len(wished))
+        with opened_pool(ray) as pool:
+            task = _task(artifact, episodes, split, learned, seed, progress, pool)
+            work = Work(
+                partial(_searched, task, how), _searched_elsewhere, (*place_of(artifact), task.calls, seed, how)
+            )
+            outcomes = pool.map(work, [(strategy, budgets[sparsity]) for strategy, sparsity in wished])
+            for number, (strategy, sparsity) in enumerate(wished):
+                progress(f"search: {strategy} {sparsity:g}", number, len(wished))
+                for series, one in next(outcomes).items():
+                    if isinstance(one, str):
+                        skipped[f"{series} {sparsity:g}"] = one
+                    else:
+                        found[series, sparsity], short = one
+                        cut += [f"{series} {sparsity:g}"] * short
+            progress("search", len(wished), len(wished))
     warnings = _warnings(artifact, split, compared)
     if cut:
         told = f"the limit of {max_minutes:g} minutes cut the search short of {', '.join(cut)}: see --max-minutes."
@@ -170,19 +172,59 @@ def compare(
     return Comparison(points, len(chosen), split.validation, threads, yardsticks, skipped, tuple(warnings))
 
 
+Outcome = dict[str, tuple[Found, bool] | str]
+"""By series: what was found and whether the time cut that short, or why there is nothing."""
+
+How = tuple[int | None, float, bool]
+"""Intervals at most, seconds of a search, and whether its plan takes part with a correction too."""
+
+
+def _searched(task: Task, how: How, wish: tuple[str, int]) -> Outcome:
+    """What a strategy, the first of the wish, finds for so many cells."""
+    (strategy, cells), (intervals, seconds, correct) = wish, how
+    try:
+        found, short = plan_of(strategy, replace(task, budget=cells), intervals, seconds)
+    except CalibrationError as error:
+        return {strategy: str(error)}
+    outcome: Outcome = {strategy: (found, short)}
+    if correct and not strategy_of(strategy).fits_correction:
+        try:
+            outcome[f"{strategy}, corrected"] = task.corrected(found), False
+        except CalibrationError as error:
+            outcome[f"{strategy}, corrected"] = str(error)
+    return outcome
+
+
+def _searched_elsewhere(
+    path: str, identity: str, calls: Calls, seed: int, how: How
+) -> Callable[[tuple[str, int]], Outcome]:
+    artifact = artifact_elsewhere(path, identity)
+    return partial(_searched, _of_schedules(Task.of(artifact, Executor(artifact), calls, 0, seed)), how)
+
+
 def _task(
-    artifact: Artifact, episodes: Sequence[Episode], split: Split, limit: int, seed: int, progress: Progress
+    artifact: Artifact,
+    episodes: Sequence[Episode],
+    split: Split,
+    limit: int,
+    seed: int,
+    progress: Progress,
+    pool: Pool,
 ) -> Task:
     """What strategies are given, but for the budget: calls with what the dense policy answers to them."""
     executor = Executor(artifact)
     calls = draw_calls(executor, artifact.manifest.spec, episodes, split, limit, 1, seed)["calibration"]
     progress("dense calls to learn from", 0, calls.count)
     paths: list[torch.Tensor] = []
-    for found in dense_rounds(executor, calls):
+    for found in dense_rounds(executor, calls, pool=pool):
         paths.append(found)
         progress("dense calls to learn from", sum(map(len, paths)), calls.count)
-    # Without constants of a pruner nobody spends time on plans that depend on the observation: schedules are compared.
-    return replace(Task.of(artifact, executor, replace(calls, path=torch.cat(paths)), 0, seed), pruner={})
+    return _of_schedules(Task.of(artifact, executor, replace(calls, path=torch.cat(paths)), 0, seed))
+
+
+def _of_schedules(task: Task) -> Task:
+    """Without constants of a pruner nobody spends time on plans that depend on the observation."""
+    return replace(task, pruner={})
 
 
 def _enter(

@@ -96,7 +96,7 @@ class CrowdedSchedules:
         members = crowded_family(self._whole.steps, full_steps, crowding)
         self._bar.stage(what, len(members))
         for number, steps in enumerate(members):
-            errors = self._errors(steps)
+            errors = self._errors(steps, members[number:])
             if errors is None:
                 break
             if found is None or errors.normalised < found[0].normalised:
@@ -104,14 +104,15 @@ class CrowdedSchedules:
             self._bar.update(number + 1, f"error {found[0].units:.4g}", self._clock.left())
         return None if found is None else Best(found[1], found[0].units)
 
-    def _errors(self, steps: tuple[int, ...]) -> Errors | None:
-        """The errors of a schedule; None if they are not known and there is no time."""
+    def _errors(self, steps: tuple[int, ...], coming: Sequence[tuple[int, ...]]) -> Errors | None:
+        """The errors of a schedule, the first of those that are coming; None if not known and there is no time."""
         known = self._state.progress.setdefault(self.KEY, {})
         key = ",".join(map(str, steps))
         if key not in known:
             # All plans together are judged on fewer calls than one is compared on: that takes no longer.
             if 2 * self._whole.comparing(len(steps)) + self._whole.correcting(len(steps)) > self._clock.left():
                 return None
+            self._whole.expect(coming)
             errors = self._whole.errors(steps)
             known[key] = [errors.normalised, errors.units]
             self._state.progress["seconds"] = self._clock.elapsed()

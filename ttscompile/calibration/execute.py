@@ -39,6 +39,7 @@ class Executor:
             streams and residuals.
 
     Attributes:
+        artifact: the policy.
         correction: of the sampler's steps, for all that is run but ``run_dense``; None for none.
         model: of the policy.
         types: of each block's residual.
@@ -49,6 +50,7 @@ class Executor:
 
     def __init__(self, artifact: Artifact, device: torch.device | None = None) -> None:
         blocks = artifact.manifest.blocks
+        self.artifact = artifact
         self.model = ReferenceModel.from_artifact(artifact, device)
         pieces = artifact.pieces
         read = [graph for graph in (pieces.condition, pieces.step) if graph is not None]

@@ -37,6 +37,7 @@ from .judge import (
     require_success,
     uniform_of,
 )
+from .pool import opened_pool
 from .progress import Bar
 from .pruner.switches import has_head
 from .result import CalibrationResult
@@ -81,6 +82,7 @@ def calibrate(
     correct: bool = False,
     device: str | None = None,
     progress: bool = True,
+    ray: str | None = None,
 ) -> CalibrationResult:
     """Learn which residuals an artifact can reuse, from a few recorded episodes, and write the plans into it.
 
@@ -116,6 +118,9 @@ def calibrate(
             results differ from those of the CPU by rounding. ``latency_ms`` is of onnxruntime, on the CPU.
         max_intervals: an end that does not depend on the machine's speed; None for the strategy's own.
         progress: show a bar on standard error.
+        ray: address of a Ray cluster that answers dense calls and compares candidates, or ``local`` for one of this
+            machine's cores; the outcome is the same. All its machines see the artifact under the same path. None
+            works in this process.
 
     Returns:
         What was achieved.
@@ -127,11 +132,17 @@ def calibrate(
         TrajectoryError: the recordings do not fit the policy.
         ArtifactError: no artifact, one that another process is changing, or it cannot be written.
         RuntimeUnavailableError: torch does not have the device.
+        ClusterError: the cluster cannot be reached, or is gone; what was done before can be resumed.
     """
     begun = time.monotonic()
     seed = integer(seed, "seed", CalibrationError)
     if max_intervals is not None:
         max_intervals = integer(max_intervals, "max_intervals", CalibrationError)
+    if ray is not None and device is not None:
+        raise CalibrationError(
+            f"expected a device or a cluster; found device {device!r} and ray {ray!r}: workers of a cluster compute on"
+            " their processors. Leave one of the two out."
+        )
     there = None if device is None else device_of(device)
     asked = (target_sparsity, target_flops, latency_ms, max_action_error, threads)
     goal_of(*asked)  # what cannot be is refused before anything is read
@@ -140,7 +151,8 @@ def calibrate(
         raise CalibrationError(
             f"{path}: only a directory can be calibrated. Unzip the artifact and give the directory."
         )
-    with locked(Path(path)):  # all the while: a second calibration would undo the first
+    # All the while: a second calibration would undo the first.
+    with locked(Path(path)), opened_pool(ray) as pool:
         artifact = load_artifact(Path(path))
         goal = goal_of(*asked, usual=usual_sparsity(artifact.manifest.steps))
         spec, chosen = artifact.manifest.spec, strategy_of(strategy)
@@ -178,7 +190,7 @@ def calibrate(
                 bar.warn(warning)
             least = {"calibration": fewest, "validation": limit}
             sets = {
-                name: with_targets(executor, name, calls, least[name], state, clock, bar)
+                name: with_targets(executor, name, calls, least[name], state, clock, bar, pool)
                 for name, calls in sets.items()
             }
             if clock.left() < 0:
@@ -186,7 +198,7 @@ def calibrate(
                     f"{max_minutes:g} minutes were over when the dense policy had answered the calls to learn from:"
                     f" strategy {strategy!r} needs {fewest}. Its search is the shortest there is; allow more time."
                 )
-            task = Task.of(artifact, executor, sets["calibration"], 0, seed)
+            task = Task.of(artifact, executor, sets["calibration"], 0, seed, pool)
             crowded = CrowdedSchedules(task.whole, state, clock, bar)
             if budget is None:
                 budget = budget_of_error(crowded, goal, artifact.manifest.steps, len(artifact.manifest.blocks))

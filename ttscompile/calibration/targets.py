@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +12,7 @@ from ..core.spec import PolicySpec
 from ..trajectories.episodes import Episode
 from .calls import Calls, Split, prepare_calls, sample_calls
 from .execute import Executor, workers
+from .pool import Here, Pool, Work, artifact_elsewhere, place_of
 from .progress import Bar
 from .state import StateFile
 from .task import Clock
@@ -27,7 +28,14 @@ TARGETS_AT_ONCE = 16
 
 
 def with_targets(
-    executor: Executor, name: str, calls: Calls, least: int, state: StateFile, clock: Clock, bar: Bar
+    executor: Executor,
+    name: str,
+    calls: Calls,
+    least: int,
+    state: StateFile,
+    clock: Clock,
+    bar: Bar,
+    pool: Pool | None = None,
 ) -> Calls:
     """The calls with what the dense policy answers to them; the first of them where the time does not do for all.
 
@@ -40,7 +48,7 @@ def with_targets(
         with state.reading():
             path = torch.cat([path, torch.from_numpy(known)])
     bar.stage(f"dense, {name}", calls.count, len(path))
-    rounds, key = dense_rounds(executor, calls, len(path)), f"{name} targets"
+    rounds, key = dense_rounds(executor, calls, len(path), pool), f"{name} targets"
     # A calibration that was interrupted later goes on with as many as it had then.
     count = min(calls.count, int(state.progress.get(key, calls.count)))
     while len(path) < count and (len(path) < least or clock.elapsed() < SHARE * clock.limit):
@@ -55,20 +63,31 @@ def with_targets(
     return replace(calls, path=path)
 
 
-def dense_rounds(executor: Executor, calls: Calls, begin: int = 0) -> Iterator[torch.Tensor]:
+def dense_rounds(executor: Executor, calls: Calls, begin: int = 0, pool: Pool | None = None) -> Iterator[torch.Tensor]:
     """What the dense policy answers to calls, from number ``begin`` on, a round of all workers at a time.
 
     Yields:
         Paths ``[n, K, T, D]``, in order.
     """
-    at_once = torch.get_num_threads() * TARGETS_AT_ONCE
+    pool = pool or Here()
+    at_once = max(pool.count, torch.get_num_threads()) * TARGETS_AT_ONCE
+    work = Work(executor.run_dense, _dense_elsewhere, place_of(executor.artifact), threads=True)
     while begin < calls.count:
         end = min(begin + at_once, calls.count)
         parts = [np.arange(i, min(i + TARGETS_AT_ONCE, end)) for i in range(begin, end, TARGETS_AT_ONCE)]
-        with workers() as pool:
-            found = list(pool.map(lambda part: executor.run_dense(executor.select(calls, part)), parts))
+        found = list(pool.map(work, [executor.select(calls, part) for part in parts]))
         begin = end
         yield torch.cat(found)
+
+
+def _dense_elsewhere(path: str, identity: str) -> Callable[[Calls], torch.Tensor]:
+    executor = Executor(artifact_elsewhere(path, identity))
+
+    def answer(calls: Calls) -> torch.Tensor:
+        with workers() as threads:  # one thread does a part, as here
+            return threads.submit(executor.run_dense, calls).result()
+
+    return answer
 
 
 def draw_calls(

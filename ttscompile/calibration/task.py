@@ -18,6 +18,7 @@ from ..core.lattice import PlanArray, Source
 from ..errors import CalibrationError
 from .calls import Actions, Calls
 from .execute import Executor
+from .pool import Pool
 from .whole_steps import WholeSteps
 
 Array = npt.NDArray[Any]
@@ -118,10 +119,12 @@ class Task:
     clock: Clock = field(default_factory=Clock)
 
     @classmethod
-    def of(cls, artifact: Artifact, executor: Executor, calls: Calls, budget: int, seed: int) -> Task:
-        """The task of finding a plan for an artifact."""
+    def of(
+        cls, artifact: Artifact, executor: Executor, calls: Calls, budget: int, seed: int, pool: Pool | None = None
+    ) -> Task:
+        """The task of finding a plan for an artifact; schedules of whole steps are compared in the pool."""
         actions, kinds = Actions(artifact.manifest.spec), tuple(block.kind for block in artifact.manifest.blocks)
-        whole = WholeSteps(executor, actions, calls, seed)
+        whole = WholeSteps(executor, actions, calls, seed, pool)
         return cls(executor, actions, calls, budget, seed, artifact.pruner, kinds, whole)
 
     def draw(self, *stage: int) -> np.random.Generator:

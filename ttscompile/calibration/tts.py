@@ -75,10 +75,12 @@ class Tts:
             self._adaptation.advance()
             return
         if interval < len(self._crowded):
+            self._whole.expect(self._crowded[interval:])
             self._try([self._crowded[interval]])
         else:
-            distance, i = self._moves[interval - len(self._crowded)]
-            self._try([self._moved(i, offset) for offset in (-distance, distance)])
+            moves = self._moves[interval - len(self._crowded) :]
+            self._whole.expect(steps for move in moves for steps in self._candidates(*move))  # if none of them helps
+            self._try(self._candidates(*moves[0]))
         if interval + 1 >= len(self._crowded) + len(self._moves):
             self.close()
 
@@ -103,11 +105,13 @@ class Tts:
         notes = {**self._settled.notes, "switches": self._adaptation.switches}
         return replace(self._settled, notes=notes, pruner=self._adaptation.pruner)
 
-    def _try(self, candidates: list[tuple[int, ...] | None]) -> None:
+    def _candidates(self, distance: int, i: int) -> list[tuple[int, ...]]:
+        """The schedules with the i-th step moved in either direction, where it can be."""
+        return [steps for offset in (-distance, distance) if (steps := self._moved(i, offset)) is not None]
+
+    def _try(self, candidates: list[tuple[int, ...]]) -> None:
         """Take the best of the candidates if it is better than the schedule so far."""
         for steps in candidates:
-            if steps is None:
-                continue
             error = self._whole.errors(steps).normalised
             if not error >= self.loss:  # the first one beats NaN
                 self._steps, self.loss = steps, error

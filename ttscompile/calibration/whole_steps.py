@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from ..core.lattice import BoolArray, PlanArray, whole_steps_plan
 from .calls import Actions, Calls, IntArray
 from .execute import Executor
 from .fit_correction import anchors_of, fit_correction
+from .pool import Here, Pool, Work, artifact_elsewhere, place_of
 
 FITTED, COMPARED = 384, 128
 """Calls on which a candidate's correction is fitted, and others on which its error is measured; fewer if there are
@@ -41,14 +43,18 @@ class WholeSteps:
         calls: with what the dense policy answers to them.
         seed: decides which of the calls corrections are fitted on, and which, of other episodes, schedules are compared
             on.
+        pool: where candidates are compared; None for this process.
     """
 
     _pace = 0.0
     """Seconds that a comparison took, for each step that its schedule computes; the most so far."""
 
-    def __init__(self, executor: Executor, actions: Actions, calls: Calls, seed: int) -> None:
+    def __init__(self, executor: Executor, actions: Actions, calls: Calls, seed: int, pool: Pool | None = None) -> None:
         self._executor, self._actions, self._calls = executor, actions, calls
         self._reading: dict[int, bool] = {}
+        self._known: dict[tuple[int, ...], Errors] = {}
+        self._pool = pool or Here()
+        self._work = Work(self.measured, _measured_elsewhere, (*place_of(executor.artifact), calls, seed))
         order = np.random.default_rng((seed, 3, 0)).permutation(calls.count)
         apart = _set_apart(calls.episodes[order])
         self._compared = self._fitted = executor.select(calls, order[apart][:COMPARED])
@@ -69,7 +75,24 @@ class WholeSteps:
 
         Or without one where that is better: fitted on too few calls, a correction does harm.
         """
-        return min(self._with_and_without(self.plan(steps)), key=lambda errors: errors.normalised)
+        self.expect([tuple(steps)])
+        return self._known[tuple(steps)]
+
+    def expect(self, schedules: Iterable[tuple[int, ...]]) -> None:
+        """Compare the first of these schedules now, and those after it that the pool has room for; unless it is known.
+
+        ``errors`` then knows them. What is not asked for after all was computed in vain, and changes nothing.
+        """
+        coming = list(islice(schedules, self._pool.count))
+        if not coming or coming[0] in self._known:
+            return
+        coming = [steps for steps in dict.fromkeys(coming) if steps not in self._known]
+        for steps, (errors, pace) in zip(coming, self._pool.map(self._work, coming), strict=True):
+            self._known[steps], self._pace = errors, max(self._pace, pace)
+
+    def measured(self, steps: Sequence[int]) -> tuple[Errors, float]:
+        """The errors of a schedule, and ``_pace``: what is done for a candidate, wherever that is."""
+        return min(self._with_and_without(self.plan(steps)), key=lambda errors: errors.normalised), self._pace
 
     def correction(self, steps: Sequence[int]) -> Correction | None:
         """The correction of a schedule, fitted on all calls; None where the schedule is better without."""
@@ -127,6 +150,13 @@ class WholeSteps:
         samples = self._executor.corrected(correction).run(plan, calls)
         normalised, units = (self._actions.errors(samples, calls.targets, units=u).mean() for u in (False, True))
         return Errors(float(normalised), float(units))
+
+
+def _measured_elsewhere(
+    path: str, identity: str, calls: Calls, seed: int
+) -> Callable[[Sequence[int]], tuple[Errors, float]]:
+    artifact = artifact_elsewhere(path, identity)
+    return WholeSteps(Executor(artifact), Actions(artifact.manifest.spec), calls, seed).measured
 
 
 def _full_steps(plan: PlanArray) -> int:

@@ -10,7 +10,7 @@ import click
 import ttscompile
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.strategies import DEFAULT, NAMES, STRATEGIES
-from ttscompile.cli.options import artifact_argument, json_option, seed_option, threads_option
+from ttscompile.cli.options import artifact_argument, json_option, ray_option, seed_option, threads_option
 from ttscompile.cli.output import manifest_of, only_results_on_stdout, print_json, results
 from ttscompile.cli.recordings import FilesCommand, Sources, require_recordings, trajectories_options
 from ttscompile.cli.summary import print_summary
@@ -69,6 +69,7 @@ from ttscompile.report.summary import document
     help="Device that the calls to learn from compute on, as torch calls it: cuda, mps. Without this option the CPU.",
 )
 @click.option("--resume", is_flag=True, help="Go on where a calibration that was interrupted stopped.")
+@ray_option
 @json_option
 def calibrate(
     directory: Path,

@@ -13,6 +13,7 @@ from ttscompile.cli.options import (
     count_option,
     json_option,
     names_option,
+    ray_option,
     seed_option,
     threads_option,
 )
@@ -99,6 +100,7 @@ def _sparsities(_: click.Context, __: click.Parameter, value: str | None) -> tup
 )
 @count_option("--intervals", "Of each search, at most; for a quick look.", default=None)
 @seed_option("Of the split, the noise and the searches.")
+@ray_option
 @click.option("--plot", "picture", type=PICTURE, help="Draw into this file (.png, .svg, .pdf).")
 @json_option
 def compare(

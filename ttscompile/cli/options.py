@@ -71,6 +71,14 @@ def seed_option(help: str, default: int | None = 0) -> Decorator:
     return count_option("--seed", help, default=default, least=0, most=MOST_SEED)
 
 
+ray_option = click.option(
+    "--ray",
+    type=ANY_TEXT,
+    metavar="ADDRESS|local",
+    help="Work on the machines of this Ray cluster, or of one with this machine's cores; the outcome is the same.",
+)
+
+
 def names_option(name: str, known: Sequence[str], *, default: str, help: str) -> Decorator:
     """An option that takes known names with commas between, as ``tuple[str, ...]`` without repetitions."""
 
