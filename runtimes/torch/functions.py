@@ -152,8 +152,6 @@ class _Writer:
         called, reads = f"f{name[1:]}", list[str]()
         self._scope[called] = function
         texts = [self._text(node, argument, reads) for argument in node.args]
-        if bad := [key for key, _ in node.kwargs if not key.isidentifier()]:
-            raise CaptureError(f"node {node} has arguments called {bad}, which no operation has.")
         texts += [f"{key}={self._text(node, argument, reads)}" for key, argument in node.kwargs]
         self._lines.append(_Line(name, f"{called}({', '.join(texts)})", tuple(reads)))
         if isinstance(value, Tensor) and value.numel() and not self._is_foreign(node, value):
@@ -186,7 +184,7 @@ class _Writer:
         source = (
             f"def function({', '.join(self._parameters)}):\n{body}    return ({''.join(f'{r}, ' for r in results)})"
         )
-        # Names made here, and those of arguments: nothing else of the artifact is in the source.
+        # Names made here, and those of arguments that the operation has taken: nothing else of an artifact.
         exec(compile(source, "<function of a graph>", "exec"), self._scope)  # noqa: S102
         made: Function = self._scope["function"]
         return made

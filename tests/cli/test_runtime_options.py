@@ -22,6 +22,7 @@ def test_bench_times_torch_beside_the_same_plan_in_onnxruntime(toy_compiled: Pat
     assert result.exit_code == 0, result.stderr
     told = json.loads(result.stdout)
     assert (told["runtime"], told["device"]) == ("torch", "cpu")
+    assert 0 < told["precision_error"]["mean"] < 0.1
     contestants = [(each["label"], each["plan"]) for each in told["contestants"]]
     assert contestants == [("compiled, torch on cpu, bf16", "dense"), ("onnxruntime", "dense")]
 

@@ -36,11 +36,9 @@ from .toys import B, f32, node, toy_program
 
 VARIANTS = [
     {},
-    {"sequence_first": True},
     {"noise": 0.0, "steps": 8},
     {"steps": 1},
     {"blocks": 1},
-    {"normed": True},
     {"normed": True, "sequence_first": True},
 ]
 
@@ -308,6 +306,18 @@ def test_a_graph_that_cannot_be_written_is_refused(change: dict[str, object], me
     one = replace(node("y", "tanh.default", f32(B, 4), Ref("x")), **change)
     with pytest.raises(CaptureError, match=message):
         write_function(Graph({"x": f32(B, 4)}, {}, (one,), ("y",)), {}, [torch.zeros(1, 4)], 1, None)
+
+
+def test_nothing_of_an_artifact_gets_into_the_source_of_a_function() -> None:
+    """Names of arguments are the only text of a graph that a function holds, and operations take none but their own."""
+    wrong = "alpha=print('executed'), beta"
+    bad = replace(node("y", "add.Tensor", f32(B, 4), Ref("x"), Ref("x")), kwargs=((wrong, 1),))
+    with pytest.raises((TypeError, RuntimeError), match="print"):
+        write_function(Graph({"x": f32(B, 4)}, {}, (bad,), ("y",)), {}, [torch.zeros(1, 4)], 1, None)
+    odd = replace(node("y'; print()", "tanh.default", f32(B, 4), Ref("x); print(")), kwargs=())
+    graph = Graph({"x); print(": f32(B, 4)}, {}, (odd,), ("y'; print()",))
+    x = torch.ones(1, 4)
+    assert torch.equal(write_function(graph, {}, [x], 1, None)(x)[0], x.tanh())
 
 
 @pytest.mark.parametrize("variant", [{}, {"normed": True, "sequence_first": True}], ids=str)

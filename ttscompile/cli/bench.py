@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 
 import click
@@ -19,9 +20,11 @@ from ttscompile.cli.options import (
 from ttscompile.cli.output import print_identity, print_json, progress, results, say, table
 from ttscompile.cli.timing import Compiled, Measurement, contestants, measure
 from ttscompile.cli.types import PATH, TEXT
+from ttscompile.core.spec import FP32
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.units import ms, share
-from ttscompile.runtimes.open import CPU
+from ttscompile.runtimes.open import CPU, open_runtime
+from ttscompile.verification.against_fp32 import measure_precision
 
 RIVALS = ("original", "eager", "onnxruntime-dense", "onnxruntime")
 """The checkpoint with the sampler it was saved with; with the artifact's; the artifact computed in full; and the same
@@ -79,9 +82,14 @@ def bench(
         say(console, f"warning: {directory} runs dense: it is not calibrated, or --plan dense was given.")
     with console.status("timing") as status:
         measured = measure(entered, runs, seed, lambda done, total: status.update(f"timing: round {done} of {total}"))
+    error = None
+    if runtime == "torch" and precision not in (None, FP32):
+        with console.status(f"comparing actions in {precision} and {FP32}"):
+            pair = (open_runtime(artifact, runtime, threads, device, each) for each in (precision, FP32))
+            error = measure_precision(artifact, (next(pair), next(pair)))
     if as_json:
         of = {"identity": identity, "machine": fingerprint(), "threads": threads, "runs": runs, "runtime": runtime}
-        of |= {"device": device or CPU}
+        of |= {"device": device or CPU, "precision_error": error and asdict(error)}
         print_json(of | {"contestants": [m.to_json() for m in measured]})
         return
     output, head = results(), ("", "ms a call", "quartiles", "calls/s", "speed-up", "GFLOP", "reused")
@@ -91,6 +99,12 @@ def bench(
         f"Medians of {runs} calls, one stream, {threads} thread{'s' * (threads > 1)}; plan {entered[0].plan!r}."
         " Speed-up: how many times faster the first row is. Prologue and pruner: their ms of the call.",
     )
+    if error is not None:
+        say(
+            output,
+            f"Actions of {error.calls} dense calls in {precision} are {error.mean:.4g} off those in {FP32} on average,"
+            f" {error.p90:.4g} at the 90th percentile, {error.largest:.4g} at most, in their units.",
+        )
     print_identity(identity, output)
     say(output, one_line(fingerprint()))
 

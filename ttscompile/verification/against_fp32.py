@@ -14,6 +14,7 @@ from ..core.spec import FP32, ChunkSpec, FloatArray, Noise
 from ..errors import ObservationError
 from ..runtimes.open import open_runtime
 from ..runtimes.random_calls import normalized, random_calls
+from ..runtimes.runtime import Runtime
 
 CALLS = 8
 """Random observations that a precision is measured on. On Push-T at K = 100 that takes some seconds."""
@@ -25,17 +26,22 @@ MARGIN = 4.0
 """Tolerance over the largest difference that was measured."""
 
 Call = tuple[Mapping[str, FloatArray], Noise]
+Pair = tuple[Runtime, Runtime]
 
 
-def measure_precision(artifact: Artifact) -> PrecisionError:
+def measure_precision(artifact: Artifact, runtimes: Pair | None = None) -> PrecisionError:
     """Dense calls in the artifact's precision against dense calls in fp32, on random observations, with equal noise.
 
     Observations are as ``ObservationSpec.draw`` makes them. Figures are rounded to four digits, so that they rarely
     depend on the processor.
+
+    Args:
+        artifact: with blocks of another precision.
+        runtimes: one in the precision in question and one in fp32; None for the artifact's in onnxruntime.
     """
     spec = artifact.manifest.spec
     calls = [(normalized(spec, obs), noise) for obs, noise in random_calls(spec, CALLS, SEED)]
-    differences = compare(artifact, artifact.schedule(DENSE), calls)
+    differences = compare(artifact, artifact.schedule(DENSE), calls, runtimes=runtimes)
     errors = np.array([action_errors(spec.chunk, one, other) for one, other in differences])
     shares = [float(np.abs(one - other).max() / np.abs(other).max()) for one, other in differences]
     p90 = np.quantile(errors.mean(axis=1), 0.9)
@@ -43,7 +49,11 @@ def measure_precision(artifact: Artifact) -> PrecisionError:
 
 
 def compare(
-    artifact: Artifact, plan: npt.NDArray[np.int8], calls: Iterable[Call], correction: Correction | None = None
+    artifact: Artifact,
+    plan: npt.NDArray[np.int8],
+    calls: Iterable[Call],
+    correction: Correction | None = None,
+    runtimes: Pair | None = None,
 ) -> list[tuple[FloatArray, FloatArray]]:
     """Denoised samples ``[T, D]`` of each call in the artifact's precision, and in fp32.
 
@@ -54,11 +64,12 @@ def compare(
         plan: ``[K, blocks]``, without reads of earlier calls.
         calls: normalised observation and noise of one stream each.
         correction: of the plan.
+        runtimes: see ``measure_precision``.
 
     Raises:
         ObservationError: an action is not a number.
     """
-    runtimes = open_runtime(artifact), open_runtime(artifact.at_precision(FP32))
+    runtimes = runtimes or (open_runtime(artifact), open_runtime(artifact.at_precision(FP32)))
     pairs = []
     for obs, noise in calls:
         samples = []
