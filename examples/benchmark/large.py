@@ -134,6 +134,7 @@ def run_smolvla(folder: Path, rounds: int = 5, precisions: tuple[str, ...] = ("f
         total = statistics.median(sum(row) for row in rows[1:])
         print(f"{total:8.2f} s  {name}: {', '.join(f'{each:.2f}' for each in medians)}")
     print(f"{error:8.1e}  the dense call from eager; {peak():.2f} GiB at most, all of them loaded")
+    print("prologue:", large_smolvla.integer_prologue(folder / "compiled"))
 
 
 def run(folder: Path) -> None:
