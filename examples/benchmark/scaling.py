@@ -5,7 +5,8 @@
 
 It answers dense calls with observations that are drawn, and compares the schedules of one crowded family, each with a
 correction of its own. Every number of cores takes its turn in every round; what counts is the ratio of the medians.
-Ray's own start is not counted. The answers must be the same bits, or this ends with status 1.
+The start of Ray and
+of its processes is not counted; that each opens the artifact is. The answers must be the same bits, or this ends with status 1.
 """
 
 from __future__ import annotations
@@ -53,6 +54,7 @@ def main(directory: Path, cores: str, calls: int, full_steps: int, rounds: int) 
     for _ in range(rounds):
         for count in counts:
             with RayPool("local", cores=count) as pool:
+                list(dense_rounds(executor, drawn, pool=pool))  # starts the processes, which import torch
                 begun = time.perf_counter()
                 path = torch.cat(list(dense_rounds(executor, drawn, pool=pool)))
                 dense = time.perf_counter()

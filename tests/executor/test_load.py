@@ -117,7 +117,7 @@ def test_the_time_of_day_is_not_looked_at(monkeypatch: pytest.MonkeyPatch) -> No
 
     monkeypatch.setattr(time, "time", fail)
     policy = ScriptedPolicy(FakeClock(), latency={"dense": 0.0})
-    with AsyncExecutor(policy, 100, ExecutorSettings(max_hold=1000)) as executor:
+    with AsyncExecutor(policy, 100, ExecutorSettings(max_hold=1000, max_age=REAL_LIMIT)) as executor:
         now = executor.now()
         for ago in (0.01, 0.0):
             executor.observe({"obs": np.zeros(2)}, now - ago)
