@@ -5,8 +5,8 @@
 
 It answers dense calls with observations that are drawn, and compares the schedules of one crowded family, each with a
 correction of its own. Every number of cores takes its turn in every round; what counts is the ratio of the medians.
-The start of Ray and
-of its processes is not counted; that each opens the artifact is. The answers must be the same bits, or this ends with status 1.
+The start of Ray and of its processes is not counted; that each opens the artifact is. The answers must be the same
+bits, or this ends with status 1.
 """
 
 from __future__ import annotations
