@@ -48,7 +48,7 @@ from .passes.split_features import SplitFeatures
 from .passes.split_tokens import SplitTokens
 from .passes.unfold_batch import UnfoldBatch
 from .passes.widen_attention import WidenAttention
-from .verification.against_fp32 import measure_precision
+from .runtimes.against_fp32 import measure_precision
 from .verification.record_golden import record_original
 
 if TYPE_CHECKING:

@@ -14,10 +14,9 @@ from tests.once import Once
 from ttscompile import Noise, TtscompileError
 from ttscompile.artifact import load_artifact
 from ttscompile.errors import ArtifactError, RuntimeUnavailableError
-from ttscompile.runtimes import open_runtime
+from ttscompile.runtimes import against_fp32, open_runtime
 from ttscompile.runtimes.onnxruntime import sessions
 from ttscompile.runtimes.random_calls import random_calls
-from ttscompile.verification import against_fp32
 
 from .agreement import largest_difference, random_inputs
 

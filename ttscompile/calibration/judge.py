@@ -14,10 +14,10 @@ from ..artifact.manifest import DENSE, UNIFORM, Manifest
 from ..core.lattice import PlanArray, uniform_plan
 from ..errors import CalibrationFailedError
 from ..ir.pieces import PRUNER
+from ..runtimes.against_fp32 import action_errors, compare
 from ..runtimes.random_calls import normalized, random_noise
 from ..runtimes.settle import pruner_plan
 from ..trajectories.episodes import Episode
-from ..verification.against_fp32 import action_errors, compare
 from .budget import ERROR, FLOPS, Goal
 from .calls import LARGEST, Actions, Calls, FloatArray, draw_noise, sample_calls
 from .execute import Executor

@@ -23,8 +23,8 @@ from ttscompile.cli.types import PATH, TEXT
 from ttscompile.core.spec import FP32
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.units import ms, share
+from ttscompile.runtimes.against_fp32 import measure_precision
 from ttscompile.runtimes.open import CPU, open_runtime
-from ttscompile.verification.against_fp32 import measure_precision
 
 RIVALS = ("original", "eager", "onnxruntime-dense", "onnxruntime")
 """The checkpoint with the sampler it was saved with; with the artifact's; the artifact computed in full; and the same

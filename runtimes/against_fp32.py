@@ -7,14 +7,15 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 import numpy.typing as npt
 
-from ..artifact.load import Artifact
-from ..artifact.manifest import DENSE, PrecisionError
-from ..core.correction import Correction
-from ..core.spec import FP32, ChunkSpec, FloatArray, Noise
-from ..errors import ObservationError
-from ..runtimes.open import open_runtime
-from ..runtimes.random_calls import normalized, random_calls
-from ..runtimes.runtime import Runtime
+from ttscompile.artifact.load import Artifact
+from ttscompile.artifact.manifest import DENSE, PrecisionError
+from ttscompile.core.correction import Correction
+from ttscompile.core.spec import FP32, ChunkSpec, FloatArray, Noise
+from ttscompile.errors import ObservationError
+
+from .open import open_runtime
+from .random_calls import normalized, random_calls
+from .runtime import Runtime
 
 CALLS = 8
 """Random observations that a precision is measured on. On Push-T at K = 100 that takes some seconds."""
