@@ -84,7 +84,8 @@ def denoise(
                 state = advance(state, network.idle.predict(known, state.sample), step, offset[step])
             k += count
             continue
-        stream, reached = network.stem(state.sample.permute(1, 2, 0), k), 0
+        first = stream = network.stem(state.sample.permute(1, 2, 0), k)
+        reached, lane.whole = 0, None if plan.counts[k] else lane.whole
         for cell in islice(cells, plan.counts[k]):
             b = cell - k * blocks
             if b != reached:
@@ -95,6 +96,8 @@ def denoise(
                 residuals[cell] = residual
         if reached != blocks:
             stream = stream + lane.total()
+        if plan.counts[k] == blocks:
+            lane.whole = stream - first
         prediction = network.tail(stream, k).permute(2, 0, 1)
         state = advance(state, prediction, k, offset[k])
         k += 1
@@ -106,11 +109,13 @@ class _Lane:
 
     Attributes:
         current: what each block computed last.
+        whole: the sum of all of these, where one step computed them; None where it is not known.
     """
 
     def __init__(self, plan: Instructions, blocks: int, rollout: Mapping[int, Tensor]) -> None:
         nothing = torch.zeros(0)  # step 0 computes all blocks before anything is read
         self.current, self._table = [nothing] * blocks, [nothing] * blocks
+        self.whole: Tensor | None = None
         self._summed = self._table if plan.table else self.current
         self._sums = [nothing] * plan.slots
         self._gaps, self._loads = iter(plan.gaps), zip(plan.load_rows, plan.load_from, strict=True)
@@ -125,5 +130,7 @@ class _Lane:
             for row, source in islice(self._loads, loads):
                 self._table[row] = self.current[~source] if source < 0 else self._rollout[source]
             several = self._summed[start:stop]
+            if self.whole is not None and len(several) == len(self.current) and self._summed is self.current:
+                several = [self.whole]
             self._sums[slot] = torch.stack(several).sum(0) if len(several) > 1 else several[0]
         return self._sums[slot]
