@@ -5,25 +5,19 @@ from __future__ import annotations
 import threading
 import weakref
 from collections.abc import Mapping
-from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.artifact.load import Artifact, load_artifact
+from ttscompile.artifact.load import Artifact
 from ttscompile.artifact.manifest import DENSE
-from ttscompile.core.paths import on_hub
-from ttscompile.core.spec import FP32, FloatArray, Noise
+from ttscompile.core.spec import FloatArray, Noise
 from ttscompile.errors import (
-    ArtifactChangedError,
     IllegalPlanError,
     NonFiniteActionsError,
-    RuntimeUnavailableError,
     TtscompileError,
 )
-from ttscompile.hub import fetch_artifact
 from ttscompile.measure.process import LONGEST_WAIT, Process
 
 from .arrays import Array, check_observation, check_seed, like, read_observation
@@ -31,106 +25,9 @@ from .info import BlockInfo, PolicyInfo
 from .inpainting import check_prefix, prefix_refusal
 from .instruct import Instruct
 from .liveness import rollout_needs
-from .open import kind_of, open_runtime
 from .queues import Queues, is_window
 from .report import CallReport
 from .runtime import Runtime
-
-TRIES = 3
-"""Times that ``load`` begins before it gives up on an artifact that is replaced while it is loaded."""
-
-
-def load(
-    path: str | Path,
-    runtime: str = "onnxruntime",
-    threads: int = 1,
-    seed: int | None = None,
-    *,
-    precision: str | None = None,
-    plan: str | None = None,
-    device: str | None = None,
-    tokenizer: str | Path | None = None,
-) -> CompiledPolicy:
-    """Load a compiled policy.
-
-    Args:
-        path: the directory that ``convert`` wrote, or the same zipped; or ``hf://org/name[@revision][/folder]``, which
-            ``huggingface_hub`` downloads, once. Give a commit as the revision, and it is the same artifact for ever.
-        runtime: ``onnxruntime``; ``torch``, which needs torch and computes on any device that it has; or ``reference``,
-            which is slow and needs torch.
-        threads: threads of arithmetic, of this policy alone. 1 computes on the caller's thread and makes none. With
-            more, ``threads - 1`` of them look for work for 50 us after each block, and then sleep: a loaded policy that
-            is not called takes no processor time.
-        seed: of the noise that is drawn when none is given; None for another sequence every time.
-        precision: of the residual blocks. ``fp32`` is what every artifact holds; None for what it was converted with.
-            Torch computes the products of the blocks in ``fp32``, which is what None means there, ``bf16`` or
-            ``fp16``; the reference in fp32 alone.
-        plan: that ``predict_action`` uses when it is given none: ``dense`` or the name of a plan of the artifact; None
-            for the artifact's default.
-        device: where torch computes: ``cpu``, ``cuda``, ``cuda:1``, ``mps``. None for the CPU.
-        tokenizer: ``tokenizer.json`` of the policy's language model, or its folder: observations may then have the text
-            ``task`` in place of tokens. Needs the package tokenizers. None: the caller gives tokens.
-
-    Raises:
-        IllegalPlanError: the artifact has no plan of this name.
-        ObservationError: the tokenizer cannot be had, or the policy has no use for it.
-        ArtifactChangedError: the artifact was replaced while it was loaded, and again whenever it was tried again.
-        ArtifactError: the artifact is missing, damaged, of another version, or without blocks of this precision.
-        RuntimeUnavailableError: the runtime, or ``huggingface_hub``, cannot be had on this machine.
-        HubError: the repository cannot be had, or holds no artifact.
-        TtscompileError: the seed is no whole number of at least 0.
-    """
-    seed = check_seed(seed)
-    origin = None
-    if on_hub(path):
-        fetched = fetch_artifact(str(path))
-        path, origin = fetched.path, fetched.origin
-    for _ in range(TRIES - 1):
-        with suppress(ArtifactChangedError):
-            return _load(path, runtime, threads, seed, precision, plan, device, tokenizer, origin)
-    return _load(path, runtime, threads, seed, precision, plan, device, tokenizer, origin)
-
-
-def _load(
-    path: str | Path,
-    runtime: str,
-    threads: int,
-    seed: int | None,
-    precision: str | None,
-    plan: str | None,
-    device: str | None,
-    tokenizer: str | Path | None,
-    origin: str | None,
-) -> CompiledPolicy:
-    return open_policy(load_artifact(path), runtime, threads, seed, precision, plan, device, tokenizer, origin)
-
-
-def open_policy(
-    artifact: Artifact,
-    runtime: str = "onnxruntime",
-    threads: int = 1,
-    seed: int | None = None,
-    precision: str | None = None,
-    plan: str | None = None,
-    device: str | None = None,
-    tokenizer: str | Path | None = None,
-    origin: str | None = None,
-) -> CompiledPolicy:
-    """The policy of an artifact that is loaded; see ``load`` and ``CompiledPolicy``."""
-    made, own = kind_of(runtime).precisions, FP32
-    if made:
-        if precision is not None and precision not in made:
-            those = ", ".join(map(repr, made))
-            problem = f"runtime {runtime!r} computes in {those} alone; found precision {precision!r}"
-            raise RuntimeUnavailableError(f"{problem}. Leave it out.")
-        own, precision = precision or FP32, FP32
-    if precision is not None:
-        artifact = artifact.at_precision(precision)
-    if plan is not None:
-        _require_plan(artifact, plan)  # before the sessions are opened
-    opened = open_runtime(artifact, runtime, threads, device, own)
-    instruct = None if tokenizer is None else Instruct(artifact.manifest.spec, tokenizer)
-    return CompiledPolicy(artifact, opened, seed, plan, own if made else None, origin, instruct)
 
 
 class CompiledPolicy:
@@ -167,7 +64,7 @@ class CompiledPolicy:
         self._precision = precision or artifact.manifest.precision_name
         self._manifest = artifact.manifest
         self._default = artifact.manifest.default_plan if plan is None else plan
-        _require_plan(artifact, self._default)
+        require_plan(artifact, self._default)
         self._prefix_refusal = prefix_refusal(artifact.manifest.spec)
         self._rng = np.random.default_rng(check_seed(seed))
         self._report: CallReport | None = None
@@ -394,7 +291,7 @@ class CompiledPolicy:
             return plan, None, False
         if plan == DENSE:
             return self._artifact.schedule(DENSE), DENSE, False
-        _require_plan(self._artifact, plan)
+        require_plan(self._artifact, plan)
         return (None if self._manifest.plans[plan].pruned else self._artifact.schedule(plan)), plan, True
 
     def _turn(self) -> threading.Lock:
@@ -426,7 +323,7 @@ def _end_calls(lock: threading.Lock, process: Process) -> None:
         lock.acquire(timeout=LONGEST_WAIT)
 
 
-def _require_plan(artifact: Artifact, name: str) -> None:
+def require_plan(artifact: Artifact, name: str) -> None:
     """Raise unless the artifact has a plan of this name."""
     known = [DENSE, *artifact.manifest.plans]
     if not isinstance(name, str):

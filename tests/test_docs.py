@@ -23,6 +23,7 @@ import zarr
 from click.testing import CliRunner
 
 from tests.calibration import policies, tasks
+from tests.commands_of_docs import NOT_RUN, SHORTER
 from tests.once import Once
 from tests.passes.modules import MODULES, spec
 from ttscompile.calibration import strategies
@@ -51,44 +52,6 @@ COMMANDS = [command for block in BLOCKS if block.language == "console" for comma
 COMMANDS.sort(key=lambda command: command.block.page != TUTORIAL)
 FOLLOWED = sorted({b.page for b in BLOCKS if b.language in ("console", "python")} - {ROOT / "CONTRIBUTING.md"})
 """The commands of the guide are in ``NOT_RUN``; its two files have a test of their own."""
-
-NOT_RUN = {
-    "make": "sets up an environment; what it runs then are CI's own steps, and tests/examples/test_pusht_demo.py",
-    "pip install": "would change the environment of this run",
-    "git clone": "there is no network",
-    "source": "of the shell, and for what make would have set up",
-    "cd": "of the shell",
-    "python examples/benchmark/sweep.py": "takes 20 minutes; tests/examples/test_benchmark_sweep.py runs it in short",
-    ".venv/bin/pytest": "a part of this suite, or of the test of the guide's own files",
-    ".venv/bin/ruff": "make lint",
-    "ttscompile serve": "has no end; tests/executor/test_serve.py and test_locked.py start it",
-    "python examples/serve": "needs a server; the same tests run it against one",
-    "ttscompile convert hf://": "from the hub: tests/hub",
-    "ttscompile push compiled/ org/compiled-policy --private": "to the hub: tests/hub",
-    "ttscompile convert outputs/train": "a LeRobot policy: tests/frontends/test_lerobot_golden.py converts two",
-    "lerobot-": "a command of LeRobot: tests/plugins runs it, where lerobot is installed",
-    "python -m lerobot_policy_ttscompile": "the same",
-    "ttscompile convert pretrained_model": "a LeRobot policy, with --task: tests/frontends/test_lerobot.py",
-    "python examples/vla/drive.py": "of a LeRobot policy: tests/examples/test_vla_drive.py runs it",
-    "ttscompile calibrate compiled/ --trajectories calls.npz --ray": "of Ray: tests/calibration/test_pool.py",
-    "ttscompile compare compiled/ --trajectories calls.npz --ray": "of Ray: tests/calibration/test_pool.py",
-    "ttscompile calibrate compiled/ --trajectories lerobot": "of LeRobot: tests/trajectories/test_recordings.py",
-}
-"""How the commands begin that are not run here, and why. Every other one is run; of these the options are checked."""
-
-SHORTER = {
-    "convert": "--steps 5",
-    "calibrate": "--target-sparsity 0.8 --max-minutes 0.001",
-    "compare": "--sparsities 0.8 --intervals 1 --calls 4 --learned-calls 8",
-    "verify": "--calls 4",
-    "report": "--runs 1",
-    "bench": "--runs 1",
-    "push": "--runs 1",
-    "realtime": "--runs 1",
-    "record.py": "--episodes 2 --threads 1",
-    "evaluate.py": "--episodes 1 --threads 1",
-}
-"""Options that are added to what is shown, so that it takes seconds: five denoising steps, of which one is computed."""
 
 
 @pytest.fixture(scope="module")

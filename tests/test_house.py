@@ -121,7 +121,7 @@ def test_no_modules_import_each_other() -> None:
         ("ttscompile.passes.hoist", "ttscompile.passes.partition"),
         ("ttscompile.runtimes.runtime", "ttscompile.frontends"),
         ("ttscompile.runtimes.runtime", "ttscompile.calibration"),
-        ("ttscompile.artifact.load", "ttscompile.runtimes.policy.load"),
+        ("ttscompile.artifact.load", "ttscompile.runtimes.load.load"),
         ("ttscompile.errors", "ttscompile.core.spec"),
         ("ttscompile.driver", "ttscompile.cli"),
     ],

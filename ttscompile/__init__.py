@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from .runtimes.executor import ExecutorSettings as ExecutorSettings
     from .runtimes.executor import GuardLimits as GuardLimits
     from .runtimes.info import PolicyInfo as PolicyInfo
+    from .runtimes.load import load as load
     from .runtimes.policy import CompiledPolicy as CompiledPolicy
-    from .runtimes.policy import load as load
     from .runtimes.report import CallReport as CallReport
     from .runtimes.torch.module import to_module as to_module
     from .samplers.edm import EDMDenoiser as EDMDenoiser
@@ -52,7 +52,8 @@ _HOMES = {
         "runtimes.report": ("CallReport",),
         "runtimes.executor": ("AsyncExecutor", "ExecutorSettings", "GuardLimits"),
         "runtimes.info": ("PolicyInfo",),
-        "runtimes.policy": ("CompiledPolicy", "load"),
+        "runtimes.load": ("load",),
+        "runtimes.policy": ("CompiledPolicy",),
         "runtimes.torch.module": ("to_module",),
         "samplers.edm": ("EDMDenoiser", "edm_table"),
         "samplers.flow": ("flow_matching_table",),

@@ -172,6 +172,9 @@ class _Judged(WholeSteps):
     def correcting(self, full_steps: int) -> float:
         return 0.0
 
+    def expect(self, schedules: Any) -> None:
+        pass
+
     def errors(self, steps: Any) -> Errors:
         self.asked.append(tuple(steps))
         return Errors(1 / len(steps), 10 / len(steps))

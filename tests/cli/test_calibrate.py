@@ -63,6 +63,8 @@ def test_every_file_up_to_the_next_option_is_taken(arguments: list[str], asked: 
         "max_action_error": None,
         "threads": 1,
         "max_minutes": 15.0,
+        "device": None,
+        "ray": None,
     }
 
 

@@ -22,7 +22,8 @@ from ttscompile.core.spec import LARGEST
 from ttscompile.core.values import check_numbers, check_values
 from ttscompile.errors import IllegalPlanError, NonFiniteActionsError, ObservationError, TtscompileError
 from ttscompile.runtimes.inpainting import check_prefix
-from ttscompile.runtimes.policy import CompiledPolicy, load
+from ttscompile.runtimes.load import load
+from ttscompile.runtimes.policy import CompiledPolicy
 
 from .agreement import call_terms
 from .conftest import MakeArtifact

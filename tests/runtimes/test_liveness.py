@@ -15,7 +15,7 @@ from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import IllegalPlanError
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.liveness import readable_rollout, rollout_needs
-from ttscompile.runtimes.policy import load
+from ttscompile.runtimes.load import load
 
 from .agreement import call_terms, random_inputs
 

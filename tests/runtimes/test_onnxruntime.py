@@ -20,8 +20,8 @@ from ttscompile.errors import ArtifactError, IllegalPlanError, ObservationError,
 from ttscompile.ir.program import Binding
 from ttscompile.runtimes import Runtime, open_runtime
 from ttscompile.runtimes.instructions import Instructions, instructions_of
+from ttscompile.runtimes.load import load
 from ttscompile.runtimes.onnxruntime.workspace import Workspace
-from ttscompile.runtimes.policy import load
 
 from .agreement import call_terms, largest_difference, random_inputs
 from .conftest import MakeArtifact

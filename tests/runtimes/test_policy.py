@@ -21,7 +21,8 @@ from ttscompile.core.lattice import dense_plan, uniform_plan
 from ttscompile.core.spec import Affine
 from ttscompile.errors import IllegalPlanError, ObservationError, TtscompileError
 from ttscompile.runtimes import open_runtime
-from ttscompile.runtimes.policy import CompiledPolicy, load
+from ttscompile.runtimes.load import load
+from ttscompile.runtimes.policy import CompiledPolicy
 
 from .agreement import call_terms
 from .conftest import MakeArtifact

@@ -17,7 +17,7 @@ from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.write import update_calibration
 from ttscompile.errors import RuntimeUnavailableError, TtscompileError
 from ttscompile.runtimes import open_runtime
-from ttscompile.runtimes.policy import load
+from ttscompile.runtimes.load import load
 
 OBS = np.array([[0.3, -1.2]], np.float32)
 

@@ -14,7 +14,8 @@ from ttscompile.artifact import Artifact
 from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import IllegalPlanError, ObservationError
 from ttscompile.runtimes.arrays import check_observation, read_observation
-from ttscompile.runtimes.policy import CompiledPolicy, load
+from ttscompile.runtimes.load import load
+from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.runtimes.queues import Queues, is_window
 
 SPECS = {"observation.state": ObservationSpec((3, 2)), "tokens": ObservationSpec((4,), dtype="int64", window=False)}

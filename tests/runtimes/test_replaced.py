@@ -21,8 +21,8 @@ from ttscompile.artifact.load import read_manifest
 from ttscompile.artifact.write import update_calibration
 from ttscompile.core.lattice import Source, uniform_plan
 from ttscompile.errors import ArtifactChangedError, ArtifactError
+from ttscompile.runtimes import load as loading
 from ttscompile.runtimes import open as opening
-from ttscompile.runtimes import policy
 
 from .replaced import CHANGES, COMMANDS, answer, load_often, prepared, prepared_by_commands, reuse
 from .toys import toy_program, written_artifact
@@ -68,7 +68,7 @@ def around_sessions(monkeypatch: pytest.MonkeyPatch, before: Swap, after: Swap =
             after()
 
     with monkeypatch.context() as patched:
-        patched.setattr(policy, "open_runtime", opened)
+        patched.setattr(loading, "open_runtime", opened)
         yield
 
 
@@ -169,7 +169,7 @@ def test_written_in_place_while_sessions_open(places: tuple[Path, Path], monkeyp
         return made
 
     monkeypatch.setattr(onnxruntime, "InferenceSession", opened)
-    monkeypatch.setattr(policy, "TRIES", 1)
+    monkeypatch.setattr(loading, "TRIES", 1)
     with pytest.raises(ArtifactChangedError):
         ttscompile.load(places[0])
 
@@ -212,7 +212,7 @@ def test_without_proc_exchanged_there_and_back_is_seen(
     """As on macOS: what was opened by name in between is the other's, and nothing of it is used."""
     monkeypatch.setattr(folder, "HELD", str(places[0] / "none"))
     assert ttscompile.load(places[0], runtime).info.identity in expected
-    monkeypatch.setattr(policy, "TRIES", 1)
+    monkeypatch.setattr(loading, "TRIES", 1)
 
     def swap() -> None:
         assert exchange(*places)

@@ -18,7 +18,7 @@ from ttscompile.report import Given, Section, build, render, verified
 from ttscompile.report.comparison import read_comparison
 from ttscompile.report.page import require_packages
 from ttscompile.report.verified import NOT_RUN
-from ttscompile.runtimes.policy import open_policy
+from ttscompile.runtimes.load import open_policy
 from ttscompile.trajectories import load_trajectories
 
 

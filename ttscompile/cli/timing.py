@@ -15,7 +15,8 @@ from ttscompile.core.lattice import Source
 from ttscompile.core.spec import FP32, Affine, Noise, PolicySpec
 from ttscompile.errors import RuntimeUnavailableError, SpecError
 from ttscompile.measure.timer import Timer, Times
-from ttscompile.runtimes.policy import CompiledPolicy, open_policy
+from ttscompile.runtimes.load import open_policy
+from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.runtimes.random_calls import Observation, normalized, random_call
 
 if TYPE_CHECKING:
@@ -95,7 +96,7 @@ class Compiled:
     Attributes:
         runtime: ``onnxruntime`` or ``torch``.
         device: that torch computes on; None for the CPU.
-        precision: of the residual blocks; None for the runtime's own, see ``runtimes.policy.load``.
+        precision: of the residual blocks; None for the runtime's own, see ``runtimes.load.load``.
         threads: that it, and each of its rivals, computes with.
     """
 
