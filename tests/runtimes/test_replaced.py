@@ -49,7 +49,7 @@ def expected(both: tuple[Path, Path]) -> dict[str, bytes]:
     return {read_manifest(path).identity: answer(ttscompile.load(path), read_manifest(path).spec) for path in both}
 
 
-def is_whole(loaded: policy.CompiledPolicy, expected: dict[str, bytes], path: Path) -> bool:
+def is_whole(loaded: ttscompile.CompiledPolicy, expected: dict[str, bytes], path: Path) -> bool:
     return expected[loaded.info.identity] == answer(loaded, read_manifest(path).spec)
 
 
