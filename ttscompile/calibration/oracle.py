@@ -18,9 +18,9 @@ import numpy as np
 import torch
 
 from ..artifact.load import load_artifact
-from ..core.correction import MOST_NUMBERS
+from ..core.correction import MOST_NUMBERS, Correction
 from ..core.given import integer
-from ..core.lattice import whole_steps_plan
+from ..core.lattice import PlanArray, whole_steps_plan
 from ..errors import CalibrationError
 from .calls import Actions, Calls, load_episodes, prepare_calls, sample_calls, split_episodes
 from .choosing import Choice, Errors, choices
@@ -130,6 +130,10 @@ def oracle(
         answered(drawn(numbers, stage), f"dense calls to {what}")
         for stage, (what, numbers) in enumerate({"learn from": learning, "judge": split.validation}.items(), 1)
     ]
+
+    def wrong(plan: PlanArray, correction: Correction | None, part: Calls) -> Array:
+        return actions.errors(executor.corrected(correction).run(plan, part), part.targets, units=True)
+
     counts = [count for count in (budget - 1, budget, budget + 1) if 0 < count < steps]
     placed = [one for count in counts for one in placements(steps, count, schedules, seed)]
     errors: list[list[Array]] = [[], []]
@@ -138,13 +142,10 @@ def oracle(
         plan = whole_steps_plan(steps, blocks, one)
         # As calibration decides for most policies; what does harm is left out.
         made = [fit_correction(executor, plan, fitted, reads) for reads in (True, False)]
-        answers = [
-            [actions.errors(executor.corrected(each).run(plan, part), part.targets, units=True) for part in parts]
-            for each in (*made, None)
-        ]
-        means = [float(learned.mean()) for learned, _ in answers]
-        for column, error in zip(errors, answers[means.index(min(means))], strict=True):
-            column.append(error)
+        tried = [(wrong(plan, each, parts[0]), each) for each in (*made, None)]
+        best, correction = min(tried, key=lambda pair: float(pair[0].mean()))
+        errors[0].append(best)
+        errors[1].append(wrong(plan, correction, parts[1]))
     progress("schedules", len(placed), len(placed))
     learned, judged = (_errors(executor, part, each, draws) for part, each in zip(parts, errors, strict=True))
     computed = np.array([len(one) for one in placed])
