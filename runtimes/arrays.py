@@ -50,11 +50,11 @@ def read_observation(
         others: leave keys alone that are not the policy's, rather than refuse them.
 
     Returns:
-        The arrays, images resized where the policy does that, and not checked; and the first of them that came as a
+        The arrays, not checked but for images that the policy resizes, which are; and the first of them that came as a
         tensor, as it came, or None.
 
     Raises:
-        ObservationError: no mapping, another set of keys, or what ``plain`` refuses.
+        ObservationError: no mapping, another set of keys, or what ``plain`` or ``fitted`` refuses.
     """
     if not isinstance(obs, Mapping):
         expected = f"a dictionary with the keys {sorted(specs)}"
@@ -66,10 +66,10 @@ def read_observation(
         remedy = "Give exactly the keys that the policy was compiled for."
         raise ObservationError(f"expected the observation keys {sorted(specs)}; found {found}. {remedy}")
     example = next((value for value in given.values() if is_tensor(value)), None)
-    arrays = {
-        key: fitted(plain(value, f"observation {key!r}", ObservationError, specs[key].dtype), specs[key])
-        for key, value in given.items()
-    }
+    arrays = {}
+    for key, value in given.items():
+        what, spec = f"observation {key!r}", specs[key]
+        arrays[key] = fitted(plain(value, what, ObservationError, spec.dtype), spec, what)
     return arrays, example
 
 

@@ -31,7 +31,7 @@ class Instruct:
         if spec.instruction is None:
             remedy = "Leave the tokenizer out."
             raise ObservationError(f"{path}: this policy takes no text that alone would give its tokens. {remedy}")
-        self._told = spec.instruction
+        self._told, self._keys = spec.instruction, tuple(spec.observations)
         self._length = spec.observations[spec.instruction.tokens].shape[0]
         self._tokenizer = Tokenizer(path, ObservationError)
         self._made: dict[str, list[int]] = {}
@@ -46,15 +46,16 @@ class Instruct:
             return obs
         rest = {key: value for key, value in obs.items() if key != TASK}
         task = obs[TASK]
-        streams = next((len(value) for value in rest.values() if hasattr(value, "shape")), 1)
+        own = (rest[key] for key in self._keys if key in rest)
+        streams = next((len(value) for value in own if getattr(value, "shape", ())), 1)
         texts = [task] * streams if isinstance(task, str) else task
         if not isinstance(texts, list | tuple) or not all(isinstance(text, str) for text in texts):
             raise ObservationError(f"the task is {task!r:.80}; expected a text, or one for each stream.")
         tokens = np.zeros((len(texts), self._length), np.int64)
         mask = np.zeros((len(texts), self._length), np.bool_)
         for i, text in enumerate(texts):
-            own = self._tokens(text)[: self._length]  # what is longer is cut, as lerobot does
-            tokens[i, : len(own)], mask[i, : len(own)] = own, True
+            made = self._tokens(text)[: self._length]  # what is longer is cut, as lerobot does
+            tokens[i, : len(made)], mask[i, : len(made)] = made, True
         return {**rest, self._told.tokens: tokens, self._told.mask: mask}
 
     def _tokens(self, text: str) -> list[int]:

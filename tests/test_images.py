@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,8 @@ from torch.nn import functional
 
 from ttscompile import ObservationSpec
 from ttscompile.core.images import fitted
-from ttscompile.errors import SpecError
+from ttscompile.errors import SpecError, TrajectoryError
+from ttscompile.trajectories import load_trajectories
 
 
 @pytest.mark.parametrize("size", [(30, 50), (50, 30), (7, 9), (16, 16), (1, 40)])
@@ -38,3 +41,22 @@ def test_only_images_of_another_size_change() -> None:
 def test_only_images_fit() -> None:
     with pytest.raises(SpecError, match="fit is for images with bounds"):
         ObservationSpec((4,), fit="start")
+
+
+@pytest.mark.parametrize(
+    ("value", "message"), [(200.0, "Divide by 255"), (np.inf, "finite|infinity"), (np.nan, "NaN|nan")]
+)
+@pytest.mark.parametrize("size", [4, 8])
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_a_recording_is_checked_before_it_is_resized(
+    tmp_path: Path, value: float, message: str, size: int, kind: type[np.floating]
+) -> None:
+    spec = ObservationSpec((1, 3, 4, 4), bounds=(0.0, 1.0), fit="centre")
+    images = np.random.RandomState(0).uniform(0, 1, (4, 1, 3, size, size)).astype(kind)
+    file = tmp_path / "calls.npz"
+    np.savez(file, top=images, episode_ends=np.array([2, 4]))
+    assert [each.calls for each in load_trajectories([file], {"top": spec}, 1)] == [2, 2]
+    images[1, 0, 2, 3, 3] = value
+    np.savez(file, top=images, episode_ends=np.array([2, 4]))
+    with pytest.raises(TrajectoryError, match=f"calls.npz: 'top' .*({message})"):
+        load_trajectories([file], {"top": spec}, 1)

@@ -124,6 +124,8 @@ def convert(
     module, spec = load_checkpoint_policy(checkpoint, format, options)
     spec = replace(spec, source={**spec.source, **base})
     beside = files_beside(checkpoint, spec)
+    if spec.source.get("format") == "lerobot" and not beside:
+        explain("files_beside", ("none for LeRobot: the instruction holds the state",))
     return _compile(module, spec, directory, prediction_horizon, precision, single_file, explain, beside)
 
 

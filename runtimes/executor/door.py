@@ -63,16 +63,18 @@ class Door:
     def __init__(self, limits: ServerLimits, clock: Callable[[], float] = time.monotonic) -> None:
         self.limits = limits
         self._clock = clock
-        self._visits: dict[Any, Visit] = {}
+        self._visits: dict[tuple[Any, Any], Visit] = {}  # two addresses of the server may have one peer
         self._refusals: dict[str, deque[float]] = {}
         self._told: dict[str, float] = {}
         self._count = 0
 
-    def comes(self, peer: tuple[Any, ...]) -> bool:
+    def comes(self, peer: tuple[Any, ...], own: Any = None) -> bool:
         """Whether the handshake of a new connection may begin.
 
         Args:
             peer: as ``accept`` gives it.
+            own: address of the server that it came to, as ``getsockname`` gives it; with ``peer`` it names the
+                connection, here and in what follows.
         """
         network, now = network_of(peer[0]), self._clock()
         waiting = [each.network for each in self._visits.values() if not each.client]
@@ -82,46 +84,47 @@ class Door:
             why = "too many handshakes are under way"
         else:
             self._count += 1
-            self._visits[peer] = Visit(self._count, _shown(peer), network, now)
+            self._visits[peer, own] = Visit(self._count, _shown(peer), network, now)
             return True
         if now - self._told.get(network, -MINUTE) >= MINUTE:  # one line: whoever is cut off must not fill the disk
             self._remember(self._told, network, now)
             _write("cut off", _shown(peer), why=f"{why}; others of this minute are not written")
         return False
 
-    def refusal(self, peer: tuple[Any, ...]) -> str:
+    def refusal(self, peer: tuple[Any, ...], own: Any = None) -> str:
         """Why one more client of this address cannot be had now; empty if it can."""
         clients = Counter(each.network for each in self._visits.values() if each.client)
         if clients.total() >= self.limits.clients:
             return f"{self.limits.clients} clients are connected, and that is how many may be."
         most = self.limits.clients_per_address
-        if most is not None and clients[self._visits[peer].network] >= most:
+        if most is not None and clients[self._visits[peer, own].network] >= most:
             return f"{most} clients of this address are connected, and that is how many may be."
         return ""
 
-    def answers(self, peer: tuple[Any, ...], status: int, tls: str | None) -> None:
+    def answers(self, peer: tuple[Any, ...], status: int, tls: str | None, own: Any = None) -> None:
         """Note how a handshake was answered.
 
         Args:
             peer: as above.
             status: of HTTP; 101 makes it a client.
             tls: version of TLS, None without.
+            own: as above.
         """
-        visit = self._visits[peer]
+        visit = self._visits[peer, own]
         visit.answered, visit.client = True, status == HTTPStatus.SWITCHING_PROTOCOLS
         if not visit.client and status != HTTPStatus.SERVICE_UNAVAILABLE:  # which is no fault of the client
             self._refuse(visit.network)
         event = "let in" if visit.client else "refused"
         _write(event, visit.peer, connection=visit.number, status=int(status), tls=tls)
 
-    def requested(self, peer: tuple[Any, ...]) -> None:
+    def requested(self, peer: tuple[Any, ...], own: Any = None) -> None:
         """Count a request; of a connection that was cut off meanwhile one may still be read."""
-        if (visit := self._visits.get(peer)) is not None:
+        if (visit := self._visits.get((peer, own))) is not None:
             visit.requests += 1
 
-    def leaves(self, peer: tuple[Any, ...]) -> None:
+    def leaves(self, peer: tuple[Any, ...], own: Any = None) -> None:
         """Forget a connection whose socket is closed."""
-        visit = self._visits.pop(peer, None)
+        visit = self._visits.pop((peer, own), None)
         if visit is None:
             return
         seconds = round(self._clock() - visit.since, 3)
@@ -171,8 +174,12 @@ class Entrance(socket.socket):
     def accept(self) -> tuple[socket.socket, Any]:
         """As of any socket; a connection that may not begin is closed, as if nobody had come."""
         accepted, peer = super().accept()
-        if self._door.comes(peer):
-            return Guest(self._door, peer, accepted), peer
+        try:
+            own = accepted.getsockname()
+            if self._door.comes(peer, own):
+                return Guest(self._door, peer, own, accepted), peer
+        except OSError:  # of some systems, where the connection has ended already
+            pass
         accepted.close()
         raise BlockingIOError  # what an event loop expects; it looks after the others before it comes again
 
@@ -183,17 +190,18 @@ class Guest(socket.socket):
     Args:
         door: is told.
         peer: address, as ``accept`` gives it.
+        own: address of the server that it came to.
         accepted: whose descriptor this one takes over.
     """
 
-    def __init__(self, door: Door, peer: Any, accepted: socket.socket) -> None:
+    def __init__(self, door: Door, peer: Any, own: Any, accepted: socket.socket) -> None:
         super().__init__(accepted.family, accepted.type, accepted.proto, fileno=accepted.detach())
-        self._door, self._peer = door, peer
+        self._door, self._peer, self._own = door, peer, own
 
     def close(self) -> None:
         """As of any socket."""
         super().close()
-        self._door.leaves(self._peer)
+        self._door.leaves(self._peer, self._own)
 
 
 class Pace:

@@ -9,6 +9,7 @@ takes a thread, from a pool of a fixed size.
 from __future__ import annotations
 
 import asyncio
+import errno
 import logging
 import socket
 from collections.abc import Callable, Coroutine
@@ -34,6 +35,12 @@ if TYPE_CHECKING:
 
 WAITS_PER_CLIENT = 4
 """Threads that may wait for an action, a client: one for it, the others for those before it that vanished waiting."""
+
+
+_NOT_HERE = (errno.EAFNOSUPPORT, errno.EADDRNOTAVAIL)
+"""Errors of an address that a name has and this machine has not: ``::1`` of ``localhost`` where there is no IPv6."""
+_BACKLOG = 100
+"""Connections that wait to be accepted, as asyncio has it."""
 
 
 class ExecutorServer:
@@ -119,15 +126,33 @@ class ExecutorServer:
             self._pool.shutdown(wait=False, cancel_futures=True)
 
     async def _listen(self, host: str, port: int) -> list[Entrance]:
-        """A socket for each address that the host has; two for ``localhost``, where there is IPv6."""
-        loop, made = asyncio.get_running_loop(), list[Entrance]()
+        """A socket for each address that the host has, all of one port; two for ``localhost``, where there is IPv6.
+
+        An address that this machine has not is left out, with a line in the log, where there is another.
+        """
+        loop, made, absent = asyncio.get_running_loop(), list[Entrance](), list[tuple[str, OSError]]()
         with ExitStack() as opened:
             try:
-                for family, *_, address in await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM):
-                    entrance = opened.enter_context(Entrance(self._door, family))
-                    entrance.bind(address)
+                found = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+                for family, (name, own, *more) in dict.fromkeys((family, address) for family, *_, address in found):
+                    if own == 0 and made:
+                        own = made[0].getsockname()[1]
+                    try:
+                        entrance = opened.enter_context(Entrance(self._door, family))
+                        entrance.bind((name, own, *more))
+                    except OSError as error:
+                        if error.errno not in _NOT_HERE:
+                            raise
+                        absent.append((str(name), error))
+                        continue
                     self._lock.require(entrance.getsockname()[0])
                     made.append(entrance)
+                if absent and not made:
+                    raise absent[0][1]
+                for entrance in made:
+                    entrance.listen(_BACKLOG)
+                for name, why_not in absent:
+                    self._log.warning("not listening on %s: %s", name, why_not.strerror)
             except (OSError, OverflowError, UnicodeError) as error:  # also a name that cannot be one
                 remedy = "Choose another port (0 takes any that is free), or an address of this machine."
                 why = getattr(error, "strerror", None) or error
@@ -143,18 +168,19 @@ class ExecutorServer:
             response = connection.respond(HTTPStatus.UNAUTHORIZED, "The token is missing or wrong.\n")
             response.headers["WWW-Authenticate"] = "Bearer"
             return response
-        if full := self._door.refusal(connection.remote_address):
+        if full := self._door.refusal(connection.remote_address, connection.local_address):
             return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{full}\n")
         return None
 
     def _answered(self, connection: ServerConnection, _: Handshake, response: Response) -> None:
         tls = connection.transport.get_extra_info("ssl_object")
-        self._door.answers(connection.remote_address, response.status_code, tls.version() if tls else None)
+        version, own = tls.version() if tls else None, connection.local_address
+        self._door.answers(connection.remote_address, response.status_code, version, own)
 
     async def _client(self, connection: ServerConnection) -> None:
         from websockets.exceptions import ConnectionClosed
 
-        loop, peer = asyncio.get_running_loop(), connection.remote_address
+        loop, peer, own = asyncio.get_running_loop(), connection.remote_address, connection.local_address
         pace = Pace(self._limits.requests_per_second, loop.time())
         try:
             while True:
@@ -164,7 +190,7 @@ class ExecutorServer:
                 except TimeoutError:
                     await connection.close(1008, f"no complete request for {self._limits.idle_timeout:g} s")
                     return
-                self._door.requested(peer)
+                self._door.requested(peer, own)
                 if wait := pace.wait(loop.time()):
                     await asyncio.sleep(wait)
                 reply = await self._unless_gone(connection, self._reply(text))

@@ -7,7 +7,7 @@ It shares no loop with the reference, which stays slow and literal: each is the 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import partial
 
 import numpy as np
@@ -23,7 +23,7 @@ from ttscompile.runtimes.instructions import Instructions, instructions_of
 from ttscompile.runtimes.liveness import readable_rollout
 
 from .capture import Capture, Line, Lines, cuda_graphs
-from .devices import device_of, narrow_type
+from .devices import device_of, exact_arithmetic, narrow_type
 from .network import Parts
 from .sampler import Advance
 from .workspace import Workspace
@@ -58,7 +58,7 @@ class TorchBackend:
         self._artifact, self._manifest, self._threads = artifact, artifact.manifest, threads
         self.device = device_of(device)
         if capture is None and self.device.type == "cuda":
-            capture = cuda_graphs()
+            capture = cuda_graphs(self.device)
         self._lines = Lines(capture)
         groups = self._manifest.groups
         dense = dense_plan(self._manifest.steps, len(groups))
@@ -155,15 +155,14 @@ class TorchBackend:
     @contextmanager
     def _settings(self) -> Iterator[None]:
         """The settings of torch that a call needs, which are the process's: as they were after it."""
-        before, exact = torch.get_num_threads(), torch.backends.cudnn.allow_tf32
+        before = torch.get_num_threads()
+        current = torch.cuda.device(self.device) if self.device.type == "cuda" else nullcontext()
         try:
             if before != self._threads:
                 torch.set_num_threads(self._threads)
-            torch.backends.cudnn.allow_tf32 = False
-            with fitting(self._artifact), torch.inference_mode():
+            with current, exact_arithmetic(self.device), fitting(self._artifact), torch.inference_mode():
                 yield
         finally:
-            torch.backends.cudnn.allow_tf32 = exact
             if before != self._threads:
                 torch.set_num_threads(before)
 

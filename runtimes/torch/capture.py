@@ -62,19 +62,22 @@ class Lines:
         self._captured.clear()
 
 
-def cuda_graphs() -> Capture:
-    """CUDA graphs that share one pool of memory: they run one after the other."""
+def cuda_graphs(device: torch.device) -> Capture:
+    """CUDA graphs of a device that share one pool of memory: they run one after the other.
+
+    Each is captured on a stream of that device; torch's own for captures is of whichever device had the first.
+    """
     pool = torch.cuda.graph_pool_handle()
 
     def capture(line: Line) -> Line:
-        side: torch.cuda.Stream = torch.cuda.Stream()  # type: ignore[no-untyped-call]
-        side.wait_stream(torch.cuda.current_stream())
+        side: torch.cuda.Stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+        side.wait_stream(torch.cuda.current_stream(device))
         with torch.cuda.stream(side):
             for _ in range(WARM_UP):
                 line()
-        torch.cuda.current_stream().wait_stream(side)
+        torch.cuda.current_stream(device).wait_stream(side)
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, pool=pool):
+        with torch.cuda.graph(graph, pool=pool, stream=side):
             line()
         replay: Line = graph.replay
         return replay

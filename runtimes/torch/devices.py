@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any, TypeVar
+
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -13,22 +17,73 @@ from ttscompile.errors import RuntimeUnavailableError
 NARROW = {FP32: None, BF16: torch.bfloat16, FP16: torch.float16}
 """Precisions of the products in residual blocks."""
 
+_CUDNN: Any = torch.backends.cudnn
+_ONEDNN: Any = torch.backends.mkldnn
+_ROUNDING = torch.backends.cuda.matmul, _CUDNN.conv, _CUDNN.rnn, _ONEDNN.matmul, _ONEDNN.conv, _ONEDNN.rnn
+"""Operations that torch may be told to compute float32 in fewer bits for."""
+
+_EXACT = ("ieee", "none")
+
+Setting = TypeVar("Setting")
+
 
 def device_of(name: str) -> torch.device:
-    """The device of this name, once it was found to work.
+    """The device of this name, with its number where such devices have one, once it was found to work.
 
     Raises:
         RuntimeUnavailableError: torch knows no such device, or cannot compute there.
     """
     try:
-        device = torch.device(name)
-        torch.zeros(1, device=device).add_(1)
+        found: torch.device = torch.zeros(1, device=torch.device(name)).add_(1).device
     except Exception as error:  # AssertionError of a build without CUDA, RuntimeError, AcceleratorError, TypeError
         first = (str(error).strip() or type(error).__name__).splitlines()[0][:200]
         problem = f"device {name!r} cannot be had: {first}"
         remedy = "Use device='cpu', or install the build of torch that has it: https://pytorch.org/get-started."
         raise RuntimeUnavailableError(f"{problem}. {remedy}") from error
-    return device
+    return found
+
+
+@contextmanager
+def exact_arithmetic(device: torch.device | None) -> Iterator[None]:
+    """Within the block float32 is computed in float32, whatever the caller told torch: no autocast, no TF32.
+
+    The settings of torch, of which autocast is the thread's and the others are the process's, are as they were after
+    it. They have older and newer names; the older ones cannot be read where a caller has used the newer.
+
+    Args:
+        device: where the block computes, beside the CPU; None for the CPU alone.
+    """
+    cudnn, kinds = torch.backends.cudnn, {"cpu"} if device is None else {"cpu", device.type}
+    matmul, convolution = _older(torch.get_float32_matmul_precision), _older(lambda: bool(cudnn.allow_tf32))
+    newer = [(operations, operations.fp32_precision) for operations in _ROUNDING]
+    with ExitStack() as settings:
+        for kind in filter(torch.amp.is_autocast_available, kinds):
+            settings.enter_context(torch.autocast(kind, enabled=False))
+        try:
+            if matmul not in (None, "highest"):
+                torch.set_float32_matmul_precision("highest")
+            if convolution:
+                cudnn.allow_tf32 = False
+            for operations, before in newer:
+                if before not in _EXACT:
+                    operations.fp32_precision = "ieee"
+            yield
+        finally:
+            if matmul not in (None, "highest"):
+                torch.set_float32_matmul_precision(matmul)
+            if convolution:
+                cudnn.allow_tf32 = True
+            for operations, before in newer:
+                if before not in _EXACT or matmul != "highest":
+                    operations.fp32_precision = before
+
+
+def _older(read: Callable[[], Setting]) -> Setting | None:
+    """A setting by its older name; None where the newer ones say what it cannot."""
+    try:
+        return read()
+    except RuntimeError:
+        return None
 
 
 def placed(array: npt.NDArray[np.generic], device: torch.device) -> Tensor:

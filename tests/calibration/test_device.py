@@ -10,7 +10,10 @@ import pytest
 import torch
 
 import ttscompile
+from ttscompile.calibration.execute import Executor
 from ttscompile.errors import CalibrationError, RuntimeUnavailableError
+
+from .killed import killed
 
 
 class _Home(torch.autograd.Function):
@@ -77,3 +80,30 @@ def test_the_network_stays_on_its_device(
 def test_a_device_that_torch_does_not_have_is_refused_before_anything_is_read(tmp_path: Path) -> None:
     with pytest.raises(RuntimeUnavailableError, match="device 'abacus' cannot be had"):
         ttscompile.calibrate(tmp_path / "nowhere", [tmp_path / "nothing.npz"], device="abacus", progress=False)
+
+
+def test_nothing_is_computed_in_fewer_bits_than_the_policy_has(
+    artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever the caller chose for its own: TF32, which is what cuDNN does unless it is told, and autocast."""
+    run_dense, seen = Executor.run_dense, set[Any]()
+
+    def looking(self: Executor, calls: Any) -> Any:
+        seen.add((torch.backends.cudnn.allow_tf32, torch.is_autocast_enabled("cpu")))
+        return run_dense(self, calls)
+
+    monkeypatch.setattr(Executor, "run_dense", looking)
+    with torch.autocast("cpu", torch.bfloat16), suppress(CalibrationError):
+        ttscompile.calibrate(artifact, [recording], 0.5, max_minutes=0.01, max_intervals=1, progress=False)
+    assert seen == {(False, False)}
+    assert torch.backends.cudnn.allow_tf32
+
+
+def test_a_calibration_is_not_resumed_on_another_device(artifact: Path, recording: Path) -> None:
+    def calibrate(**options: Any) -> None:
+        ttscompile.calibrate(artifact, [recording], 0.5, max_minutes=0.01, progress=False, **options)
+
+    with killed():
+        calibrate()
+    with pytest.raises(CalibrationError, match="other settings: device was cpu, now meta"):
+        calibrate(device="meta", resume=True)

@@ -48,6 +48,19 @@ def test_a_full_server_is_no_fault_of_the_client() -> None:
     assert door.comes(("10.0.0.1", 4)) and door.refusal(("10.0.0.1", 4)) == ""
 
 
+def test_connections_of_one_peer_to_two_addresses_of_the_server_are_two() -> None:
+    door = Door(ServerLimits(clients=2, handshakes=2), lambda: 0.0)
+    peer, one, other = ("10.0.0.9", 5000), ("10.0.0.1", 80), ("10.0.0.2", 80)
+    for own in (one, other):
+        assert door.comes(peer, own)
+        door.answers(peer, 101, None, own)
+    door.requested(peer, other)
+    door.leaves(peer, one)
+    assert [(each.number, each.requests) for each in door._visits.values()] == [(2, 1)]
+    door.leaves(peer, other)
+    assert not door._visits
+
+
 def test_a_door_remembers_so_many_addresses() -> None:
     door = Door(ServerLimits(refusals_per_minute=1), lambda: 0.0)
     for number in range(MOST_ADDRESSES + 10):

@@ -14,9 +14,10 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import BESIDE, update_calibration
 from ttscompile.core.lattice import dense_plan
 from ttscompile.errors import CheckpointError
+from ttscompile.frontends import files_beside, load_checkpoint_policy
 from ttscompile.frontends.lerobot_files import lerobot_files
 
-from . import lerobot_unets
+from . import lerobot_unets, pis
 from .lerobot_tiny import DA, DS, SIDE, change_json, save_policy
 
 STATE, TOP = "observation.state", "observation.images.top"
@@ -91,6 +92,20 @@ def test_they_are_the_same_bytes_again_and_go_with_an_artifact_that_is_replaced(
         lerobot_unets.ENVIRONMENT: {"type": "ENV", "shape": [5]},
     }
     assert "tokenizer" not in (again / "policy_preprocessor.json").read_text()
+
+
+@pytest.mark.parametrize("kind", pis.KINDS)
+def test_there_are_none_where_the_instruction_holds_the_state(tmp_path: Path, kind: str) -> None:
+    directory = pis.save(kind, tmp_path / "policy")
+    _, spec = load_checkpoint_policy(directory)
+    assert set(files_beside(directory, spec)) == (set(BESIDE) if kind == "pi0" else set())
+
+
+def test_convert_says_that_there_are_none(tmp_path: Path) -> None:
+    said: dict[str, tuple[str, ...]] = {}
+    ttscompile.convert(pis.save("pi05", tmp_path / "policy"), tmp_path / "compiled", explain=said.__setitem__)
+    assert said["files_beside"] == ("none for LeRobot: the instruction holds the state",)
+    assert not {path.name for path in (tmp_path / "compiled").iterdir()} & set(BESIDE)
 
 
 @pytest.mark.parametrize("format", ["auto", "lerobot"])

@@ -13,7 +13,7 @@ from safetensors.torch import load_file, save_file
 import ttscompile
 from tests.once import Once
 from ttscompile.core.spec import Noise
-from ttscompile.errors import CheckpointError
+from ttscompile.errors import CheckpointError, ObservationError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.families import AS_SAVED, LoadOptions
@@ -21,7 +21,7 @@ from ttscompile.ir.program import Program
 
 from ..families.support import record
 from . import pis
-from .lerobot_tiny import change_json
+from .lerobot_tiny import change_json, write_json
 from .vlas import CAMERAS, MASK, STATE, TOKENS, Array, as_given
 
 
@@ -80,6 +80,32 @@ def test_what_is_compiled_gives_them_too(
         found = policy.predict_action_chunk(pis.observation(call), noise=Noise(pis.noise()), plan="dense")
         assert found.shape == (1, 4, pis.ACTION_DIM)
         assert np.abs(found - golden[f"{kind}.{call}"][:, :4]).max() < 1e-4
+
+
+@pytest.mark.parametrize("call", [0, 1])
+@pytest.mark.parametrize(("value", "message"), [(200.0, "Divide by 255"), (np.inf, "must be finite")])
+def test_images_are_checked_before_they_are_resized(
+    once: Once, tmp_path: Path, call: int, value: float, message: str
+) -> None:
+    """Of the second call's images the size is another."""
+    artifact, _ = once.compiled("whole pi05", lambda to: ttscompile.convert(pis.save("pi05", tmp_path / "policy"), to))
+    policy, observed = ttscompile.load(artifact), pis.observation(call)
+    observed[CAMERAS[0]][0, 0, 3, 3] = value
+    frames = {key: spec.frames for key, spec in policy.info.observation.items()}
+    given = {key: observed[key] if count is None else observed[key][:, None] for key, count in frames.items()}
+    with pytest.raises(ObservationError, match=f"observation '{CAMERAS[0]}' .*{message}"):
+        policy.predict_action(given)
+
+
+def test_the_tokenizer_beside_a_policy_that_is_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(pis.save("pi0", tmp_path / "policy"))
+    write_json(tmp_path / "config.json", {"model_type": "paligemma"})
+    (tmp_path / "tokenizer.json").write_text("no tokenizer")
+    with pytest.raises(CheckpointError, match=r"tokenizer\.json") as caught:
+        load_checkpoint_policy(Path(), options=LoadOptions(task="go"))
+    assert str(tmp_path / "tokenizer.json") in str(caught.value)
 
 
 def assert_recorded(kind: str, program: Program) -> None:

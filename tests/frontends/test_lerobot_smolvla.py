@@ -106,6 +106,12 @@ def test_the_text_of_a_task_in_place_of_its_tokens(
             policy.reset()
             found = policy.predict_action_chunk(batch | {"task": task}, noise=Noise(given["noise"]), plan="dense")
             assert np.abs(found - golden[f"call{call}.action"]).max() < 1e-4
+    # What else LeRobot has in a batch tells nothing about the number of streams.
+    for foreign in ({"timestamp": np.float32(0.5)}, {"frame_index": np.arange(3)}):
+        policy.reset()
+        one = foreign | batch | {"task": str(given["task"])}
+        found = policy.predict_action_chunk(one, noise=Noise(given["noise"]), plan="dense")
+        assert np.abs(found - golden["call1.action"]).max() < 1e-4
     with pytest.raises(ObservationError, match="the task is 3; expected a text"):
         policy.predict_action_chunk(batch | {"task": 3})
     with pytest.raises(ObservationError, match="no such file; expected the tokenizer.json"):

@@ -23,6 +23,8 @@ class Hub:
     Attributes:
         commits: commit and files, by repository.
         asked: paths of all requests.
+        private: repositories that were made so.
+        without_lists: whether the files of a repository are not listed, as if the network failed then.
         url: of the server.
     """
 
@@ -30,6 +32,8 @@ class Hub:
         self.commits: dict[str, list[tuple[str, dict[str, bytes]]]] = {}
         self.asked: list[str] = []
         self.large: dict[str, bytes] = {}
+        self.private: set[str] = set()
+        self.without_lists = False
         self.url = ""
 
     def commit(self, repository: str, files: dict[str, bytes]) -> str:
@@ -83,9 +87,13 @@ class _Handler(BaseHTTPRequestHandler):
             if m := re.fullmatch(r"/api/models/([^/]+/[^/]+)(?:/revision/([^/]+))?", path):
                 commit, files = self.hub.find(m[1], unquote(m[2] or "main"))
                 siblings = [{"rfilename": name} for name in files]
-                self._answer({"id": m[1], "sha": commit, "siblings": siblings, "tags": [], "private": False})
+                private = m[1] in self.hub.private
+                self._answer({"id": m[1], "sha": commit, "siblings": siblings, "tags": [], "private": private})
             elif m := re.fullmatch(r"/api/models/([^/]+/[^/]+)/tree/([^/]+)/?", path):
                 commit, files = self.hub.find(m[1], unquote(m[2]))
+                if self.hub.without_lists:
+                    self._answer(b"", 404)
+                    return
                 self._answer([_entry(name, content) for name, content in files.items()])
             elif m := re.fullmatch(r"/([^/]+/[^/]+)/resolve/([^/]+)/(.+)", path):
                 commit, files = self.hub.find(m[1], unquote(m[2]))
@@ -113,6 +121,8 @@ class _Handler(BaseHTTPRequestHandler):
         if path == "/api/repos/create":
             asked = json.loads(body)
             name = "/".join(filter(None, (asked.get("organization"), asked["name"])))
+            if name not in self.hub.commits and (asked.get("private") or asked.get("visibility") == "private"):
+                self.hub.private.add(name)
             self.hub.commits.setdefault(name, [])
             self._answer({"url": f"{self.hub.url}/{name}", "name": name, "id": name})
         elif path == "/api/validate-yaml":

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import pickle
-import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -22,7 +21,7 @@ from tests.passes.modules import MODULES, spec
 from ttscompile.artifact.load import load_artifact
 from ttscompile.cli import main
 from ttscompile.core.spec import PolicySpec
-from ttscompile.errors import ArtifactError, HubError, ReportError, RuntimeUnavailableError, TtscompileError
+from ttscompile.errors import ArtifactError, HubError, RuntimeUnavailableError, TtscompileError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.hub import fetch_artifact, fetch_checkpoint
@@ -236,6 +235,40 @@ def test_of_several_checkpoints_one_has_to_be_named(hub: Hub, tmp_path: Path) ->
         fetch_checkpoint("hf://org/code")
 
 
+def test_without_a_listing_a_part_of_the_cache_is_not_taken_for_all(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two checkpoints one is there; of a directory all is, or its processors are not."""
+    from huggingface_hub import constants
+
+    root = Path(__file__).parents[2] / "examples" / "policies" / "flow" / "policy"
+    files = {each.relative_to(root).as_posix(): each.read_bytes() for each in root.rglob("*") if each.is_file()}
+    processors = {"policy_preprocessor.json", "policy_postprocessor.json"}
+    hub.commit("org/two", {"a.ckpt": b"a", "b.ckpt": b"b"})
+    commit = hub.commit("org/whole", files)
+    hub.commit("org/part", {name: content for name, content in files.items() if name not in processors})
+    fetch_checkpoint("hf://org/two/a.ckpt")
+    fetch_checkpoint("hf://org/whole")
+    fetch_checkpoint("hf://org/part")
+    for name in ("HF_HUB_OFFLINE", "without_lists"):
+        with monkeypatch.context() as lost:
+            lost.setattr(hub if name == "without_lists" else constants, name, True)
+            for refused in ("hf://org/two", "hf://org/part"):
+                with pytest.raises(HubError, match=f"^{refused}: .*Is the name right, is there a network"):
+                    fetch_checkpoint(refused)
+            assert fetch_checkpoint("hf://org/two/a.ckpt").path.read_bytes() == b"a"
+            assert fetch_checkpoint("hf://org/whole").origin == f"hf://org/whole@{commit}"
+
+
+def test_of_names_in_a_repository_plain_ones_alone_are_shown(hub: Hub) -> None:
+    hub.commit("org/two", {"\x1b[31m.ckpt": b"a", "in/a.ckpt": b"b", "in/\x1b.ckpt": b"c"})
+    for name, example in (("hf://org/two", "in/a.ckpt"), ("hf://org/two/in", "in/a.ckpt")):
+        with pytest.raises(HubError, match="checkpoints. Say which: ") as caught:
+            fetch_checkpoint(name)
+        assert str(caught.value).endswith(f": hf://org/two@REVISION/{example}")
+    hub.commit("org/two", {"\x1b[31m.ckpt": b"a", "\x1b[32m.ckpt": b"b"})
+    with pytest.raises(HubError, match=r"Say which: hf://org/two@REVISION/PATH\.ckpt$"):
+        fetch_checkpoint("hf://org/two")
+
+
 class Runs:
     """Unpickled, it would make a folder."""
 
@@ -291,6 +324,18 @@ def test_a_repository_with_something_else_is_left_alone(hub: Hub, toy_artifact: 
         ttscompile.push(toy_artifact, "mine", runs=1)
 
 
+def test_what_is_to_be_private_goes_into_no_public_repository(hub: Hub, toy_artifact: Path) -> None:
+    hub.commit("org/public", {})
+    before = len(hub.asked)
+    with pytest.raises(HubError, match=r"^org/public: expected a private repository; it is public"):
+        ttscompile.push(toy_artifact, "org/public", runs=1, private=True)
+    assert len(hub.commits["org/public"]) == 1
+    assert not [each for each in hub.asked[before:] if "preupload" in each or "commit" in each or "lfs" in each]
+    ttscompile.push(toy_artifact, "org/own", runs=1, private=True)
+    ttscompile.push(toy_artifact, "org/own", runs=1, private=True)
+    assert hub.private == {"org/own"} and len(hub.commits["org/own"]) == 2
+
+
 def test_without_the_library_names_of_the_hub_say_what_they_need(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     with pytest.raises(RuntimeUnavailableError, match=r"pip install 'ttscompile\[hub\]'"):
@@ -318,54 +363,3 @@ def test_the_environment_says_which_hub_and_the_cache_serves_when_it_is_gone(
         assert origin == f"hf://org/name@{hub.find('org/name', 'main')[0]}"
         assert run("-P", "-c", code, "hf://org/name") == origin
     assert run("-P", "-c", code, "hf://org/name") == origin
-
-
-def test_a_card_of_a_calibrated_artifact_has_its_figures(
-    toy_artifact: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calibrated = tmp_path / "calibrated"
-    shutil.copytree(toy_artifact, calibrated)
-    obs = np.random.default_rng(0).standard_normal((40, 2), np.float32)
-    np.savez(tmp_path / "calls.npz", obs=obs, episode_ends=[10, 20, 30, 40])
-    ttscompile.calibrate(calibrated, [tmp_path / "calls.npz"], target_sparsity=0.5, strategy="interval")
-    identity = load_artifact(calibrated).manifest.identity
-    figure = {"mean": 0.75, "low": 0.5, "high": 1.0}
-    variant = {"identity": identity, "label": "/home/me/calibrated:x|y", "success": figure, "score": figure}
-    document: dict[str, Any] = {
-        "environment": "pusht",
-        "machine": {
-            "processor": "a <b>processor</b>",
-            "instructions": [],
-            "cores": 1,
-            "load_average": 0,
-            "memory_gib": 1,
-            "system": "Linux",
-        },
-        "variants": [{**variant, "episodes": [{}] * 8}, {**variant, "identity": "0" * 64, "episodes": []}],
-    }
-    (tmp_path / "success.json").write_text(json.dumps(document))
-    words = ["push", str(calibrated), "org/name", "--dry-run", "--runs", "1", "--evaluation"]
-    result = CliRunner().invoke(main, [*words, str(tmp_path / "success.json")])
-    assert result.exit_code == 0, result.output
-    record = load_artifact(calibrated).manifest.calibration
-    assert record is not None
-    plan = load_artifact(calibrated).manifest.default_plan
-    for told in (
-        f"{record['plans'][plan]['error']:.4g}",
-        "| pusht | calibrated:x\\|y | 8 | 0.750 \\[0.500, 1.000\\] | 0.750 \\[0.500, 1.000\\] |",
-        "a \\<b\\>processor\\</b\\>",
-        "--target-sparsity 0.5 --strategy interval --seed 0`",
-        f"| identity | {identity} |",
-        "licence | not known: ask who trained the base",
-        'policy = ttscompile.load("hf://org/name", threads=1)',
-    ):
-        assert told in result.stdout, result.stdout
-    assert "/home/me" not in result.stdout and str(tmp_path) not in result.stdout
-    for bad, why in (
-        (b"{", "expected what examples/evaluation/evaluate.py --json printed"),
-        (json.dumps({**document, "variants": document["variants"][1:]}).encode(), "no variant in it has the identity"),
-        (json.dumps({**document, "variants": [variant]}).encode(), "found KeyError"),
-    ):
-        (tmp_path / "bad.json").write_bytes(bad)
-        with pytest.raises(ReportError, match=why):
-            ttscompile.push(calibrated, "org/name", evaluations=[tmp_path / "bad.json"], dry_run=True, runs=1)

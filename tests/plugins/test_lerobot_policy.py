@@ -157,6 +157,23 @@ def test_it_is_saved_as_it_is_and_not_trained(saved: tuple[str, Path, Path], tmp
         opened(tmp_path / "copy")
 
 
+def test_of_a_repository_an_artifact_s_files_are_downloaded(
+    saved: tuple[str, Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import huggingface_hub
+    from huggingface_hub.utils import filter_repo_objects
+
+    _, _, compiled = saved
+    policy, _, _ = opened(compiled)
+    asked: list[dict[str, Any]] = []
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", lambda _, **words: asked.append(words) or str(compiled))
+    again = type(policy).from_pretrained("org/name", config=policy.config, revision="main")
+    assert again._policy.info.identity == policy._policy.info.identity and asked[0].pop("revision") == "main"
+    own = {each.name for each in compiled.iterdir()}
+    others = {"README.md", "video.mp4", "pytorch_model.bin", "code.py", "old/manifest.json", "old/weights.safetensors"}
+    assert set(filter_repo_objects([*own, *others], **asked[0])) == own
+
+
 def command(name: str, *options: str) -> subprocess.CompletedProcess[str]:
     """Run one of lerobot's commands, as a shell would."""
     words = [sys.executable, "-W", "ignore", "-m", name, *options]

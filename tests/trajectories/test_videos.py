@@ -70,6 +70,10 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
     ),
     "codec": (lambda root: write_video(root / FILE, 0, 9, "mpeg4"), "the video is mpeg4; expected one of h264, hevc"),
     "between": (lambda root: _episodes(root, **{"videos/top/from_timestamp": [-0.4, 0.5]}), "has no frame at -0.400 s"),
+    "no time": (
+        lambda root: _episodes(root, **{"videos/top/from_timestamp": [0.0, float("nan")]}),
+        r"the time of row \d+ in the videos of 'top' is nan; expected finite seconds",
+    ),
     "episode": (lambda root: _episodes(root, episode_index=[0, 7]), r"there is no video 'top' of the episodes \[1\]"),
     "fps": (lambda root: _info(root, lambda info: info.pop("fps")), "fps of meta/info.json is None; expected frames"),
     "depth": (

@@ -21,7 +21,7 @@ from ..core.given import integer
 from ..core.lattice import sparsity
 from ..errors import CalibrationError
 from ..ir.pieces import PRUNER
-from ..runtimes.torch.devices import device_of
+from ..runtimes.torch.devices import device_of, exact_arithmetic
 from ..trajectories.episodes import Episode
 from ..verification.record_golden import record_plans
 from .budget import ERROR, LATENCY, Budget, Goal, cells_of, goal_of, measure_budget
@@ -152,7 +152,7 @@ def calibrate(
             f"{path}: only a directory can be calibrated. Unzip the artifact and give the directory."
         )
     # All the while: a second calibration would undo the first.
-    with locked(Path(path)), opened_pool(ray) as pool:
+    with locked(Path(path)), opened_pool(ray) as pool, exact_arithmetic(there):
         artifact = load_artifact(Path(path))
         goal = goal_of(*asked, usual=usual_sparsity(artifact.manifest.steps))
         spec, chosen = artifact.manifest.spec, strategy_of(strategy)
@@ -175,6 +175,7 @@ def calibrate(
                 "validation_fraction": validation_fraction,
                 "max_intervals": max_intervals,
                 "correct": correct,
+                "device": "cpu" if there is None else str(there),
             },
         )
         if not (resume and state.load()):

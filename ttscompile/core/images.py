@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 
-from .given import Array
+from ..errors import ObservationError
+from .given import Array, Errors
 from .spec import ObservationSpec
+from .values import check_values
 
 
-def fitted(array: Array, spec: ObservationSpec) -> Array:
+def fitted(array: Array, spec: ObservationSpec, what: str = "an image", error: Errors = ObservationError) -> Array:
     """An image of another size as the specification has it; anything else as it is.
 
     What openpi and LeRobot do: bilinear, without smoothing what becomes smaller.
@@ -17,12 +21,19 @@ def fitted(array: Array, spec: ObservationSpec) -> Array:
     Args:
         array: ``[..., C, h, w]``.
         spec: of the observation, of a window or of a frame.
+        what: for the message, ``observation 'obs'``.
+        error: class of the error.
+
+    Raises:
+        TtscompileError: of the class ``error``: what would be resized is not finite, or outside of its bounds.
     """
     if spec.fit is None or array.dtype != np.float32 or array.ndim < 3 or not array.size:
         return array
     channels, height, width = spec.shape[-3:]
     if array.shape[-3] != channels or array.shape[-2:] == (height, width):
         return array
+    array = array.copy()  # another thread may write into the caller's
+    check_values(array, replace(spec, normalizer=None), what, error)  # what is resized is clipped, and looks right
     before = array.shape[-2:]
     ratio = max(before[1] / width, before[0] / height)
     rows, columns = (max(int(n / ratio), 1) for n in before)

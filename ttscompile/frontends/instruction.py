@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from ..core.tokenizer import Tokenizer, find_tokenizer
@@ -9,6 +10,16 @@ from ..errors import CheckpointError
 from .clip import NAME_FOLDER
 
 _NO_TASK = "Or leave the task out: the policy then takes tokens as an observation."
+
+
+def encoder_folders(encoders: str | os.PathLike[str] | None, directory: Path) -> list[Path]:
+    """Where a language model's files are looked for: the folder that the user names, the checkpoint's, the one above.
+
+    Args:
+        encoders: that the user names; None for none.
+        directory: of the checkpoint.
+    """
+    return [*([] if encoders is None else [Path(encoders)]), directory, directory.resolve().parent]
 
 
 def task_tokens(text: str, name: str, folder: Path | None, most: int, vocabulary: int) -> list[int]:

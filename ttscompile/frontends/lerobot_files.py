@@ -14,7 +14,7 @@ from typing import Any
 
 from ..core.spec import PolicySpec
 from .lerobot_config import ACTION, CONFIG
-from .lerobot_processors import POSTPROCESSOR, PREPROCESSOR
+from .lerobot_processors import POSTPROCESSOR, PREPROCESSOR, PROMPT
 from .settings import read_json
 
 LANGUAGE = "observation.language."
@@ -31,12 +31,17 @@ _TEXT = {
 def lerobot_files(directory: Path, spec: PolicySpec) -> dict[str, bytes]:
     """The files of a compiled policy by name; the same policy gives the same bytes.
 
+    None of a policy whose prompt holds the state (pi05): lerobot's step that writes it there needs what the original
+    normalises with, and without that step tokens would be wrong.
+
     Args:
         directory: that lerobot saved the original to, which was read.
         spec: of the compiled policy.
     """
     entries = read_json(directory / CONFIG)
     steps = read_json(directory / PREPROCESSOR)["steps"]
+    if entries["type"] == "pi05" or any(step.get("registry_name") == PROMPT for step in steps):
+        return {}
     renamed = {
         new: old
         for step in steps

@@ -20,7 +20,7 @@ from ..errors import CheckpointError
 from .clip import find_encoder
 from .encoded import EncodedDenoiser
 from .families import LoadOptions
-from .instruction import task_tokens
+from .instruction import encoder_folders, task_tokens
 from .language_layers import LanguageConfig
 from .lerobot_config import CONFIG, MOST, MOST_PIXELS, STATE, LeRobotConfig
 from .lerobot_policy import read_weights
@@ -71,8 +71,7 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
         sizes |= {"tokens": length, "vocabulary": config.vocabulary}
     else:
         name = str(processors.tokenizer.get("tokenizer_name") or "google/paligemma-3b-pt-224")
-        folders = [*([] if options.encoders is None else [Path(options.encoders)]), directory, directory.parent]
-        found = find_encoder(name, folders, "paligemma")
+        found = find_encoder(name, encoder_folders(options.encoders, directory), "paligemma")
         text = options.task if options.task.endswith("\n") or not processors.new_line else f"{options.task}\n"
         task = torch.tensor([task_tokens(text, name, found, length, config.vocabulary)])
     encoder = Gathered(shared, processors, Prefix(network), config.state, task)

@@ -25,10 +25,10 @@ PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.
 _RENAME, _TOKENIZE, _NORMALIZE = "rename_observations_processor", "tokenizer_processor", "normalizer_processor"
 _UNNORMALIZE, _BATCH, _DEVICE = "unnormalizer_processor", "to_batch_processor", "device_processor"
 _NEW_LINE = ("smolvla_new_line_processor", "pi0_new_line_processor")
-_PROMPT = "pi05_prepare_state_tokenizer_processor_step"
+PROMPT = "pi05_prepare_state_tokenizer_processor_step"
 _RELATIVE, _ABSOLUTE = "relative_actions_processor", "absolute_actions_processor"
 _KNOWN_STEPS: Mapping[str, frozenset[str]] = {
-    PREPROCESSOR: frozenset({_RENAME, _BATCH, _TOKENIZE, _DEVICE, _NORMALIZE, *_NEW_LINE, _PROMPT, _RELATIVE}),
+    PREPROCESSOR: frozenset({_RENAME, _BATCH, _TOKENIZE, _DEVICE, _NORMALIZE, *_NEW_LINE, PROMPT, _RELATIVE}),
     POSTPROCESSOR: frozenset({_BATCH, _DEVICE, _UNNORMALIZE, _ABSOLUTE}),
 }
 _ONCE = frozenset({_RENAME, _TOKENIZE, _NORMALIZE, _UNNORMALIZE})
@@ -155,7 +155,7 @@ def read_processors(directory: Path, features: Features) -> Processors:
         action=_statistics(directory, after, _UNNORMALIZE, features).get("action"),
         tokenizer=next((dict(step["config"]) for step in before if step["registry_name"] == _TOKENIZE), {}),
         new_line=any(step["registry_name"] in _NEW_LINE for step in before),
-        state_in_prompt=any(step["registry_name"] == _PROMPT for step in before),
+        state_in_prompt=any(step["registry_name"] == PROMPT for step in before),
     )
 
 

@@ -17,7 +17,7 @@ from ..errors import CheckpointError
 from .clip import NAME_FOLDER, find_encoder
 from .encoded import EncodedDenoiser
 from .families import LoadOptions
-from .instruction import task_tokens
+from .instruction import encoder_folders, task_tokens
 from .language_layers import LanguageConfig
 from .lerobot_config import MOST, MOST_PIXELS, LeRobotConfig
 from .lerobot_policy import read_weights
@@ -63,7 +63,7 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     """Rebuild a policy from its directory and the entries of its ``config.json``; see ``Family.load``."""
     shared = read_vla_config(directory, entries, options)
     settings, processors = shared.settings, read_vla_processors(shared)
-    folders = [*([] if options.encoders is None else [Path(options.encoders)]), directory, directory.resolve().parent]
+    folders = encoder_folders(options.encoders, directory)
     name = settings.text("vlm_model_name", _MODEL, _MOST_LETTERS)
     config = read_config(shared, _language_model(name, folders))
     length = settings.number("tokenizer_max_length", 48, MOST)

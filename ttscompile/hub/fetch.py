@@ -28,6 +28,7 @@ _OF_LEROBOT = re.compile(
 )
 """What ``convert`` reads of a directory that lerobot saved, whose processors name the files of their statistics as they
 like, and of a folder of its encoders in it."""
+_PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
 _CHECKPOINT = ".ckpt"
 MOST_FILES = 1000
 MOST_MANIFEST_BYTES = 32 << 20
@@ -90,12 +91,20 @@ def fetch_checkpoint(text: str) -> Fetched:
             return _fetched(hub, name, text, folder.name, [name.inside])
         try:
             files = _listing(hub, name.repository, folder.name)
-        except Exception as error:  # no network, of whichever library: what was downloaded before may be enough
-            try:
-                return _fetched(hub, name, text, folder.name, _of_checkpoint(name, text, _kept(folder)))
-            except HubError:
-                raise error from None
+        except Exception:  # no network, of whichever library: what was downloaded before may be enough
+            files = _kept(folder)
+            if not _whole(name, files):
+                raise
         return _fetched(hub, name, text, folder.name, _of_checkpoint(name, text, files))
+
+
+def _whole(name: HubName, kept: list[str]) -> bool:
+    """Whether files in the cache say without a listing what the checkpoint is: a directory of LeRobot does.
+
+    One ``.ckpt`` does not: the repository may have others, which nobody downloaded.
+    """
+    inside = f"{name.inside}/" if name.inside else ""
+    return {inside + each for each in (_CONFIG, _WEIGHTS, *_PROCESSORS)} <= set(kept)
 
 
 def _of_checkpoint(name: HubName, text: str, files: list[str]) -> list[str]:
@@ -108,7 +117,8 @@ def _of_checkpoint(name: HubName, text: str, files: list[str]) -> list[str]:
     if len(found) == 1:
         return found
     if found:
-        raise HubError(f"{text}: it has {len(found)} checkpoints. Say which: {name.at('REVISION')}/{found[0]}")
+        example = next((each.removeprefix(inside) for each in found if plain(each)), f"PATH{_CHECKPOINT}")
+        raise HubError(f"{text}: it has {len(found)} checkpoints. Say which: {name.at('REVISION')}/{example}")
     has = ", ".join(each for each in files[:4] if plain(each)) or "nothing"
     expected = f"expected {_CONFIG} and {_WEIGHTS} of LeRobot, or one file {_CHECKPOINT} of Diffusion Policy"
     raise HubError(f"{text}: there is no checkpoint in it; {expected}; found {has}.")

@@ -20,13 +20,14 @@ def upload(folder: Path, names: Sequence[str], repository: str, card: str, *, pr
         names: of the artifact's files.
         repository: ``org/name``.
         card: text of its ``README.md``.
-        private: whether a repository that is made now is nobody else's to see.
+        private: whether the repository is nobody else's to see; one that is there already must be private then.
 
     Returns:
         ``hf://org/name@commit``.
 
     Raises:
-        HubError: the repository holds something else than an artifact, or cannot be written.
+        HubError: the repository holds something else than an artifact, is public although ``private`` was asked for, or
+            cannot be written.
         RuntimeUnavailableError: ``huggingface_hub`` is not installed.
     """
     require_repository(repository, repository)
@@ -34,6 +35,8 @@ def upload(folder: Path, names: Sequence[str], repository: str, card: str, *, pr
     with told(repository):
         api = hub.HfApi()
         api.create_repo(repository, private=private, exist_ok=True)
+        if private and not api.repo_info(repository).private:
+            raise HubError(f"{repository}: expected a private repository; it is public already. Give another.")
         there = set(api.list_repo_files(repository)) - _MADE_BY_THE_HUB
         if there and MANIFEST not in there:
             found = ", ".join(sorted(there)[:3])

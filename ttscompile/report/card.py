@@ -23,6 +23,10 @@ from .page import Section, Table
 BASE, BASE_LICENCE = "base", "base_licence"
 """Entries of ``PolicySpec.source`` that ``convert`` writes of a checkpoint from the hub."""
 _MOST_BYTES = 64 << 20
+_TOKENIZER = (
+    "It is told its task in words. Text takes the base's tokenizer, which is not in this repository, and the package"
+    " `tokenizers`: give `load` its folder, `tokenizer=DIR`. Without it, give the tokens and their mask yourself."
+)
 _SPECIAL = re.compile(r"([\\`*_\[\]<>|#~])")
 
 
@@ -117,8 +121,10 @@ def card(
     lines = ["---", *(f"{key}: {json.dumps(value)}" for key, value in head.items()), "---", ""]
     lines += [f"# {_plain(repository.partition('/')[2])}", ""]
     of = "a policy" if base is None else f"[{base.repository}](https://huggingface.co/{base.repository})"
-    lines += [f"This is {of}, compiled by ttscompile: it runs in real time with numpy and onnxruntime alone.", ""]
+    lines += [f"This is {of}, compiled by ttscompile: it runs with numpy and onnxruntime alone.", ""]
     lines += ["```python", "import ttscompile", "", f'policy = ttscompile.load("hf://{repository}", threads=1)', "```"]
+    if manifest.spec.instruction is not None:
+        lines += ["", _TOKENIZER]
     for section in (
         _what(manifest, base, licence),
         _errors(manifest),

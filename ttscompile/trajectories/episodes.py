@@ -218,7 +218,9 @@ def _checked(path: Path, key: str, array: Array, spec: ObservationSpec, frames: 
     frames = frames and spec.frames is not None
     shape, what = (spec.shape[1:], "[F, *frame]") if frames else (spec.shape, "[N, *shape]")
     if array.dtype.kind == "f" and spec.fit is not None:
-        array = fitted(array.astype(np.float32), spec)
+        with np.errstate(over="ignore"):
+            single = array.astype(np.float32)
+        array = fitted(single, spec, f"{path}: {key!r}", TrajectoryError)
     if array.shape[1:] != shape:
         told = f"{path}: {key!r} has shape {list(array.shape)}; expected {what} = [.., {', '.join(map(str, shape))}]."
         if array.shape[1:] == spec.shape[1:] and not frames:

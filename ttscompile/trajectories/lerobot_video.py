@@ -6,6 +6,7 @@ in them an episode begins. Frames are found by their times, as LeRobot does it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
@@ -39,7 +40,8 @@ def video_frames(
         column: reads tables.
 
     Raises:
-        TrajectoryError: PyAV is not installed; a video is missing or damaged, of another codec, or lacks a frame.
+        TrajectoryError: PyAV is not installed; a video is missing or damaged, of another codec, or lacks a frame; a
+            time is not finite.
     """
     try:
         import av  # noqa: F401
@@ -57,10 +59,14 @@ def video_frames(
     missing = sorted(set(episodes.tolist()) - set(begins))
     if missing:
         raise TrajectoryError(f"{path}: there is no video {name!r} of the episodes {missing[:5]}. Copy it again.")
-    wanted = (
+    wanted = [
         (begins[episode][0], begins[episode][1] + time)
         for episode, time in zip(episodes.tolist(), times.tolist(), strict=True)
-    )
+    ]
+    row = next((i for i, (_, time) in enumerate(wanted) if not math.isfinite(time)), None)
+    if row is not None:
+        told = f"{path}: the time of row {row} in the videos of {name!r} is {wanted[row][1]}; expected finite seconds"
+        raise TrajectoryError(f"{told}. Copy it again.")
     for file, group in groupby(wanted, key=lambda each: each[0]):
         with one_error(f"{path}: the video {file.relative_to(path)} cannot be decoded", ". Copy it again"):
             yield from _at(file, [time for _, time in group], 0.5 / fps)

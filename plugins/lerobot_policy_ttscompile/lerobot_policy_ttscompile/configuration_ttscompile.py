@@ -14,7 +14,7 @@ class TtscompileConfig(PreTrainedConfig):
 
     Attributes:
         n_action_steps: actions of a chunk that are executed.
-        runtime: ``onnxruntime``, or ``reference``, which is slow.
+        runtime: ``onnxruntime``, ``torch``, or ``reference``, which is slow.
         threads: threads of arithmetic.
         plan: name of a plan of the artifact, ``dense`` among them; None for the artifact's default.
         precision: of the residual blocks, ``fp32`` or the artifact's own; None for the latter.

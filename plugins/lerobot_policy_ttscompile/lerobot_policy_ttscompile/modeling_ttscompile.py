@@ -23,6 +23,11 @@ from .configuration_ttscompile import TtscompileConfig
 logger = logging.getLogger(__name__)
 
 _LANGUAGE = "observation.language."
+_FILES = [
+    *("manifest.json", "program.json", "*.onnx", "*.safetensors"),
+    *("config.json", "policy_preprocessor.json", "policy_postprocessor.json"),
+]
+"""Of a repository: an artifact's files, and those that LeRobot reads beside them. ``load`` checks them."""
 
 
 class TtscompilePolicy(PreTrainedPolicy):
@@ -83,7 +88,8 @@ class TtscompilePolicy(PreTrainedPolicy):
         if not directory.is_dir():
             from huggingface_hub import snapshot_download
 
-            directory = Path(snapshot_download(str(pretrained_name_or_path), **hub))
+            wanted = {"allow_patterns": _FILES, "ignore_patterns": "*/*"}  # patterns take folders for names
+            directory = Path(snapshot_download(str(pretrained_name_or_path), **wanted, **hub))
         assert isinstance(config, TtscompileConfig)
         return cls(config, directory).eval()
 
