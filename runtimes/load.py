@@ -65,24 +65,14 @@ def load(
     if on_hub(path):
         fetched = fetch_artifact(str(path))
         path, origin = fetched.path, fetched.origin
+
+    def once() -> CompiledPolicy:
+        return open_policy(load_artifact(path), runtime, threads, seed, precision, plan, device, tokenizer, origin)
+
     for _ in range(TRIES - 1):
         with suppress(ArtifactChangedError):
-            return _load(path, runtime, threads, seed, precision, plan, device, tokenizer, origin)
-    return _load(path, runtime, threads, seed, precision, plan, device, tokenizer, origin)
-
-
-def _load(
-    path: str | Path,
-    runtime: str,
-    threads: int,
-    seed: int | None,
-    precision: str | None,
-    plan: str | None,
-    device: str | None,
-    tokenizer: str | Path | None,
-    origin: str | None,
-) -> CompiledPolicy:
-    return open_policy(load_artifact(path), runtime, threads, seed, precision, plan, device, tokenizer, origin)
+            return once()
+    return once()
 
 
 def open_policy(

@@ -29,6 +29,23 @@ if TYPE_CHECKING:
 STEPS = 4
 
 
+class Stages:
+    """Prints what each stage of a conversion took, and what all of them did."""
+
+    def __init__(self) -> None:
+        self._start = self._last = time.perf_counter()
+
+    def __call__(self, stage: str, notes: tuple[str, ...]) -> None:
+        """A stage has ended."""
+        now = time.perf_counter()
+        print(f"{now - self._last:7.1f} s  {peak():5.2f} GiB  {stage}: {notes[0] if notes else ''}", flush=True)
+        self._last = now
+
+    def end(self) -> None:
+        """All have."""
+        print(f"{time.perf_counter() - self._start:7.1f} s  {peak():5.2f} GiB  in all")
+
+
 def convert(folder: Path, network: nn.Module, horizon: int) -> None:
     """Compile the network; print what each stage took."""
     import numpy as np
@@ -47,16 +64,9 @@ def convert(folder: Path, network: nn.Module, horizon: int) -> None:
         sampler=flow_matching_table(STEPS),
         chunk=ChunkSpec(ACTIONS, 0, horizon),
     )
-    start = last = time.perf_counter()
-
-    def explain(stage: str, notes: tuple[str, ...]) -> None:
-        nonlocal last
-        now = time.perf_counter()
-        print(f"{now - last:7.1f} s  {peak():5.2f} GiB  {stage}: {notes[0] if notes else ''}", flush=True)
-        last = now
-
-    ttscompile.compile_denoiser(network, spec, folder / "compiled", explain=explain)
-    print(f"{time.perf_counter() - start:7.1f} s  {peak():5.2f} GiB  in all")
+    stages = Stages()
+    ttscompile.compile_denoiser(network, spec, folder / "compiled", explain=stages)
+    stages.end()
 
     rng = np.random.default_rng(0)
     obs = rng.standard_normal((1, OBSERVED), dtype=np.float32)
@@ -83,16 +93,9 @@ def convert_smolvla(folder: Path) -> None:
 
     large_smolvla.save(folder / "smolvla")
     print(f"{peak():5.2f} GiB before compiling")
-    start = last = time.perf_counter()
-
-    def explain(stage: str, notes: tuple[str, ...]) -> None:
-        nonlocal last
-        now = time.perf_counter()
-        print(f"{now - last:7.1f} s  {peak():5.2f} GiB  {stage}: {notes[0] if notes else ''}", flush=True)
-        last = now
-
-    ttscompile.convert(folder / "smolvla", folder / "compiled", precision="int8", explain=explain)
-    print(f"{time.perf_counter() - start:7.1f} s  {peak():5.2f} GiB  in all")
+    stages = Stages()
+    ttscompile.convert(folder / "smolvla", folder / "compiled", precision="int8", explain=stages)
+    stages.end()
 
 
 def run_smolvla(folder: Path, rounds: int = 5, precisions: tuple[str, ...] = ("fp32", "int8")) -> None:
