@@ -98,6 +98,6 @@ def open_policy(
         artifact = artifact.at_precision(precision)
     if plan is not None:
         require_plan(artifact, plan)  # before the sessions are opened
-    opened = open_runtime(artifact, runtime, threads, device, own)
+    opened = open_runtime(artifact, runtime, threads, device, own, plan)
     instruct = None if tokenizer is None else Instruct(artifact.manifest.spec, tokenizer)
     return CompiledPolicy(artifact, opened, seed, plan, own if made else None, origin, instruct)

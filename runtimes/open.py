@@ -90,7 +90,12 @@ def kind_of(runtime: str) -> Kind:
 
 
 def open_runtime(
-    artifact: Artifact, runtime: str = "onnxruntime", threads: int = 1, device: str | None = None, precision: str = FP32
+    artifact: Artifact,
+    runtime: str = "onnxruntime",
+    threads: int = 1,
+    device: str | None = None,
+    precision: str = FP32,
+    plan: str | None = None,
 ) -> Runtime:
     """Make a runtime for an artifact.
 
@@ -100,6 +105,7 @@ def open_runtime(
         threads: see ``Options``.
         device: see ``Options``; None for the CPU.
         precision: see ``Options``.
+        plan: see ``Runtime``.
 
     Raises:
         RuntimeUnavailableError: no runtime of this name, its packages are missing, or threads, device or precision
@@ -114,9 +120,14 @@ def open_runtime(
         able = ", ".join(repr(name) for name, each in RUNTIMES.items() if each.devices)
         problem = f"runtime {runtime!r} computes on the CPU alone; found device {device!r}"
         raise RuntimeUnavailableError(f"{problem}. Use runtime={able}.")
-    try:
-        with artifact.reading(), fitting(artifact):  # a backend reads arrays that are mapped from the files
-            return Runtime(artifact, kind.make(artifact, Options(threads, device or CPU, precision)))
-    except ModuleNotFoundError as error:
-        problem = f"runtime {runtime!r} needs {error.name!r}, which is not installed"
-        raise RuntimeUnavailableError(f"{problem}. Run: pip install '{kind.install}'.") from error
+    options = Options(threads, device or CPU, precision)
+
+    def backend(weights: Artifact) -> Backend[Any]:
+        try:
+            with weights.reading(), fitting(weights):  # a backend reads arrays that are mapped from the files
+                return kind.make(weights, options)
+        except ModuleNotFoundError as error:
+            problem = f"runtime {runtime!r} needs {error.name!r}, which is not installed"
+            raise RuntimeUnavailableError(f"{problem}. Run: pip install '{kind.install}'.") from error
+
+    return Runtime(artifact, backend, plan)

@@ -10,7 +10,7 @@ queue. Everything else runs on the caller's thread. What executes the pieces is 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import wait
 from dataclasses import dataclass
 from functools import partial
@@ -48,6 +48,15 @@ class _Settled:
     pruner: float = 0.0  # ms, from the condition values to the instructions; 0 if the plan was given
 
 
+class _Opened:
+    """A backend for the weights of some plans, and what it made of the plans that it was given."""
+
+    def __init__(self, artifact: Artifact, backend: Backend[Any]) -> None:
+        self.backend, self.lowering = backend, LoweringCache(backend.lower)
+        for schedule in artifact.schedules.values():
+            self.lowering.lower(schedule)
+
+
 class Runtime:
     """One episode at a time on a fixed number of streams.
 
@@ -57,22 +66,33 @@ class Runtime:
     dense call, and one whose plan is a matrix of the caller's, keeps all that it computes; and from the first such
     matrix on every call does, since another may read any of it.
 
+    A plan with weights of its own (``Artifact.with_weights_of``) has a backend of its own. The one that ``plan`` needs
+    is opened at once, another one by the first call that needs it. Between calls with different weights nothing is
+    reused.
+
     Args:
         artifact: loaded and checked.
-        backend: opened on the same artifact.
+        open_backend: on an artifact with the weights of some plan.
+        plan: name of the plan that most calls will have; None for the artifact's default.
     """
 
-    def __init__(self, artifact: Artifact, backend: Backend[Any]) -> None:
+    def __init__(
+        self, artifact: Artifact, open_backend: Callable[[Artifact], Backend[Any]], plan: str | None = None
+    ) -> None:
+        self._artifact, self._open_backend = artifact, open_backend
         self._manifest, self._groups = artifact.manifest, artifact.manifest.groups
-        self.backend = backend
-        self._lowering = LoweringCache(backend.lower)
-        for schedule in artifact.schedules.values():
-            self._lowering.lower(schedule)
+        self._opened: dict[bool, _Opened] = {}
+        self._used = self._opened_for(self._manifest.default_plan if plan is None else plan)
         pruned = any(plan.pruned for plan in self._manifest.plans.values())
         self._helper = Helper(HELPER) if pruned else None  # its thread is there before the first call
         self._matrices = False  # whether one was ever given
         self._written: BoolArray | None = None
         self._dropped: BoolArray | None = None  # computed in this episode, and not kept
+
+    @property
+    def backend(self) -> Backend[Any]:
+        """That of the last call."""
+        return self._used.backend
 
     @property
     def streams(self) -> int | None:
@@ -123,9 +143,12 @@ class Runtime:
                 and the artifact has no pruner.
             ObservationError: the number of streams differs from the episode's, or ``noise`` does not fit.
         """
-        backend = self.backend
         spec, streams = self._manifest.spec, len(next(iter(obs.values())))
         self.require_streams(streams)
+        before, self._used = self._used, self._opened_for(plan_name)
+        if before is not self._used and self._written is not None:
+            self._written = self._dropped = np.zeros_like(self._written)
+        backend = self._used.backend
         noise = check_noise(noise, streams, spec)
         known = None if prefix is None else known_samples(spec, prefix, noise.initial)
         cells = (streams, self._manifest.steps, len(self._groups))
@@ -171,10 +194,18 @@ class Runtime:
         )
         return sample, report
 
+    def _opened_for(self, plan: str | None) -> _Opened:
+        """What computes the plan of this name, with its weights."""
+        artifact = self._artifact.with_weights_of(plan)
+        own = artifact is not self._artifact
+        if own not in self._opened:
+            self._opened[own] = _Opened(artifact, self._open_backend(artifact))
+        return self._opened[own]
+
     def _prune_beside_first_step(self, written: BoolArray) -> tuple[_Settled, float]:
         """Step 0, and meanwhile the plan of the steps after it; ms that the loop stood still for it."""
         self._helper = self._helper or Helper(HELPER)
-        pruning = self._helper.submit(partial(_prune, self.backend, self._lowering, written))
+        pruning = self._helper.submit(partial(_prune, self.backend, self._used.lowering, written))
         try:
             self.backend.first_step()
             ready = time.perf_counter()
@@ -203,7 +234,7 @@ class Runtime:
         check = partial(require_legal, plans, self._groups, written)
         if (rollout & ~written).any():
             check()
-        return _Settled(plans, tuple(self._lowering.lower(one, check) for one in plans), legalised)
+        return _Settled(plans, tuple(self._used.lowering.lower(one, check) for one in plans), legalised)
 
 
 def _prune(backend: Backend[Any], lowering: LoweringCache[Any], written: BoolArray) -> _Settled:

@@ -41,7 +41,7 @@ MAY_IMPORT = {
     "runtimes": BELOW_ARTIFACT | {"hub"},
     "doctor": BELOW_ARTIFACT | {"runtimes"},
     "verification": BELOW_ARTIFACT | {"frontends", "runtimes", "trajectories"},
-    "calibration": BELOW_ARTIFACT | {"runtimes", "trajectories", "verification"},
+    "calibration": BELOW_ARTIFACT | {"lower", "runtimes", "trajectories", "verification"},
     "report": BELOW_ARTIFACT | {"hub", "plots", "runtimes", "trajectories", "verification"},
     "driver": BELOW_ARTIFACT | {"capture", "frontends", "hub", "lower", "passes", "runtimes", "verification"},
     "cli": BELOW_ARTIFACT

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from .measure.versions import VERSION as __version__
 
 if TYPE_CHECKING:
+    from .calibration.distill import distill as distill
     from .calibration.pipeline import calibrate as calibrate
     from .core.lattice import Source as Source
     from .core.lattice import legalize as legalize
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
 _HOMES = {
     name: home
     for home, names in {
+        "calibration.distill": ("distill",),
         "calibration.pipeline": ("calibrate",),
         "core.lattice": ("Source", "legalize"),
         "core.spec": ("Affine", "ChunkSpec", "Noise", "ObservationSpec", "PolicySpec", "SamplerTable"),

@@ -32,7 +32,19 @@ from ttscompile.core.spec import FP32
 from ttscompile.errors import ArtifactError, RuntimeUnavailableError
 from ttscompile.ir.graph import TensorType
 from ttscompile.ir.joint import Joint, join
-from ttscompile.ir.pieces import ADVANCE, IDLE, JOINT, LAYERS, OF_ALL_BLOCKS, PRUNER, RESIDUAL, STEM, STREAM, block_name
+from ttscompile.ir.pieces import (
+    ADVANCE,
+    DENSE_STEP,
+    IDLE,
+    JOINT,
+    LAYERS,
+    OF_ALL_BLOCKS,
+    PRUNER,
+    RESIDUAL,
+    STEM,
+    STREAM,
+    block_name,
+)
 from ttscompile.measure.machine import has_integer_dot_product
 
 Array: TypeAlias = npt.NDArray[Any]
@@ -40,6 +52,9 @@ Array: TypeAlias = npt.NDArray[Any]
 
 SINGLE_THREADED = frozenset({STEM, ADVANCE, PRUNER, IDLE})
 """Pieces too small for a second thread."""
+
+FIRST_STEP = "first_step"
+"""Name of the session that computes step 0: that of ``dense_step``, but for a plan with weights of its own."""
 
 SPIN_US = 50
 """How long a thread of the blocks' session looks for work before it sleeps: longer than what lies between most blocks
@@ -73,6 +88,8 @@ def open_sessions(artifact: Artifact, threads: int, blocks: bool = True) -> dict
     """
     single = {block_name(b) for b in range(len(artifact.manifest.blocks))}
     sessions = _open(artifact, set(artifact.manifest.pieces) - single - {JOINT, LAYERS}, threads)
+    first = artifact.first_step
+    sessions[FIRST_STEP] = sessions[DENSE_STEP] if first is None else _open(first, [DENSE_STEP], threads)[DENSE_STEP]
     return sessions | _open_blocks(artifact, threads) if blocks else sessions
 
 

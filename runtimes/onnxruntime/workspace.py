@@ -26,7 +26,7 @@ from ttscompile.runtimes.inpainting import Known, MaskedUpdates
 
 from .contexts import BoundBlock, ContextValues
 from .idle_steps import IdleSteps
-from .sessions import Array, Bound, run_named
+from .sessions import FIRST_STEP, Array, Bound, run_named
 
 
 class Workspace:
@@ -160,7 +160,7 @@ class Workspace:
             piece = self._manifest.pieces[DENSE_STEP]
             inputs = {CONTEXT + name: self._contexts.at(name, k) for name in piece.contexts} | {STREAM: self.fresh}
             outputs = dict(zip(piece.outputs, (self.stream, *self.current), strict=True))
-            bound = self._dense[k] = Bound(self._sessions[DENSE_STEP], inputs, outputs)
+            bound = self._dense[k] = Bound(self._sessions[DENSE_STEP if k else FIRST_STEP], inputs, outputs)
         return bound
 
     def run_dense(self, k: int) -> None:

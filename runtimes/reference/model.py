@@ -80,6 +80,7 @@ class ReferenceModel:
         groups: FORWARD group of each block.
         weights: value of every constant of the pieces.
         device: where the pieces compute. Samples, and what the sampler does with them, are on the CPU wherever that is.
+        first: values of constants that blocks have at step 0, where those are others; None for the same.
 
     Attributes:
         device: where the pieces compute.
@@ -87,6 +88,7 @@ class ReferenceModel:
         blocks: number of residual blocks.
         groups: FORWARD group of each block.
         sampler: what moves the sample on.
+        weights: every constant by name; at step 0 blocks may have others (``first``).
         pruner_weights: the pruner's tensors by name.
     """
 
@@ -98,16 +100,20 @@ class ReferenceModel:
         groups: Sequence[int],
         weights: Mapping[str, npt.NDArray[np.generic]],
         device: torch.device | None = None,
+        first: Mapping[str, npt.NDArray[np.generic]] | None = None,
     ) -> None:
         self.device = torch.device("cpu") if device is None else device
         self._pieces, self._types, self.sampler = pieces, tuple(types), TorchSampler(spec.sampler)
-        self._weights = {name: _tensor(value).to(self.device) for name, value in weights.items()}
+        self.weights = {name: _tensor(value).to(self.device) for name, value in weights.items()}
         self._tables = {name: _tensor(value).to(self.device) for name, value in self._pieces.tables.items()}
-        evaluator = partial(Evaluator, weights=self._weights, device=self.device)
+        evaluator = partial(Evaluator, weights=self.weights, device=self.device)
         self._condition = evaluator(pieces.condition)
         self._step = evaluator(pieces.step) if pieces.step is not None else None
         self._stem = evaluator(pieces.stem.graph)
-        self._blocks = tuple(evaluator(piece.graph) for piece in pieces.blocks)
+        self._blocks = self._first = tuple(evaluator(piece.graph) for piece in pieces.blocks)
+        if first is not None:
+            own = {**self.weights, **{name: _tensor(value).to(self.device) for name, value in first.items()}}
+            self._first = tuple(Evaluator(piece.graph, own, self.device) for piece in pieces.blocks)
         self._tail = evaluator(pieces.tail.graph)
         self.steps = spec.sampler.steps
         self.blocks = len(self._pieces.blocks)
@@ -129,13 +135,14 @@ class ReferenceModel:
         manifest = artifact.manifest
         weights = {**artifact.weights, **artifact.pruner}
         types = [block.type for block in manifest.blocks]
-        return cls(artifact.pieces, manifest.spec, types, manifest.groups, weights, device)
+        first = None if artifact.first_step is None else artifact.first_step.weights
+        return cls(artifact.pieces, manifest.spec, types, manifest.groups, weights, device, first)
 
     @property
     def pruner_weights(self) -> dict[str, Tensor]:
         """The pruner's tensors by name; empty if the program has no pruner."""
         pruner = self._pieces.pruner
-        return {} if pruner is None else {n: self._weights[n] for n in pruner.constants if n.startswith("pruner.")}
+        return {} if pruner is None else {n: self.weights[n] for n in pruner.constants if n.startswith("pruner.")}
 
     def prologue(self, obs: Mapping[str, Tensor]) -> Contexts:
         """Everything that the observation decides before the loop starts.
@@ -178,7 +185,7 @@ class ReferenceModel:
         if pruner is None:
             raise IllegalPlanError("the program has no pruner: run insert_pruner, or give a plan.")
         given = {name: value.to(self.device) for name, value in (weights or {}).items()}
-        return Evaluator(pruner, {**self._weights, **given}, self.device)(contexts.condition)[0].cpu()
+        return Evaluator(pruner, {**self.weights, **given}, self.device)(contexts.condition)[0].cpu()
 
     def stem(self, sample: Tensor, k: int, contexts: Contexts) -> Tensor:
         """The residual stream of step k, on the device, from the sample ``[B, T, D]``."""
@@ -194,7 +201,8 @@ class ReferenceModel:
             contexts: of the observation.
             streams: which streams to evaluate; None for all. The result holds these only.
         """
-        return self._blocks[b](self._bind(self._pieces.blocks[b], stream, k, contexts, streams))[0]
+        blocks = self._blocks if k else self._first
+        return blocks[b](self._bind(self._pieces.blocks[b], stream, k, contexts, streams))[0]
 
     def tail(self, stream: Tensor, k: int, contexts: Contexts) -> Tensor:
         """The network's output ``[B, T, D]`` at step k, on the CPU, from the residual stream after the last block."""
@@ -216,6 +224,7 @@ class ReferenceModel:
         blocks: Blocks,
         correction: Correction | None = None,
         known: Known | None = None,
+        since: tuple[int, Carried] | None = None,
     ) -> Iterator[Carried]:
         """The denoising loop, whatever the blocks do: what is carried after each step.
 
@@ -226,10 +235,11 @@ class ReferenceModel:
             blocks: asked once a step, in order.
             correction: of the sampler's steps; None for none.
             known: what a prefix makes known of the samples; None for nothing.
+            since: a step to begin with, and what is carried to it; None for the whole loop.
         """
-        carried = hold(self.sampler.begin(initial), known, 0)
+        begin, carried = (0, hold(self.sampler.begin(initial), known, 0)) if since is None else since
         condition = self.condition(contexts) if correction is not None and correction.reads else None
-        for k in range(self.steps):
+        for k in range(begin, self.steps):
             prediction = self.predict(carried.sample, k, contexts, blocks)
             draw = None if noise is None else noise[k]
             carried = self.sampler.advance(carried, prediction, draw, k, correction, condition)

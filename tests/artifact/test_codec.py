@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from tests.artifact.tiny import tiny_spec
 from ttscompile.artifact import codec
-from ttscompile.artifact.manifest import Manifest, PlanRecord
+from ttscompile.artifact.manifest import SCHEMA_VERSION, Manifest, PlanRecord
 from ttscompile.artifact.strict_json import Value, dump, parse
 from ttscompile.artifact.typed_json import from_json, to_json
 from ttscompile.core.spec import Affine, ObservationSpec, PolicySpec, SamplerTable
@@ -180,8 +180,9 @@ def test_another_schema_version_says_what_to_do(manifest: Manifest, version: obj
 
 
 def test_a_future_schema_is_named_before_anything_else_is_read() -> None:
-    content = dump({"format": "ttscompile artifact", "schema_version": 7, "new": "thing"})
-    with pytest.raises(ArtifactError, match="schema_version: expected 6, .*; found 7"):
+    content = dump({"format": "ttscompile artifact", "schema_version": SCHEMA_VERSION + 1, "new": "thing"})
+    expected = f"schema_version: expected {SCHEMA_VERSION}, .*; found {SCHEMA_VERSION + 1}"
+    with pytest.raises(ArtifactError, match=expected):
         codec.decode(content)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 from ..errors import ArtifactError
 from ..ir.pieces import ADVANCE, CONDITION, OF_ALL_BLOCKS, PRUNER, STEM, block_name
 from . import typed_json
-from .manifest import DENSE, FORMAT, MANIFEST, SCHEMA_VERSION, Manifest, PrecisionRecord
+from .manifest import DENSE, DISTILLED, FORMAT, MANIFEST, SCHEMA_VERSION, DistilledRecord, Manifest, PrecisionRecord
 from .strict_json import REMEDY, Value, dump, dump_compact, parse
 
 MAX_MANIFEST_BYTES = 32 * 2**20
@@ -69,6 +69,8 @@ def from_json(root: Value) -> Manifest:
     manifest = typed_json.from_json(Manifest, Value(document, root.path))
     if manifest.precision is not None:
         _check_precision(manifest, manifest.precision, members["precision"])
+    if manifest.distilled is not None:
+        _check_distilled(manifest, manifest.distilled, members["distilled"])
     _check_parts(manifest, members)
     return manifest
 
@@ -108,6 +110,8 @@ def identities(manifest: Manifest) -> tuple[str, str]:
         record = manifest.precision
         models = {name: hashes[file] for name, file in record.models.items()}
         whole["precision"] = {"name": record.name, "weights": hashes[record.weights], "models": models}
+    if manifest.distilled is not None:
+        whole["distilled"] = sorted(hashes[file] for file in manifest.distilled.files)
     return _checksum(whole), model_identity
 
 
@@ -131,10 +135,14 @@ def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:
     files = {piece.file for piece in manifest.pieces.values()} | {n for n in vars(manifest.stores).values() if n}
     if manifest.precision is not None:
         files |= {manifest.precision.weights, *manifest.precision.models.values()}
+    if manifest.distilled is not None:
+        files |= manifest.distilled.files
     if files != set(manifest.files):
         fields["files"].fail(f"exactly the files {sorted(files)}")
     if DENSE in manifest.plans:
         fields["plans"].fail("no plan called 'dense', which every artifact has")
+    if (manifest.distilled is not None) != (DISTILLED in manifest.plans):
+        fields["distilled"].fail(f"weights exactly when there is a plan called {DISTILLED!r}")
     if manifest.default_plan not in {DENSE, *manifest.plans}:
         fields["default_plan"].fail(f"one of {[DENSE, *manifest.plans]}")
     scheduled = any(not plan.pruned for plan in manifest.plans.values())
@@ -152,6 +160,23 @@ def _check_precision(manifest: Manifest, record: PrecisionRecord, value: Value) 
     own = {record.weights, *record.models.values()}
     others = {piece.file for piece in manifest.pieces.values()} | set(vars(manifest.stores).values())
     if len(own) <= len(record.models) or own & others:
+        value.fail("a file for each model and one for the weights, which nothing else uses")
+
+
+def _check_distilled(manifest: Manifest, record: DistilledRecord, value: Value) -> None:
+    known = {*map(block_name, range(len(manifest.blocks))), *OF_ALL_BLOCKS}
+    if set(record.models) != known:
+        value.fail(f"a model of each of {', '.join(sorted(known))}")
+    own, other = record.precision, manifest.precision
+    if (None if own is None else (own.name, set(own.models))) != (
+        None if other is None else (other.name, set(other.models))
+    ):
+        value.fail("blocks of the artifact's other precision exactly where the artifact has such")
+    others = {piece.file for piece in manifest.pieces.values()} | set(vars(manifest.stores).values())
+    if other is not None:
+        others |= {other.weights, *other.models.values()}
+    count = 1 + len(record.models) + (0 if own is None else 1 + len(own.models))
+    if len(record.files) != count or record.files & others:
         value.fail("a file for each model and one for the weights, which nothing else uses")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import math
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -21,7 +20,7 @@ from ..core.lattice import PlanArray, Source, check_plan, dense_plan
 from ..core.paths import require_path
 from ..core.spec import FP32
 from ..errors import ArtifactError, IllegalPlanError
-from ..ir.graph import Graph, TensorType
+from ..ir.graph import Graph
 from ..ir.pieces import CONDITION, PRUNER, STEM, STEP, TAIL, LoopPiece, block_name
 from ..ir.program import Binding, Pieces
 from ..measure.versions import release
@@ -31,20 +30,14 @@ from .codec import MAX_MANIFEST_BYTES, decode, identities
 from .files import check_file, read_file
 from .folder import Folder, Stamp
 from .graph_json import graph_from_json
-from .manifest import DENSE, MANIFEST, Manifest, Requires, abbreviated
+from .manifest import DENSE, DISTILLED, MANIFEST, Manifest, Requires, abbreviated
 from .onnx_files import check_model
+from .size import check_size
 from .strict_json import REMEDY, Value, parse
 
 TABLE_PREFIX = "table/"
 CORRECTION_PREFIX = "correction/"
 CORRECTION_FIELDS = tuple(field.name for field in fields(Correction))
-
-FREE_BYTES = 2**30
-MAX_RATIO = 64
-"""Buffers of one stream may take so many times the bytes of the artifact's files, or ``FREE_BYTES``. Push-T: 0.3."""
-
-_HISTORY = 16
-"""Samples that a runtime keeps beside those of every step, and then some."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +52,9 @@ class Artifact:
         pruner: constants of the pruner (their names start with ``pruner.``); empty if there is none.
         schedules: int8 ``[K, blocks]`` by name, without ``dense``.
         corrections: of the sampler's steps, by the name of the plan that they belong to.
+        distilled: constants that the plan ``distilled`` has in place of those of ``weights``, read-only views of the
+            file; empty if there is no such plan.
+        first_step: the artifact whose blocks compute step 0, where those are not its own (``with_weights_of``).
     """
 
     path: Path
@@ -68,9 +64,11 @@ class Artifact:
     pruner: Mapping[str, npt.NDArray[Any]]
     schedules: Mapping[str, PlanArray]
     corrections: Mapping[str, Correction]
+    distilled: Mapping[str, npt.NDArray[Any]]
     _folder: Folder = field(repr=False)
     _stamps: Mapping[str, Stamp] = field(repr=False)
     _unpacked: Unpacked | None = field(default=None, repr=False)
+    first_step: Artifact | None = field(default=None, repr=False)
 
     @property
     def files(self) -> Path:
@@ -124,6 +122,31 @@ class Artifact:
         if name == own:
             return self
         return replace(self, manifest=replace(self.manifest, precision=None))
+
+    def with_weights_of(self, plan: str | None) -> Artifact:
+        """The artifact whose blocks are those that a plan computes after step 0: itself, but for ``distilled``.
+
+        Step 0 has the original's weights in every plan.
+
+        Args:
+            plan: its name; None for one that has none.
+        """
+        record, manifest = self.manifest.distilled, self.manifest
+        if plan != DISTILLED or record is None:
+            return self
+        models = record.models
+        pieces = {n: replace(one, file=models.get(n, one.file)) for n, one in manifest.pieces.items()}
+        precision = None if manifest.precision is None else record.precision
+        manifest = replace(manifest, pieces=pieces, precision=precision, distilled=None)
+        return replace(self.with_weights(self.distilled), manifest=manifest, distilled={})
+
+    def with_weights(self, constants: Mapping[str, npt.NDArray[Any]]) -> Artifact:
+        """The artifact with other constants after step 0, for the reference runtime, which reads no models.
+
+        Args:
+            constants: of residual blocks, by name.
+        """
+        return replace(self, weights={**self.weights, **constants}, first_step=self)
 
     def schedule(self, name: str) -> PlanArray:
         """A schedule by name, ``dense`` among them, int8 ``[K, blocks]``.
@@ -276,9 +299,8 @@ def _open(path: Path, folder: Folder, stamps: Mapping[str, Stamp], manifest: Man
             f"{directory}: expected the identity {manifest.short_identity}; its content has"
             f" {abbreviated(identities(manifest)[0])}. {REMEDY}"
         )
-    _check_size(manifest, directory)
-    models = {piece.file for piece in manifest.pieces.values()}
-    for name in sorted(models | (set(manifest.precision.models.values()) if manifest.precision else set())):
+    check_size(manifest, directory)
+    for name in sorted(name for name in manifest.files if name.endswith(".onnx")):
         check_model(directory / name, manifest.files)
     stored = tensors.read(directory / manifest.stores.weights)
     tables = {n.removeprefix(TABLE_PREFIX): a for n, a in stored.items() if n.startswith(TABLE_PREFIX)}
@@ -286,6 +308,9 @@ def _open(path: Path, folder: Folder, stamps: Mapping[str, Stamp], manifest: Man
     wanted = {name: (kind.dtype, (manifest.steps, *kind.at(1))) for name, kind in kinds.items()}
     tensors.check_arrays("table", tables, wanted, directory / manifest.stores.weights)
     schedules, corrections = _plans(directory, manifest)
+    distilled = _optional(directory, None if manifest.distilled is None else manifest.distilled.weights)
+    of_weights = {name: (str(stored[name].dtype), stored[name].shape) for name in distilled if name in stored}
+    tensors.check_arrays("distilled weight", distilled, of_weights, directory)
     return Artifact(
         path=path,
         manifest=manifest,
@@ -294,6 +319,7 @@ def _open(path: Path, folder: Folder, stamps: Mapping[str, Stamp], manifest: Man
         pruner=_optional(directory, manifest.stores.pruner),
         schedules=schedules,
         corrections=corrections,
+        distilled=distilled,
         _folder=folder,
         _stamps=stamps,
     )
@@ -362,32 +388,3 @@ def _check_runtime(requires: Requires, directory: Path) -> None:
             f"{directory}: its graphs (opset {requires.opset}) need onnxruntime >= {requires.onnxruntime}; {found} is"
             f" installed. Run: pip install 'onnxruntime>={requires.onnxruntime}'."
         )
-
-
-def _check_size(manifest: Manifest, directory: Path) -> None:
-    """Raise if the values that a manifest declares are out of proportion to its files: it may declare what it likes."""
-    allowed = max(FREE_BYTES, MAX_RATIO * sum(record.bytes for record in manifest.files.values()))
-    total = sum(_bytes(manifest))
-    if total > allowed:
-        raise ArtifactError(
-            f"{directory}: expected a policy whose values take at most {allowed} bytes, {MAX_RATIO} times its"
-            f" files; its manifest declares {total}. {REMEDY}"
-        )
-
-
-def _bytes(manifest: Manifest) -> Iterator[int]:
-    """Sizes of what a runtime allocates for one stream, about; Python's integers do not overflow."""
-    steps, (horizon, channels) = manifest.steps, manifest.spec.sample
-    drawn = horizon + manifest.spec.left_out  # noise is drawn for the original's steps, too
-    yield 4 * drawn * channels * (steps + _HISTORY)
-    yield 4 * steps * channels * (_HISTORY * horizon) * horizon  # the sampler's update, a matrix a step and channel
-    for spec in manifest.spec.observations.values():
-        yield math.prod(spec.shape) * np.dtype(spec.dtype).itemsize
-    for context in manifest.contexts.values():
-        yield _nbytes(context.type) * (1 if context.binding is Binding.CONDITION else steps)
-    for block in manifest.blocks:
-        yield 4 * _nbytes(block.type)
-
-
-def _nbytes(kind: TensorType) -> int:
-    return math.prod(kind.at(1)) * np.dtype(kind.dtype).itemsize

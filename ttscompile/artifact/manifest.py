@@ -19,12 +19,14 @@ from ..ir.pieces import OF_ALL_BLOCKS, PRUNER
 from ..ir.program import Binding
 
 FORMAT = "ttscompile artifact"
-SCHEMA_VERSION = 6
+SCHEMA_VERSION = 7
 MANIFEST = "manifest.json"
 DENSE = "dense"
 """The plan that computes every cell; every artifact has it without listing it."""
 UNIFORM = "uniform"
 """The plan that calibration adds for comparisons alone: as many steps computed, evenly spaced. Not for a robot."""
+DISTILLED = "distilled"
+"""The plan whose residual blocks have weights of their own, which ``distill`` trained."""
 
 _SHOWN = 12
 
@@ -234,6 +236,27 @@ class PrecisionRecord:
 
 
 @dataclass(frozen=True)
+class DistilledRecord:
+    """Weights of residual blocks that the plan ``distilled`` has in place of the original's; both are in the artifact.
+
+    Attributes:
+        weights: name of the file with the constants that differ.
+        models: name of the ONNX file by piece, where it is not the file of the piece.
+        precision: of the same blocks in the artifact's other precision; None where the artifact has none.
+    """
+
+    weights: FileName
+    models: Mapping[str, FileName]
+    precision: PrecisionRecord | None
+
+    @property
+    def files(self) -> set[str]:
+        """Names of all its files."""
+        own = {self.weights, *self.models.values()}
+        return own if self.precision is None else own | {self.precision.weights, *self.precision.models.values()}
+
+
+@dataclass(frozen=True)
 class Manifest:
     """The manifest.
 
@@ -256,6 +279,7 @@ class Manifest:
         requires: what the ONNX graphs need.
         files: every file but the manifest.
         precision: of the blocks where it is not fp32. The reference runtime computes in fp32 always.
+        distilled: weights of the plan of this name; None where there is no such plan.
     """
 
     schema_version: int
@@ -275,6 +299,7 @@ class Manifest:
     requires: Requires
     files: Mapping[FileName, FileRecord]
     precision: PrecisionRecord | None = None
+    distilled: DistilledRecord | None = None
 
     @property
     def precision_name(self) -> str:

@@ -22,6 +22,7 @@ from ..measure.versions import VERSION
 from . import records, tensors
 from .bind import LoweredBlocks, bind, places_of, store_blocks
 from .codec import decode, encode, identities
+from .distilled import DistilledWeights, store_distilled
 from .files import (
     PARTIAL,
     content_hash,
@@ -56,7 +57,8 @@ WEIGHTS = "weights.safetensors"
 GOLDEN = "golden.safetensors"
 
 _STALE = re.compile(
-    rf"(pruner-[0-9a-f]+\.(onnx|safetensors)|(golden_)?plans-[0-9a-f]+\.safetensors|\..+{re.escape(PARTIAL)})"
+    rf"(pruner-[0-9a-f]+\.(onnx|safetensors)|(golden_)?plans-[0-9a-f]+\.safetensors"
+    rf"|distilled-[0-9a-f]+-[A-Za-z0-9_]+\.(onnx|safetensors)|\..+{re.escape(PARTIAL)})"
 )
 BESIDE = ("config.json", "policy_preprocessor.json", "policy_postprocessor.json")
 """Files for LeRobot that may stand in an artifact. Nothing here reads them, the manifest does not list them, and no
@@ -120,6 +122,7 @@ def update_calibration(
     record: Mapping[str, Any],
     *,
     corrections: Mapping[str, Correction] | None = None,
+    distilled: DistilledWeights | None = None,
     model_identity: str | None = None,
     golden: Callable[[Artifact], Mapping[str, GoldenPlan]] | None = None,
     held: bool = False,
@@ -138,6 +141,7 @@ def update_calibration(
         default_plan: what ``predict_action`` uses when it is given no plan.
         record: what was done to get here; JSON.
         corrections: of the sampler's steps, by the name of their plan; None for none.
+        distilled: weights of the plan ``distilled``, which then is one of the schedules; None drops those of before.
         model_identity: of the artifact that was calibrated; refuses another one.
         golden: records what the reference runtime makes of the plans (``record_golden.record_plans``), given the
             artifact as it will be; None leaves the artifact without, and its plans cannot be verified.
@@ -171,10 +175,12 @@ def update_calibration(
         try:
             arrays = _plan_arrays(manifest, schedules, corrections or {})
             manifest = _store(directory, manifest, "plans", arrays)
+            manifest = store_distilled(artifact, manifest, distilled)
             if pruner_weights is not None:
                 manifest = _store_pruner(artifact, manifest, pruner_weights)
             after = replace(
                 artifact,
+                distilled={} if distilled is None else distilled.weights,
                 manifest=manifest,
                 schedules=dict(schedules),
                 corrections=dict(corrections or {}),

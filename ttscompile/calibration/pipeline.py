@@ -168,7 +168,7 @@ def calibrate(
             Path(path),
             {
                 "model": artifact.manifest.model_identity[:16],
-                "trajectories": _digest(episodes),
+                "trajectories": digest(episodes),
                 "budget": goal.record(),
                 "strategy": strategy,
                 "seed": seed,
@@ -334,7 +334,8 @@ def _relax(
     return found, budget
 
 
-def _digest(episodes: Sequence[Episode]) -> str:
+def digest(episodes: Sequence[Episode]) -> str:
+    """Of everything that the episodes hold: 16 digits."""
     digest = hashlib.sha256()
     for episode in episodes:
         for key, array in sorted(episode.observations.items()):

@@ -13,6 +13,7 @@ from ttscompile.cli.bench import bench
 from ttscompile.cli.calibrate import calibrate
 from ttscompile.cli.compare import compare
 from ttscompile.cli.convert import convert
+from ttscompile.cli.distill import distill
 from ttscompile.cli.doctor import doctor
 from ttscompile.cli.ending import TRACEBACK, Commands
 from ttscompile.cli.inspect import inspect
@@ -41,6 +42,7 @@ for _command, _what in (
     (doctor, "What stands in the way on this machine."),
     (convert, "Compile a checkpoint into an artifact."),
     (calibrate, "Learn from recorded episodes what an artifact may leave out."),
+    (distill, "Train weights for a plan of very few steps, as a last resort."),
     (inspect, "What is in an artifact; a picture of a plan."),
     (verify, "Does it do what the original did, and do its plans engage?"),
     (report, "All about an artifact on one page."),

@@ -17,6 +17,7 @@ from torch import nn
 
 from ..artifact.golden import DIGITS, Golden, GoldenPlan, load_golden, pattern, probe_stream, project
 from ..artifact.load import Artifact
+from ..artifact.manifest import DISTILLED
 from ..core.spec import FloatArray, Noise
 from ..errors import CaptureError
 from ..frontends.eager import eager_policy
@@ -139,10 +140,14 @@ def record_plans(artifact: Artifact) -> dict[str, GoldenPlan]:
     """
     if artifact.manifest.stores.golden is None:
         return {}
-    golden, model = load_golden(artifact), ReferenceModel.from_artifact(artifact)
+    golden, found = load_golden(artifact), dict[str, GoldenPlan]()
     obs = golden.network_observations(artifact.manifest.spec)
+    models = {plan: ReferenceModel.from_artifact(artifact.with_weights_of(plan)) for plan in (None, DISTILLED)}
     with torch.no_grad():
-        return {name: _episode(artifact, model, name, golden, obs) for name in artifact.manifest.plans}
+        for name in artifact.manifest.plans:
+            model = models[DISTILLED if name == DISTILLED else None]
+            found[name] = _episode(artifact, model, name, golden, obs)
+    return found
 
 
 def _episode(

@@ -1,0 +1,245 @@
+"""Low-rank changes of the weights of residual blocks, trained until a sparse loop gives the dense policy's answers.
+
+The schedule and its correction stay as they are, and so does step 0. What the loop carries to the next computed step is
+known, therefore, before training begins; from there on the loop is differentiated. Low-rank changes: LoRA (arXiv
+2106.09685); a policy of few steps that is trained to answer as one of many: progressive distillation (arXiv
+2202.00512), here for one schedule, from recorded observations alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from ..artifact.load import Artifact
+from ..core.correction import Correction
+from ..core.lattice import PlanArray, Source
+from ..runtimes.reference.sampler import Carried
+from .calls import Actions, Calls, IntArray
+from .execute import Executor, State, last, workers
+
+Array = npt.NDArray[Any]
+
+BATCH, PART = 64, 16
+"""Calls of one update, and how many of them a thread differentiates at once: gradients are summed in this order,
+however many threads there are."""
+
+WARM_UP = 20
+"""Updates in which the rate grows to what it is."""
+
+RATE = 1e-3
+SCALE = 4.0
+LARGEST_GRADIENT = 1.0
+PREDICTED = 0.1
+"""Weight of the whole prediction in the loss, beside 1 of what is executed: an executor plays what follows when a call
+is late."""
+
+SMALLEST = 2
+"""A matrix is changed if both of its sides are at least so many times the rank."""
+
+
+def trainable(artifact: Artifact, rank: int) -> tuple[str, ...]:
+    """Constants that can be changed: matrices, or kernels, of residual blocks that no other piece reads."""
+    pieces = artifact.pieces
+    others = {
+        name for key, graph in artifact.graphs.items() if not key.startswith("block_") for name in graph.constants
+    }
+    mine = {name for piece in pieces.blocks for name in piece.graph.constants} - others
+    return tuple(
+        sorted(
+            name
+            for name in mine
+            if artifact.weights[name].dtype == np.float32
+            and artifact.weights[name].ndim >= 2
+            and min(_sides(artifact.weights[name].shape)) >= SMALLEST * rank
+        )
+    )
+
+
+def _sides(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Rows and columns of a constant, all axes but the first as one."""
+    return shape[0], math.prod(shape[1:])
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """Calls, and what their loop carries to the first step that is trained.
+
+    Attributes:
+        calls: with targets.
+        carried: to step ``Student.begin``.
+    """
+
+    calls: Calls
+    carried: Carried
+
+
+class Student:
+    """A policy whose blocks change by low-rank matrices after step 0.
+
+    Args:
+        artifact: the original.
+        plan: a schedule of whole steps ``[K, blocks]``, at least two of them computed.
+        correction: of the schedule.
+        rank: of the changes.
+        seed: of the first changes, and of the order of the calls.
+        updates: how many there are to be.
+        device: where it computes; None for the CPU.
+
+    Attributes:
+        begin: the first step that is trained: the second that the schedule computes.
+        done: number of updates so far.
+    """
+
+    def __init__(
+        self,
+        artifact: Artifact,
+        plan: PlanArray,
+        correction: Correction | None,
+        rank: int,
+        seed: int,
+        updates: int,
+        device: torch.device | None = None,
+    ) -> None:
+        names = trainable(artifact, rank)
+        self._executor = Executor(artifact.with_weights({n: artifact.weights[n] for n in names}), device)
+        self._plan, self._correction, self._seed, self._updates = plan, correction, seed, updates
+        self._computed = (plan == Source.COMPUTE).all(axis=1)
+        self.begin = int(np.flatnonzero(self._computed)[1])
+        self._actions = Actions(artifact.manifest.spec)
+        self._weights = {n: self._executor.model.weights[n].requires_grad_() for n in names}
+        self._original = {n: value.detach().clone() for n, value in self._weights.items()}
+        draw = torch.Generator().manual_seed(seed)
+        self._factors: dict[str, Tensor] = {}
+        for name, value in self._original.items():
+            rows, columns = _sides(tuple(value.shape))
+            right = torch.randn(rank, columns, generator=draw) / math.sqrt(rank)
+            self._factors[f"{name}/left"] = torch.zeros(rows, rank, device=value.device)
+            self._factors[f"{name}/right"] = right.to(value.device)
+        self._adam = torch.optim.Adam(list(self._factors.values()), lr=RATE)
+        self.done = 0
+
+    @property
+    def executor(self) -> Executor:
+        """Runs the student, with the correction."""
+        return self._executor.corrected(self._correction)
+
+    def lesson(self, calls: Calls) -> Lesson:
+        """The calls as far as nothing of them is trained."""
+        parts = [np.arange(i, min(i + PART, calls.count)) for i in range(0, calls.count, PART)]
+        with workers() as pool:
+            carried = list(pool.map(self._until, [self._executor.select(calls, part) for part in parts]))
+        return Lesson(calls, Carried(*(torch.cat(each) for each in zip(*carried, strict=True))))
+
+    def update(self, lesson: Lesson, passed: float) -> float:
+        """Learn from one batch.
+
+        Args:
+            lesson: calls to learn from.
+            passed: share of the time that there is; the rate falls with it, or with the updates done.
+
+        Returns:
+            The loss of the batch.
+        """
+        part = max(passed, self.done / self._updates)
+        rate = RATE * min(1.0, (self.done + 1) / WARM_UP) * 0.5 * (1 + math.cos(math.pi * min(1.0, part)))
+        batch = self._batch(lesson.calls.count)
+        shares = [batch[i : i + PART] for i in range(0, len(batch), PART)]
+        with workers() as pool:
+            found = list(pool.map(partial(self._gradients, lesson, len(batch)), shares))
+        for name, factor in self._factors.items():
+            factor.grad = torch.stack([gradients[name] for _, gradients in found]).sum(0)
+        torch.nn.utils.clip_grad_norm_(list(self._factors.values()), LARGEST_GRADIENT)
+        for group in self._adam.param_groups:
+            group["lr"] = rate
+        self._adam.step()
+        self.done += 1
+        self._write()
+        return sum(loss for loss, _ in found)
+
+    def weights(self) -> dict[str, Array]:
+        """The changed constants, by name."""
+        return {name: value.detach().cpu().numpy().copy() for name, value in self._weights.items()}
+
+    def state(self) -> dict[str, Array]:
+        """Everything that going on needs but ``done``."""
+        arrays = {f"factor/{name}": value.cpu().numpy() for name, value in self._factors.items()}
+        for name, factor in self._factors.items():
+            moments = self._adam.state[factor]
+            arrays |= {f"{key}/{name}": moments[key].cpu().numpy() for key in ("exp_avg", "exp_avg_sq")}
+        return arrays
+
+    def restore(self, arrays: Mapping[str, Array], done: int) -> None:
+        """Go on after so many updates."""
+        for name, factor in self._factors.items():
+            factor.copy_(torch.from_numpy(arrays[f"factor/{name}"]))
+            moments = {key: torch.from_numpy(arrays[f"{key}/{name}"]) for key in ("exp_avg", "exp_avg_sq")}
+            there = {key: value.reshape(factor.shape).to(factor.device) for key, value in moments.items()}
+            self._adam.state[factor] = {"step": torch.tensor(float(done)), **there}
+        self.done = done
+        self._write()
+
+    def _batch(self, count: int) -> IntArray:
+        """Numbers of the calls of the next update: all calls in a new order, again and again."""
+        size = min(BATCH, count)
+        turn, place = divmod(self.done, count // size)
+        order = np.random.default_rng((self._seed, 6, turn)).permutation(count)
+        return np.asarray(order[place * size : (place + 1) * size])
+
+    def _until(self, calls: Calls) -> Carried:
+        loop = self._loop(calls)
+        with torch.no_grad():
+            return deque((next(loop) for _ in range(self.begin)), maxlen=1).pop()
+
+    def _gradients(self, lesson: Lesson, size: int, numbers: IntArray) -> tuple[float, dict[str, Tensor]]:
+        """Loss of some calls of a batch, as their share of it, and its gradients by factor."""
+        calls, index = self._executor.select(lesson.calls, numbers), torch.from_numpy(numbers)
+        carried = Carried(*(value[index] for value in lesson.carried))
+        with torch.enable_grad():
+            sample = last(one.sample for one in self._loop(calls, (self.begin, carried)))
+            executed = self._actions.executed(sample) - self._actions.executed(calls.targets)
+            loss = executed.square().mean() + PREDICTED * (sample - calls.targets).square().mean()
+            loss = loss * (len(numbers) / size)
+            whole = torch.autograd.grad(loss, list(self._weights.values()))
+        gradients = {}
+        for name, gradient in zip(self._weights, whole, strict=True):
+            left, right = self._factors[f"{name}/left"], self._factors[f"{name}/right"]
+            matrix = gradient.reshape(len(left), -1) * _scale(right)
+            gradients[f"{name}/left"], gradients[f"{name}/right"] = matrix @ right.T, left.T @ matrix
+        return float(loss.detach()), gradients
+
+    def _loop(self, calls: Calls, since: tuple[int, Carried] | None = None) -> Iterator[Carried]:
+        """The sparse loop, whole or from a step on; idle steps add what the last computed one did."""
+        state, total = State(), calls.initial
+
+        def blocks(k: int, stem: Tensor) -> Tensor:
+            nonlocal total
+            if not self._computed[k]:
+                return stem + total
+            stream = self._executor.step(self._plan[k][None], k, stem, calls, state)
+            total = stream - stem
+            return stream
+
+        model = self._executor.model
+        return model.steps_of(calls.contexts, calls.initial, calls.noise, blocks, self._correction, since=since)
+
+    @torch.no_grad()
+    def _write(self) -> None:
+        """Put the changes into the weights that the executor reads."""
+        for name, value in self._weights.items():
+            left, right = self._factors[f"{name}/left"], self._factors[f"{name}/right"]
+            value.copy_(self._original[name] + (left @ right * _scale(right)).reshape(value.shape))
+
+
+def _scale(right: Tensor) -> float:
+    """Of a change, for so many columns: with it the rate that suits one size of a matrix suits others."""
+    return SCALE / math.sqrt(right.shape[1])

@@ -1,0 +1,52 @@
+"""``ttscompile distill``: weights of its own for a schedule that computes very few steps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+import ttscompile
+from ttscompile.artifact.load import load_artifact
+from ttscompile.cli.options import artifact_argument, count_option, json_option, seed_option
+from ttscompile.cli.output import manifest_of, only_results_on_stdout, print_json, results
+from ttscompile.cli.recordings import FilesCommand, Sources, require_recordings, trajectories_options
+from ttscompile.cli.summary import print_summary
+from ttscompile.cli.types import MINUTES, TEXT
+from ttscompile.report.summary import document
+
+
+@click.command(cls=FilesCommand)
+@artifact_argument
+@trajectories_options()
+@click.option("--plan", type=TEXT, default="schedule", show_default=True, help="Schedule to distil.")
+@count_option("--rank", "Of the change of each matrix.", default=16)
+@count_option("--updates", "Of the weights, if there is time.", default=600)
+@seed_option("Of the split, the noise and the training; take that of the calibration.")
+@click.option("--max-minutes", type=MINUTES, default=15.0, show_default=True, help="All in all, about.")
+@click.option("--device", type=TEXT, help="Device to train on, as torch calls it: cuda, mps. Otherwise the CPU.")
+@click.option("--resume", is_flag=True, help="Go on where a distillation that was interrupted stopped.")
+@json_option
+def distill(
+    directory: Path,
+    trajectories: tuple[Path, ...],
+    sources: Sources,
+    as_json: bool,
+    **training: Any,  # ttscompile.distill takes them by the same names
+) -> None:
+    """Train weights for the later steps of a calibrated schedule of the artifact DIRECTORY. The last resort.
+
+    Where very few steps are computed, no correction brings the actions back to those of the dense policy. The plan
+    'distilled' then has weights of its own, trained to the dense policy's answers on the recorded observations. The
+    original's weights stay beside them, for all other plans. Exit status 1: it is no better on held-out episodes.
+    """
+    manifest_of(directory)
+    require_recordings(trajectories)
+    with only_results_on_stdout():
+        ttscompile.distill(directory, trajectories=list(trajectories), observation=sources, **training)
+    artifact = load_artifact(directory)
+    if as_json:
+        print_json(document(artifact))
+    else:
+        print_summary(artifact, results())
