@@ -1,0 +1,304 @@
+"""Distillation from end to end on a small policy: what the plan ``distilled`` is, and what it leaves as it was."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import ttscompile
+from tests.once import Once
+from ttscompile.artifact import codec, tensors
+from ttscompile.artifact.files import describe
+from ttscompile.artifact.load import Artifact, load_artifact
+from ttscompile.artifact.manifest import DENSE, DISTILLED, MANIFEST
+from ttscompile.artifact.write import update_calibration
+from ttscompile.calibration import student
+from ttscompile.calibration.calls import prepare_calls
+from ttscompile.calibration.distill import Distilled, distill
+from ttscompile.calibration.execute import Executor
+from ttscompile.calibration.pipeline import calibrate
+from ttscompile.calibration.student import Student, trainable
+from ttscompile.errors import ArtifactError, CalibrationError, CalibrationFailedError
+from ttscompile.runtimes.open import open_runtime
+from ttscompile.runtimes.policy import CompiledPolicy
+from ttscompile.runtimes.reference.model import ReferenceModel
+from ttscompile.trajectories.episodes import Episode
+from ttscompile.verification import verify
+
+from . import policies
+from .killed import killed
+
+Noise = ttscompile.Noise
+UPDATES = 40
+
+
+def train(directory: Path, recording: Path, **changes: Any) -> Distilled:
+    return distill(directory, [recording], **{"rank": 4, "updates": UPDATES, "progress": False, **changes})
+
+
+def whole_steps(directory: Path, recording: Path) -> Path:
+    """The artifact with a schedule that computes two of its ten steps."""
+    calibrate(directory, [recording], 0.8, "interval", progress=False)
+    return directory
+
+
+@pytest.fixture(scope="module")
+def scheduled(compiled: Path, recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = shutil.copytree(compiled, tmp_path_factory.mktemp("scheduled") / "compiled")
+    return whole_steps(Path(directory), recording)
+
+
+@pytest.fixture(scope="module")
+def distilled(scheduled: Path, recording: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Distilled]:
+    """A distilled artifact and the result; not to be changed."""
+    directory = Path(shutil.copytree(scheduled, tmp_path_factory.mktemp("distilled") / "compiled"))
+    return directory, train(directory, recording)
+
+
+@pytest.fixture
+def copied(scheduled: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(scheduled, tmp_path / "compiled"))
+
+
+def contents(directory: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(directory.iterdir())}
+
+
+def call(seed: int, streams: int = 3) -> tuple[dict[str, Any], Noise]:
+    draw = np.random.default_rng(seed)
+    shape = (streams, policies.HORIZON, policies.CHANNELS)
+    steps = draw.standard_normal((policies.STEPS, *shape), dtype=np.float32)
+    obs = {"obs": draw.standard_normal((streams, 2, 3)).astype(np.float32)}
+    return obs, Noise(draw.standard_normal(shape, dtype=np.float32), steps)
+
+
+def actions(policy: CompiledPolicy, plan: str, seed: int = 0) -> Any:
+    obs, noise = call(seed)
+    return policy.predict_action(obs, noise=noise, plan=plan)["action_pred"]
+
+
+def test_the_artifact_gets_a_plan_that_is_nearer_to_the_dense_policy(distilled: tuple[Path, Distilled]) -> None:
+    directory, result = distilled
+    artifact = load_artifact(directory)
+    assert result.after.error < result.before.error
+    assert (result.updates, result.stopped) == (UPDATES, "finished")
+    assert artifact.manifest.default_plan == DISTILLED
+    np.testing.assert_array_equal(artifact.schedule(DISTILLED), artifact.schedule("schedule"))
+    record = artifact.manifest.calibration
+    assert record is not None
+    assert record["distilled"] == json.loads(json.dumps(result.record()))
+    assert record["plans"][DISTILLED]["error"] == result.after.error
+
+
+def test_all_other_plans_are_what_they_were(scheduled: Path, distilled: tuple[Path, Distilled]) -> None:
+    before, after = ttscompile.load(scheduled), ttscompile.load(distilled[0])
+    assert after.info.default_plan == DISTILLED
+    assert after.info.model_identity == before.info.model_identity
+    assert after.info.identity != before.info.identity
+    actions(after, DISTILLED)
+    for plan in (DENSE, "schedule", "uniform"):
+        np.testing.assert_array_equal(actions(after, plan), actions(before, plan))
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_onnxruntime_gives_the_references_answer(distilled: tuple[Path, Distilled], threads: int) -> None:
+    reference = ttscompile.load(distilled[0], runtime="reference")
+    policy = ttscompile.load(distilled[0], threads=threads)
+    wanted = actions(reference, DISTILLED)
+    np.testing.assert_allclose(actions(policy, DISTILLED), wanted, atol=2e-5)
+    assert np.abs(wanted - actions(reference, "schedule")).max() > 1e-2
+
+
+def test_step_0_has_the_originals_weights_and_later_steps_have_not(distilled: tuple[Path, Distilled]) -> None:
+    artifact = load_artifact(distilled[0])
+    original, own = (ReferenceModel.from_artifact(artifact.with_weights_of(plan)) for plan in (None, DISTILLED))
+    obs = {"obs": torch.from_numpy(call(1)[0]["obs"])}
+    contexts, stream = original.prologue(obs), torch.randn(3, policies.HORIZON, policies.WIDTH)
+    assert torch.equal(own.block(1, 0, stream, contexts), original.block(1, 0, stream, contexts))
+    assert not torch.equal(own.block(1, 1, stream, contexts), original.block(1, 1, stream, contexts))
+
+
+def test_nothing_is_reused_between_calls_with_different_weights(distilled: tuple[Path, Distilled]) -> None:
+    artifact = load_artifact(distilled[0])
+    policy = CompiledPolicy(artifact, open_runtime(artifact), seed=0)
+    everything = np.zeros((policies.STEPS, len(artifact.manifest.blocks)), np.int8)
+    obs, noise = call(2)
+    rollout = everything + 3
+    rollout[0] = 0
+    policy.predict_action(obs, noise=noise, plan=everything)
+    policy.predict_action(obs, noise=noise, plan=rollout)  # reads what the call before computed
+    policy.predict_action(obs, noise=noise, plan=DISTILLED)
+    with pytest.raises(ttscompile.TtscompileError, match="ROLLOUT"):
+        policy.predict_action(obs, noise=noise, plan=rollout)
+
+
+def test_verify_knows_both_sets_of_weights(distilled: tuple[Path, Distilled], recording: Path, tmp_path: Path) -> None:
+    found = verify(distilled[0], [recording], calls=8)
+    assert {rung.status for rung in found.rungs} == {"passed"}, found.rungs
+    other = Path(shutil.copytree(distilled[0], tmp_path / "exchanged"))
+    exchange_weights(other)
+    found = verify(other)
+    (failed,) = [rung for rung in found.rungs if rung.status == "failed"]
+    assert failed.name == "plans" and "'distilled'" in failed.told
+
+
+def exchange_weights(directory: Path) -> None:
+    """Weights of another distillation, in an artifact that hashes say is whole."""
+
+    manifest = codec.decode((directory / MANIFEST).read_bytes())
+    assert manifest.distilled is not None
+    path = directory / manifest.distilled.weights
+    arrays = {name: np.array(value) * 1.1 for name, value in tensors.read(path).items()}
+    path.write_bytes(tensors.serialize({name: value.astype(np.float32) for name, value in arrays.items()}))
+    manifest = replace(manifest, files={**manifest.files, path.name: describe(path)})
+    identity, model = codec.identities(manifest)
+    (directory / MANIFEST).write_bytes(codec.encode(replace(manifest, identity=identity, model_identity=model)))
+
+
+@pytest.mark.parametrize("saves", [1, 4])
+def test_a_distillation_that_was_killed_goes_on_to_the_same_bytes(
+    distilled: tuple[Path, Distilled], copied: Path, recording: Path, saves: int
+) -> None:
+    before = load_artifact(copied).manifest.identity
+    with killed(saves):
+        train(copied, recording)
+    assert load_artifact(copied).manifest.identity == before  # the artifact works as it did
+    train(copied, recording, resume=True)
+    assert contents(copied) == contents(distilled[0])
+
+
+def test_the_outcome_does_not_depend_on_the_number_of_threads(
+    distilled: tuple[Path, Distilled], copied: Path, recording: Path
+) -> None:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1 if threads > 1 else 2)
+    try:
+        train(copied, recording)
+    finally:
+        torch.set_num_threads(threads)
+    assert contents(copied) == contents(distilled[0])
+
+
+def test_what_is_no_better_is_not_kept(copied: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = contents(copied)
+    monkeypatch.setattr(student, "RATE", 0.0)
+    with pytest.raises(CalibrationFailedError, match="after 1 updates. The artifact is as it was"):
+        train(copied, recording, updates=1)
+    assert {name: one for name, one in contents(copied).items() if name in before} == before
+
+
+def test_the_time_limit_ends_it(copied: Path, recording: Path) -> None:
+    result = train(copied, recording, updates=100_000, max_minutes=0.1)
+    assert result.stopped == "time limit"
+    assert 0 < result.updates < 100_000
+
+
+def test_calibrating_again_drops_it(distilled: tuple[Path, Distilled], recording: Path, tmp_path: Path) -> None:
+    directory = whole_steps(Path(shutil.copytree(distilled[0], tmp_path / "compiled")), recording)
+    artifact = load_artifact(directory)
+    assert artifact.manifest.distilled is None and DISTILLED not in artifact.manifest.plans
+    assert not list(directory.glob("distilled*"))
+
+
+def test_in_eight_bits(once: Once, recording: Path, tmp_path: Path) -> None:
+    directory = Path(shutil.copytree(policies.compiled(once, "int8"), tmp_path / "compiled"))
+    train(whole_steps(directory, recording), recording)
+    assert {rung.status for rung in verify(directory).rungs} <= {"passed", "skipped"}
+    exact, own = ttscompile.load(directory, precision="fp32"), ttscompile.load(directory)
+    wanted, found = actions(exact, DISTILLED), actions(own, DISTILLED)
+    between = np.abs(wanted - actions(exact, "schedule")).max()
+    assert 0 < np.abs(found - wanted).max() < 0.5 * between
+
+
+@pytest.mark.parametrize(
+    ("plan", "message"),
+    [
+        ("pruner", r"found 'pruner'. Give one of \['schedule', 'uniform'\]"),
+        (DISTILLED, r"found 'distilled'. Give one of \['schedule', 'uniform'\]"),
+    ],
+)
+def test_a_plan_that_cannot_be_distilled(scheduled: Path, recording: Path, plan: str, message: str) -> None:
+    with pytest.raises(CalibrationError, match=message):
+        train(scheduled, recording, plan=plan)
+
+
+def test_a_schedule_of_single_cells_is_refused(artifact: Path, recording: Path) -> None:
+    plan = np.full((policies.STEPS, len(load_artifact(artifact).manifest.blocks)), 2, np.int8)
+    plan[0] = plan[4, 1] = 0
+    update_calibration(artifact, None, {"schedule": plan}, "schedule", {})
+    with pytest.raises(CalibrationError, match="expected whole steps, at least two of them computed"):
+        train(artifact, recording)
+
+
+def test_an_artifact_that_is_not_calibrated_is_refused(compiled: Path, recording: Path) -> None:
+    with pytest.raises(CalibrationError, match="Calibrate the artifact first"):
+        train(compiled, recording)
+
+
+def test_a_change_touches_blocks_alone(compiled: Path) -> None:
+    artifact = load_artifact(compiled)
+    names = trainable(artifact, 4)
+    assert len(names) == 3 * policies.LAYERS
+    elsewhere = {name for key, graph in artifact.graphs.items() if "block" not in key for name in graph.constants}
+    assert not elsewhere & set(names)
+    assert trainable(artifact, policies.WIDTH) == ()  # nothing is so large
+
+
+def test_training_learns_its_lesson(scheduled: Path) -> None:
+    """Eight calls by heart: what it is judged on otherwise is other calls, of a network that nobody trained."""
+    one, lesson = _student(load_artifact(scheduled))
+    losses = [one.update(lesson, 0.0) for _ in range(80)]
+    assert losses[-1] < 0.5 * losses[0]
+
+
+def test_an_update_follows_the_gradient_of_the_loss(scheduled: Path) -> None:
+    """Gradients of the factors are those of the changes that they make, by finite differences of the loss."""
+    artifact = load_artifact(scheduled)
+    one, lesson = _student(artifact)
+    for _ in range(3):
+        one.update(lesson, 0.0)
+    numbers = np.arange(8)
+    loss, gradients = one._gradients(lesson, 8, numbers)
+    name = next(iter(gradients))
+    factor, direction = one._factors[name], torch.sign(gradients[name])
+    width = 1e-3
+    losses = []
+    for sign in (1, -1):
+        factor += sign * width * direction
+        one._write()
+        losses.append(one._gradients(lesson, 8, numbers)[0])
+        factor -= sign * width * direction
+    slope = (losses[0] - losses[1]) / (2 * width)
+    assert slope == pytest.approx(float(gradients[name].abs().sum()), rel=0.05)
+    assert loss < losses[0]
+
+
+def _student(artifact: Artifact) -> tuple[Student, Any]:
+    spec, executor = artifact.manifest.spec, Executor(artifact)
+    draw = np.random.default_rng(0)
+    episode = Episode("test", {"obs": draw.standard_normal((8, 2, 3)).astype(np.float32)})
+    calls = prepare_calls(executor.model, spec, [episode], [(0, i) for i in range(8)], (0,))
+    calls = replace(calls, path=executor.run_dense(calls))
+    one = Student(artifact, artifact.schedule("schedule"), None, 4, 0, 100)
+    return one, one.lesson(calls)
+
+
+@pytest.mark.parametrize("change", [{"rank": 0}, {"updates": 0}, {"max_minutes": 0.0}, {"validation_fraction": 1.0}])
+def test_arguments_that_cannot_be(scheduled: Path, recording: Path, change: dict[str, Any]) -> None:
+    with pytest.raises(CalibrationError, match="expected|must be"):
+        train(scheduled, recording, **change)
+
+
+def test_a_record_that_does_not_fit_is_refused(distilled: tuple[Path, Distilled]) -> None:
+    document = json.loads((distilled[0] / MANIFEST).read_bytes())
+    del document["checksum"], document["distilled"]["models"]["block_00"]
+    document["checksum"] = codec._checksum(document)
+    with pytest.raises(ArtifactError, match="distilled: expected a model of each of"):
+        codec.decode(json.dumps(document).encode())
