@@ -29,7 +29,7 @@ from ttscompile.errors import CaptureError
 from ttscompile.ir.evaluate import resolve_enum, resolve_op
 from ttscompile.ir.graph import Argument, Batch, Enum, Graph, Node, Ref
 
-from .packed import GELU, LINEAR, PACKED_LINEAR, gelu_kind, packed_weight, packs
+from .packed import GELU, HALF_LINEAR, LINEAR, PACKED_LINEAR, gelu_kind, half_weight, packed_weight, packs
 
 Function = Callable[..., tuple[Tensor, ...]]
 """Takes the graph's inputs in order, and gives its outputs in order."""
@@ -134,10 +134,7 @@ class _Writer:
     def write(self, node: Node) -> None:
         """Compute a node, and write it down unless it is fixed or a view."""
         resolved = resolve_op(node)  # refuses what must not run
-        packed = self._packed(node)
-        if packed is not None:
-            node = self._packed_nodes[node.name] = packed
-        function = _OWN.get(node.op, resolved) if packed is None or PACKED_LINEAR is None else PACKED_LINEAR
+        node, function = self._packed(node) or (node, _OWN.get(node.op, resolved))
         args = [self._value(node, argument) for argument in node.args]
         kwargs = {name: self._value(node, argument) for name, argument in node.kwargs}
         value = function(*args, **kwargs)
@@ -157,20 +154,32 @@ class _Writer:
         if isinstance(value, Tensor) and value.numel() and not self._is_foreign(node, value):
             self._owners.setdefault(_storage(value), (name, value))
 
-    def _packed(self, node: Node) -> Node | None:
-        """A node in whose place ``PACKED_LINEAR`` does the same with its arguments; None if it is no such node."""
+    def _packed(self, node: Node) -> tuple[Node, Callable[..., Any]] | None:
+        """What does the same as a node on a packed weight: its arguments, and the function; None if nothing does."""
         before = self._packed_nodes.get(next(node.refs(), ""))
         if node.op == GELU and before is not None and before.args[3] == "none" and self._readers[before.name] == 1:
-            return replace(before, name=node.name, args=(*before.args[:3], "gelu", (), gelu_kind(node)))
+            return self._with_packed(
+                replace(before, name=node.name, args=(*before.args[:3], "gelu", (), gelu_kind(node)))
+            )
         if node.op != LINEAR or node.kwargs or not isinstance(node.args[0], Ref) or not isinstance(node.args[1], Ref):
             return None
         value, weight = (self._values[each.name] for each in node.args[:2] if isinstance(each, Ref))
         fixed = [name in self._fixed for name in node.refs()]
         if fixed[0] or not all(fixed[1:]) or not packs(value, weight):
             return None
-        name = f"{node.name}.packed"
+        name, bias = f"{node.name}.packed", (*node.args, None)[2]
+        half = half_weight(weight, self._values[bias.name] if isinstance(bias, Ref) else None)
+        if half is not None and HALF_LINEAR is not None:
+            self.fix(name, half)
+            return replace(node, args=(node.args[0], Ref(name))), HALF_LINEAR
         self.fix(name, packed_weight(value, weight))
-        return replace(node, args=(node.args[0], Ref(name), (*node.args, None)[2], "none", (), ""))
+        return self._with_packed(replace(node, args=(node.args[0], Ref(name), bias, "none", (), "")))
+
+    def _with_packed(self, node: Node) -> tuple[Node, Callable[..., Any]]:
+        """A node with the arguments of ``PACKED_LINEAR``, which a later one may take the place of."""
+        assert PACKED_LINEAR is not None  # or nothing packs
+        self._packed_nodes[node.name] = node
+        return node, PACKED_LINEAR
 
     def function(self, outputs: Sequence[str]) -> Function:
         """The function with these results."""

@@ -27,6 +27,7 @@ from ttscompile.runtimes.torch.capture import Line, Lines
 from ttscompile.runtimes.torch.functions import write_function
 from ttscompile.runtimes.torch.loop import denoise
 from ttscompile.runtimes.torch.network import Parts, StreamsNetwork
+from ttscompile.runtimes.torch.packed import HALF_LINEAR
 from ttscompile.runtimes.torch.sampler import Advance
 
 from .agreement import call_terms, largest_difference, random_inputs
@@ -68,6 +69,18 @@ def test_it_agrees_with_the_reference(make_artifact: MakeArtifact, variant: dict
     for seed in range(5):
         rng = np.random.default_rng(seed)
         assert largest_difference(artifact, *runtimes, rng, streams=1 + seed % 4, calls=4) < allowed
+
+
+def test_a_policy_that_was_saved_in_half_precision_agrees_with_the_reference(make_artifact: MakeArtifact) -> None:
+    """Its weights are read in half precision, and nothing is computed in it."""
+    program = toy_program(pruner=False)
+    saved = {
+        name: value.astype(np.float16).astype(value.dtype) if name.endswith(".w") else value
+        for name, value in program.weights.items()
+    }
+    artifact, rng = make_artifact(replace(program, weights=saved)), np.random.default_rng(0)
+    runtimes = open_runtime(artifact, "torch"), open_runtime(artifact, "reference")
+    assert largest_difference(artifact, *runtimes, rng, streams=2, calls=4) < bound(call_terms(artifact))
 
 
 def test_streams_with_one_plan_are_a_batch(make_artifact: MakeArtifact) -> None:
@@ -282,6 +295,25 @@ def test_a_function_computes_what_its_graph_says_with_fewer_operations() -> None
                 assert_equal_but_for_rounding(one, other, 40)
         names = function.__code__.co_varnames
         assert len(names) - 1 < len(graph.nodes) - 3, names  # transpositions of the weight, moves, and the gelu
+
+
+@pytest.mark.skipif(torch.backends.quantized.engine not in ("x86", "fbgemm"), reason="this torch has no FBGEMM")
+@pytest.mark.parametrize("bias", [True, False])
+def test_only_weights_that_half_precision_holds_are_read_in_it(bias: bool) -> None:
+    half, rng = torch.randn(7, 5, generator=torch.Generator().manual_seed(0)).half().float(), np.random.default_rng(0)
+    terms = 5 + 2
+    linear = node("y", "linear.default", f32(B, 3, 7), Ref("x"), Ref("w"), *[Ref("b")] * bias)
+    nodes = linear, node("g", "gelu.default", f32(B, 3, 7), Ref("y"))
+    graph = Graph({"x": f32(B, 3, 5)}, {"w": f32(7, 5), "b": f32(7)}, nodes, ("g",))
+    x, b = (torch.from_numpy(rng.standard_normal(shape).astype(np.float32)) for shape in ((2, 3, 5), (7,)))
+    finer, large = half.clone(), half.clone()
+    finer[6, 4] *= 1 + 2**-20
+    large[0, 0] = 2.0**17
+    for weight, expected in ((half, True), (finer, False), (large, False)):
+        weights = {"w": weight, "b": b}
+        function = write_function(graph, weights, [torch.zeros_like(x)], 2, None)
+        assert any(value is HALF_LINEAR for value in function.__globals__.values()) == expected
+        assert_equal_but_for_rounding(function(x)[0], evaluate(graph, weights, {"x": x})[0], terms)
 
 
 def test_a_function_reads_weights_where_nothing_can_be_packed() -> None:
