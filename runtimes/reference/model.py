@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from types import MappingProxyType
 
 import numpy as np
 import numpy.typing as npt
@@ -80,7 +81,7 @@ class ReferenceModel:
         groups: FORWARD group of each block.
         weights: value of every constant of the pieces.
         device: where the pieces compute. Samples, and what the sampler does with them, are on the CPU wherever that is.
-        first: values of constants that blocks have at step 0, where those are others; None for the same.
+        first: values of constants that blocks have at step 0, where those are others.
 
     Attributes:
         device: where the pieces compute.
@@ -100,7 +101,7 @@ class ReferenceModel:
         groups: Sequence[int],
         weights: Mapping[str, npt.NDArray[np.generic]],
         device: torch.device | None = None,
-        first: Mapping[str, npt.NDArray[np.generic]] | None = None,
+        first: Mapping[str, npt.NDArray[np.generic]] = MappingProxyType({}),
     ) -> None:
         self.device = torch.device("cpu") if device is None else device
         self._pieces, self._types, self.sampler = pieces, tuple(types), TorchSampler(spec.sampler)
@@ -111,7 +112,7 @@ class ReferenceModel:
         self._step = evaluator(pieces.step) if pieces.step is not None else None
         self._stem = evaluator(pieces.stem.graph)
         self._blocks = self._first = tuple(evaluator(piece.graph) for piece in pieces.blocks)
-        if first is not None:
+        if first:
             own = {**self.weights, **{name: _tensor(value).to(self.device) for name, value in first.items()}}
             self._first = tuple(Evaluator(piece.graph, own, self.device) for piece in pieces.blocks)
         self._tail = evaluator(pieces.tail.graph)
@@ -135,8 +136,7 @@ class ReferenceModel:
         manifest = artifact.manifest
         weights = {**artifact.weights, **artifact.pruner}
         types = [block.type for block in manifest.blocks]
-        first = None if artifact.first_step is None else artifact.first_step.weights
-        return cls(artifact.pieces, manifest.spec, types, manifest.groups, weights, device, first)
+        return cls(artifact.pieces, manifest.spec, types, manifest.groups, weights, device, artifact.first_weights)
 
     @property
     def pruner_weights(self) -> dict[str, Tensor]:

@@ -74,6 +74,7 @@ class SparseCall(nn.Module):
 
     def __init__(self, artifact: Artifact, plan: str) -> None:
         super().__init__()
+        artifact = artifact.with_weights_of(plan)
         manifest, pieces = artifact.manifest, artifact.pieces
         self._spec, self._pieces, self._features = manifest.spec, pieces, manifest.features
         groups = manifest.groups
@@ -86,6 +87,7 @@ class SparseCall(nn.Module):
         self._names: dict[str, str] = {}  # of buffers, by what they hold
         constants = {name for graph in pieces.graphs().values() for name in graph.constants}
         self._keep("weight", {name: value for name, value in artifact.weights.items() if name in constants})
+        self._keep("first weight", artifact.first_weights)
         self._keep("table", pieces.tables)
         correction = artifact.corrections.get(plan)
         self._advance = Advance(manifest.spec, correction, CPU)
@@ -172,6 +174,7 @@ class _Exported:
     def __init__(self, module: SparseCall, obs: Mapping[str, Tensor], streams: int) -> None:
         self._pieces, self._streams, self._evaluators = module._pieces, streams, module._evaluators
         self._weights, self._tables = module._kept("weight"), module._kept("table")
+        self._first = self._weights | module._kept("first weight")
         self.idle = None if module._idle is None else module._idle.on(module._kept("idle"))
         made = self._evaluators["condition"]({**self._weights, **obs})
         self._condition = dict(zip(self._pieces.condition.outputs, made, strict=True))
@@ -197,7 +200,8 @@ class _Exported:
 
     def _run(self, name: str, piece: LoopPiece, value: Tensor, k: int) -> Tensor:
         reads = {context: self._context(context, k) for context in piece.contexts}
-        result: Tensor = self._evaluators[name]({**self._weights, piece.stream: value, **reads})[0]
+        weights = self._weights if k else self._first
+        result: Tensor = self._evaluators[name]({**weights, piece.stream: value, **reads})[0]
         return result
 
     def _context(self, name: str, k: int) -> Tensor:

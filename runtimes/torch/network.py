@@ -34,6 +34,8 @@ class Parts:
         self.device, self.narrow = device, narrow
         values = {**artifact.weights, **artifact.pruner}
         self.weights = {name: devices.placed(value, device) for name, value in values.items()}
+        first = {name: devices.placed(value, device) for name, value in artifact.first_weights.items()}
+        self.first = self.weights | first if first else self.weights
         form, _ = idle_form(self.pieces, values)
         self.idle = None if form is None else IdleSteps(form, device)
 
@@ -78,7 +80,11 @@ class StreamsNetwork:
         self._tail, self._tail_reads = self._loop_piece(pieces.tail, stream)
         with self._narrow():
             blocks = [self._loop_piece(piece, stream, parts.narrow) for piece in pieces.blocks]
+            first = blocks
+            if parts.first is not parts.weights:
+                first = [self._loop_piece(piece, stream, parts.narrow, parts.first) for piece in pieces.blocks]
         self._blocks, self._block_reads = zip(*blocks, strict=True)
+        self._first, _ = zip(*first, strict=True)
         self._pruner = None
         if pieces.pruner is not None:
             self._pruner_reads = [self.values[name] for name in pieces.pruner.inputs]
@@ -118,11 +124,12 @@ class StreamsNetwork:
 
     def block(self, b: int, k: int, stream: Tensor) -> Tensor:
         """See ``loop.Network``."""
+        block = self._blocks[b] if k else self._first[b]
         if self._parts.narrow is None:
-            residual: Tensor = self._blocks[b](stream, *self._block_reads[b][k])[0]
+            residual: Tensor = block(stream, *self._block_reads[b][k])[0]
             return residual
         with self._narrow():
-            residual = self._blocks[b](stream, *self._block_reads[b][k])[0]
+            residual = block(stream, *self._block_reads[b][k])[0]
             return residual
 
     def tail(self, stream: Tensor, k: int) -> Tensor:
@@ -154,20 +161,25 @@ class StreamsNetwork:
         streams: int,
         narrow: torch.dtype | None = None,
         order: Sequence[str] | None = None,
+        weights: Mapping[str, Tensor] | None = None,
     ) -> Function:
         if order is not None:  # of the parameters; those that the graph does not read are there too
             types = {name: graph.inputs.get(name, TensorType((), "float32")) for name in order}
             graph = Graph(types, graph.constants, graph.nodes, graph.outputs)
-        return write_function(graph, self._parts.weights, examples, streams, narrow)
+        return write_function(graph, weights or self._parts.weights, examples, streams, narrow)
 
     def _loop_piece(
-        self, piece: LoopPiece, value: Tensor, narrow: torch.dtype | None = None
+        self,
+        piece: LoopPiece,
+        value: Tensor,
+        narrow: torch.dtype | None = None,
+        weights: Mapping[str, Tensor] | None = None,
     ) -> tuple[Function, list[tuple[Tensor, ...]]]:
         """The function of a piece, with the stream first, and its contexts at each step."""
         contexts = list(piece.contexts)
         reads = [tuple(self._at(name, k) for name in contexts) for k in range(self._steps)]
         order = [piece.stream, *contexts]
-        return self._written(piece.graph, [value, *reads[0]], self.streams, narrow, order), reads
+        return self._written(piece.graph, [value, *reads[0]], self.streams, narrow, order, weights), reads
 
     def _at(self, name: str, k: int) -> Tensor:
         """The value of a context at step k."""

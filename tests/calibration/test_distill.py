@@ -21,22 +21,26 @@ from ttscompile.artifact.manifest import DENSE, DISTILLED, MANIFEST
 from ttscompile.artifact.write import update_calibration
 from ttscompile.calibration import student
 from ttscompile.calibration.calls import prepare_calls
-from ttscompile.calibration.distill import Distilled, distill
+from ttscompile.calibration.distill import Distilled, _train, distill
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.pipeline import calibrate
+from ttscompile.calibration.progress import Bar
+from ttscompile.calibration.state import StateFile
 from ttscompile.calibration.student import Student, trainable
+from ttscompile.calibration.task import Clock
 from ttscompile.errors import ArtifactError, CalibrationError, CalibrationFailedError
 from ttscompile.runtimes.open import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.runtimes.reference.model import ReferenceModel
 from ttscompile.trajectories.episodes import Episode
 from ttscompile.verification import verify
+from ttscompile.verification.engaged import ENGAGED
 
 from . import policies
 from .killed import killed
 
 Noise = ttscompile.Noise
-UPDATES = 40
+UPDATES = 24
 
 
 def train(directory: Path, recording: Path, **changes: Any) -> Distilled:
@@ -107,13 +111,22 @@ def test_all_other_plans_are_what_they_were(scheduled: Path, distilled: tuple[Pa
         np.testing.assert_array_equal(actions(after, plan), actions(before, plan))
 
 
-@pytest.mark.parametrize("threads", [1, 2])
-def test_onnxruntime_gives_the_references_answer(distilled: tuple[Path, Distilled], threads: int) -> None:
+@pytest.mark.parametrize(("runtime", "threads"), [("onnxruntime", 1), ("onnxruntime", 2), ("torch", 1)])
+def test_runtimes_give_the_references_answer(distilled: tuple[Path, Distilled], runtime: str, threads: int) -> None:
     reference = ttscompile.load(distilled[0], runtime="reference")
-    policy = ttscompile.load(distilled[0], threads=threads)
+    policy = ttscompile.load(distilled[0], runtime, threads)
     wanted = actions(reference, DISTILLED)
     np.testing.assert_allclose(actions(policy, DISTILLED), wanted, atol=2e-5)
     assert np.abs(wanted - actions(reference, "schedule")).max() > 1e-2
+
+
+def test_the_module_of_torch_gives_the_references_answer(distilled: tuple[Path, Distilled]) -> None:
+    obs, noise = call(0)
+    assert noise.steps is not None
+    given = {"obs": torch.from_numpy(obs["obs"])}
+    made = ttscompile.to_module(distilled[0])(given, torch.from_numpy(noise.initial), torch.from_numpy(noise.steps))
+    wanted = actions(ttscompile.load(distilled[0], runtime="reference"), DISTILLED)
+    np.testing.assert_allclose(made.numpy(), wanted, atol=2e-5)
 
 
 def test_step_0_has_the_originals_weights_and_later_steps_have_not(distilled: tuple[Path, Distilled]) -> None:
@@ -141,7 +154,8 @@ def test_nothing_is_reused_between_calls_with_different_weights(distilled: tuple
 
 def test_verify_knows_both_sets_of_weights(distilled: tuple[Path, Distilled], recording: Path, tmp_path: Path) -> None:
     found = verify(distilled[0], [recording], calls=8)
-    assert {rung.status for rung in found.rungs} == {"passed"}, found.rungs
+    others = [rung for rung in found.rungs if rung.name != ENGAGED]  # which times calls
+    assert {rung.status for rung in others} == {"passed"}, others
     other = Path(shutil.copytree(distilled[0], tmp_path / "exchanged"))
     exchange_weights(other)
     found = verify(other)
@@ -194,10 +208,10 @@ def test_what_is_no_better_is_not_kept(copied: Path, recording: Path, monkeypatc
     assert {name: one for name, one in contents(copied).items() if name in before} == before
 
 
-def test_the_time_limit_ends_it(copied: Path, recording: Path) -> None:
-    result = train(copied, recording, updates=100_000, max_minutes=0.1)
-    assert result.stopped == "time limit"
-    assert 0 < result.updates < 100_000
+def test_the_time_limit_ends_training(scheduled: Path, tmp_path: Path) -> None:
+    one, lesson = _student(load_artifact(scheduled))
+    _train(one, lesson.calls, StateFile(tmp_path, {}), Clock(0.0), Bar(False), 100)
+    assert one.done == 1  # the first update is not asked how long it will take
 
 
 def test_calibrating_again_drops_it(distilled: tuple[Path, Distilled], recording: Path, tmp_path: Path) -> None:
@@ -210,7 +224,7 @@ def test_calibrating_again_drops_it(distilled: tuple[Path, Distilled], recording
 def test_in_eight_bits(once: Once, recording: Path, tmp_path: Path) -> None:
     directory = Path(shutil.copytree(policies.compiled(once, "int8"), tmp_path / "compiled"))
     train(whole_steps(directory, recording), recording)
-    assert {rung.status for rung in verify(directory).rungs} <= {"passed", "skipped"}
+    assert {rung.status for rung in verify(directory).rungs if rung.name != ENGAGED} <= {"passed", "skipped"}
     exact, own = ttscompile.load(directory, precision="fp32"), ttscompile.load(directory)
     wanted, found = actions(exact, DISTILLED), actions(own, DISTILLED)
     between = np.abs(wanted - actions(exact, "schedule")).max()

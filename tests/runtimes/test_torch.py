@@ -116,7 +116,7 @@ def calibrated(make_artifact: MakeArtifact) -> Artifact:
 
 def both(artifact: Artifact, lines: list[Line]) -> list[Runtime]:
     captured = TorchBackend(artifact, capture=replaying(lines))
-    return [Runtime(artifact, captured), open_runtime(artifact, "reference")]
+    return [Runtime(artifact, lambda opened: captured), open_runtime(artifact, "reference")]
 
 
 @pytest.mark.parametrize("name", ["evenly", "mixed", DENSE])

@@ -140,6 +140,12 @@ class Artifact:
         manifest = replace(manifest, pieces=pieces, precision=precision, distilled=None)
         return replace(self.with_weights(self.distilled), manifest=manifest, distilled={})
 
+    @property
+    def first_weights(self) -> Mapping[str, npt.NDArray[Any]]:
+        """Constants that blocks have at step 0, where those are others."""
+        first = {} if self.first_step is None else self.first_step.weights
+        return {name: value for name, value in first.items() if value is not self.weights[name]}
+
     def with_weights(self, constants: Mapping[str, npt.NDArray[Any]]) -> Artifact:
         """The artifact with other constants after step 0, for the reference runtime, which reads no models.
 
