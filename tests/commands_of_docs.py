@@ -12,6 +12,7 @@ NOT_RUN = {
     ".venv/bin/pytest": "a part of this suite, or of the test of the guide's own files",
     ".venv/bin/ruff": "make lint",
     "ttscompile serve": "has no end; tests/executor/test_serve.py and test_locked.py start it",
+    "ttscompile distill": "ends with 1 after so short a training; tests/calibration/test_distill.py trains",
     "python examples/serve": "needs a server; the same tests run it against one",
     "ttscompile convert hf://": "from the hub: tests/hub",
     "ttscompile push compiled/ org/compiled-policy --private": "to the hub: tests/hub",
