@@ -63,7 +63,7 @@ def test_it_is_the_reference_within_the_stated_tolerance(converted: tuple[Path, 
 
 def test_fp32_is_the_default_and_inspect_says_so(toy_compiled: Path) -> None:
     told = json.loads(run("inspect", toy_compiled, "--json").stdout)
-    assert told["precision"] == {"name": "fp32", "blocks": 0, "bytes": 0, "error": None}
+    assert told["precision"] == {"name": "fp32", "blocks": 0, "bytes": 0, "error": None, "parts": {}}
     assert "fp32" in run("inspect", toy_compiled).stdout
 
 

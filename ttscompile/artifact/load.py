@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -22,7 +22,7 @@ from ..core.paths import require_path
 from ..core.spec import FP32
 from ..errors import ArtifactError, IllegalPlanError
 from ..ir.graph import Graph, TensorType
-from ..ir.pieces import CONDITION, PRUNER, STEM, STEP, TAIL, LoopPiece, block_name
+from ..ir.pieces import CONDITION, PRUNER, STEM, STEP, TAIL, LoopPiece, block_name, part_of
 from ..ir.program import Binding, Pieces
 from ..measure.versions import release
 from . import tensors
@@ -99,7 +99,7 @@ class Artifact:
             yield
 
     def onnx_file(self, piece: str) -> str:
-        """Name of the ONNX file of a piece, whose weights are beside it; of a block the one in its precision."""
+        """Name of the ONNX file of a piece, whose weights are beside it; the one in its precision."""
         record = self.manifest.precision
         models = {} if record is None else record.models
         return models.get(piece, self.manifest.pieces[piece].file)
@@ -109,13 +109,12 @@ class Artifact:
         return self.path / self.onnx_file(piece)
 
     def at_precision(self, name: str) -> Artifact:
-        """The same artifact with its residual blocks in a precision: its own, or ``fp32``, which all artifacts hold.
+        """The same artifact in a precision: its own, or ``fp32``, which all artifacts hold.
 
         Raises:
-            ArtifactError: it has no blocks of this precision.
+            ArtifactError: it has no weights of this precision.
         """
-        own = self.manifest.precision_name
-        if name not in (FP32, own):
+        if name not in (FP32, own := self.manifest.precision_name):
             known = list(dict.fromkeys((FP32, own)))
             raise ArtifactError(
                 f"{self.path}: precision {name!r}: expected one that the artifact holds, {known}. Convert the"
@@ -124,6 +123,13 @@ class Artifact:
         if name == own:
             return self
         return replace(self, manifest=replace(self.manifest, precision=None))
+
+    def with_parts(self, parts: Collection[str]) -> Artifact:
+        """The same artifact with only these parts (``ir.pieces.part_of``) in its precision."""
+        record = self.manifest.precision
+        models = {} if record is None else {n: file for n, file in record.models.items() if part_of(n) in parts}
+        own = replace(record, models=models) if record is not None and models else None
+        return replace(self, manifest=replace(self.manifest, precision=own))
 
     def schedule(self, name: str) -> PlanArray:
         """A schedule by name, ``dense`` among them, int8 ``[K, blocks]``.

@@ -20,7 +20,7 @@ from ..ir.pieces import PRUNER
 from ..ir.program import Binding, Program
 from ..measure.versions import VERSION
 from . import records, tensors
-from .bind import LoweredBlocks, bind, places_of, store_blocks
+from .bind import LoweredPieces, bind, places_of, store_pieces
 from .codec import decode, encode, identities
 from .files import (
     PARTIAL,
@@ -70,7 +70,7 @@ def write_artifact(
     program: Program,
     models: Mapping[str, ModelProto],
     directory: str | os.PathLike[str],
-    blocks: LoweredBlocks | None = None,
+    lowered: LoweredPieces | None = None,
     golden: Golden | None = None,
     beside: Mapping[str, bytes] | None = None,
 ) -> Manifest:
@@ -82,7 +82,7 @@ def write_artifact(
         program: after all passes.
         models: from ``lower_program``.
         directory: where it goes; its parents are made. An artifact that is there is replaced.
-        blocks: residual blocks of another precision, which then is the artifact's; None for fp32.
+        lowered: pieces of another precision, which then is the artifact's; None for fp32.
         golden: what the original network answered; None leaves the artifact without, which then cannot be verified.
         beside: files for other programs, by name, one of ``BESIDE``.
 
@@ -99,7 +99,7 @@ def write_artifact(
         target.parent.mkdir(parents=True, exist_ok=True)
         recover(target)
         with locked(target) if target.is_dir() else nullcontext(), new_folder(target) as partial:
-            manifest = _fill(partial, program, models, blocks, golden)
+            manifest = _fill(partial, program, models, lowered, golden)
             for name, content in (beside or {}).items():
                 assert name in BESIDE
                 write_synced(partial / name, content)
@@ -197,7 +197,7 @@ def _fill(
     folder: Path,
     program: Program,
     models: Mapping[str, ModelProto],
-    blocks: LoweredBlocks | None,
+    lowered: LoweredPieces | None,
     golden: Golden | None,
 ) -> Manifest:
     """Write all files of a new artifact into an empty folder."""
@@ -222,7 +222,7 @@ def _fill(
     pieces = records.piece_records(program, models, files)
     for name in pieces:
         write_synced(folder / files[name], bind(models[name], places, name))
-    precision = None if blocks is None else store_blocks(folder, blocks, pieces, places)
+    precision = None if lowered is None else store_pieces(folder, lowered, pieces, places)
     if golden is not None:
         write_synced(folder / GOLDEN, tensors.serialize(golden.arrays()))
     document = {
