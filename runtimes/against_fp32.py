@@ -134,8 +134,14 @@ class _Exact:
         pairs = list(zip(own, exact, strict=True))
         largest = max(action_errors(self.chunk, *pair).max() for pair in pairs)
         share = max(float(np.abs(one - other).max() / np.abs(other).max()) for one, other in pairs)
-        figures = map(_rounded, (means.mean(), np.quantile(means, 0.9), largest, MARGIN * share))
-        return PrecisionError(len(own), *figures, self.other_noise)
+        return PrecisionError(
+            calls=len(own),
+            mean=_rounded(means.mean()),
+            p90=_rounded(np.quantile(means, 0.9)),
+            largest=_rounded(largest),
+            tolerance=_rounded(MARGIN * share),
+            other_noise=self.other_noise,
+        )
 
 
 def _rounded(number: float) -> float:

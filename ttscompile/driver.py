@@ -231,10 +231,10 @@ def _lower_pieces(
     parts, asked, staying = parts_to_lower(program, keep_fp32)
     try:
         own, weights, notes = lower_precision(models, program.weights, INT8, parts)
-    except LoweringError as error:
+    except LoweringError as reason:
         if precision != AUTO:
             raise
-        explain("lower_precision", (str(error), *staying))
+        explain("lower_precision", (str(reason), *staying))
         return None
     if any(map(is_block, own)):
         own |= lower_all_blocks(program.pieces.blocks, {**models, **own})

@@ -127,7 +127,7 @@ def store_pieces(
     if taken := sorted(set(lowered.weights) & set(places)):
         raise ArtifactError(f"{where}: expected constants of new names; found {taken[0]!r}. {REPORT}")
     file = f"weights_{lowered.name}.safetensors"
-    write_synced(folder / file, tensors.serialize(lowered.weights))
+    tensors.write(folder / file, lowered.weights)
     places = {**places, **places_of(folder / file, lowered.weights)}
     files = {}
     for name, model in lowered.models.items():

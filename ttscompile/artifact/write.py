@@ -210,7 +210,7 @@ def _fill(
     pruner = {name: value for name, value in values.items() if name.startswith(records.PRUNER_PREFIX)}
     stored = {name: value for name, value in values.items() if name not in pruner}
     tables = {TABLE_PREFIX + n: program.pieces.tables[n] for n, c in contexts.items() if c.binding is Binding.TABLE}
-    write_synced(folder / WEIGHTS, tensors.serialize({**stored, **tables}))
+    tensors.write(folder / WEIGHTS, {**stored, **tables})
     places = places_of(folder / WEIGHTS, stored)
     pruner_file = None
     if PRUNER in graphs:
