@@ -38,9 +38,11 @@ def test_convert_and_inspect_say_the_precision_and_its_error(converted: tuple[Pa
     directory, told = converted
     stage = next(stage for stage in told.pop("stages") if stage["stage"] == "lower_precision")
     assert stage["notes"][0].startswith("int8: 6 matrices of 3 of 3 blocks")
+    assert stage["notes"][1].startswith("condition stays fp32: ") and "of a step" in stage["notes"][1]
     assert json.loads(run("inspect", directory, "--json").stdout) == told
     record = told["precision"]
     assert (record["name"], record["blocks"]) == ("int8", 3)
+    assert record["parts"] == {"blocks": {"kept": True, "alone": None}}
     assert 0.85e6 < record["bytes"] < 1.0e6
     assert 0.02 < record["error"]["mean"] < 2.0, "of 512 pixels"
     text = " ".join(run("inspect", directory).stdout.split())

@@ -139,8 +139,10 @@ def store_pieces(
             )
         files[name] = f"{name}_{lowered.name}.onnx"
         write_synced(folder / files[name], bind(model, places, name))
-    measured = {part: lowered.parts.get(part) for part in map(part_of, files) if part is not None}
-    return PrecisionRecord(lowered.name, file, files, lowered.error, {**measured, **lowered.parts})
+    known = {*lowered.parts, *map(part_of, files)}
+    order = dict.fromkeys(part for part in map(part_of, pieces) if part is not None and part in known)
+    parts = {part: lowered.parts.get(part) for part in order}
+    return PrecisionRecord(lowered.name, file, files, lowered.error, parts)
 
 
 def _set(tensor: TensorProto, place: Place, piece: str) -> None:
