@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import torch
 from torch import nn
 
+import ttscompile
+from tests.once import Once
 from ttscompile.core.spec import ChunkSpec, ObservationSpec, PolicySpec
 from ttscompile.frontends.encoded import EncodedDenoiser
+from ttscompile.ir.program import Program
 from ttscompile.samplers.flow import flow_matching_table
 
 WIDTH, FEATURES, HORIZON, ACTIONS = 32, 64, 4, 2
@@ -56,6 +60,15 @@ class Hand(nn.Module):
         for read, block in zip(self.reads, self.blocks, strict=True):
             x = x + block(x + read(seen)[:, None] + timestep[:, None, None])
         return self.leave(x)  # type: ignore[no-any-return]
+
+
+def compiled(once: Once) -> tuple[Path, Program]:
+    """The artifact in eight bits, beside it ``call.onnx``, the single file; and its program."""
+
+    def make(path: Path) -> Program:
+        return ttscompile.compile_denoiser(*policy(), path, precision="int8", single_file=path.parent / "call.onnx")
+
+    return once.compiled("seeing int8", make)
 
 
 def policy(loud: float = 0.0) -> tuple[nn.Module, PolicySpec]:

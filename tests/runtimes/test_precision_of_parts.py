@@ -11,17 +11,21 @@ import onnx
 import pytest
 
 import ttscompile
+from tests.lower.whole_call import Episode, inputs
 from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import Manifest
-from ttscompile.driver import transform
+from ttscompile.calibration.judge import precision_record
+from ttscompile.calibration.task import Found
 from ttscompile.errors import LoweringError
 from ttscompile.ir.pieces import part_of
 from ttscompile.ir.program import Program
 from ttscompile.lower.precision import parts_to_lower
+from ttscompile.report.facts import left_out, score_table
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.against_fp32 import FEW_CALLS, SHARE
 from ttscompile.runtimes.random_calls import random_call
+from ttscompile.trajectories.episodes import Episode as Recorded
 
 from . import seeing
 from .agreement import largest_difference, random_inputs
@@ -32,14 +36,13 @@ LOUD = 1000.0
 
 @pytest.fixture
 def int8(once: Once) -> Path:
-    return once.compiled(
-        "seeing int8", lambda path: ttscompile.compile_denoiser(*seeing.policy(), path, precision="int8")
-    )[0]
+    """The policy in eight bits, its single file beside it."""
+    return seeing.compiled(once)[0]
 
 
-@pytest.fixture(scope="module")
-def program() -> Program:
-    return transform(*seeing.policy())
+@pytest.fixture
+def program(once: Once) -> Program:
+    return seeing.compiled(once)[1]
 
 
 def compiled(path: Path, loud: float = 0.0, **options: object) -> tuple[Manifest, list[str]]:
@@ -99,6 +102,32 @@ def test_it_is_the_reference_within_its_own_tolerance_whatever_the_threads(int8:
     np.testing.assert_array_equal(*samples)
     statuses = {rung.name: rung.status for rung in ttscompile.verify(int8).rungs}
     assert "failed" not in statuses.values() and statuses["precision"] == "passed"
+
+
+def test_the_single_file_computes_the_same(int8: Path) -> None:
+    policy = ttscompile.load(int8)
+    obs, noise = inputs(policy, np.random.default_rng(0), 2)
+    found = Episode((int8.parent / "call.onnx").read_bytes(), 2).call(obs, noise, np.zeros((3, 3), np.int8))
+    expected = policy.predict_action(obs, noise=noise, plan="dense")
+    np.testing.assert_allclose(found["action"], expected["action"], rtol=1e-4, atol=1e-4)
+    exact = ttscompile.load(int8, precision="fp32").predict_action(obs, noise=noise, plan="dense")
+    assert np.abs(exact["action"] - expected["action"]).max() > 1e-3
+
+
+def test_calibration_measures_the_parts_on_recorded_calls(int8: Path) -> None:
+    artifact, draw = load_artifact(int8), np.random.default_rng(0)
+    episodes = [Recorded("seen", {"image": draw.standard_normal((9, 3, 16, 16), dtype=np.float32)})]
+    record = precision_record(artifact, episodes, [0], Found(artifact.schedule("dense")), seed=0)["precision"]
+    assert list(record["parts"]) == ["condition", "blocks"]
+    assert all(0 < error < record["plans"]["dense"]["error_p90"] * 2 for error in record["parts"].values())
+    alone, much = [f"dense, {part} alone: int8 against fp32" for part in record["parts"]], record["parts"]["condition"]
+    table = score_table({"precision": record})
+    assert {row[0] for row in table.rows} >= set(alone)
+    assert all(len(row) == len(table.head) for row in table.rows)
+    assert left_out({"precision": record, "other_noise": 11 * max(record["parts"].values())}) == ()
+    (told,) = left_out({"precision": {**record, "parts": {"condition": much}}, "other_noise": 2 * much})
+    assert told.startswith("int8 in condition changes actions by 50% of what other noise does")
+    assert "--keep-fp32 condition" in told
 
 
 def test_auto_leaves_out_what_changes_the_actions_much_and_says_so(tmp_path: Path) -> None:
