@@ -180,8 +180,8 @@ def test_another_schema_version_says_what_to_do(manifest: Manifest, version: obj
 
 
 def test_a_future_schema_is_named_before_anything_else_is_read() -> None:
-    content = dump({"format": "ttscompile artifact", "schema_version": 7, "new": "thing"})
-    with pytest.raises(ArtifactError, match="schema_version: expected 6, .*; found 7"):
+    content = dump({"format": "ttscompile artifact", "schema_version": 8, "new": "thing"})
+    with pytest.raises(ArtifactError, match="schema_version: expected 7, .*; found 8"):
         codec.decode(content)
 
 

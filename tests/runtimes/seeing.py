@@ -16,7 +16,7 @@ from ttscompile.ir.program import Program
 from ttscompile.samplers.flow import flow_matching_table
 
 WIDTH, FEATURES, HORIZON, ACTIONS = 32, 64, 4, 2
-LARGE = 100
+LARGE = 500
 """Weights of the encoder's last layer are so many times what they come as: actions depend on what is seen."""
 
 
@@ -31,17 +31,17 @@ class Eye(nn.Module):
         super().__init__()
         self.first = nn.Conv2d(3, 32, 3, stride=2, padding=1)
         self.second = nn.Conv2d(32, FEATURES, 3, stride=2, padding=1)
-        self.last = nn.Linear(16 * FEATURES, FEATURES)
+        self.last = nn.Linear(FEATURES, FEATURES)
         with torch.no_grad():
             assert self.second.bias is not None
             self.second.bias[0] = loud
             self.last.weight *= LARGE
-            self.last.weight[:, :16] *= float(loud == 0)
+            self.last.weight[:, 0] *= float(loud == 0)
 
     def forward(self, observations: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """See the class."""
         seen = torch.relu(self.second(torch.relu(self.first(observations["image"]))))
-        return self.last(seen.flatten(1))  # type: ignore[no-any-return]
+        return self.last(seen.flatten(2).transpose(1, 2)).mean(1)  # type: ignore[no-any-return]
 
 
 class Hand(nn.Module):

@@ -6,6 +6,7 @@ quarter of the bytes; then it is what ``precision`` makes of a matrix product. `
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,6 +20,9 @@ Array = npt.NDArray[Any]
 DOMAIN = "com.microsoft"
 INTEGER_PRODUCT = "MatMulIntegerToFloat"
 """uint8 by int8 into int32, scaled by column, with the bias added."""
+
+_STREAMS = re.compile(r"([1-9][0-9]*\*)?B")
+"""A size that depends on the number of streams, as ``onnx_model.value_info`` writes it."""
 
 LEAST = 2048
 """Channels in times channels out from which integers are faster: gathering a tap costs as much for any. How many times
@@ -51,10 +55,16 @@ class Convolution:
 
 
 def shapes_of(model: ModelProto) -> dict[str, tuple[int, ...]]:
-    """Shapes of values, zero for a size that is not known; nothing for a model without convolutions."""
-    if not any(node.op_type == "Conv" for node in model.graph.node):
-        return {}
-    graph = shape_inference.infer_shapes(model, data_prop=True).graph
+    """Shapes of values for one stream; zero for a size that is not known."""
+    alone = ModelProto()
+    alone.CopyFrom(model)
+    for value in alone.graph.input:
+        for size in value.type.tensor_type.shape.dim:
+            if _STREAMS.fullmatch(size.dim_param):
+                size.dim_value = int(size.dim_param.partition("*")[0].replace("B", "1"))
+    for value in alone.graph.output:  # they say the number of streams, too
+        value.type.tensor_type.ClearField("shape")
+    graph = shape_inference.infer_shapes(alone, data_prop=True).graph
     return {
         value.name: tuple(d.dim_value for d in value.type.tensor_type.shape.dim)
         for value in [*graph.value_info, *graph.input]

@@ -8,8 +8,9 @@ activations, biases, and the residual itself.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -34,6 +35,10 @@ PROLOGUE = "prologue"
 
 LEAST_SHARE = 0.2
 """Of the arithmetic of one step's blocks, which every call has: a smaller part would make hardly any call faster."""
+
+LEAST_ROWS = 8
+"""Of a product in the prologue. One with fewer takes next to no time there, and its one row is often all that a policy
+knows of the world: a position, features and a sentence, whose sizes have nothing to do with each other."""
 
 _DOMAIN_VERSION = 1
 _PRODUCT = "DynamicQuantizeMatMul"
@@ -124,7 +129,7 @@ def lower_precision(
         lowered: dict[str, ModelProto] = {}
         new: dict[str, Array] = {}
         for name in pieces:
-            model, own = quantize_model(models[name], weights)
+            model, own = quantize_model(models[name], weights, 0 if part == BLOCKS else LEAST_ROWS)
             if own:
                 lowered[name] = model
                 new.update(own)
@@ -152,7 +157,7 @@ def _notes(
         yield f"{precision}: {count} matrices of {where}, {megabytes:.1f} MB{convolved}"
     for name in pieces:
         if name not in lowered:
-            yield f"{name} stays fp32: no product with constant weights"
+            yield f"{name} stays fp32: no product with constant weights" + " and many rows" * (part != BLOCKS)
     if whole := kinds["Conv"] + kinds["ConvTranspose"]:
         yield f"convolutions that stay fp32 in {part}, of few channels, in groups, or transposed: {whole}"
 
@@ -173,12 +178,15 @@ def require_precision(precision: str, keep_fp32: Collection[str] = ()) -> None:
         raise LoweringError(f"{given} stays fp32, as does everything in precision 'fp32'. Give precision 'int8' too.")
 
 
-def quantize_model(model: ModelProto, weights: Mapping[str, Array]) -> tuple[ModelProto, dict[str, Array]]:
+def quantize_model(
+    model: ModelProto, weights: Mapping[str, Array], least_rows: int = 0
+) -> tuple[ModelProto, dict[str, Array]]:
     """One model with its products by constants in integers; inputs and outputs stay as they are.
 
     Args:
         model: from ``lower``: constants are initializers without data.
         weights: values of constants, by name. Only these are quantised.
+        least_rows: of one stream, that a product has to have; a product whose rows are not known has none.
 
     Returns:
         A new model, and the constants that it has and ``model`` has not, by name: int8 ``[rows, columns]`` and
@@ -195,7 +203,10 @@ def quantize_model(model: ModelProto, weights: Mapping[str, Array]) -> tuple[Mod
 
     nodes: list[NodeProto] = []
     for node in model.graph.node:
-        if (product := _product(node, known, matrices)) is not None:
+        product = _product(node, known, matrices)
+        if product is not None and _rows(shapes.get(product.x, ())) < least_rows:
+            nodes.append(node)
+        elif product is not None:
             nodes.append(_integer_product(node, product, constants))
         elif (convolution := convolution_of(node, _attributes(node), known, shapes)) is not None:
             integers, scales = _integers(convolution.weight, convolution.matrix, constants)
@@ -270,6 +281,11 @@ def _product(node: NodeProto, known: Mapping[str, Array], matrices: Mapping[str,
     if not 0 < rows <= MOST_ROWS or (bias and (bias not in known or known[bias].shape != (columns,))):
         return None
     return _Product(x, replace(matrix, value=value), bias)
+
+
+def _rows(shape: Sequence[int]) -> int:
+    """Rows of a product whose first factor has this shape."""
+    return math.prod(shape[:-1]) if shape else 0
 
 
 def _integer_product(node: NodeProto, product: _Product, constants: dict[str, Array]) -> NodeProto:
