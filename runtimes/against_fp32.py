@@ -1,8 +1,9 @@
-"""What blocks of another precision than fp32 do to the actions: calls in both, with equal noise."""
+"""What another precision than fp32 does to the actions, and in which parts: calls in both, with equal noise."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -20,14 +21,38 @@ from .runtime import Runtime
 CALLS = 8
 """Random observations that a precision is measured on. On Push-T at K = 100 that takes some seconds."""
 
+FEW_CALLS = 3
+"""Of these, those that single parts are measured on, and other noise: a dense call of a large policy takes seconds."""
+
 SEED = 8
 """Of these observations and the noise."""
 
 MARGIN = 4.0
 """Tolerance over the largest difference that was measured."""
 
+SHARE = 0.1
+"""Of what other noise changes: by so much at most the actions may change in what ``measure_parts`` chooses. Push-T in
+int8: 0.03."""
+
 Call = tuple[Mapping[str, FloatArray], Noise]
 Pair = tuple[Runtime, Runtime]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a precision does to the actions.
+
+    Attributes:
+        kept: the parts that are in it.
+        error: with all of these; None if there are none.
+        alone: of each part that was measured, the mean of its difference where it alone is in the precision.
+        other_noise: see ``PrecisionError``.
+    """
+
+    kept: tuple[str, ...]
+    error: PrecisionError | None
+    alone: Mapping[str, float]
+    other_noise: float
 
 
 def measure_precision(artifact: Artifact, runtimes: Pair | None = None) -> PrecisionError:
@@ -37,55 +62,127 @@ def measure_precision(artifact: Artifact, runtimes: Pair | None = None) -> Preci
     depend on the processor.
 
     Args:
-        artifact: with blocks of another precision.
+        artifact: with parts of another precision.
         runtimes: one in the precision in question and one in fp32; None for the artifact's in onnxruntime.
     """
-    spec = artifact.manifest.spec
-    calls = [(normalized(spec, obs), noise) for obs, noise in random_calls(spec, CALLS, SEED)]
-    differences = compare(artifact, artifact.schedule(DENSE), calls, runtimes=runtimes)
-    errors = np.array([action_errors(spec.chunk, one, other) for one, other in differences])
-    shares = [float(np.abs(one - other).max() / np.abs(other).max()) for one, other in differences]
-    p90 = np.quantile(errors.mean(axis=1), 0.9)
-    return PrecisionError(CALLS, *(float(f"{n:.4g}") for n in (errors.mean(), p90, errors.max(), MARGIN * max(shares))))
+    own, exact = runtimes or (open_runtime(artifact), open_runtime(artifact.at_precision(FP32)))
+    against = _Exact.of(artifact, exact)
+    return against.error(answers(own, artifact.schedule(DENSE), against.calls))
 
 
-def compare(
-    artifact: Artifact,
-    plan: npt.NDArray[np.int8],
-    calls: Iterable[Call],
-    correction: Correction | None = None,
-    runtimes: Pair | None = None,
-) -> list[tuple[FloatArray, FloatArray]]:
-    """Denoised samples ``[T, D]`` of each call in the artifact's precision, and in fp32.
+def measure_parts(artifact: Artifact, choose: bool = False) -> Measured:
+    """What the precision of an artifact does to the actions, as a whole and part by part; see ``measure_precision``.
 
-    Each call is an episode of one stream: the scale of activations is that of the whole batch.
+    One runtime is open at a time: each holds all weights.
 
     Args:
-        artifact: with blocks of another precision.
+        artifact: with parts of another precision.
+        choose: leave out parts, those with the largest difference first, until the mean difference is at most ``SHARE``
+            of what other noise changes.
+    """
+    assert artifact.manifest.precision is not None
+    exact = _Exact.of(artifact, open_runtime(artifact.at_precision(FP32)))
+
+    def measured(parts: Collection[str], calls: int = CALLS) -> PrecisionError:
+        runtime = open_runtime(artifact.with_parts(parts))
+        return exact.error(answers(runtime, artifact.schedule(DENSE), exact.calls[:calls]))
+
+    kept = artifact.manifest.precision.kept
+    error: PrecisionError | None = measured(kept)
+    alone = {part: measured([part], FEW_CALLS).mean for part in kept} if len(kept) > 1 else {}
+    while choose and error is not None and error.mean > SHARE * exact.other_noise:
+        worst = max(kept, key=lambda part: alone.get(part, 0.0))
+        alone.setdefault(worst, error.mean)
+        kept = tuple(part for part in kept if part != worst)
+        error = measured(kept) if kept else None
+    return Measured(kept, error, alone, exact.other_noise)
+
+
+@dataclass(frozen=True, eq=False)
+class _Exact:
+    """Dense calls in fp32.
+
+    Attributes:
+        chunk: of the policy.
+        calls: normalised observations of one stream each, and noise.
+        samples: what fp32 made of them, ``[T, D]`` each.
+        other_noise: mean difference of the executed actions from those with other noise.
+    """
+
+    chunk: ChunkSpec
+    calls: Sequence[Call]
+    samples: Sequence[FloatArray]
+    other_noise: float
+
+    @classmethod
+    def of(cls, artifact: Artifact, runtime: Runtime) -> _Exact:
+        spec, plan = artifact.manifest.spec, artifact.schedule(DENSE)
+        calls: list[Call] = [(normalized(spec, obs), noise) for obs, noise in random_calls(spec, CALLS, SEED)]
+        samples = answers(runtime, plan, calls)
+        swapped = [(calls[i][0], calls[i + 1][1]) for i in range(FEW_CALLS)]
+        apart = mean_errors(spec.chunk, answers(runtime, plan, swapped), samples[:FEW_CALLS])
+        return cls(spec.chunk, calls, samples, _rounded(float(apart.mean())))
+
+    def error(self, own: Sequence[FloatArray]) -> PrecisionError:
+        """Of samples in another precision, those of the first calls.
+
+        Raises:
+            ObservationError: an action is not a number.
+        """
+        exact = self.samples[: len(own)]
+        means = mean_errors(self.chunk, own, exact)
+        pairs = list(zip(own, exact, strict=True))
+        largest = max(action_errors(self.chunk, *pair).max() for pair in pairs)
+        share = max(float(np.abs(one - other).max() / np.abs(other).max()) for one, other in pairs)
+        return PrecisionError(
+            calls=len(own),
+            mean=_rounded(means.mean()),
+            p90=_rounded(np.quantile(means, 0.9)),
+            largest=_rounded(largest),
+            tolerance=_rounded(MARGIN * share),
+            other_noise=self.other_noise,
+        )
+
+
+def _rounded(number: float) -> float:
+    return float(f"{number:.4g}")
+
+
+def answers(
+    runtime: Runtime, plan: npt.NDArray[np.int8], calls: Iterable[Call], correction: Correction | None = None
+) -> list[FloatArray]:
+    """Denoised samples ``[T, D]`` of calls that are an episode of one stream each.
+
+    One stream, because the scale of activations is that of the whole batch.
+
+    Args:
+        runtime: that makes the calls.
         plan: ``[K, blocks]``, without reads of earlier calls.
         calls: normalised observation and noise of one stream each.
         correction: of the plan.
-        runtimes: see ``measure_precision``.
+    """
+    samples = []
+    for obs, noise in calls:
+        runtime.reset()
+        samples.append(runtime.predict(obs, noise, plan, correction=correction)[0][0])
+    return samples
+
+
+def mean_errors(chunk: ChunkSpec, own: Sequence[FloatArray], exact: Sequence[FloatArray]) -> npt.NDArray[np.float64]:
+    """Mean ``action_errors`` of each call, of samples in the artifact's precision against those in fp32.
 
     Raises:
         ObservationError: an action is not a number.
     """
-    runtimes = runtimes or (open_runtime(artifact), open_runtime(artifact.at_precision(FP32)))
-    pairs = []
-    for obs, noise in calls:
-        samples = []
-        for runtime in runtimes:
-            runtime.reset()
-            samples.append(runtime.predict(obs, noise, plan, correction=correction)[0][0])
-        if not np.isfinite(samples).all():
-            own, exact = (np.count_nonzero(~np.isfinite(sample)) for sample in samples)
+    for pair in zip(own, exact, strict=True):
+        if not np.isfinite(pair).all():
+            wrong, plain = (np.count_nonzero(~np.isfinite(sample)) for sample in pair)
             raise ObservationError(
-                f"the policy's action is not a number: {exact} of its values in precision {FP32!r}, {own} in that of"
+                f"the policy's action is not a number: {plain} of its values in precision {FP32!r}, {wrong} in that of"
                 f" the artifact. Convert with precision {FP32!r}; where it fails too, look for NaN in the checkpoint"
                 " and in the recorded observations."
             )
-        pairs.append((samples[0], samples[1]))
-    return pairs
+    return np.array([action_errors(chunk, *pair).mean() for pair in zip(own, exact, strict=True)])
 
 
 def action_errors(chunk: ChunkSpec, one: FloatArray, other: FloatArray) -> npt.NDArray[np.float64]:

@@ -36,7 +36,7 @@ class PolicyInfo:
         model_identity: the same without plans, corrections and pruner: what calibration leaves as it is.
         plans: names that ``predict_action(plan=...)`` takes.
         default_plan: the one that is taken when none is given.
-        precision: of the residual blocks: ``fp32``, ``int8``; on torch ``bf16`` and ``fp16``, too.
+        precision: ``fp32``, or ``int8`` in the parts that the artifact has in it; on torch ``bf16`` and ``fp16``, too.
         rollout: what keeping the rollout cache of one stream takes.
         prefix_refusal: why ``predict_action`` takes no ``prefix``; None if it does.
     """

@@ -42,7 +42,7 @@ def load(
             more, ``threads - 1`` of them look for work for 50 us after each block, and then sleep: a loaded policy that
             is not called takes no processor time.
         seed: of the noise that is drawn when none is given; None for another sequence every time.
-        precision: of the residual blocks. ``fp32`` is what every artifact holds; None for what it was converted with.
+        precision: of blocks and prologue. ``fp32`` is what every artifact holds; None for what it was converted with.
             Torch computes the products of the blocks in ``fp32``, which is what None means there, ``bf16`` or
             ``fp16``; the reference in fp32 alone.
         plan: that ``predict_action`` uses when it is given none: ``dense`` or the name of a plan of the artifact; None

@@ -41,7 +41,7 @@ class CompiledPolicy:
         runtime: opened on the same artifact.
         seed: of the noise that is drawn when none is given.
         plan: see ``load``.
-        precision: of the residual blocks; None for the artifact's.
+        precision: see ``load``; None for the artifact's.
         origin: ``hf://org/name@commit`` of an artifact from the hub; None for another.
         instruct: puts tokens in the place of a task's text; None for none.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from torch import nn
 
-from .artifact.bind import LoweredBlocks
+from .artifact.bind import LoweredPieces
 from .artifact.files import replace_file
 from .artifact.load import load_artifact
 from .artifact.write import require_replaceable, write_artifact
@@ -19,8 +19,8 @@ from .capture.export import capture
 from .capture.narrow import narrow, unneeded
 from .core.given import integer
 from .core.paths import on_hub, require_free_or_path
-from .core.spec import FP32, PolicySpec
-from .errors import ArtifactError, NoResidualBlocksError, PassError, SpecError
+from .core.spec import AUTO, FP32, INT8, PolicySpec
+from .errors import ArtifactError, LoweringError, NoResidualBlocksError, PassError, SpecError
 from .frontends import files_beside, load_checkpoint_policy
 from .frontends.encoded import parts
 from .frontends.families import LoadOptions
@@ -28,10 +28,11 @@ from .hub import fetch_checkpoint
 from .ir.dataflow import reachable_from
 from .ir.flops import graph_flops, node_flops
 from .ir.graph import Graph
+from .ir.pieces import is_block
 from .ir.program import Captured, Cut, Program
 from .ir.verify import verify
 from .lower.joint import lower_all_blocks
-from .lower.precision import lower_precision, require_precision
+from .lower.precision import lower_precision, parts_to_lower, require_precision
 from .lower.program import lower_program
 from .lower.single_file import lower_single_file
 from .passes.base import After, Before, Pass
@@ -48,7 +49,7 @@ from .passes.split_features import SplitFeatures
 from .passes.split_tokens import SplitTokens
 from .passes.unfold_batch import UnfoldBatch
 from .passes.widen_attention import WidenAttention
-from .runtimes.against_fp32 import measure_precision
+from .runtimes.against_fp32 import SHARE, measure_parts
 from .verification.record_golden import record_original
 
 if TYPE_CHECKING:
@@ -77,6 +78,7 @@ def convert(
     without_cameras: Sequence[str] | None = None,
     prediction_horizon: int | None = None,
     precision: str = FP32,
+    keep_fp32: Collection[str] = (),
     single_file: str | os.PathLike[str] | None = None,
     explain: Explain = _silent,
 ) -> Program:
@@ -101,7 +103,8 @@ def convert(
         without_cameras: of a vision-language-action model: names of cameras that it was trained with and that the robot
             lacks. None leaves out only those that lerobot calls empty.
         prediction_horizon: predict only the first so many steps of the policy's horizon; see ``compile_denoiser``.
-        precision: of the weights of residual blocks: ``fp32`` or ``int8``; see ``compile_denoiser``.
+        precision: of the weights: ``fp32``, ``int8`` or ``auto``; see ``compile_denoiser``.
+        keep_fp32: what stays in fp32 beside another precision; see ``compile_denoiser``.
         single_file: where one ONNX file of the whole call goes too, for programs without ttscompile; None for none.
             ``ttscompile.lower.single_file`` describes its inputs and outputs.
         explain: told what each stage did.
@@ -109,8 +112,7 @@ def convert(
     Raises:
         TtscompileError: the checkpoint is refused, its network cannot be compiled, or the artifact cannot be written.
     """
-    if precision != FP32:
-        require_precision(precision)  # before minutes of work
+    require_precision(precision, keep_fp32)  # before minutes of work
     require_replaceable(directory)
     base: dict[str, str] = {}
     if on_hub(checkpoint):
@@ -126,7 +128,7 @@ def convert(
     beside = files_beside(checkpoint, spec)
     if spec.source.get("format") == "lerobot" and not beside:
         explain("files_beside", ("none for LeRobot: the instruction holds the state",))
-    return _compile(module, spec, directory, prediction_horizon, precision, single_file, explain, beside)
+    return _compile(module, spec, directory, prediction_horizon, precision, keep_fp32, single_file, explain, beside)
 
 
 def compile_denoiser(
@@ -136,6 +138,7 @@ def compile_denoiser(
     *,
     prediction_horizon: int | None = None,
     precision: str = FP32,
+    keep_fp32: Collection[str] = (),
     single_file: str | os.PathLike[str] | None = None,
     explain: Explain = _silent,
 ) -> Program:
@@ -147,9 +150,13 @@ def compile_denoiser(
         directory: where the artifact goes; None compiles without writing.
         prediction_horizon: predict only the first so many steps of the sample: less to compute at every step, with the
             same actions, where attention is causal. Refused where it is not. None predicts all.
-        precision: of the weights of residual blocks: ``fp32``, or ``int8``, which is faster on processors with integer
-            dot products. What it does to the actions is measured, and the artifact says it; fp32 stays in the artifact
-            too, for the reference runtime and ``load(..., precision="fp32")``.
+        precision: of the weights of residual blocks and of the prologue, image encoders above all: ``fp32``, or
+            ``int8``, which is faster on processors with integer dot products. What it does to the actions is measured,
+            and the artifact says it; fp32 stays in the artifact too, for the reference runtime and ``load(...,
+            precision="fp32")``. ``auto`` takes int8 and leaves out the parts that change the actions by more than a
+            tenth of what other noise does.
+        keep_fp32: parts that stay in fp32 whatever the precision: ``blocks``; ``prologue``, or a piece of it by name,
+            ``condition`` or ``step``.
         single_file: see ``convert``.
         explain: told what each stage did.
 
@@ -159,7 +166,7 @@ def compile_denoiser(
     Raises:
         TtscompileError: it cannot be captured, it has no residual blocks, or the artifact cannot be written.
     """
-    return _compile(module, spec, directory, prediction_horizon, precision, single_file, explain, {})
+    return _compile(module, spec, directory, prediction_horizon, precision, keep_fp32, single_file, explain, {})
 
 
 def _compile(
@@ -168,13 +175,13 @@ def _compile(
     directory: str | os.PathLike[str] | None,
     prediction_horizon: int | None,
     precision: str,
+    keep_fp32: Collection[str],
     single_file: str | os.PathLike[str] | None,
     explain: Explain,
     beside: Mapping[str, bytes],
 ) -> Program:
     """See ``compile_denoiser``; ``beside`` goes into the directory, for other programs."""
-    if precision != FP32:
-        require_precision(precision)
+    require_precision(precision, keep_fp32)
     if prediction_horizon is not None:
         prediction_horizon = integer(prediction_horizon, "prediction_horizon", SpecError, 1)
     if single_file is not None:
@@ -191,16 +198,16 @@ def _compile(
         return program
     models = lower_program(program)
     explain("lower", (f"{len(models)} ONNX models",))
-    blocks = None if precision == FP32 else _lower_blocks(program, models, precision, explain)
+    lowered = None if precision == FP32 else _lower_pieces(program, models, precision, keep_fp32, explain)
     whole: bytes | None = None
     if single_file is not None:  # made before anything is written: without one there is no artifact either
-        lowered, weights = ({}, {}) if blocks is None else (blocks.models, blocks.weights)
-        model = lower_single_file(program, {**models, **lowered}, {**program.weights, **weights})
+        own, weights = ({}, {}) if lowered is None else (lowered.models, lowered.weights)
+        model = lower_single_file(program, {**models, **own}, {**program.weights, **weights})
         whole = model.SerializeToString(deterministic=True)
     if directory is not None:
         golden = record_original(module, program)
         explain("record_original", (f"{len(golden.steps)} of {spec.sampler.steps} steps, {golden.streams} streams",))
-        manifest = write_artifact(program, models, directory, blocks, golden, beside)
+        manifest = write_artifact(program, models, directory, lowered, golden, beside)
         explain("write", (f"identity {manifest.short_identity}",))
     if whole is not None and single_file is not None:
         _write(Path(single_file), whole)
@@ -217,17 +224,40 @@ def _write(path: Path, content: bytes) -> None:
         raise ArtifactError(f"{path}: the single file cannot be written: {error}. Give another path.") from error
 
 
-def _lower_blocks(program: Program, models: Models, precision: str, explain: Explain) -> LoweredBlocks:
-    """Residual blocks of another precision than fp32, and the error that they make."""
-    lowered, weights, notes = lower_precision(models, program.weights, precision)
-    lowered |= lower_all_blocks(program.pieces.blocks, {**models, **lowered})
-    blocks = LoweredBlocks(precision, lowered, weights)
+def _lower_pieces(
+    program: Program, models: Models, precision: str, keep_fp32: Collection[str], explain: Explain
+) -> LoweredPieces | None:
+    """Blocks and prologue in another precision than fp32, and what that changes; None if nothing is left of it."""
+    parts, asked, staying = parts_to_lower(program, keep_fp32)
+    try:
+        own, weights, notes = lower_precision(models, program.weights, INT8, parts)
+    except LoweringError as reason:
+        if precision != AUTO:
+            raise
+        explain("lower_precision", (str(reason), *staying))
+        return None
+    if any(map(is_block, own)):
+        own |= lower_all_blocks(program.pieces.blocks, {**models, **own})
+    lowered = LoweredPieces(INT8, own, weights)
     with TemporaryDirectory() as folder:
-        write_artifact(program, models, folder, blocks)
-        error = measure_precision(load_artifact(folder))
-    made = f"action error of dense calls {error.mean:.4g} on average, 90th percentile {error.p90:.4g}, against fp32"
-    explain("lower_precision", (*notes, made))
-    return replace(blocks, error=error)
+        write_artifact(program, models, folder, lowered)
+        found = measure_parts(load_artifact(folder), choose=precision == AUTO)
+    error, noise = found.error, found.other_noise
+    left = [
+        f"{part} stays fp32: actions would be {found.alone[part]:.4g} off" for part in parts if part not in found.kept
+    ]
+    if error is None:
+        told = f"fp32: other noise changes actions by {noise:.4g}, and int8 by more than {SHARE:.0%} of it"
+    else:
+        told = (
+            f"action error of dense calls {error.mean:.4g} on average, 90th percentile {error.p90:.4g}, against fp32;"
+            f" other noise changes them by {noise:.4g}"
+        )
+    alone = [f"{part} alone: {found.alone[part]:.4g}" for part in found.kept if part in found.alone]
+    explain("lower_precision", (*notes, *staying, *left, told, *alone))
+    if error is None:
+        return None
+    return replace(lowered.of_parts(found.kept), error=error, parts={**found.alone, **dict.fromkeys(asked)})
 
 
 def transform(module: nn.Module, spec: PolicySpec, *, explain: Explain = _silent) -> Program:

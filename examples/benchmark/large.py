@@ -4,6 +4,7 @@
     python examples/benchmark/large.py --unet 512,1024,2048 --horizon 64        # LeRobot's U-Net
     python examples/benchmark/large.py --unet 256,512,1024 --horizon 16         # Diffusion Policy's
     python examples/benchmark/large.py --smolvla                                # LeRobot's SmolVLA, whole
+    python examples/benchmark/large.py --clip                                   # its multi_task_dit with CLIP B/16
 
 The transformer is an ordinary DiT with adaLN-Zero. Both have 14 actions and an observation vector of 64 numbers, and
 four steps. Converting and running are two processes, so that each has its own peak of resident memory.
@@ -24,9 +25,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    import numpy as np
     from torch import nn
 
+    from ttscompile import PolicySpec
+
 STEPS = 4
+
+MOST_NOTES = 8
+"""Of a stage, that are printed."""
 
 
 class Stages:
@@ -38,7 +45,7 @@ class Stages:
     def __call__(self, stage: str, notes: tuple[str, ...]) -> None:
         """A stage has ended."""
         now = time.perf_counter()
-        print(f"{now - self._last:7.1f} s  {peak():5.2f} GiB  {stage}: {notes[0] if notes else ''}", flush=True)
+        print(f"{now - self._last:7.1f} s  {peak():5.2f} GiB  {stage}: {'; '.join(notes[:MOST_NOTES])}", flush=True)
         self._last = now
 
     def end(self) -> None:
@@ -98,31 +105,77 @@ def convert_smolvla(folder: Path) -> None:
     stages.end()
 
 
-def run_smolvla(folder: Path, rounds: int = 5, precisions: tuple[str, ...] = ("fp32", "int8")) -> None:
-    """One call after the other, in turn: eager, dense, with weights of eight bits, and two of ten steps.
+def convert_clip(folder: Path) -> None:
+    """Compile a ``multi_task_dit`` of its real size."""
+    import large_clip
+
+    import ttscompile
+
+    module, spec = large_clip.policy()
+    print(f"{peak():5.2f} GiB before compiling")
+    stages = Stages()
+    ttscompile.compile_denoiser(module, spec, folder / "compiled", precision="int8", explain=stages)
+    stages.end()
+
+
+def run_smolvla(folder: Path) -> None:
+    """See ``compare``; two of ten steps are computed."""
+    import large_smolvla
+
+    from ttscompile.frontends import load_checkpoint_policy
+
+    module, spec = load_checkpoint_policy(folder / "smolvla")
+    compare(folder, "vision, prefix, loop", large_smolvla.eager(module, spec), spec, 2)
+
+
+def run_clip(folder: Path) -> None:
+    """See ``compare``; five of a hundred steps are computed."""
+    import large_clip
+
+    module, spec = large_clip.policy()
+    compare(folder, "encoder, loop", large_clip.eager(module, spec), spec, 5)
+
+
+def compare(
+    folder: Path,
+    parts: str,
+    eager: Callable[[], tuple[np.ndarray, list[float]]],
+    spec: PolicySpec,
+    computed: int,
+    rounds: int = 5,
+) -> None:
+    """One call after the other, in turn: eager, dense and with few computed steps, in fp32 and in int8.
 
     Seconds are the processor's: all calls are on one thread, and the machine may be busy.
+
+    Args:
+        folder: with the artifact.
+        parts: what ``eager`` takes the time of.
+        eager: a call of the original.
+        spec: of the policy.
+        computed: how many steps the sparse plan computes.
+        rounds: that are counted.
     """
     import large_smolvla
     import numpy as np
     import torch
 
     import ttscompile
-    from ttscompile.frontends import load_checkpoint_policy
+    from ttscompile.artifact.load import load_artifact
 
     torch.set_num_threads(1)
-    module, spec = load_checkpoint_policy(folder / "smolvla")
-    eager = large_smolvla.eager(module, spec)
-    policies = {name: ttscompile.load(folder / "compiled", precision=name) for name in precisions}
+    record = load_artifact(folder / "compiled").manifest.precision
+    assert record is not None and record.error is not None
+    policies = {name: ttscompile.load(folder / "compiled", precision=name) for name in ("fp32", "int8")}
     info = policies["fp32"].info
     obs, noise = large_smolvla.call(spec)
     few = np.full((info.K, len(info.blocks)), ttscompile.Source.TIMESTEP, np.int8)
-    few[0] = few[info.K // 2] = ttscompile.Source.COMPUTE
-    plans = {"dense": "dense", "2 of 10 steps": few}
+    few[np.arange(computed) * info.K // computed] = ttscompile.Source.COMPUTE
+    plans = {"dense": "dense", f"{computed} of {info.K} steps": few}
     times: dict[str, list[list[float]]] = {}
     for _ in range(rounds + 1):  # the first does not count
-        expected, parts = eager()
-        times.setdefault("eager: vision, prefix, loop", []).append(parts)
+        expected, split = eager()
+        times.setdefault(f"eager: {parts}", []).append(split)
         for precision, policy in policies.items():
             for name, plan in plans.items():
                 start = time.process_time()
@@ -137,7 +190,9 @@ def run_smolvla(folder: Path, rounds: int = 5, precisions: tuple[str, ...] = ("f
         total = statistics.median(sum(row) for row in rows[1:])
         print(f"{total:8.2f} s  {name}: {', '.join(f'{each:.2f}' for each in medians)}")
     print(f"{error:8.1e}  the dense call from eager; {peak():.2f} GiB at most, all of them loaded")
-    print("prologue:", large_smolvla.integer_prologue(folder / "compiled"))
+    alone = ", ".join(f"{part} alone {value:.2g}" for part, value in record.parts.items() if value is not None)
+    print(f"{record.told}: dense actions {record.error.mean:.2g} from fp32; {alone};", end=" ")
+    print(f"other noise {record.error.other_noise:.2g}")
 
 
 def run(folder: Path) -> None:
@@ -176,12 +231,15 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=1024)
     parser.add_argument("--unet", help="channels of the levels of a U-Net, in place of the transformer")
     parser.add_argument("--smolvla", action="store_true", help="LeRobot's SmolVLA, in place of the transformer")
+    parser.add_argument("--clip", action="store_true", help="LeRobot's multi_task_dit with CLIP B/16, likewise")
     parser.add_argument("--horizon", type=int, default=32, help="actions of a chunk")
     parser.add_argument("--output", type=Path, help="a folder to keep the artifact in; a temporary one otherwise")
     parser.add_argument("--only", choices=["convert", "run"], help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.smolvla and options.only is not None:
         (convert_smolvla if options.only == "convert" else run_smolvla)(options.output)
+    elif options.clip and options.only is not None:
+        (convert_clip if options.only == "convert" else run_clip)(options.output)
     elif options.only == "convert":
         from large_networks import transformer, unet
 
@@ -196,7 +254,7 @@ def main() -> None:
             folder.mkdir(parents=True, exist_ok=True)
             for part in ("convert", "run"):
                 own = [f"--layers={options.layers}", f"--width={options.width}", f"--horizon={options.horizon}"]
-                own += ["--smolvla"] * options.smolvla
+                own += ["--smolvla"] * options.smolvla + ["--clip"] * options.clip
                 own += [] if options.unet is None else [f"--unet={options.unet}"]
                 subprocess.run([sys.executable, __file__, *own, f"--output={folder}", f"--only={part}"], check=True)
 

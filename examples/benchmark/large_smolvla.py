@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import statistics
 from collections.abc import Callable
 from pathlib import Path
 from time import process_time
@@ -105,42 +104,3 @@ def eager(module: nn.Module, spec: PolicySpec) -> Callable[[], tuple[np.ndarray,
         return spec.chunk.unnormalized(x.numpy()), [took[0], prefix - start - took[0], process_time() - prefix]
 
     return run
-
-
-def integer_prologue(folder: Path, repeats: int = 3) -> str:
-    """What the prologue would take with its products in eight bits, which artifacts do not have: a sentence."""
-    import onnx
-    import onnxruntime
-    from safetensors.numpy import load_file
-
-    from ttscompile.artifact.load import load_artifact
-    from ttscompile.lower.precision import quantize_model
-
-    artifact = load_artifact(folder)
-    weights = load_file(folder / artifact.manifest.stores.weights)
-    model = onnx.load(folder / artifact.manifest.pieces["condition"].file, load_external_data=False)
-    integer, more = quantize_model(model, weights)
-    obs, _ = call(artifact.manifest.spec)
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    took, found = [], []
-    for each, values in ((model, weights), (integer, {**weights, **more})):
-        for tensor in each.graph.initializer:
-            if tensor.name in values:
-                tensor.CopyFrom(onnx.numpy_helper.from_array(values[tensor.name], tensor.name))
-        path = folder.parent / "prologue.onnx"
-        onnx.save(each, path, save_as_external_data=True, location="prologue.bin")
-        session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-        inputs = {each.name: obs[each.name] for each in session.get_inputs()}
-        found.append([value for value in session.run(None, inputs) if value.ndim == 4 and value.shape[1] > 1])
-        times = []
-        for _ in range(repeats):
-            start = process_time()
-            session.run(None, inputs)
-            times.append(process_time() - start)
-        took.append(statistics.median(times))
-        for name in ("prologue.onnx", "prologue.bin"):
-            (folder.parent / name).unlink()
-    error = np.median([np.abs(a - b).mean() / np.abs(a).mean() for a, b in zip(*found, strict=True)])
-    products = f"{len(more) // 2} products in int8; keys and values {error:.1%} off"
-    return f"{took[1]:.2f} s in place of {took[0]:.2f} with {products}"

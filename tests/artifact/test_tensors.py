@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from safetensors.numpy import load_file
+from safetensors.numpy import load_file, save
 
 from ttscompile.artifact import tensors
 from ttscompile.errors import ArtifactError
@@ -28,7 +28,8 @@ def test_what_is_written_is_read_by_us_and_by_the_library(values: dict[str, np.n
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "t.safetensors"
-        path.write_bytes(tensors.serialize(values))
+        tensors.write(path, values)
+        assert path.read_bytes() == tensors.serialize(values) == save(values), "other bytes than the library's"
         found, theirs = tensors.read(path), load_file(path)
         assert set(found) == set(values) == set(theirs)
         for name, value in values.items():

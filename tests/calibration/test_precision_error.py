@@ -29,6 +29,7 @@ def test_the_error_of_the_precision_has_figures_of_its_own(int8: Path, compiled:
     record = manifest.calibration["precision"]
     assert (record["name"], record["calls"]) == ("int8", 8)
     assert list(record["plans"]) == ["dense", "schedule"]
+    assert record["parts"] == {"blocks": record["plans"]["dense"]["error"]}
     assert before.precision is not None and before.precision.error is not None
     for score in record["plans"].values():
         assert 0 < score["error"] <= score["error_p90"] < 5 * before.precision.error.largest

@@ -38,9 +38,11 @@ def test_convert_and_inspect_say_the_precision_and_its_error(converted: tuple[Pa
     directory, told = converted
     stage = next(stage for stage in told.pop("stages") if stage["stage"] == "lower_precision")
     assert stage["notes"][0].startswith("int8: 6 matrices of 3 of 3 blocks")
+    assert stage["notes"][1].startswith("condition stays fp32: ") and "of a step" in stage["notes"][1]
     assert json.loads(run("inspect", directory, "--json").stdout) == told
     record = told["precision"]
     assert (record["name"], record["blocks"]) == ("int8", 3)
+    assert record["parts"] == {"blocks": {"kept": True, "alone": None}}
     assert 0.85e6 < record["bytes"] < 1.0e6
     assert 0.02 < record["error"]["mean"] < 2.0, "of 512 pixels"
     text = " ".join(run("inspect", directory).stdout.split())
@@ -63,7 +65,7 @@ def test_it_is_the_reference_within_the_stated_tolerance(converted: tuple[Path, 
 
 def test_fp32_is_the_default_and_inspect_says_so(toy_compiled: Path) -> None:
     told = json.loads(run("inspect", toy_compiled, "--json").stdout)
-    assert told["precision"] == {"name": "fp32", "blocks": 0, "bytes": 0, "error": None}
+    assert told["precision"] == {"name": "fp32", "blocks": 0, "bytes": 0, "error": None, "parts": {}}
     assert "fp32" in run("inspect", toy_compiled).stdout
 
 

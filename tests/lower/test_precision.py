@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import onnx
-import onnxruntime
 import pytest
 import torch
 from hypothesis import given, settings
@@ -18,33 +17,16 @@ from onnx.helper import make_graph, make_model, make_node, make_opsetid, make_te
 from torch.nn import functional
 
 from tests.lower.modules import captured, random_values
+from tests.lower.running import session
 from tests.runtimes.toys import B, f32, node
 from ttscompile.errors import LoweringError
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Graph, Ref
-from ttscompile.lower.precision import lower_precision, quantize_matrix, quantize_model
+from ttscompile.lower.precision import LEAST_ROWS, lower_precision, quantize_matrix, quantize_model
 from ttscompile.lower.program import lower_graph
 from ttscompile.measure.machine import has_integer_dot_product
-from ttscompile.runtimes.onnxruntime.sessions import EXACT_INTEGERS
 
 Array = npt.NDArray[Any]
-
-
-def session(model: ModelProto, constants: Mapping[str, Array], exact: bool = True) -> onnxruntime.InferenceSession:
-    filled = ModelProto()
-    filled.CopyFrom(model)
-    for tensor in filled.graph.initializer:
-        if not tensor.raw_data:
-            value = constants[tensor.name]
-            assert (tuple(tensor.dims), onnx.helper.tensor_dtype_to_np_dtype(tensor.data_type)) == (
-                value.shape,
-                value.dtype,
-            )
-            tensor.raw_data = np.ascontiguousarray(value).tobytes()
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    options.add_session_config_entry(EXACT_INTEGERS, str(int(exact)))
-    return onnxruntime.InferenceSession(filled.SerializeToString(), options, providers=["CPUExecutionProvider"])
 
 
 def by_hand(nodes: list[NodeProto], weights: Mapping[str, Array], rows: int, columns: int) -> ModelProto:
@@ -175,7 +157,7 @@ def test_what_is_no_plain_product_by_a_constant_stays_as_it_is(nodes: list[NodeP
     same, constants = quantize_model(model, weights)
     assert constants == {}
     assert same.SerializeToString() == model.SerializeToString()
-    with pytest.raises(LoweringError, match="none of the 1 residual blocks multiplies"):
+    with pytest.raises(LoweringError, match="no piece of blocks multiplies by a constant"):
         lower_precision({"block_00": model, "stem": model}, weights, "int8")
 
 
@@ -202,6 +184,18 @@ def test_only_blocks_are_lowered_and_the_notes_say_which() -> None:
     assert again["block_00"].SerializeToString(deterministic=True) == made["block_00"].SerializeToString(
         deterministic=True
     )
+
+
+def test_products_of_few_rows_stay_in_the_prologue_and_not_in_blocks() -> None:
+    """A condition vector is one row, of numbers of many sizes, and one scale is too few for it."""
+    kinds = {"many": f32(B, LEAST_ROWS, 4), "few": f32(B, LEAST_ROWS - 1, 4), "vector": f32(B, 4)}
+    nodes = tuple(node(f"{name}.made", "linear.default", kind, Ref(name), Ref(name[0])) for name, kind in kinds.items())
+    weights = {name[0]: np.ones((4, 4), np.float32) for name in kinds}
+    graph = Graph(kinds, dict.fromkeys(weights, f32(4, 4)), nodes, tuple(each.name for each in nodes))
+    models = {"condition": lower_graph(graph, "condition"), "block_00": lower_graph(graph, "block_00")}
+    for part, expected in (("condition", {"m"}), ("blocks", {"m", "f", "v"})):
+        _, constants, _ = lower_precision(models, weights, "int8", (part,))
+        assert {name.removesuffix(".int8") for name in constants if name.endswith(".int8")} == expected
 
 
 def test_a_precision_that_cannot_be_had_is_refused_with_what_can() -> None:
@@ -237,4 +231,4 @@ def test_convolutions_that_stay_are_counted() -> None:
     graph = Graph({"x": few, "long": many}, dict.fromkeys(values, f32(4, 4, 3)), nodes, ("y", "z"))
     _, constants, notes = lower_precision({"block_00": lower_graph(graph, "block_00")}, values, "int8")
     assert set(constants) == {"v.int8", "v.int8.scale"}
-    assert notes[1] == "convolutions that stay fp32, over more than 32 positions, in groups, or transposed: 1"
+    assert notes[1] == "convolutions that stay fp32 in blocks, of few channels, in groups, or transposed: 1"

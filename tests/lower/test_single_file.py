@@ -24,7 +24,7 @@ from tests.runtimes.plans import random_plan, random_reading
 from tests.runtimes.toys import pencil_program, toy_program
 from ttscompile import Noise, legalize
 from ttscompile.artifact import load_artifact
-from ttscompile.artifact.bind import LoweredBlocks
+from ttscompile.artifact.bind import LoweredPieces
 from ttscompile.artifact.write import write_artifact
 from ttscompile.core.correction import OBSERVED, READING, Correction, no_correction
 from ttscompile.core.lattice import Source
@@ -183,7 +183,7 @@ def test_blocks_of_another_precision(tmp_path: Path) -> None:
     models = lower_program(program)
     lowered, weights, _ = lower_precision(models, program.weights, "int8")
     lowered |= lower_all_blocks(program.pieces.blocks, {**models, **lowered})
-    write_artifact(program, models, tmp_path / "artifact", LoweredBlocks("int8", lowered, weights))
+    write_artifact(program, models, tmp_path / "artifact", LoweredPieces("int8", lowered, weights))
     model = lower_single_file(program, {**models, **lowered}, {**program.weights, **weights})
     policy = ttscompile.load(tmp_path / "artifact", precision="int8")
     obs, noise = inputs(policy, np.random.default_rng(0), 2)

@@ -111,8 +111,10 @@ def test_a_policy_that_gives_no_numbers_is_not_measured(int8: Path, monkeypatch:
     artifact = load_artifact(int8)
     broken = {"obs": np.full((1, 2, 3), np.nan, np.float32)}
     noise = Noise(np.zeros((1, 8, 2), np.float32), np.zeros((10, 1, 8, 2), np.float32))
+    runtimes = [open_runtime(one) for one in (artifact, artifact.at_precision("fp32"))]
+    own, exact = (against_fp32.answers(one, artifact.schedule("dense"), [(broken, noise)]) for one in runtimes)
     with pytest.raises(TtscompileError, match="not a number"):
-        against_fp32.compare(artifact, artifact.schedule("dense"), [(broken, noise)])
+        against_fp32.mean_errors(policies.spec().chunk, own, exact)
 
 
 def test_nothing_to_lower_and_unknown_precisions_are_refused_before_anything_is_written(tmp_path: Path) -> None:

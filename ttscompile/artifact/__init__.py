@@ -1,6 +1,6 @@
 """The artifact: what ``convert`` writes and the robot loads. ``docs/design.md`` section 5.
 
-``load`` and ``manifest`` need numpy alone; ``write`` needs onnx and safetensors, which it imports when it is called.
+``load`` and ``manifest`` need numpy alone; ``write`` needs onnx, which it imports when it is called.
 """
 
 from .load import Artifact, load_artifact

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ArtifactError
+from ..ir.pieces import part_of
 from . import tensors
 from .files import write_synced
 from .manifest import PieceRecord, PrecisionError, PrecisionRecord
@@ -43,20 +44,28 @@ class Place:
 
 
 @dataclass(frozen=True)
-class LoweredBlocks:
-    """What ``lower_precision`` made of residual blocks.
+class LoweredPieces:
+    """What ``lower_precision`` made of blocks and prologue.
 
     Attributes:
         name: of the precision.
-        models: by block, and of the piece ``blocks`` if the artifact has it.
+        models: by piece, those that hold all blocks among them.
         weights: the constants that these models have and the program has not.
         error: as measured; None if it was not.
+        parts: see ``PrecisionRecord``.
     """
 
     name: str
     models: Mapping[str, ModelProto]
     weights: Mapping[str, npt.NDArray[Any]]
     error: PrecisionError | None = None
+    parts: Mapping[str, float | None] = field(default_factory=dict)
+
+    def of_parts(self, parts: Collection[str]) -> LoweredPieces:
+        """The same with the models of these parts alone, and what they read."""
+        models = {name: model for name, model in self.models.items() if part_of(name) in parts}
+        read = {tensor.name for model in models.values() for tensor in _initializers(model.graph)}
+        return replace(self, models=models, weights={n: value for n, value in self.weights.items() if n in read})
 
 
 def places_of(path: Path, values: Mapping[str, npt.NDArray[Any]]) -> dict[str, Place]:
@@ -100,37 +109,40 @@ def interface(model: ModelProto) -> tuple[tuple[str, ...], tuple[str, ...]]:
     return inputs, tuple(value.name for value in model.graph.output)
 
 
-def store_blocks(
-    folder: Path, blocks: LoweredBlocks, pieces: Mapping[str, PieceRecord], places: Mapping[str, Place]
+def store_pieces(
+    folder: Path, lowered: LoweredPieces, pieces: Mapping[str, PieceRecord], places: Mapping[str, Place]
 ) -> PrecisionRecord:
-    """Write blocks beside those in fp32, which the reference runtime computes with, into the folder of a new artifact.
+    """Write pieces beside those in fp32, which the reference runtime computes with, into the folder of a new artifact.
 
     Args:
         folder: of the artifact.
-        blocks: what to write.
+        lowered: what to write.
         pieces: of the artifact.
         places: of the program's constants, which these models read too.
 
     Raises:
         ArtifactError: a model that does not fit its piece, or a constant that has the name of another.
     """
-    where = f"precision {blocks.name!r}"
-    if taken := sorted(set(blocks.weights) & set(places)):
+    where = f"precision {lowered.name!r}"
+    if taken := sorted(set(lowered.weights) & set(places)):
         raise ArtifactError(f"{where}: expected constants of new names; found {taken[0]!r}. {REPORT}")
-    file = f"weights_{blocks.name}.safetensors"
-    write_synced(folder / file, tensors.serialize(blocks.weights))
-    places = {**places, **places_of(folder / file, blocks.weights)}
+    file = f"weights_{lowered.name}.safetensors"
+    tensors.write(folder / file, lowered.weights)
+    places = {**places, **places_of(folder / file, lowered.weights)}
     files = {}
-    for name, model in blocks.models.items():
+    for name, model in lowered.models.items():
         (inputs, outputs), piece = interface(model), pieces.get(name)
         if piece is None or (inputs, outputs) != (piece.inputs, piece.outputs):
             expected = "no such piece" if piece is None else (list(piece.inputs), list(piece.outputs))
             raise ArtifactError(
                 f"{where}: {name!r} reads {list(inputs)} and gives {list(outputs)}; expected {expected}. {REPORT}"
             )
-        files[name] = f"{name}_{blocks.name}.onnx"
+        files[name] = f"{name}_{lowered.name}.onnx"
         write_synced(folder / files[name], bind(model, places, name))
-    return PrecisionRecord(name=blocks.name, weights=file, models=files, error=blocks.error)
+    known = {*lowered.parts, *map(part_of, files)}
+    order = dict.fromkeys(part for part in map(part_of, pieces) if part is not None and part in known)
+    parts = {part: lowered.parts.get(part) for part in order}
+    return PrecisionRecord(lowered.name, file, files, lowered.error, parts)
 
 
 def _set(tensor: TensorProto, place: Place, piece: str) -> None:

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ..errors import ArtifactError
-from ..ir.pieces import ADVANCE, CONDITION, OF_ALL_BLOCKS, PRUNER, STEM, block_name
+from ..ir.pieces import ADVANCE, CONDITION, OF_ALL_BLOCKS, PRUNER, STEM, block_name, part_of
 from . import typed_json
 from .manifest import DENSE, DISTILLED, FORMAT, MANIFEST, SCHEMA_VERSION, DistilledRecord, Manifest, PrecisionRecord
 from .strict_json import REMEDY, Value, dump, dump_compact, parse
@@ -79,7 +79,7 @@ def identities(manifest: Manifest) -> tuple[str, str]:
     """Identity and model identity of what a manifest describes; its own two fields are not read.
 
     The model identity covers weights, tables, graphs, sampler, normalisers, observations, chunk and block table. The
-    identity covers that, the pruner's weights, all plans, which of them is the default, and blocks of another
+    identity covers that, the pruner's weights, all plans, which of them is the default, and weights of another
     precision: a calibration, which computes in fp32, belongs to the model with or without them. Neither covers what
     people are told: source, FLOPs, reasons, sparsities, errors, calibration record, versions.
 
@@ -151,12 +151,17 @@ def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:
 
 
 def _check_precision(manifest: Manifest, record: PrecisionRecord, value: Value) -> None:
-    known = list(map(block_name, range(len(manifest.blocks))))
-    single = set(record.models) - set(OF_ALL_BLOCKS)
-    if not single or not single <= set(known):
-        value.fail(f"models of some of the blocks {', '.join(known)} and of nothing else")
-    if not set(OF_ALL_BLOCKS) <= set(record.models):
+    blocks = set(map(block_name, range(len(manifest.blocks))))
+    known = {piece for piece in manifest.pieces if part_of(piece) is not None} | blocks
+    models = set(record.models)
+    if not models or not models <= known:
+        value.fail(f"models of some of {', '.join(sorted(known))} and of nothing else")
+    if (all_blocks := set(OF_ALL_BLOCKS) & models) and not blocks & models:
+        value.fail(f"models of some blocks beside {' and '.join(sorted(all_blocks))}")
+    if blocks & models and len(all_blocks) < len(OF_ALL_BLOCKS):
         value.fail(f"models called {' and '.join(OF_ALL_BLOCKS)} too")
+    if not {part_of(piece) for piece in models} <= set(record.parts) <= {part_of(piece) for piece in known}:
+        value.fail("the parts that its models belong to, and no others than the policy has")
     own = {record.weights, *record.models.values()}
     others = {piece.file for piece in manifest.pieces.values()} | set(vars(manifest.stores).values())
     if len(own) <= len(record.models) or own & others:
@@ -167,15 +172,14 @@ def _check_distilled(manifest: Manifest, record: DistilledRecord, value: Value) 
     known = {*map(block_name, range(len(manifest.blocks))), *OF_ALL_BLOCKS}
     if set(record.models) != known:
         value.fail(f"a model of each of {', '.join(sorted(known))}")
-    own, other = record.precision, manifest.precision
-    if (None if own is None else (own.name, set(own.models))) != (
-        None if other is None else (other.name, set(other.models))
-    ):
-        value.fail("blocks of the artifact's other precision exactly where the artifact has such")
+    other = manifest.precision
+    lower = set() if other is None else set(other.models) & known
+    if set(record.precision_models) != lower or (record.precision_weights is None) is bool(lower):
+        value.fail(f"models in another precision, and a file of their weights, for {sorted(lower) or 'nothing'}")
     others = {piece.file for piece in manifest.pieces.values()} | set(vars(manifest.stores).values())
     if other is not None:
         others |= {other.weights, *other.models.values()}
-    count = 1 + len(record.models) + (0 if own is None else 1 + len(own.models))
+    count = 1 + len(record.models) + len(record.precision_models) + bool(lower)
     if len(record.files) != count or record.files & others:
         value.fail("a file for each model and one for the weights, which nothing else uses")
 

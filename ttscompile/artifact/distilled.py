@@ -75,10 +75,11 @@ def store_distilled(artifact: Artifact, manifest: Manifest, distilled: Distilled
     places = places_of(weights, distilled.weights)
     blocks = (*map(block_name, range(len(manifest.blocks))), *OF_ALL_BLOCKS)
     models = again({name: manifest.pieces[name].file for name in blocks}, places)
-    precision = manifest.precision
-    if precision is not None:
-        own = write(f"weights_{precision.name}.safetensors", contents[1])
-        places |= places_of(own, distilled.precision)
-        names = again(precision.models, places, f"_{precision.name}")
-        precision = replace(precision, weights=own.name, models=names)
-    return replace(manifest, files=files, distilled=DistilledRecord(weights.name, models, precision))
+    lower = {} if manifest.precision is None else manifest.precision.models
+    lower = {name: file for name, file in lower.items() if name in blocks}
+    own, names = None, dict[str, str]()
+    if lower:
+        path = write("weights_lower.safetensors", contents[1])
+        own, places = path.name, places | places_of(path, distilled.precision)
+        names = again(lower, places, "_lower")
+    return replace(manifest, files=files, distilled=DistilledRecord(weights.name, models, own, names))

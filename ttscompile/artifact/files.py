@@ -11,7 +11,7 @@ import re
 import secrets
 import shutil
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from io import BufferedReader
 from pathlib import Path
@@ -90,10 +90,10 @@ def check_file(path: Path, record: FileRecord) -> None:
         )
 
 
-def write_synced(path: Path, content: bytes) -> None:
-    """Write a new file and wait until it is on disk."""
+def write_synced(path: Path, content: bytes | Iterable[bytes | memoryview]) -> None:
+    """Write a new file, whole or part by part, and wait until it is on disk."""
     with path.open("xb") as file:
-        file.write(content)
+        file.writelines([content] if isinstance(content, bytes) else content)
         file.flush()
         os.fsync(file.fileno())
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -21,17 +20,17 @@ from ..core.paths import require_path
 from ..core.spec import FP32
 from ..errors import ArtifactError, IllegalPlanError
 from ..ir.graph import Graph
-from ..ir.pieces import CONDITION, PRUNER, STEM, STEP, TAIL, LoopPiece, block_name
+from ..ir.pieces import CONDITION, PRUNER, STEM, STEP, TAIL, LoopPiece, block_name, part_of
 from ..ir.program import Binding, Pieces
-from ..measure.versions import release
 from . import tensors
 from .archive import Unpacked, is_checkpoint, unpack
 from .codec import MAX_MANIFEST_BYTES, decode, identities
 from .files import check_file, read_file
 from .folder import Folder, Stamp
 from .graph_json import graph_from_json
-from .manifest import DENSE, DISTILLED, MANIFEST, Manifest, Requires, abbreviated
+from .manifest import DENSE, DISTILLED, MANIFEST, Manifest, abbreviated
 from .onnx_files import check_model
+from .requires import check_runtime
 from .size import check_size
 from .strict_json import REMEDY, Value, parse
 
@@ -97,7 +96,7 @@ class Artifact:
             yield
 
     def onnx_file(self, piece: str) -> str:
-        """Name of the ONNX file of a piece, whose weights are beside it; of a block the one in its precision."""
+        """Name of the ONNX file of a piece, whose weights are beside it; the one in its precision."""
         record = self.manifest.precision
         models = {} if record is None else record.models
         return models.get(piece, self.manifest.pieces[piece].file)
@@ -107,13 +106,12 @@ class Artifact:
         return self.path / self.onnx_file(piece)
 
     def at_precision(self, name: str) -> Artifact:
-        """The same artifact with its residual blocks in a precision: its own, or ``fp32``, which all artifacts hold.
+        """The same artifact in a precision: its own, or ``fp32``, which all artifacts hold.
 
         Raises:
-            ArtifactError: it has no blocks of this precision.
+            ArtifactError: it has no weights of this precision.
         """
-        own = self.manifest.precision_name
-        if name not in (FP32, own):
+        if name not in (FP32, own := self.manifest.precision_name):
             known = list(dict.fromkeys((FP32, own)))
             raise ArtifactError(
                 f"{self.path}: precision {name!r}: expected one that the artifact holds, {known}. Convert the"
@@ -122,6 +120,13 @@ class Artifact:
         if name == own:
             return self
         return replace(self, manifest=replace(self.manifest, precision=None))
+
+    def with_parts(self, parts: Collection[str]) -> Artifact:
+        """The same artifact with only these parts (``ir.pieces.part_of``) in its precision."""
+        record = self.manifest.precision
+        models = {} if record is None else {n: file for n, file in record.models.items() if part_of(n) in parts}
+        own = replace(record, models=models) if record is not None and models else None
+        return replace(self, manifest=replace(self.manifest, precision=own))
 
     def with_weights_of(self, plan: str | None) -> Artifact:
         """The artifact whose blocks are those that a plan computes after step 0: itself, but for ``distilled``.
@@ -134,9 +139,11 @@ class Artifact:
         record, manifest = self.manifest.distilled, self.manifest
         if plan != DISTILLED or record is None:
             return self
-        models = record.models
-        pieces = {n: replace(one, file=models.get(n, one.file)) for n, one in manifest.pieces.items()}
-        precision = None if manifest.precision is None else record.precision
+        pieces = {n: replace(one, file=record.models.get(n, one.file)) for n, one in manifest.pieces.items()}
+        precision = manifest.precision
+        if precision is not None:
+            models = {name: record.precision_models.get(name, file) for name, file in precision.models.items()}
+            precision = replace(precision, models=models)
         manifest = replace(manifest, pieces=pieces, precision=precision, distilled=None)
         return replace(self.with_weights(self.distilled), manifest=manifest, distilled={})
 
@@ -291,7 +298,7 @@ def _load_directory(path: Path, shown: Path) -> Artifact:
         raise ArtifactError(f"{shown}: cannot be opened: {error}. {REMEDY}") from error
     with folder.unchanged([MANIFEST]) as first:
         manifest = read_manifest(folder.files)
-        _check_runtime(manifest.requires, folder.files)
+        check_runtime(manifest.requires, folder.files)
         with folder.unchanged(manifest.files) as stamps:
             for name, record in manifest.files.items():
                 check_file(folder.files / name, record)
@@ -379,18 +386,3 @@ def check_schedule(name: str, plan: npt.NDArray[Any], manifest: Manifest) -> Non
         raise IllegalPlanError(f"schedule {name!r}: {error}") from error
     if (plan[0] != Source.COMPUTE).any():
         raise IllegalPlanError(f"schedule {name!r}: expected COMPUTE in all of step 0; found {plan[0].tolist()}.")
-
-
-def _check_runtime(requires: Requires, directory: Path) -> None:
-    if importlib.util.find_spec("onnxruntime") is None:
-        return  # the reference runtime does without; the onnxruntime runtime says that it is missing
-    # From 1.31 on it reports its use to its makers, on threads of its own, for which the end of a forked child waits.
-    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
-    import onnxruntime
-
-    found = str(onnxruntime.__version__)
-    if release(found) < release(requires.onnxruntime):
-        raise ArtifactError(
-            f"{directory}: its graphs (opset {requires.opset}) need onnxruntime >= {requires.onnxruntime}; {found} is"
-            f" installed. Run: pip install 'onnxruntime>={requires.onnxruntime}'."
-        )

@@ -15,7 +15,7 @@ from ..core.lattice import PlanArray, plan_flops
 from ..core.rules import NotNegative, Positive, Rule, Sha256, Share
 from ..core.spec import FP32, PolicySpec
 from ..ir.graph import TensorType
-from ..ir.pieces import OF_ALL_BLOCKS, PRUNER
+from ..ir.pieces import PRUNER, is_block, part_of
 from ..ir.program import Binding
 
 FORMAT = "ttscompile artifact"
@@ -203,6 +203,8 @@ class PrecisionError:
         largest: of any executed action number of any call.
         tolerance: what may be expected of dense calls in general: the largest difference of a denoised sample from the
             reference runtime's, as a share of its largest value.
+        other_noise: the yardstick: the same mean for two dense calls in fp32 on one observation with different noise,
+            over some of the calls.
     """
 
     calls: Positive
@@ -210,29 +212,45 @@ class PrecisionError:
     p90: NotNegative
     largest: NotNegative
     tolerance: NotNegative
+    other_noise: NotNegative
 
 
 @dataclass(frozen=True)
 class PrecisionRecord:
-    """Residual blocks with weights of another precision than fp32, which the artifact holds beside those in fp32.
+    """Parts with weights of another precision than fp32, which the artifact holds beside those in fp32.
 
     Attributes:
         name: ``int8``.
         weights: name of the file with their weights.
-        models: name of the ONNX file by block, where it is not the file of the piece; and of the piece ``blocks``,
-            which holds all blocks, if there is one.
+        models: name of the ONNX file by piece, where it is not the file of the piece: of blocks, and with them of the
+            pieces that hold all of them; and of pieces of the prologue.
         error: what it does to the actions; None before it is measured.
+        parts: by part (``ir.pieces.part_of``), the mean over some calls of the difference that it makes where it alone
+            is in this precision; None where that was not measured. A part without models stays fp32: it was asked for,
+            or what was measured is too much.
     """
 
     name: Annotated[str, Rule("one of 'int8'", "int8".__eq__)]
     weights: FileName
     models: Mapping[str, FileName]
     error: PrecisionError | None
+    parts: Mapping[str, NotNegative | None]
 
     @property
     def blocks(self) -> int:
         """How many residual blocks have such weights."""
-        return len(set(self.models) - set(OF_ALL_BLOCKS))
+        return sum(map(is_block, self.models))
+
+    @property
+    def kept(self) -> tuple[str, ...]:
+        """The parts that have such weights, in order."""
+        own = {part_of(piece) for piece in self.models}
+        return tuple(part for part in self.parts if part in own)
+
+    @property
+    def told(self) -> str:
+        """``int8 in blocks and condition``."""
+        return f"{self.name} in {' and '.join(self.kept)}"
 
 
 @dataclass(frozen=True)
@@ -241,19 +259,22 @@ class DistilledRecord:
 
     Attributes:
         weights: name of the file with the constants that differ.
-        models: name of the ONNX file by piece, where it is not the file of the piece.
-        precision: of the same blocks in the artifact's other precision; None where the artifact has none.
+        models: name of the ONNX file by piece, of each block and of the pieces that hold all of them.
+        precision_weights: name of the file with what the artifact's other precision makes of them; None where no block
+            has another precision.
+        precision_models: name of the ONNX file by piece, of those of these that have another precision.
     """
 
     weights: FileName
     models: Mapping[str, FileName]
-    precision: PrecisionRecord | None
+    precision_weights: FileName | None
+    precision_models: Mapping[str, FileName]
 
     @property
     def files(self) -> set[str]:
         """Names of all its files."""
-        own = {self.weights, *self.models.values()}
-        return own if self.precision is None else own | {self.precision.weights, *self.precision.models.values()}
+        own = {self.weights, *self.models.values(), *self.precision_models.values()}
+        return own if self.precision_weights is None else own | {self.precision_weights}
 
 
 @dataclass(frozen=True)
@@ -278,7 +299,7 @@ class Manifest:
         stores: names of the files that are not ONNX.
         requires: what the ONNX graphs need.
         files: every file but the manifest.
-        precision: of the blocks where it is not fp32. The reference runtime computes in fp32 always.
+        precision: of blocks and prologue where it is not fp32. The reference runtime computes in fp32 always.
         distilled: weights of the plan of this name; None where there is no such plan.
     """
 

@@ -1,4 +1,4 @@
-"""safetensors files: read with numpy alone, written with the safetensors library.
+"""safetensors files: read and written with numpy alone, an array at a time.
 
 Layout of a file: length of the header (8 bytes, little-endian); header (JSON: name -> dtype, shape, offsets into the
 data); data.
@@ -7,9 +7,10 @@ Source: the format's description, https://github.com/huggingface/safetensors#for
 
 from __future__ import annotations
 
+import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from io import BufferedReader
 from pathlib import Path
@@ -20,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ArtifactError
-from .files import opened
+from .files import opened, write_synced
 from .strict_json import REMEDY, Value, parse
 
 Array = npt.NDArray[Any]
@@ -42,6 +43,7 @@ _DTYPES: Mapping[str, np.dtype[Any]] = MappingProxyType(
         "F64": np.dtype("<f8"),
     }
 )
+_WIDEST_FIRST = ("I64", "F64", "F32", "I32", "F16", "I16", "I8", "U8", "BOOL")
 
 
 @dataclass(frozen=True)
@@ -160,24 +162,46 @@ def check_arrays(
 
 
 def serialize(arrays: Mapping[str, Array]) -> bytes:
-    """The bytes of a safetensors file, the same whatever the order of the arrays; needs the safetensors library.
+    """The bytes of a safetensors file, the same whatever the order of the arrays.
 
     Raises:
         ArtifactError: an array of a dtype that the format or the reader lacks.
     """
-    from safetensors.numpy import save
+    return b"".join(_chunks(arrays))
 
-    plain = {}
-    for name in sorted(arrays):
-        array = np.asarray(arrays[name])
-        if array.dtype.newbyteorder("<") not in _DTYPES.values():
+
+def write(path: Path, arrays: Mapping[str, Array]) -> None:
+    """Write a new safetensors file, one array after the other: all of them together may be half of the memory.
+
+    Raises:
+        ArtifactError: see ``serialize``.
+    """
+    write_synced(path, _chunks(arrays))
+
+
+def _chunks(arrays: Mapping[str, Array]) -> Iterator[bytes | memoryview]:
+    """A file in parts: its header, and each array. Their order is that of the safetensors library."""
+    kinds = {dtype: code for code, dtype in _DTYPES.items()}
+    arrays = {name: np.asarray(array) for name, array in arrays.items()}
+    for name, array in arrays.items():
+        if array.dtype.newbyteorder("<") not in kinds:
             raise ArtifactError(
                 f"tensor {name!r} has dtype {array.dtype}; an artifact can hold"
                 f" {', '.join(str(d) for d in _DTYPES.values())}. Convert the weight before compiling."
             )
-        # The library writes an array's buffer as it lies in memory, whatever its strides.
-        plain[name] = np.asarray(array, dtype=array.dtype.newbyteorder("<"), order="C")
-    return bytes(save(plain))
+    codes = {name: kinds[array.dtype.newbyteorder("<")] for name, array in arrays.items()}
+    order = sorted(codes, key=lambda name: (_WIDEST_FIRST.index(codes[name]), name))
+    header, end = dict[str, Any](), 0
+    for name in order:
+        array = arrays[name]
+        header[name] = {"dtype": codes[name], "shape": array.shape, "data_offsets": (end, end + array.nbytes)}
+        end += array.nbytes
+    text = json.dumps(header, ensure_ascii=False, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % _PREFIX)
+    yield len(text).to_bytes(_PREFIX, "little") + text
+    for name in order:
+        plain = np.asarray(arrays[name], dtype=arrays[name].dtype.newbyteorder("<"), order="C")
+        yield plain.reshape(-1).view(np.uint8).data
 
 
 def _entry(value: Value, start: int) -> Entry:

@@ -20,7 +20,7 @@ from ..ir.pieces import PRUNER
 from ..ir.program import Binding, Program
 from ..measure.versions import VERSION
 from . import records, tensors
-from .bind import LoweredBlocks, bind, places_of, store_blocks
+from .bind import LoweredPieces, bind, places_of, store_pieces
 from .codec import decode, encode, identities
 from .distilled import DistilledWeights, store_distilled
 from .files import (
@@ -72,7 +72,7 @@ def write_artifact(
     program: Program,
     models: Mapping[str, ModelProto],
     directory: str | os.PathLike[str],
-    blocks: LoweredBlocks | None = None,
+    lowered: LoweredPieces | None = None,
     golden: Golden | None = None,
     beside: Mapping[str, bytes] | None = None,
 ) -> Manifest:
@@ -84,7 +84,7 @@ def write_artifact(
         program: after all passes.
         models: from ``lower_program``.
         directory: where it goes; its parents are made. An artifact that is there is replaced.
-        blocks: residual blocks of another precision, which then is the artifact's; None for fp32.
+        lowered: pieces of another precision, which then is the artifact's; None for fp32.
         golden: what the original network answered; None leaves the artifact without, which then cannot be verified.
         beside: files for other programs, by name, one of ``BESIDE``.
 
@@ -101,7 +101,7 @@ def write_artifact(
         target.parent.mkdir(parents=True, exist_ok=True)
         recover(target)
         with locked(target) if target.is_dir() else nullcontext(), new_folder(target) as partial:
-            manifest = _fill(partial, program, models, blocks, golden)
+            manifest = _fill(partial, program, models, lowered, golden)
             for name, content in (beside or {}).items():
                 assert name in BESIDE
                 write_synced(partial / name, content)
@@ -203,7 +203,7 @@ def _fill(
     folder: Path,
     program: Program,
     models: Mapping[str, ModelProto],
-    blocks: LoweredBlocks | None,
+    lowered: LoweredPieces | None,
     golden: Golden | None,
 ) -> Manifest:
     """Write all files of a new artifact into an empty folder."""
@@ -216,7 +216,7 @@ def _fill(
     pruner = {name: value for name, value in values.items() if name.startswith(records.PRUNER_PREFIX)}
     stored = {name: value for name, value in values.items() if name not in pruner}
     tables = {TABLE_PREFIX + n: program.pieces.tables[n] for n, c in contexts.items() if c.binding is Binding.TABLE}
-    write_synced(folder / WEIGHTS, tensors.serialize({**stored, **tables}))
+    tensors.write(folder / WEIGHTS, {**stored, **tables})
     places = places_of(folder / WEIGHTS, stored)
     pruner_file = None
     if PRUNER in graphs:
@@ -228,7 +228,7 @@ def _fill(
     pieces = records.piece_records(program, models, files)
     for name in pieces:
         write_synced(folder / files[name], bind(models[name], places, name))
-    precision = None if blocks is None else store_blocks(folder, blocks, pieces, places)
+    precision = None if lowered is None else store_pieces(folder, lowered, pieces, places)
     if golden is not None:
         write_synced(folder / GOLDEN, tensors.serialize(golden.arrays()))
     document = {

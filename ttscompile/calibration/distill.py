@@ -23,7 +23,7 @@ from ..core.correction import FEATURES, Correction
 from ..core.given import integer
 from ..core.lattice import PlanArray, Source, whole_steps_plan
 from ..errors import CalibrationError, CalibrationFailedError
-from ..ir.pieces import block_name
+from ..ir.pieces import is_block
 from ..lower.precision import quantize_model
 from ..runtimes.torch.devices import device_of, exact_arithmetic
 from ..verification.record_golden import record_plans
@@ -251,12 +251,9 @@ def _in_precision(artifact: Artifact, weights: Mapping[str, Any]) -> dict[str, A
     """The constants that the artifact's other precision makes of these weights, by name; none where it has none."""
     import onnx
 
-    if artifact.manifest.precision is None:
-        return {}
-    known, made = {**artifact.weights, **weights}, dict[str, Any]()
-    for b in range(len(artifact.manifest.blocks)):
-        file = artifact.files / artifact.manifest.pieces[block_name(b)].file
-        model = onnx.load(file, load_external_data=False)
+    record, known, made = artifact.manifest.precision, {**artifact.weights, **weights}, dict[str, Any]()
+    for name in filter(is_block, () if record is None else record.models):
+        model = onnx.load(artifact.files / artifact.manifest.pieces[name].file, load_external_data=False)
         made |= quantize_model(model, known)[1]
     return made
 

@@ -12,9 +12,11 @@ import torch
 from ..artifact.load import Artifact
 from ..artifact.manifest import DENSE, UNIFORM, Manifest
 from ..core.lattice import PlanArray, uniform_plan
+from ..core.spec import FP32
 from ..errors import CalibrationFailedError
 from ..ir.pieces import PRUNER
-from ..runtimes.against_fp32 import action_errors, compare
+from ..runtimes.against_fp32 import FEW_CALLS, answers, mean_errors
+from ..runtimes.open import open_runtime
 from ..runtimes.random_calls import normalized, random_noise
 from ..runtimes.settle import pruner_plan
 from ..trajectories.episodes import Episode
@@ -111,8 +113,9 @@ def precision_record(
         seed: the seed of the choice of calls and of their noise.
 
     Returns:
-        ``{"precision": {"name": .., "calls": .., "plans": {plan: {"error": .., "error_p90": ..}}}}`` for the
-        calibration record, in the units of the actions; empty for an artifact in fp32.
+        ``{"precision": {"name": .., "calls": .., "plans": {plan: {"error": .., "error_p90": ..}}, "parts": {part:
+        error}}}`` for the calibration record, in the units of the actions; empty for an artifact in fp32. ``parts`` has
+        the mean error of dense calls with each part alone in the precision, on some of the calls where there are more.
     """
     precision, spec = artifact.manifest.precision, artifact.manifest.spec
     if precision is None:
@@ -121,12 +124,19 @@ def precision_record(
     for number, row in sample_calls(episodes, numbers, IN_PRECISION, seed):
         obs = {key: episodes[number].observations[key][row : row + 1] for key in spec.observations}
         calls.append((normalized(spec, obs), random_noise(spec, draw)))
-    scores = {}
-    for name, one in {DENSE: Found(artifact.schedule(DENSE)), SCHEDULE: schedule}.items():
-        pairs = compare(artifact, one.schedule, calls, one.correction)
-        errors = [action_errors(spec.chunk, left, right).mean() for left, right in pairs]
-        scores[name] = {"error": float(np.mean(errors)), "error_p90": float(np.quantile(errors, 0.9))}
-    return {"precision": {"name": precision.name, "calls": len(calls), "plans": scores}}
+    plain, exact, scores = open_runtime(artifact.at_precision(FP32)), dict[str, list[FloatArray]](), {}
+    plans = {DENSE: Found(artifact.schedule(DENSE)), SCHEDULE: schedule}
+    for name, one in plans.items():
+        exact[name] = answers(plain, one.schedule, calls, one.correction)
+    own = open_runtime(artifact)
+    for name, one in plans.items():
+        errors = mean_errors(spec.chunk, answers(own, one.schedule, calls, one.correction), exact[name])
+        scores[name] = {"error": float(errors.mean()), "error_p90": float(np.quantile(errors, 0.9))}
+    parts = dict.fromkeys(precision.kept, scores[DENSE]["error"])
+    for part in parts if len(parts) > 1 else ():
+        alone = answers(open_runtime(artifact.with_parts([part])), plans[DENSE].schedule, calls[:FEW_CALLS])
+        parts[part] = float(mean_errors(spec.chunk, alone, exact[DENSE][:FEW_CALLS]).mean())
+    return {"precision": {"name": precision.name, "calls": len(calls), "plans": scores, "parts": parts}}
 
 
 def require_success(result: CalibrationResult, goal: Goal) -> None:

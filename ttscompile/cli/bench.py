@@ -23,6 +23,7 @@ from ttscompile.cli.types import PATH, TEXT
 from ttscompile.core.spec import FP32
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.units import ms, share
+from ttscompile.report.facts import precision as told_precision
 from ttscompile.runtimes.against_fp32 import measure_precision
 from ttscompile.runtimes.open import CPU, open_runtime
 
@@ -38,7 +39,9 @@ plan of it on the CPU, for --runtime torch."""
 @click.option("--plan", type=TEXT, help="Plan of the compiled policy. Without this option its default plan runs.")
 @runtime_options
 @click.option(
-    "--precision", type=TEXT, help="Of the residual blocks. Without this option it is that of the artifact, or fp32."
+    "--precision",
+    type=TEXT,
+    help="Of the weights; on torch of the blocks' products. Without this option it is that of the artifact, or fp32.",
 )
 @names_option(
     "--against",
@@ -99,6 +102,8 @@ def bench(
         f"Medians of {runs} calls, one stream, {threads} thread{'s' * (threads > 1)}; plan {entered[0].plan!r}."
         " Speed-up: how many times faster the first row is. Prologue and pruner: their ms of the call.",
     )
+    if runtime == "onnxruntime" and precision != FP32 and artifact.manifest.precision is not None:
+        say(output, f"The first row computes in {told_precision(artifact.manifest)}.")
     if error is not None:
         say(
             output,

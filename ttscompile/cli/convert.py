@@ -16,7 +16,7 @@ from ttscompile.cli.output import only_results_on_stdout, print_json, progress, 
 from ttscompile.cli.summary import print_summary
 from ttscompile.cli.types import ANY_TEXT, FOLDER, NEW_FILE, PATH, PATH_OR_HUB
 from ttscompile.core.paths import on_hub, require_path
-from ttscompile.core.spec import FP32, PRECISIONS
+from ttscompile.core.spec import AUTO, FP32, PRECISIONS
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends.families import FAMILIES, FORMATS, SAMPLERS, SPACINGS
 from ttscompile.report.summary import document
@@ -76,10 +76,17 @@ from ttscompile.report.summary import document
 )
 @click.option(
     "--precision",
-    type=click.Choice(PRECISIONS),
+    type=click.Choice((*PRECISIONS, AUTO)),
     default=FP32,
     show_default=True,
-    help="Of the weights of residual blocks. int8 is faster on processors with VNNI; its error is measured and shown.",
+    help="Of the weights of residual blocks and prologue. int8 is faster on processors with VNNI; its error is measured"
+    " and shown. auto leaves out the parts that change the actions by more than a tenth of what other noise does.",
+)
+@click.option(
+    "--keep-fp32",
+    type=ANY_TEXT,
+    multiple=True,
+    help="A part that stays fp32 beside int8: blocks; prologue, or a piece of it (condition, step). May be repeated.",
 )
 @click.option(
     "--single-file",
@@ -93,6 +100,7 @@ def convert(
     directory: Path,
     prediction_horizon: int | None,
     precision: str,
+    keep_fp32: tuple[str, ...],
     single_file: Path | None,
     explain: bool,
     as_json: bool,
@@ -124,6 +132,7 @@ def convert(
             directory,
             prediction_horizon=prediction_horizon,
             precision=precision,
+            keep_fp32=keep_fp32,
             single_file=single_file,
             explain=on_stage,
             **of_checkpoint,
@@ -134,6 +143,8 @@ def convert(
     for stage in stages:
         if stage["stage"] == "narrow" and prediction_horizon is None:
             say(console, " ".join(["hint:", *stage["notes"]]))
+        if stage["stage"] == "lower_precision" and precision == AUTO:
+            say(console, "; ".join(stage["notes"]))
     if of_checkpoint["sampler"] is None and (hint := many_steps(artifact.manifest)) is not None:
         say(console, f"hint: {hint}")
     if as_json:

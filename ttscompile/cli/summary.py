@@ -62,13 +62,20 @@ def _print_facts(console: Console, made: Table) -> None:
 
 
 def _told_precision(precision: dict[str, Any], blocks: int) -> str:
-    if not precision["blocks"]:
+    if not precision["parts"]:
         return str(precision["name"])
-    told = f"{precision['name']} weights in {precision['blocks']} of {blocks} blocks, {precision['bytes'] / 1e6:.1f} MB"
+    count = f"{precision['blocks']} of {blocks} blocks"
+    kept = [count if part == "blocks" else part for part, one in precision["parts"].items() if one["kept"]]
+    told = f"{precision['name']} weights in {' and '.join(kept)}, {precision['bytes'] / 1e6:.1f} MB"
     error = precision["error"]
     if error is None:
         return f"{told}; its action error was not measured"
-    return (
-        f"{told}; dense actions {error['mean']:.4g} from fp32 on average, 90th percentile {error['p90']:.4g}"
-        f" ({error['calls']} random observations, equal noise)"
+    told += (
+        f"; dense actions {error['mean']:.4g} from fp32 on average, 90th percentile {error['p90']:.4g}"
+        f" ({error['calls']} random observations, equal noise; other noise: {error['other_noise']:.4g})"
     )
+    measured = {part: one for part, one in precision["parts"].items() if one["alone"] is not None}
+    alone = [
+        f"{part} alone {one['alone']:.4g}" + ", left in fp32" * (not one["kept"]) for part, one in measured.items()
+    ]
+    return f"{told}: {'; '.join(alone)}" if alone else told

@@ -96,7 +96,7 @@ class Compiled:
     Attributes:
         runtime: ``onnxruntime`` or ``torch``.
         device: that torch computes on; None for the CPU.
-        precision: of the residual blocks; None for the runtime's own, see ``runtimes.load.load``.
+        precision: of the weights; None for the runtime's own, see ``runtimes.load.load``.
         threads: that it, and each of its rivals, computes with.
     """
 

@@ -46,7 +46,11 @@ LAYERS: Final = "layers"
 OF_ALL_BLOCKS = (JOINT, DENSE_STEP)
 """Pieces that hold all blocks once more."""
 
+BLOCKS: Final = JOINT
+"""The part of a policy that is all of its blocks (``part_of``)."""
+
 _BLOCK = "block_"
+_SMALL = frozenset({PRUNER, STEM, TAIL, ADVANCE, IDLE, LAYERS})
 
 
 def block_name(index: int) -> str:
@@ -57,6 +61,18 @@ def block_name(index: int) -> str:
 def is_block(piece: str) -> bool:
     """Whether a piece is a residual block."""
     return piece.startswith(_BLOCK)
+
+
+def part_of(piece: str) -> str | None:
+    """Which part of a policy, of those that may each have a precision of their own, a piece belongs to.
+
+    Returns:
+        ``blocks`` for blocks and the pieces that hold all of them; the name of a piece of the prologue; and None for
+        pieces that are always in fp32: they are small, or no call needs them.
+    """
+    if is_block(piece) or piece in OF_ALL_BLOCKS:
+        return BLOCKS
+    return None if piece in _SMALL else piece
 
 
 # Values that several pieces of the loop have.

@@ -1,29 +1,46 @@
-"""Weights of residual blocks in eight bits: each matrix product with constant weights becomes an integer product.
+"""Weights in eight bits: each product with constant weights, in blocks and prologue, becomes an integer product.
 
 Blocks of a policy stream their weights from memory once a step, which is what they wait for; a quarter of the bytes,
-and the processor's integer dot product, make them faster. Everything beside these products stays in float32: layer
-norms, attention, activations, biases, and the residual itself.
+and the processor's integer dot product, make them faster. An image encoder waits for arithmetic, of which the integer
+dot product does four times as much. Everything beside these products stays in float32: layer norms, attention,
+activations, biases, and the residual itself.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 from onnx import AttributeProto, ModelProto, NodeProto, TensorProto, helper, numpy_helper
 
-from ..core.spec import INT8, PRECISIONS
+from ..core.spec import AUTO, FP32, INT8, PRECISIONS
 from ..errors import LoweringError
-from ..ir.pieces import is_block
+from ..ir.flops import graph_flops
+from ..ir.pieces import BLOCKS, OF_ALL_BLOCKS, STEP, part_of
+from .integer_convolution import DOMAIN, INTEGER_PRODUCT, convolution_of, integer_convolution, shapes_of
 from .onnx_model import live_nodes
-from .translations import FEW
+
+if TYPE_CHECKING:
+    from ..ir.program import Program
 
 Array = npt.NDArray[Any]
 
-_DOMAIN, _DOMAIN_VERSION = "com.microsoft", 1
+PROLOGUE = "prologue"
+"""All parts but the blocks, where parts are named that stay fp32."""
+
+LEAST_SHARE = 0.2
+"""Of the arithmetic of one step's blocks, which every call has: a smaller part would make hardly any call faster."""
+
+LEAST_ROWS = 8
+"""Of a product in the prologue. One with fewer takes next to no time there, and its one row is often all that a policy
+knows of the world: a position, features and a sentence, whose sizes have nothing to do with each other."""
+
+_DOMAIN_VERSION = 1
 _PRODUCT = "DynamicQuantizeMatMul"
 """Reads float32, quantises it to uint8 with one scale and zero point for the whole tensor, multiplies with int8 weights
 into int32, scales by column and adds the bias. Fastest of what onnxruntime 1.31 has; see ``docs/decisions.md``."""
@@ -52,75 +69,150 @@ class _Product:
     bias: str  # name of a constant [columns]; empty if there is none
 
 
-def lower_precision(
-    models: Mapping[str, ModelProto], weights: Mapping[str, Array], precision: str
-) -> tuple[dict[str, ModelProto], dict[str, Array], tuple[str, ...]]:
-    """The models of residual blocks again, with weights of another precision.
+def parts_to_lower(
+    program: Program, keep_fp32: Collection[str] = ()
+) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
+    """The parts of a program (``ir.pieces.part_of``) for which another precision is worth while.
 
     Args:
-        models: from ``lower_program``; the blocks among them are taken.
+        program: after all passes.
+        keep_fp32: parts that stay as they are; ``prologue`` for all of them but ``blocks``.
+
+    Returns:
+        Names of parts in order; those that stay fp32 because it was asked; and notes on what stays.
+
+    Raises:
+        LoweringError: ``keep_fp32`` has a name that is no part of the policy, or leaves nothing.
+    """
+    flops: dict[str, int] = {}
+    for piece, graph in program.pieces.graphs().items():
+        if (part := part_of(piece)) is not None:
+            times = program.spec.sampler.steps if piece == STEP else 1
+            flops[part] = flops.get(part, 0) + graph_flops(graph) * times
+    if unknown := sorted(set(keep_fp32) - {*flops, PROLOGUE}):
+        known = ", ".join(map(repr, (*flops, PROLOGUE)))
+        raise LoweringError(f"what stays fp32: {unknown[0]!r} is no part of this policy; expected one of {known}.")
+    left = tuple(part for part in flops if part in keep_fp32 or (part != BLOCKS and PROLOGUE in keep_fp32))
+    least = LEAST_SHARE * flops[BLOCKS]
+    small = [part for part in flops if part not in left and part != BLOCKS and flops[part] < least]
+    found = tuple(part for part in flops if part not in {*left, *small})
+    if not found:
+        raise LoweringError(f"everything stays fp32: {', '.join(flops)}. Keep less, or convert with precision 'fp32'.")
+    shares = (f"{part} stays fp32: {flops[part] / flops[BLOCKS]:.1%} of the arithmetic of a step" for part in small)
+    return found, left, (*(f"{part} stays fp32, as was asked" for part in left), *shares)
+
+
+def lower_precision(
+    models: Mapping[str, ModelProto], weights: Mapping[str, Array], precision: str, parts: Collection[str] = (BLOCKS,)
+) -> tuple[dict[str, ModelProto], dict[str, Array], tuple[str, ...]]:
+    """The models of some parts again, with weights of another precision.
+
+    Args:
+        models: from ``lower_program``; those of the parts are taken, but for the models that hold all blocks.
         weights: constants of the program, by name.
         precision: ``int8``; the models have ``fp32`` already.
+        parts: from ``parts_to_lower``.
 
     Returns:
         By name, the models in which a product was replaced; the new constants of these models, by name; and notes on
         what was replaced and what was not.
 
     Raises:
-        LoweringError: ``precision`` is none of onnxruntime's CPU provider, or no block has a product to replace.
+        LoweringError: ``precision`` is none of onnxruntime's CPU provider, or no part has a product to replace.
     """
     require_precision(precision)
     made: dict[str, ModelProto] = {}
     constants: dict[str, Array] = {}
-    blocks = [name for name in models if is_block(name)]
-    for name in blocks:
-        model, new = quantize_model(models[name], weights)
-        if new:
-            made[name] = model
-            constants.update(new)
-    replaced = sum(node.op_type == _PRODUCT for model in made.values() for node in model.graph.node)
+    notes: list[str] = []
+    for part in dict.fromkeys(parts):
+        pieces = [name for name in models if part_of(name) == part and name not in OF_ALL_BLOCKS]
+        lowered: dict[str, ModelProto] = {}
+        new: dict[str, Array] = {}
+        for name in pieces:
+            model, own = quantize_model(models[name], weights, 0 if part == BLOCKS else LEAST_ROWS)
+            if own:
+                lowered[name] = model
+                new.update(own)
+        made |= lowered
+        constants |= new
+        notes += _notes(precision, part, pieces, lowered, new)
     if not made:
         raise LoweringError(
-            f"precision {precision!r}: none of the {len(blocks)} residual blocks multiplies by a constant float32"
-            " matrix, so there is nothing to store in eight bits. Convert with precision 'fp32'."
+            f"precision {precision!r}: no piece of {' or '.join(parts)} multiplies by a constant float32 matrix, so"
+            " there is nothing to store in eight bits. Convert with precision 'fp32'."
         )
-    megabytes = sum(value.nbytes for value in constants.values()) / 1e6
-    note = f"{precision}: {replaced} matrices of {len(made)} of {len(blocks)} blocks, {megabytes:.1f} MB"
-    left = [f"{name} stays fp32: no product with constant weights" for name in blocks if name not in made]
-    whole = sum(node.op_type in ("Conv", "ConvTranspose") for model in made.values() for node in model.graph.node)
-    if whole:
-        left.append(f"convolutions that stay fp32, over more than {FEW} positions, in groups, or transposed: {whole}")
-    return made, constants, (note, *left)
+    return made, constants, tuple(notes)
 
 
-def require_precision(precision: str) -> None:
-    """Raise unless weights of blocks can be lowered to this precision.
+def _notes(
+    precision: str, part: str, pieces: list[str], lowered: Mapping[str, ModelProto], constants: Mapping[str, Array]
+) -> Iterator[str]:
+    """What became of the pieces of one part."""
+    kinds = Counter(node.op_type for model in lowered.values() for node in model.graph.node)
+    if lowered:
+        where = f"{len(lowered)} of {len(pieces)} blocks" if part == BLOCKS else part
+        convolved = f", {kinds[INTEGER_PRODUCT]} of convolutions" if kinds[INTEGER_PRODUCT] else ""
+        count = kinds[_PRODUCT] + kinds[INTEGER_PRODUCT]
+        megabytes = sum(value.nbytes for value in constants.values()) / 1e6
+        yield f"{precision}: {count} matrices of {where}, {megabytes:.1f} MB{convolved}"
+    for name in pieces:
+        if name not in lowered:
+            yield f"{name} stays fp32: no product with constant weights" + " and many rows" * (part != BLOCKS)
+    if whole := kinds["Conv"] + kinds["ConvTranspose"]:
+        yield f"convolutions that stay fp32 in {part}, of few channels, in groups, or transposed: {whole}"
+
+
+def require_precision(precision: str, keep_fp32: Collection[str] = ()) -> None:
+    """Raise unless weights can be lowered to this precision, and it may have parts that stay fp32.
 
     Raises:
         LoweringError: says why not.
     """
-    if precision not in PRECISIONS:
-        raise LoweringError(f"precision {precision!r}: expected one of {', '.join(map(repr, PRECISIONS))}.")
+    known = (*PRECISIONS, AUTO)
+    if precision not in known:
+        raise LoweringError(f"precision {precision!r}: expected one of {', '.join(map(repr, known))}.")
+    if isinstance(keep_fp32, str) or not all(isinstance(part, str) for part in keep_fp32):
+        raise LoweringError(f"keep_fp32: expected names of parts, ('prologue',) say; found {keep_fp32!r}.")
+    if keep_fp32 and precision == FP32:
+        given = ", ".join(map(repr, keep_fp32))
+        raise LoweringError(f"{given} stays fp32, as does everything in precision 'fp32'. Give precision 'int8' too.")
 
 
-def quantize_model(model: ModelProto, weights: Mapping[str, Array]) -> tuple[ModelProto, dict[str, Array]]:
-    """One model with its products by constant matrices in integers; inputs and outputs stay as they are.
+def quantize_model(
+    model: ModelProto, weights: Mapping[str, Array], least_rows: int = 0
+) -> tuple[ModelProto, dict[str, Array]]:
+    """One model with its products by constants in integers; inputs and outputs stay as they are.
 
     Args:
         model: from ``lower``: constants are initializers without data.
         weights: values of constants, by name. Only these are quantised.
+        least_rows: of one stream, that a product has to have; a product whose rows are not known has none.
 
     Returns:
         A new model, and the constants that it has and ``model`` has not, by name: int8 ``[rows, columns]`` and
         float32 ``[columns]``. No constants if there was nothing to replace.
     """
     known = {t.name: weights[t.name] for t in model.graph.initializer if t.name in weights}
-    matrices = _matrices(model, known)
+    matrices, shapes = _matrices(model, known), shapes_of(model)
     constants: dict[str, Array] = {}
-    nodes = []
+    small: list[TensorProto] = []
+
+    def keep(name: str, value: Array) -> str:
+        small.append(numpy_helper.from_array(value, name))
+        return name
+
+    nodes: list[NodeProto] = []
     for node in model.graph.node:
         product = _product(node, known, matrices)
-        nodes.append(node if product is None else _integer_product(node, product, constants))
+        if product is not None and _rows(shapes.get(product.x, ())) < least_rows:
+            nodes.append(node)
+        elif product is not None:
+            nodes.append(_integer_product(node, product, constants))
+        elif (convolution := convolution_of(node, _attributes(node), known, shapes)) is not None:
+            integers, scales = _integers(convolution.weight, convolution.matrix, constants)
+            nodes += integer_convolution(node, convolution, integers, scales, keep)
+        else:
+            nodes.append(node)
     nodes = live_nodes(nodes, {value.name for value in model.graph.output})
     quantized = ModelProto()
     quantized.CopyFrom(model)
@@ -130,10 +222,10 @@ def quantize_model(model: ModelProto, weights: Mapping[str, Array]) -> tuple[Mod
     kept = [tensor for tensor in model.graph.initializer if tensor.name in read]
     types = {name: helper.np_dtype_to_tensor_dtype(value.dtype) for name, value in constants.items()}
     added = [TensorProto(name=n, dims=value.shape, data_type=types[n]) for n, value in constants.items()]
-    for field, values in (("node", nodes), ("initializer", [*added, *kept])):
+    for field, values in (("node", nodes), ("initializer", [*added, *kept, *small])):
         quantized.graph.ClearField(field)
         getattr(quantized.graph, field).extend(values)
-    quantized.opset_import.append(helper.make_opsetid(_DOMAIN, _DOMAIN_VERSION))
+    quantized.opset_import.append(helper.make_opsetid(DOMAIN, _DOMAIN_VERSION))
     return quantized, constants
 
 
@@ -191,20 +283,30 @@ def _product(node: NodeProto, known: Mapping[str, Array], matrices: Mapping[str,
     return _Product(x, replace(matrix, value=value), bias)
 
 
+def _rows(shape: Sequence[int]) -> int:
+    """Rows of a product whose first factor has this shape."""
+    return math.prod(shape[:-1]) if shape else 0
+
+
 def _integer_product(node: NodeProto, product: _Product, constants: dict[str, Array]) -> NodeProto:
-    """The node that takes the place of ``node``; its constants go into ``constants``.
+    """The node that takes the place of ``node``; its constants go into ``constants``."""
+    name, scale = _integers(product.matrix.name, product.matrix.value, constants)
+    inputs = [product.x, name, scale, "", product.bias] if product.bias else [product.x, name, scale]
+    return NodeProto(name=node.name, op_type=_PRODUCT, domain=DOMAIN, input=inputs, output=node.output)
+
+
+def _integers(constant: str, matrix: Array, constants: dict[str, Array]) -> tuple[str, str]:
+    """Names of the integers and the scales of a matrix, which go into ``constants``.
 
     No two products share them: onnxruntime 1.31 cannot load such a model where it has to make the integers unsigned
     ("Attempt to replace the existing tensor"), which is on processors whose sums saturate.
     """
-    name = f"{product.matrix.name}.{INT8}"
+    name = f"{constant}.{INT8}"
     while name in constants:
         name += "_"
-    scale = f"{name}.scale"
-    values, scales = quantize_matrix(product.matrix.value)
-    constants[name], constants[scale] = np.ascontiguousarray(values), scales
-    inputs = [product.x, name, scale, "", product.bias] if product.bias else [product.x, name, scale]
-    return NodeProto(name=node.name, op_type=_PRODUCT, domain=_DOMAIN, input=inputs, output=node.output)
+    values, scales = quantize_matrix(matrix)
+    constants[name], constants[f"{name}.scale"] = np.ascontiguousarray(values), scales
+    return name, f"{name}.scale"
 
 
 def _attributes(node: NodeProto) -> dict[str, Any]:

@@ -154,7 +154,7 @@ def _what(manifest: Manifest, base: HubName | None, licence: str | None) -> Sect
         ("sampler", f"{sampler.name}, K = {sampler.steps}, timesteps {first:g}..{last:g}"),
         ("default plan", f"{manifest.default_plan}, {plan.kind}"),
         ("sparsity", f"{share(plan.sparsity)} of the cells are reused, {share(plan.flops_sparsity)} of their FLOPs"),
-        ("precision of the blocks", manifest.precision_name),
+        ("precision", facts.precision(manifest)),
         ("identity", manifest.identity),
     )
     return Section("What it is", (), (Table(("", ""), rows),))
@@ -214,6 +214,8 @@ def _made(manifest: Manifest, base: HubName | None) -> Section:
     steps = sampler.steps // 4 if sampler.name == "rk4" else sampler.steps  # which evaluates four times a step
     checkpoint = "CHECKPOINT" if base is None else base.at(str(base.revision))
     precision = "" if manifest.precision is None else f" --precision {manifest.precision_name}"
+    if manifest.precision is not None:
+        precision += "".join(f" --keep-fp32 {p}" for p in manifest.precision.parts if p not in manifest.precision.kept)
     lines = [f"ttscompile convert {checkpoint} -o DIR --sampler {sampler.name} --steps {steps}{precision}"]
     if record is not None:
         options = [("strategy", "strategy"), ("seed", "seed")]

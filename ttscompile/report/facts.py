@@ -13,6 +13,7 @@ from ..artifact.manifest import DENSE, BlockRecord, Manifest, PlanRecord, marked
 from ..ir.flops import graph_flops
 from ..ir.program import Binding
 from ..measure.units import flops, plain, share
+from ..runtimes.against_fp32 import SHARE
 from ..runtimes.liveness import rollout_needs
 from .page import Section, Table
 
@@ -55,10 +56,19 @@ def policy(manifest: Manifest) -> Section:
         ("sampler", f"{sampler.name}, {'draws noise in its steps' if sampler.stochastic else 'draws no noise'}"),
         ("denoising steps K", f"{sampler.steps}, timesteps {sampler.timesteps[0]:g}..{sampler.timesteps[-1]:g}"),
         ("clip of the denoised sample", "none" if sampler.clip is None else f"{sampler.clip:g}"),
-        ("precision of the blocks", manifest.precision_name),
+        ("precision", precision(manifest)),
         ("default plan", manifest.default_plan),
     ]
     return Section("Policy", (), (Table(("", ""), tuple(rows), prose=True),))
+
+
+def precision(manifest: Manifest) -> str:
+    """What computes in which precision: ``fp32``, or ``int8 in blocks and condition; fp32 in step``."""
+    record = manifest.precision
+    if record is None:
+        return manifest.precision_name
+    left = [part for part in record.parts if part not in record.kept]
+    return record.told + f"; fp32 in {' and '.join(left)}" * bool(left)
 
 
 def hoisting(artifact: Artifact) -> Section:
@@ -156,10 +166,13 @@ def score_table(record: Mapping[str, Any]) -> Table:
         beside = (f"{ratio:.2f}" if isinstance(ratio, int | float) else "",) if told else ()
         return name, f"{score['error']:.4g}", *beside, f"{score['error_p90']:.4g}", *(saved or ("", ""))
 
-    precision = _mapping(record.get("precision"))
+    of_precision = _mapping(record.get("precision"))
+    parts, against = _mapping(of_precision.get("parts")), f"{of_precision.get('name')} against fp32"
+    alone = {f"dense, {part} alone": error for part, error in parts.items() if len(parts) > 1}
     rows = [
         *(row(marked(name), s, share(s["sparsity"]), share(s["flops_saved"])) for name, s in scores(record).items()),
-        *(row(f"{name}: {precision.get('name')} against fp32", s) for name, s in scores(precision, _ERRORS).items()),
+        *(row(f"{name}: {against}", s) for name, s in scores(of_precision, _ERRORS).items()),
+        *((f"{name}: {against}", f"{error:.4g}", *[""] * (3 + told)) for name, error in alone.items()),
     ]
     beside = ("/ other noise",) if told else ()
     head = ("held-out episodes", "mean action error", *beside, "90th percentile", "cells reused", "FLOPs saved")
@@ -180,8 +193,20 @@ def other_noise(record: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def left_out(record: Mapping[str, Any]) -> tuple[str, ...]:
-    """Why there is no plan of a name that calibration could have made."""
-    return tuple(f"Plan {name!r}: none, {reason}." for name, reason in _mapping(record.get("skipped")).items())
+    """Why there is no plan of a name that calibration could have made; and what had better been left in fp32."""
+    plans = (f"Plan {name!r}: none, {reason}." for name, reason in _mapping(record.get("skipped")).items())
+    of_precision, apart = _mapping(record.get("precision")), record.get("other_noise")
+    much = {
+        part: error / apart
+        for part, error in _mapping(of_precision.get("parts")).items()
+        if isinstance(apart, int | float) and isinstance(error, int | float) and error > SHARE * apart > 0
+    }
+    parts = (
+        f"{of_precision.get('name')} in {part} changes actions by {times:.0%} of what other noise does."
+        f" Convert with --keep-fp32 {part} to leave it out."
+        for part, times in much.items()
+    )
+    return (*plans, *parts)
 
 
 def record_table(record: Mapping[str, Any], most: int = 200) -> Table:
@@ -234,7 +259,7 @@ def limits(artifact: Artifact) -> Section:
     if manifest.precision_name == "fp32":
         points.append("Weights are in fp32. On processors with integer dot products, --precision int8 may be faster.")
     else:
-        points.append(f"Blocks compute with {manifest.precision_name} weights: dense calls differ from fp32 as well.")
+        points.append(f"It computes in {precision(manifest)}: dense calls differ from those in fp32 as well.")
     if any(plan.pruned for plan in manifest.plans.values()):
         points.append("A plan that is made for each observation costs a different time each call.")
     needs = rollout_needs(artifact)

@@ -44,13 +44,17 @@ def document(artifact: Artifact) -> dict[str, Any]:
 
 
 def _precision(manifest: Manifest) -> dict[str, Any]:
-    """Of the blocks' weights, and what it does to the actions of dense calls; ``error`` is null for fp32."""
+    """Of the weights, and what it does to the actions of dense calls; ``error`` is null for fp32.
+
+    ``parts`` says of each part whether it is in this precision, and how much it alone changes the actions.
+    """
     record = manifest.precision
     if record is None:
-        return {"name": manifest.precision_name, "blocks": 0, "bytes": 0, "error": None}
+        return {"name": manifest.precision_name, "blocks": 0, "bytes": 0, "error": None, "parts": {}}
     size = sum(manifest.files[name].bytes for name in (record.weights, *record.models.values()))
     error = None if record.error is None else dict(vars(record.error))
-    return {"name": record.name, "blocks": record.blocks, "bytes": size, "error": error}
+    parts = {part: {"kept": part in record.kept, "alone": alone} for part, alone in record.parts.items()}
+    return {"name": record.name, "blocks": record.blocks, "bytes": size, "error": error, "parts": parts}
 
 
 def _flops(manifest: Manifest) -> dict[str, int]:

@@ -33,7 +33,7 @@ CELLS = 0.005
 processor, and near ties fall the other way."""
 
 CARRIED = 2.0
-"""How much more than a dense call a plan may differ for the precision of its blocks: an error that is made in one step
+"""How much more than a dense call a plan may differ for the precision: an error that is made in one step
 is reused in those after it. Push-T in int8: 1.8 to 4.6 times a dense call's, which has a ninth of its tolerance."""
 
 REFERENCE_STEPS = 3
@@ -62,7 +62,7 @@ def check_dense(policy: CompiledPolicy, artifact: Artifact, golden: Golden, prob
 
 
 def check_precision(artifact: Artifact, golden: Golden) -> Rung | None:
-    """Blocks of another precision than fp32 against those in fp32; None if there are none."""
+    """Parts of another precision than fp32 against the original; None if there are none."""
     record, spec = artifact.manifest.precision, artifact.manifest.spec
     if record is None:
         return None
@@ -70,7 +70,7 @@ def check_precision(artifact: Artifact, golden: Golden) -> Rung | None:
     runtime, obs = open_runtime(artifact), golden.network_observations(spec)
     runtime.reset()
     sample, _ = runtime.predict(obs, golden.noise, artifact.schedule(DENSE), plan_name=DENSE)
-    told = f"a dense call with {record.name} blocks against the original"
+    told = f"a dense call with {record.told} against the original"
     remedy = "Load with precision='fp32', or convert the checkpoint again."
     return judged(PRECISION, largest(sample, golden.sample), tolerance, VALUE, told, remedy)
 
@@ -163,7 +163,7 @@ def check_plans(
 def check_plans_precision(
     artifact: Artifact, golden: Golden, recorded: Mapping[str, GoldenPlan], runtime: Runtime
 ) -> Rung | None:
-    """The same episodes with blocks of another precision than fp32, as ``load`` runs them; None if there are none.
+    """The same episodes with parts of another precision than fp32, as ``load`` runs them; None if there are none.
 
     The record is made in fp32, so that the samples differ by what the precision does to them.
     """
@@ -178,10 +178,10 @@ def check_plans_precision(
             wrong[name] = f"{name!r} in {np.count_nonzero(differ)} of {differ.size} cells"
         elif not errors[name] <= tolerance:
             wrong[name] = f"the samples of {name!r} by {errors[name]:.2g}"
-    told = f"{', '.join(errors)}: two calls with {precision.name} blocks against what calibration stored of fp32"
+    told = f"{', '.join(errors)}: two calls with {precision.told} against what calibration stored of fp32"
     status, remedy = PASSED, ""
     if wrong:
-        told = f"with {precision.name} blocks plans are not what calibration stored of fp32: "
+        told = f"with {precision.told} plans are not what calibration stored of fp32: "
         told += ", ".join(wrong.values())
         status, remedy = FAILED, "Load with precision='fp32', or convert the checkpoint again and calibrate."
     details = {"errors": {name: finite(error) for name, error in errors.items()}}

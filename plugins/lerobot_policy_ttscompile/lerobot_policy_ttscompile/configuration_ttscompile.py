@@ -17,7 +17,7 @@ class TtscompileConfig(PreTrainedConfig):
         runtime: ``onnxruntime``, ``torch``, or ``reference``, which is slow.
         threads: threads of arithmetic.
         plan: name of a plan of the artifact, ``dense`` among them; None for the artifact's default.
-        precision: of the residual blocks, ``fp32`` or the artifact's own; None for the latter.
+        precision: of the weights, ``fp32`` or the artifact's own; None for the latter.
     """
 
     n_action_steps: int = 1

@@ -1,0 +1,203 @@
+"""Eight bits in the prologue beside the blocks: part by part, measured in actions, chosen, and left out."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+
+import ttscompile
+from tests.lower.whole_call import Episode, inputs
+from tests.once import Once
+from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.manifest import Manifest
+from ttscompile.calibration.judge import precision_record
+from ttscompile.calibration.task import Found
+from ttscompile.errors import LoweringError
+from ttscompile.ir.pieces import part_of
+from ttscompile.ir.program import Program
+from ttscompile.lower.precision import parts_to_lower
+from ttscompile.report.facts import left_out, score_table
+from ttscompile.runtimes import open_runtime
+from ttscompile.runtimes.against_fp32 import FEW_CALLS, SHARE
+from ttscompile.runtimes.random_calls import random_call
+from ttscompile.trajectories.episodes import Episode as Recorded
+
+from . import seeing
+from .agreement import largest_difference, random_inputs
+
+LOUD = 1000.0
+"""A channel of the encoder that takes all of the eight bits."""
+
+
+@pytest.fixture
+def int8(once: Once) -> Path:
+    """The policy in eight bits, its single file beside it."""
+    return seeing.compiled(once)[0]
+
+
+@pytest.fixture
+def program(once: Once) -> Program:
+    return seeing.compiled(once)[1]
+
+
+def compiled(path: Path, loud: float = 0.0, **options: object) -> tuple[Manifest, list[str]]:
+    """The manifest of the policy, compiled; and what was said of its precision."""
+    said: list[str] = []
+    explain = lambda stage, notes: said.extend(notes if stage == "lower_precision" else ())  # noqa: E731
+    ttscompile.compile_denoiser(*seeing.policy(loud), path, explain=explain, **options)  # type: ignore[arg-type]
+    return load_artifact(path).manifest, said
+
+
+def operations(path: Path, piece: str) -> set[str]:
+    artifact = load_artifact(path)
+    return {node.op_type for node in onnx.load(artifact.onnx_path(piece), load_external_data=False).graph.node}
+
+
+def test_the_encoder_has_integer_products_and_convolutions_beside_the_blocks(int8: Path) -> None:
+    found = operations(int8, "condition")
+    assert {"DynamicQuantizeMatMul", "MatMulIntegerToFloat", "Conv"} <= found, "a convolution of three channels stays"
+    assert "DynamicQuantizeMatMul" in operations(int8, "block_00") & operations(int8, "dense_step")
+    assert "DynamicQuantizeMatMul" not in operations(int8, "stem") | operations(int8, "advance")
+
+
+def test_each_part_is_measured_alone(int8: Path) -> None:
+    artifact = load_artifact(int8)
+    record = artifact.manifest.precision
+    assert record is not None and record.error is not None
+    assert record.kept == tuple(record.parts) == ("condition", "blocks")
+    assert record.told == "int8 in condition and blocks"
+    assert 0 < record.error.mean < SHARE * record.error.other_noise
+    spec = artifact.manifest.spec
+    for part, mean in record.parts.items():
+        alone = artifact.with_parts([part])
+        assert {part_of(piece) for piece in alone.manifest.precision.models} == {part}  # type: ignore[union-attr]
+        own, exact = open_runtime(alone), open_runtime(artifact.at_precision("fp32"))
+        differences = []
+        for number in range(FEW_CALLS):
+            obs, noise = random_call(spec, number, 8)
+            samples = [one.predict(obs, noise, artifact.schedule("dense"))[0] for one in (own, exact)]
+            differences.append(np.abs(samples[0] - samples[1]).mean())
+        assert mean == pytest.approx(np.mean(differences), rel=0.05)
+        assert 0 < np.mean(differences) < record.error.other_noise
+    assert artifact.with_parts([]).manifest.precision is None
+
+
+def test_it_is_the_reference_within_its_own_tolerance_whatever_the_threads(int8: Path) -> None:
+    artifact = load_artifact(int8)
+    record = artifact.manifest.precision
+    assert record is not None and record.error is not None
+    reference, samples = open_runtime(artifact, "reference"), []
+    for threads in (1, 2):
+        runtime = open_runtime(artifact, threads=threads)
+        found = largest_difference(artifact, runtime, reference, np.random.default_rng(0), 2, calls=2)
+        assert 1e-5 < found < record.error.tolerance, "not in eight bits, or further off than the artifact says"
+        obs, noise = random_inputs(artifact, np.random.default_rng(1), 2)
+        runtime.reset()
+        samples.append(runtime.predict(obs, noise, artifact.schedule("dense"))[0])
+    np.testing.assert_array_equal(*samples)
+    statuses = {rung.name: rung.status for rung in ttscompile.verify(int8).rungs}
+    assert "failed" not in statuses.values() and statuses["precision"] == "passed"
+
+
+def test_the_single_file_computes_the_same(int8: Path) -> None:
+    policy = ttscompile.load(int8)
+    obs, noise = inputs(policy, np.random.default_rng(0), 2)
+    found = Episode((int8.parent / "call.onnx").read_bytes(), 2).call(obs, noise, np.zeros((3, 3), np.int8))
+    expected = policy.predict_action(obs, noise=noise, plan="dense")
+    np.testing.assert_allclose(found["action"], expected["action"], rtol=1e-4, atol=1e-4)
+    exact = ttscompile.load(int8, precision="fp32").predict_action(obs, noise=noise, plan="dense")
+    assert np.abs(exact["action"] - expected["action"]).max() > 1e-3
+
+
+def test_calibration_measures_the_parts_on_recorded_calls(int8: Path) -> None:
+    artifact, draw = load_artifact(int8), np.random.default_rng(0)
+    episodes = [Recorded("seen", {"image": draw.standard_normal((9, 3, 16, 16), dtype=np.float32)})]
+    record = precision_record(artifact, episodes, [0], Found(artifact.schedule("dense")), seed=0)["precision"]
+    assert list(record["parts"]) == ["condition", "blocks"]
+    assert all(0 < error < record["plans"]["dense"]["error_p90"] * 2 for error in record["parts"].values())
+    alone, much = [f"dense, {part} alone: int8 against fp32" for part in record["parts"]], record["parts"]["condition"]
+    table = score_table({"precision": record})
+    assert {row[0] for row in table.rows} >= set(alone)
+    assert all(len(row) == len(table.head) for row in table.rows)
+    assert left_out({"precision": record, "other_noise": 11 * max(record["parts"].values())}) == ()
+    (told,) = left_out({"precision": {**record, "parts": {"condition": much}}, "other_noise": 2 * much})
+    assert told.startswith("int8 in condition changes actions by 50% of what other noise does")
+    assert "--keep-fp32 condition" in told
+
+
+def test_auto_leaves_out_what_changes_the_actions_much_and_says_so(tmp_path: Path) -> None:
+    manifest, said = compiled(tmp_path / "auto", LOUD, precision="auto")
+    record = manifest.precision
+    assert record is not None and record.error is not None
+    assert (record.kept, tuple(record.parts)) == (("blocks",), ("condition", "blocks"))
+    much, little = record.parts["condition"], record.parts["blocks"]
+    assert much is not None and little is not None
+    assert little < SHARE * record.error.other_noise < much
+    assert record.error.mean < SHARE * record.error.other_noise
+    assert any(note.startswith("condition stays fp32: actions would be") for note in said)
+    assert "condition_int8.onnx" not in manifest.files and operations(tmp_path / "auto", "condition") >= {"Conv"}
+    weights = manifest.files["weights_int8.safetensors"].bytes
+    assert weights < seeing.FEATURES * seeing.FEATURES * 16, "the integers of the encoder are not stored"
+
+
+def test_auto_is_fp32_where_nothing_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ttscompile.runtimes.against_fp32.SHARE", 1e-9)
+    manifest, said = compiled(tmp_path / "none", precision="auto")
+    assert manifest.precision is None
+    assert not any("int8" in name for name in manifest.files)
+    assert any("fp32: other noise changes actions by" in note for note in said)
+
+
+def test_a_part_that_was_left_out_is_in_fp32_and_named(tmp_path: Path) -> None:
+    manifest, said = compiled(tmp_path / "compiled", precision="int8", keep_fp32=("blocks",))
+    record = manifest.precision
+    assert record is not None
+    assert (record.kept, record.parts) == (("condition",), {"condition": None, "blocks": None})
+    assert set(record.models) == {"condition"}
+    assert "blocks stays fp32, as was asked" in said
+
+
+@pytest.mark.parametrize(
+    ("kept", "expected"),
+    [((), ("condition", "blocks")), (["condition"], ("blocks",)), ({"prologue"}, ("blocks",))],
+)
+def test_parts_stay_by_name_and_all_of_the_prologue_together(
+    program: Program, kept: Collection[str], expected: tuple[str, ...]
+) -> None:
+    found, left, _ = parts_to_lower(program, kept)
+    assert found == expected
+    assert {*found, *left} == {"condition", "blocks"}
+
+
+def test_what_is_no_part_and_everything_cannot_stay(program: Program) -> None:
+    with pytest.raises(LoweringError, match="'encoder' is no part of this policy; expected one of .*'prologue'"):
+        parts_to_lower(program, ("encoder",))
+    with pytest.raises(LoweringError, match="everything stays fp32: condition, blocks"):
+        parts_to_lower(program, ("blocks", "prologue"))
+
+
+def test_a_prologue_that_is_small_beside_a_step_stays_as_it_is(program: Program) -> None:
+    condition = program.pieces.condition
+    small = replace(condition, nodes=(), outputs=tuple(condition.inputs))
+    found, left, notes = parts_to_lower(replace(program, pieces=replace(program.pieces, condition=small)))
+    assert (found, left) == (("blocks",), ())
+    assert notes == ("condition stays fp32: 0.0% of the arithmetic of a step",)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"precision": "int8", "keep_fp32": "prologue"}, "expected names of parts"),
+        ({"keep_fp32": ("prologue",)}, "as does everything in precision 'fp32'"),
+        ({"precision": "int4"}, "expected one of 'fp32', 'int8', 'auto'"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_any_work(tmp_path: Path, options: dict[str, object], message: str) -> None:
+    with pytest.raises(LoweringError, match=message):
+        ttscompile.convert(tmp_path / "missing.ckpt", tmp_path / "compiled", **options)  # type: ignore[arg-type]
+    assert list(tmp_path.iterdir()) == []
