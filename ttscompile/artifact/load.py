@@ -22,7 +22,7 @@ from ..core.paths import require_path
 from ..core.spec import FP32
 from ..errors import ArtifactError, IllegalPlanError
 from ..ir.graph import Graph, TensorType
-from ..ir.pieces import CONDITION, PRUNER, STEM, STEP, TAIL, LoopPiece, block_name
+from ..ir.pieces import CONDITION, FRAMES, PRUNER, STEM, STEP, TAIL, LoopPiece, block_name, frame_pieces
 from ..ir.program import Binding, Pieces
 from ..measure.versions import release
 from . import tensors
@@ -194,6 +194,8 @@ class Artifact:
             tables=self.tables,
             bindings={name: context.binding for name, context in self.manifest.contexts.items()},
             features=self.manifest.features,
+            frames=self.graphs.get(FRAMES),
+            towers=tuple(self.graph(name) for name in frame_pieces(self.graphs)),
         )
 
 
