@@ -21,6 +21,8 @@ from ttscompile.artifact.manifest import PieceRecord
 from ttscompile.ir.pieces import FRAMES, frame_pieces
 
 Array: TypeAlias = npt.NDArray[Any]
+Content: TypeAlias = tuple[bytes, ...]
+"""The bytes of one frame, of each input of the piece that reads it."""
 Run: TypeAlias = Callable[[str, Mapping[str, Array]], tuple[Array, ...]]
 """A piece, by its name, on inputs by theirs; its outputs in order."""
 Stop: TypeAlias = Callable[[], bool]
@@ -71,7 +73,7 @@ class FrameMemory:
     """The rows of one frame piece that were computed last."""
 
     def __init__(self) -> None:
-        self._known: OrderedDict[tuple[bytes, ...], _Known] = OrderedDict()
+        self._known: OrderedDict[Content, _Known] = OrderedDict()
 
     def __len__(self) -> int:
         return len(self._known)
@@ -80,16 +82,19 @@ class FrameMemory:
         """Forget all."""
         self._known.clear()
 
-    def learn(self, rows: Sequence[Array], compute: Compute, stop: Stop = _never) -> FrameWork:
+    def learn(
+        self, contents: Sequence[Content], rows: Sequence[Array], compute: Compute, stop: Stop = _never
+    ) -> FrameWork:
         """Compute the rows that are not known; nothing is kept of one whose computing fails.
 
         Args:
+            contents: of the rows.
             rows: of each input of the piece ``[N, ...]``.
             compute: asked once for each new row.
             stop: asked before each; the rest is left out if it says so.
         """
         work = FrameWork()
-        for i, content in enumerate(_contents(rows)):
+        for i, content in enumerate(contents):
             known = self._known.get(content)
             if known is not None:
                 self._known.move_to_end(content)
@@ -102,17 +107,18 @@ class FrameMemory:
             took = 1000.0 * (time.perf_counter() - start)
             self._known[content] = _Known(values, took)
             work += FrameWork(computed=1, waited=took)
-        while len(self._known) > WINDOWS * len(rows[0]):
+        while len(self._known) > WINDOWS * len(contents):
             self._known.popitem(last=False)
         return work
 
-    def values(self, rows: Sequence[Array]) -> tuple[Array, ...]:
-        """What the piece gives for all rows, ``[N, ...]`` each; they must be known."""
-        found = [self._known[content].values for content in _contents(rows)]
+    def values(self, contents: Sequence[Content]) -> tuple[Array, ...]:
+        """What the piece gives for rows of these contents, ``[N, ...]`` each; they must be known."""
+        found = [self._known[content].values for content in contents]
         return tuple(np.concatenate(each) for each in zip(*found, strict=True))
 
 
-def _contents(rows: Sequence[Array]) -> list[tuple[bytes, ...]]:
+def contents_of(rows: Sequence[Array]) -> list[Content]:
+    """The content of each row, of the inputs of a piece ``[N, ...]``."""
     return [tuple(row.tobytes() for row in one) for one in zip(*rows, strict=True)]
 
 
@@ -143,14 +149,20 @@ class FramePieces:
 
     def learn(self, obs: Mapping[str, Array], stop: Stop = _never) -> FrameWork:
         """Compute what is new in normalised observations ``[B, ...]``, until ``stop`` says so."""
-        return self._learn(self._rows_of(obs), stop)
+        rows, work = self._rows_of(obs), FrameWork()
+        for name, piece in self._pieces.items():
+            own = [rows[n] for n in piece.inputs]
+            work += self._memory[name].learn(contents_of(own), own, partial(self._compute, name), stop)
+        return work
 
     def values(self, obs: Mapping[str, Array]) -> dict[str, Array]:
         """What the condition piece reads beside normalised observations ``[B, ...]``; nothing without frame pieces."""
-        rows, found = self._rows_of(obs), dict[str, Array]()
-        self.work = self._learn(rows)
+        rows, found, self.work = self._rows_of(obs), dict[str, Array](), FrameWork()
         for name, piece in self._pieces.items():
-            found |= zip(piece.outputs, self._memory[name].values([rows[n] for n in piece.inputs]), strict=True)
+            own, memory = [rows[n] for n in piece.inputs], self._memory[name]
+            contents = contents_of(own)
+            self.work += memory.learn(contents, own, partial(self._compute, name))
+            found |= zip(piece.outputs, memory.values(contents), strict=True)
         return found
 
     def _rows_of(self, obs: Mapping[str, Array]) -> dict[str, Array]:
@@ -158,12 +170,6 @@ class FramePieces:
             return {}
         feed = {name: np.ascontiguousarray(obs[name]) for name in self._rows.inputs}
         return dict(zip(self._rows.outputs, self._run(FRAMES, feed), strict=True))
-
-    def _learn(self, rows: Mapping[str, Array], stop: Stop = _never) -> FrameWork:
-        work = FrameWork()
-        for name, piece in self._pieces.items():
-            work += self._memory[name].learn([rows[n] for n in piece.inputs], partial(self._compute, name), stop)
-        return work
 
     def _compute(self, name: str, row: Sequence[Array]) -> tuple[Array, ...]:
         return self._run(name, dict(zip(self._pieces[name].inputs, row, strict=True)))

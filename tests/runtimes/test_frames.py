@@ -12,7 +12,7 @@ import pytest
 import ttscompile
 from tests.families import cameras
 from ttscompile.errors import ArtifactError, ObservationError
-from ttscompile.runtimes.frames import WINDOWS, FrameMemory
+from ttscompile.runtimes.frames import WINDOWS, FrameMemory, contents_of
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.verification import verify
 
@@ -208,8 +208,9 @@ def test_frames_that_differ_in_one_number_are_two() -> None:
 
     rows = np.zeros((3, 4), np.float32)
     rows[1, 2], rows[2, 2] = np.float32(1e-30), np.float32(-0.0)
-    memory.learn([rows], double)
-    np.testing.assert_array_equal(memory.values([rows])[0], 2 * rows)
+    contents = contents_of([rows])
+    memory.learn(contents, [rows], double)
+    np.testing.assert_array_equal(memory.values(contents)[0], 2 * rows)
     assert len(asked) == 3
 
 
