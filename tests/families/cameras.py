@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
+import ttscompile
 from ttscompile import ChunkSpec, ObservationSpec, PolicySpec
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.samplers.flow import flow_matching_table
@@ -100,6 +102,12 @@ class Denoiser(nn.Module):
         for block in self.blocks:
             x = x + torch.relu(block(x) + seen)
         return self.head(x)  # type: ignore[no-any-return]
+
+
+def compile_seeing(folder: Path) -> None:
+    """A policy whose two cameras share a tower, with an instruction: the artifact, and the single file."""
+    module, spec = policy("shared", told=True)
+    ttscompile.compile_denoiser(module, spec, folder / "artifact", single_file=folder / "whole.onnx")
 
 
 def policy(kind: str, told: bool = False) -> tuple[nn.Module, PolicySpec]:

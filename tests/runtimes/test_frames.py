@@ -11,6 +11,7 @@ import pytest
 
 import ttscompile
 from tests.families import cameras
+from tests.once import Once
 from ttscompile.errors import ArtifactError, ObservationError
 from ttscompile.runtimes.frames import WINDOWS, FrameMemory, contents_of
 from ttscompile.runtimes.policy import CompiledPolicy
@@ -21,12 +22,8 @@ Obs = dict[str, Array]
 
 
 @pytest.fixture(scope="module")
-def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A policy with two cameras, which share a tower, and an instruction."""
-    folder = tmp_path_factory.mktemp("seeing")
-    module, spec = cameras.policy("shared", told=True)
-    ttscompile.compile_denoiser(module, spec, folder / "artifact", single_file=folder / "whole.onnx")
-    return folder
+def compiled(once: Once) -> Path:
+    return once.folder("seeing", cameras.compile_seeing)
 
 
 @pytest.fixture

@@ -89,7 +89,9 @@ def measure_parts(policy: CompiledPolicy, plans: Sequence[str], runs: int) -> li
     found = []
     for plan, made in zip(plans, reports, strict=True):
         total = Times(tuple(report.timings.total for report in made))
-        parts = {p: float(np.median([getattr(report.timings, p) for report in made])) for p in (*PARTS, "pruner")}
+        parts = {
+            p: float(np.median([getattr(report.timings, p) for report in made])) for p in (*PARTS, "pruner", "frames")
+        }
         count = float(np.median([report.flops[0] for report in made]))
         found.append(Latency(plan, total.median, total.quartiles, parts, count))
     return found
