@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from ttscompile.core.spec import ObservationSpec
 from ttscompile.ir.evaluate import Evaluator
 from ttscompile.ir.flops import node_flops
 from ttscompile.ir.graph import Argument, Batch, Graph, Node, Ref, TensorType, backward_slice
@@ -19,7 +20,7 @@ from .base import Pass, PassResult
 
 LEAST_FLOPS = 5_000_000
 """Of a tower, for one row. With less it costs about as much to see whether a row is new as to compute it."""
-MOST_BEFORE = 0.1
+MOST_BEFORE = 0.25
 """What is computed before the rows are there is computed at every call: this share of the tower's FLOPs at most."""
 _CLOSE = 1e-3
 """Share of a tower's largest number by which batches of one and of two rows may differ: rounding is below it."""
@@ -56,9 +57,10 @@ class SplitFrames(Pass[Program, Program]):
         graph, found = program.pieces.condition, list[_Tower]()
         if program.pieces.towers:
             return PassResult(program)
-        lengths = {key: spec.frames or 1 for key, spec in program.spec.observations.items()}
-        declined: dict[str, str] = {}
-        while (tower := _largest(graph, found, lengths, declined)) is not None:
+        observations, declined = program.spec.observations, dict[str, str]()
+        lengths = {key: spec.frames or 1 for key, spec in observations.items()}
+        alone = {key for key, spec in observations.items() if _is_frame(spec)}
+        while (tower := _largest(graph, found, alone, declined)) is not None:
             if tower.flops < self._least * tower.rows:
                 break
             if _one_frame_a_row(graph, tower, lengths, program.weights):
@@ -108,14 +110,20 @@ class _Tower:
     flops: int
 
 
+def _is_frame(spec: ObservationSpec) -> bool:
+    """Whether an observation is one picture, or an instruction: what may well be the same in the next call."""
+    axes = len(spec.shape) - (spec.frames is not None)
+    return (spec.frames or 1) == 1 and (axes >= 3 or not spec.dtype.startswith("float"))
+
+
 def _largest(
-    graph: Graph, found: Collection[_Tower], lengths: Mapping[str, int], declined: Collection[str]
+    graph: Graph, found: Collection[_Tower], frames: Collection[str], declined: Collection[str]
 ) -> _Tower | None:
     """The tower with the most FLOPs among what is in no other."""
     taken = {name for tower in found for name in (*tower.inside, *tower.before)}
     observed, starts = _observed(graph), list[tuple[str, ...]]()
     types = graph.types()
-    alone = {key: types[key] for key in graph.inputs if lengths[key] == 1}
+    alone = {key: types[key] for key in graph.inputs if key in frames}
     for node in graph.nodes:
         if node.name in observed and node.name not in {*taken, *declined} and _begins(node, types, alone):
             starts.append((node.name,))
@@ -144,8 +152,8 @@ def _observed(graph: Graph) -> set[str]:
 def _begins(node: Node, types: Mapping[str, TensorType], alone: Mapping[str, TensorType]) -> bool:
     """Whether a tower may begin with a value.
 
-    It may with an observation itself, if it is among those ``alone``, which are no windows of several frames; and with
-    what first has the rows of several frames in one axis.
+    It may with an observation itself, if it is among those ``alone``, which are single frames; and with what first has
+    the rows of several frames in one axis.
     """
     size = node.type.shape[0] if len(node.types) == 1 and node.type.shape else None
     if not isinstance(size, Batch) or any(isinstance(n, Batch) for n in node.type.shape[1:]):

@@ -121,11 +121,11 @@ class OnnxBackend:
         spec = self._manifest.spec
         obs = {key: np.zeros((streams, *one.shape), one.dtype) for key, one in spec.observations.items()}
         with np.errstate(all="ignore"):  # zeros need not be in the range of the policy
-            work.start({**obs, **self.frames.values(obs)}, Noise(np.zeros((streams, *spec.sample), np.float32)), None)
+            seen = FramePieces(self._manifest.pieces, self._run).values(obs)  # none of these is to be remembered
+            work.start({**obs, **seen}, Noise(np.zeros((streams, *spec.sample), np.float32)), None)
             decode_first(work, np.zeros_like(self.keeps))
             for k in range(spec.sampler.steps):
                 work.advance(k)
             if self._pruned:
                 work.logits()
-        self.frames.forget()
         return work
