@@ -52,6 +52,9 @@ class Backend(Protocol[Lowered]):
     Methods may raise anything: the runtime then ends the episode. ``lower`` and ``logits`` are called on a thread of
     their own while ``first_step`` runs; nothing else is.
 
+    A backend that has ``frames`` too, a ``FramePieces``, computes with it what depends on one frame alone, and so only
+    for frames that are new; one that has none computes all of them in ``start``.
+
     Attributes:
         keeps: bool ``[K, blocks]``; entries of the rollout cache that are worth keeping when a plan of the artifact is
             executed. Those that none of these plans reads may be left out.

@@ -39,6 +39,8 @@ class PolicyInfo:
         precision: ``fp32``, or ``int8`` in the parts that the artifact has in it; on torch ``bf16`` and ``fp16``, too.
         rollout: what keeping the rollout cache of one stream takes.
         prefix_refusal: why ``predict_action`` takes no ``prefix``; None if it does.
+        frames: how many pieces depend on one frame alone, and are remembered by its content; 0 where there are none, or
+            where the runtime computes all of them in every call.
     """
 
     K: int
@@ -56,3 +58,4 @@ class PolicyInfo:
     precision: str
     rollout: RolloutNeeds
     prefix_refusal: str | None
+    frames: int = 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import weakref
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from ttscompile.errors import (
 from ttscompile.measure.process import LONGEST_WAIT, Process
 
 from .arrays import Array, check_observation, check_seed, like, read_observation
+from .frames import FrameWork
 from .info import BlockInfo, PolicyInfo
 from .inpainting import check_prefix, prefix_refusal
 from .instruct import Instruct
@@ -109,6 +110,7 @@ class CompiledPolicy:
             precision=self._precision,
             rollout=rollout_needs(self._artifact),
             prefix_refusal=self._prefix_refusal,
+            frames=self._runtime.frame_pieces,
         )
 
     @property
@@ -168,6 +170,38 @@ class CompiledPolicy:
             predicted, chunk = self._predict(obs, noise, plan, prefix), spec.chunk
             executed = predicted[:, chunk.start : chunk.stop]
             return {"action": like(executed.copy(), example), "action_pred": like(predicted.copy(), example)}
+
+    def prepare_frame(self, frame: Mapping[str, Any], stop: Callable[[], bool] = lambda: False) -> FrameWork:
+        """Compute what depends on one frame alone, before the call that reads it: a camera's image, the instruction.
+
+        ``predict_action`` and the others then find it by its content. It changes no action, only when the work is done;
+        without frame pieces (``info.frames``) there is none.
+
+        Args:
+            frame: by key ``[B, ...]``, not normalised, as ``select_action`` takes it. Nothing is kept of it but what
+                was computed, until ``reset``.
+            stop: asked before each piece of work; the rest is left to the call if it says so.
+
+        Returns:
+            What was computed, and what was known.
+
+        Raises:
+            ObservationError: a frame that does not fit.
+            TtscompileError: the policy is in the middle of a call.
+        """
+        with self._turn():
+            if not self._runtime.frame_pieces:
+                return FrameWork()
+            specs = self._manifest.spec.observations
+            one, whole = Queues(specs), self._read(frame, others=True)[0]
+            obs = one.observation(one.after(whole))  # a window that holds nothing else
+            with np.errstate(all="ignore"):
+                return self._runtime.learn({key: specs[key].normalized(array) for key, array in obs.items()}, stop)
+
+    def forget_frames(self) -> None:
+        """Have the next call compute all of its frames, as if none had been seen: to measure what a call may take."""
+        with self._turn():
+            self._runtime.forget_frames()
 
     def select_action(
         self, batch: Mapping[str, Any], noise: Noise | None = None, plan: str | npt.ArrayLike | None = None

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from ttscompile.core.lattice import PlanArray
+
+from .frames import FrameWork
 
 GIVEN = "given"
 """``CallReport.plan_name`` of a matrix that the caller gave no name."""
@@ -20,6 +22,7 @@ class Timings:
         wait_pruner: how long the denoising loop stood still for the pruner's plan; 0 if the plan was given.
         decode: the denoising loop, without that wait.
         total: from the normalised observation to the denoised sample.
+        frames: of the prologue, what depends on single frames alone and was not known.
     """
 
     prologue: float
@@ -27,6 +30,7 @@ class Timings:
     wait_pruner: float
     decode: float
     total: float
+    frames: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,7 @@ class CallReport:
         legalised: cells of each stream that were replaced because their residual was never computed.
         flops: FLOPs of each stream, multiply and add counted as two, prologue and pruner included.
         timings: wall time in milliseconds.
+        frames: how many frames were computed and how many were known, and what that took and saved.
     """
 
     plan: PlanArray
@@ -48,3 +53,4 @@ class CallReport:
     legalised: tuple[int, ...]
     flops: tuple[float, ...]
     timings: Timings
+    frames: FrameWork = field(default_factory=FrameWork)

@@ -29,6 +29,7 @@ from ttscompile.ir.pieces import PRUNER
 
 from .arrays import check_noise
 from .backend import Backend, Call
+from .frames import NO_FRAMES, FramePieces, FrameWork
 from .helper import Helper
 from .inpainting import known_samples
 from .report import GIVEN, CallReport, Timings
@@ -53,6 +54,7 @@ class _Opened:
 
     def __init__(self, artifact: Artifact, backend: Backend[Any]) -> None:
         self.backend, self.lowering = backend, LoweringCache(backend.lower)
+        self.frames: FramePieces = getattr(backend, "frames", NO_FRAMES)
         for schedule in artifact.schedules.values():
             self.lowering.lower(schedule)
 
@@ -99,8 +101,31 @@ class Runtime:
         """B of the episode under way; None after ``reset`` and before the first call."""
         return None if self._written is None else len(self._written)
 
+    @property
+    def frame_pieces(self) -> int:
+        """How many pieces are computed for new frames only; 0 of a backend that computes all frames in every call."""
+        return len(self._used.frames)
+
     def reset(self) -> None:
-        """Forget the rollout cache: a new episode, of any number of streams. Its memory is kept."""
+        """Forget the rollout cache and all frames: a new episode, of any number of streams. Its memory is kept."""
+        self._end_episode()
+        self.forget_frames()
+
+    def forget_frames(self) -> None:
+        """Forget all frames, so that the next call computes every one of its own."""
+        for one in self._opened.values():
+            one.frames.forget()
+
+    def learn(self, obs: Mapping[str, Any], stop: Callable[[], bool]) -> FrameWork:
+        """Compute what depends on single frames alone, for calls to come.
+
+        Args:
+            obs: as ``predict`` takes it.
+            stop: asked before each frame; the rest is left out if it says so.
+        """
+        return self._used.frames.learn(obs, stop)
+
+    def _end_episode(self) -> None:
         self._written = self._dropped = None
 
     def require_streams(self, streams: int) -> None:
@@ -164,7 +189,7 @@ class Runtime:
         backend.prepare(streams, None if settled is None else settled.lowered)
 
         start = time.perf_counter()
-        self.reset()  # a call that fails ends the episode: its residuals stand beside those of earlier ones
+        self._end_episode()  # a call that fails ends the episode: its residuals stand beside those of earlier ones
         backend.start(Call(obs, noise, correction, known, keep, written))
         prologue = time.perf_counter()
         waited = 0.0
@@ -184,12 +209,14 @@ class Runtime:
             computed=tuple(int(n) for n in np.count_nonzero(computed, axis=(1, 2))),
             legalised=settled.legalised,
             flops=tuple(self._manifest.flops.call(one, plan is None) for one in settled.plans),
+            frames=self._used.frames.work,
             timings=Timings(
                 prologue=_milliseconds(start, prologue),
                 pruner=settled.pruner,
                 wait_pruner=waited,
                 decode=_milliseconds(prologue, stop) - waited,
                 total=_milliseconds(start, stop),
+                frames=self._used.frames.work.waited,
             ),
         )
         return sample, report

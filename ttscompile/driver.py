@@ -46,6 +46,7 @@ from .passes.one_block import OneBlock
 from .passes.partition import Partition
 from .passes.regroup_sums import RegroupSums
 from .passes.split_features import SplitFeatures
+from .passes.split_frames import SplitFrames
 from .passes.split_tokens import SplitTokens
 from .passes.unfold_batch import UnfoldBatch
 from .passes.widen_attention import WidenAttention
@@ -275,7 +276,7 @@ def transform(module: nn.Module, spec: PolicySpec, *, explain: Explain = _silent
     for split in (UnfoldBatch(), SplitTokens(), SplitFeatures(), CleanUp[Cut]()):
         cut = _run(split, cut, explain)
     program = _run(Hoist(), cut, explain)
-    for finish in (InsertPruner(), CleanUp[Program]()):
+    for finish in (InsertPruner(), SplitFrames(), CleanUp[Program]()):
         program = _run(finish, program, explain)
     return program
 

@@ -82,9 +82,11 @@ def measure_latencies(
     if settings.seam == "prefix":  # one action that the normaliser maps to 0
         chunk = policy.info.action
         known["prefix"] = chunk.unnormalized(np.zeros((1, 1, chunk.action_dim), np.float32))
+    forget: Callable[[], object] = getattr(policy, "forget_frames", lambda: None)  # a call may have to compute them all
     timer = Timer(len(plans), settings.warm_up, clock.now)
     for _ in range(settings.warm_up + settings.measured_calls):
         for i in timer.round():
+            forget()
             timer.time(i, partial(policy.predict_action, obs, plan=plans[i], **known))
     return dict(zip(plans, timer.times, strict=True))
 

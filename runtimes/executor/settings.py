@@ -14,8 +14,9 @@ from .guard import GuardLimits
 from .window import FrameSpec
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
+    from ttscompile.runtimes.frames import FrameWork
     from ttscompile.runtimes.info import PolicyInfo
 
 INTERPOLATIONS = ("hold", "linear")
@@ -40,6 +41,9 @@ class Policy(Protocol):
 
     def predict_action(self, obs_dict: Mapping[str, Any], *, plan: str) -> Mapping[str, Any]:
         """``{"action": [1, Ta, Da], "action_pred": [1, T, Da]}``."""
+
+    def prepare_frame(self, frame: Mapping[str, Any], stop: Callable[[], bool]) -> FrameWork:
+        """Compute what depends on one frame alone; called only where ``info.frames`` is there, and not 0."""
 
 
 @dataclass(frozen=True)

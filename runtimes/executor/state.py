@@ -5,8 +5,10 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import ceil
 
 from ttscompile.core.spec import Affine, FloatArray
 from ttscompile.errors import DeadlineMissedError, ObservationError, StaleObservationError
@@ -81,6 +83,7 @@ class ExecutorState:
         period = 1 / resolved.policy_hz
         self._window = ObservationWindow(resolved.frames.steps, period, settings.rate_tolerance, resolved.max_age)
         self._schedule = Schedule(settings, resolved, self._guard)
+        self._early: deque[Frame] = deque(maxlen=2 * resolved.frames.steps)  # handed out
         self._used = float("-inf")  # time of the newest frame that a call was made from
         self._holds = 0
         self._gap = False
@@ -218,6 +221,35 @@ class ExecutorState:
         latest = runs_out - self._takes
         comes = window.time + self._window.interval + self._window.delay
         return max(latest, now) if comes < latest - SAME_TIME else now
+
+    def early(self, now: float) -> Frame | None:
+        """A frame that has come and that the next call will read, but as its newest; None if that was handed out.
+
+        There is none once the call is due: it computes what is left of its frames itself.
+        """
+        wanted = (frame for frame in self._awaited(now) if not any(frame is other for other in self._early))
+        return next(wanted, None)
+
+    def begin_early(self, frame: Frame) -> None:
+        """Hand out a frame that ``early`` gave."""
+        self._early.append(frame)
+        self.recorder.counts.frames_early += 1
+
+    def awaits(self, frame: Frame, now: float) -> bool:
+        """Whether a frame that was handed out is still one that the next call will read, and that is not due yet."""
+        return any(frame is other for other in self._awaited(now))
+
+    def _awaited(self, now: float) -> list[Frame]:
+        """The frames that stand before the newest one of the next call, if all goes as expected: see ``next_start``."""
+        window, schedule, start = self._window, self._schedule, self.next_start(now)
+        if window.newest is None or (start is not None and start <= now):
+            return []
+        runs_out, ahead = schedule.runs_out(now), 1
+        if runs_out is not None:
+            latest = runs_out - self._takes - window.interval - window.delay
+            first = min(schedule.executed - window.interval / 2, latest)
+            ahead = max(ceil((first - window.newest) / window.interval - SAME_TIME), 1)
+        return window.before(window.newest + ahead * window.interval)
 
     def begin(self, now: float) -> Job:
         """Start the call that ``next_start`` announced."""

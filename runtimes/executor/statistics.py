@@ -74,6 +74,7 @@ class Counts:
     frames: int = 0
     frames_late: int = 0
     frames_replaced: int = 0
+    frames_early: int = 0
     calls: int = 0
     chunks: int = 0
     chunks_refused: int = 0
@@ -100,6 +101,7 @@ class ExecutorStatistics:
         frames: observations taken.
         frames_late: of these, too old to be part of a window.
         frames_replaced: of these, of the same time as one that was there.
+        frames_early: of these, handed to ``prepare_frame`` before the call that was expected to read them.
         calls: of the policy, finished; those that measured its latency at the start are not counted.
         chunks: of these, scheduled.
         chunks_refused: of these, refused by the guard.
@@ -128,6 +130,7 @@ class ExecutorStatistics:
     frames: int
     frames_late: int
     frames_replaced: int
+    frames_early: int
     calls: int
     chunks: int
     chunks_refused: int

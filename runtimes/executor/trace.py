@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 if TYPE_CHECKING:
+    from ttscompile.runtimes.frames import FrameWork
     from ttscompile.runtimes.report import Timings
 
 Event: TypeAlias = tuple[str, str, int, float, float, Mapping[str, Any] | None]
@@ -44,6 +45,10 @@ class Trace:
         """Something that happened."""
         self._events.append(("i", name, thread, at, 0.0, args))
 
+    def frame(self, start: float, end: float, work: FrameWork) -> None:
+        """What depends on a frame alone was computed before the call that reads it."""
+        self.span(WORKER, "frame", start, end - start, {"computed": work.computed, "known": work.remembered})
+
     def call(self, start: float, end: float, args: Mapping[str, Any], timings: Timings | None) -> None:
         """A call of the policy, with its parts if there is a report of them."""
         self.span(WORKER, "inference", start, end - start, args)
@@ -51,6 +56,8 @@ class Trace:
             return
         at = max(end - timings.total / 1e3, start)
         self.span(WORKER, "prologue", at, timings.prologue / 1e3)
+        if timings.frames > 0:
+            self.span(WORKER, "frames", at, timings.frames / 1e3)
         at += timings.prologue / 1e3
         if timings.pruner > 0:
             self.span(PRUNER, "pruner", at, timings.pruner / 1e3)

@@ -153,6 +153,25 @@ class ObservationWindow:
         self.complete = self._newest(place - gone)
         return "added"
 
+    @property
+    def newest(self) -> float | None:
+        """When the newest frame was taken; None before the first."""
+        return self._times[-1] if self._times else None
+
+    def before(self, time: float) -> list[Frame]:
+        """Of the To - 1 frames that stand before one of a time those that have come, newest first.
+
+        One that is not where it should be is left out, if the next frame is expected nearer to that.
+        """
+        found, before = list[Frame](), len(self._times)
+        for back in range(1, self._steps):
+            place = time - back * self._period
+            nearest = self._nearest(place, before)
+            if nearest >= 0 and abs(self._times[nearest] - place) <= self.interval / 2 + 1e-6:
+                found.append(self._frames[nearest])
+                before = nearest
+        return found
+
     def why_incomplete(self) -> str:
         """What a complete window lacks, for people."""
         found = len(self._times)

@@ -22,6 +22,7 @@ from .measure import Clock, measure_latencies
 from .settings import ExecutorSettings, Policy, Resolved
 from .state import ExecutorState, Job
 from .trace import Trace
+from .window import Frame
 
 
 class Worker:
@@ -47,6 +48,8 @@ class Worker:
     ) -> None:
         self._policy, self._settings, self._resolved = policy, settings, resolved
         self._clock, self._trace = clock, trace
+        # Of what acts like a policy, only what has frame pieces is asked to prepare frames.
+        self._prepares = bool(getattr(policy.info, "frames", 0))
         self.lock = threading.Lock()
         self._work, self.news = threading.Condition(self.lock), threading.Condition(self.lock)
         self.process = Process()
@@ -102,7 +105,8 @@ class Worker:
         """
         if self._waiting and self._state is not None:
             start = self._state.next_start(now)
-            if start is not None and (start == now or not self._timed):
+            sooner = start is not None and (start == now or not self._timed)
+            if sooner or (self._prepares and self._state.early(now) is not None):
                 self._work.notify()
 
     def reset(self, seed: int | None) -> None:
@@ -145,6 +149,8 @@ class Worker:
             while (due := self._next()) is not None:
                 if isinstance(due, Job):
                     self._call(due)
+                elif isinstance(due, dict):
+                    self._prepare(due)
                 else:
                     self._policy.reset(*due)
         except BaseException as error:
@@ -179,8 +185,8 @@ class Worker:
             self._state = ExecutorState(settings, resolved, normalizer, tiers, latencies)
         self._ready.set()
 
-    def _next(self) -> Job | tuple[int | None] | None:
-        """Wait for what to do: a call, a reset of the policy with a seed, or (None) the end."""
+    def _next(self) -> Job | Frame | tuple[int | None] | None:
+        """Wait for what to do: a call, a frame to prepare, a reset of the policy with a seed, or (None) the end."""
         with self.lock:
             state = self._opened
             while not self._ending:
@@ -191,10 +197,26 @@ class Worker:
                 start = state.next_start(now)
                 if start is not None and start <= now:
                     return state.begin(now)
+                if self._prepares and (frame := state.early(now)) is not None:
+                    state.begin_early(frame)
+                    return frame
                 self._waiting, self._timed = True, start is not None
                 self._clock.wait(self._work, None if start is None else start - now)
                 self._waiting = False
         return None
+
+    def _prepare(self, frame: Frame) -> None:
+        """Compute what depends on a frame alone, while nothing waits for it; until that is of no use any more."""
+
+        def useless() -> bool:
+            with self.lock:
+                now = self._clock.now()
+                return self._ending or self._reset_due or not self._opened.awaits(frame, now)
+
+        start = self._clock.now()
+        work = self._policy.prepare_frame({key: value[None] for key, value in frame.items()}, useless)
+        if self._trace.on:
+            self._trace.frame(start, self._clock.now(), work)
 
     def _call(self, job: Job) -> None:
         resolved = self._resolved
@@ -217,6 +239,9 @@ class Worker:
         if self._trace.on:
             args = {"plan": job.plan, "epoch": job.epoch, "chunk": outcome}
             report = getattr(self._policy, "last_report", None)
+            if self._prepares and report is not None:
+                frames = report.frames
+                args |= {"frames": frames.computed, "frames known": frames.remembered, "hidden ms": frames.saved}
             self._trace.call(job.started, now, args, None if report is None else report.timings)
 
     @property

@@ -5,7 +5,7 @@ Its loop (``decode``, ``workspace``) shares nothing with the reference's on purp
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -13,11 +13,12 @@ from ttscompile.artifact.load import Artifact
 from ttscompile.core.lattice import PlanArray
 from ttscompile.core.spec import FloatArray, Noise
 from ttscompile.runtimes.backend import Call
+from ttscompile.runtimes.frames import FramePieces
 from ttscompile.runtimes.instructions import Instructions, instructions_of
 from ttscompile.runtimes.liveness import readable_rollout
 
 from .decode import decode_first, decode_rest
-from .sessions import open_blocks, open_sessions
+from .sessions import Array, open_blocks, open_sessions, run_named
 from .workspace import Workspace
 
 
@@ -30,6 +31,7 @@ class OnnxBackend:
 
     Attributes:
         keeps: entries of the rollout cache that some plan of the artifact can read.
+        frames: what depends on one frame alone.
         sessions: by piece; those of single blocks only once a plan needs them.
         workspace: of the batch size under way; None after one that found no memory.
 
@@ -47,6 +49,7 @@ class OnnxBackend:
         self._pruned = any(plan.pruned for plan in self._manifest.plans.values())
         self._blocks = self._pruned or any(one.partial for one in self._schedules)  # whether these have sessions
         self.sessions = open_sessions(artifact, threads, self._blocks)
+        self.frames = FramePieces(self._manifest.pieces, self._run)
         self.keeps = readable_rollout(artifact)
         self.workspace: Workspace | None = self._open_workspace(1)
 
@@ -77,7 +80,8 @@ class OnnxBackend:
     def start(self, call: Call) -> None:
         """See ``Backend.start``."""
         self._keep = call.keep
-        self._work.start(call.obs, call.noise, call.correction, call.known)
+        obs = {**call.obs, **self.frames.values(call.obs)}
+        self._work.start(obs, call.noise, call.correction, call.known)
 
     def logits(self) -> FloatArray:
         """See ``Backend.logits``."""
@@ -91,6 +95,9 @@ class OnnxBackend:
         """See ``Backend.other_steps``."""
         decode_rest(self._work, plans, self._keep)
         return self._work.result()
+
+    def _run(self, piece: str, feed: Mapping[str, Array]) -> tuple[Array, ...]:
+        return tuple(run_named(self.sessions[piece], self._manifest.pieces[piece].outputs, feed).values())
 
     @property
     def _work(self) -> Workspace:
@@ -114,7 +121,8 @@ class OnnxBackend:
         spec = self._manifest.spec
         obs = {key: np.zeros((streams, *one.shape), one.dtype) for key, one in spec.observations.items()}
         with np.errstate(all="ignore"):  # zeros need not be in the range of the policy
-            work.start(obs, Noise(np.zeros((streams, *spec.sample), np.float32)), None)
+            seen = FramePieces(self._manifest.pieces, self._run).values(obs)  # none of these is to be remembered
+            work.start({**obs, **seen}, Noise(np.zeros((streams, *spec.sample), np.float32)), None)
             decode_first(work, np.zeros_like(self.keeps))
             for k in range(spec.sampler.steps):
                 work.advance(k)

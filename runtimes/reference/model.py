@@ -23,8 +23,8 @@ from ttscompile.core.spec import Noise, PolicySpec
 from ttscompile.errors import IllegalPlanError
 from ttscompile.ir.evaluate import Evaluator
 from ttscompile.ir.graph import TensorType
-from ttscompile.ir.pieces import LoopPiece
-from ttscompile.ir.program import Binding, Pieces, Program
+from ttscompile.ir.pieces import CONDITION, LoopPiece
+from ttscompile.ir.program import Binding, Pieces, Program, frame_values
 from ttscompile.runtimes.inpainting import Known
 
 from .reuse import Caches, Cell, RolloutCache, reuse, stream_axis
@@ -108,7 +108,7 @@ class ReferenceModel:
         self.weights = {name: _tensor(value).to(self.device) for name, value in weights.items()}
         self._tables = {name: _tensor(value).to(self.device) for name, value in self._pieces.tables.items()}
         evaluator = partial(Evaluator, weights=self.weights, device=self.device)
-        self._condition = evaluator(pieces.condition)
+        self._once = {name: evaluator(graph) for name, graph in pieces.once().items()}
         self._step = evaluator(pieces.step) if pieces.step is not None else None
         self._stem = evaluator(pieces.stem.graph)
         self._blocks = self._first = tuple(evaluator(piece.graph) for piece in pieces.blocks)
@@ -155,7 +155,8 @@ class ReferenceModel:
         """
         graph = self._pieces.condition
         there = {key: value.to(self.device) for key, value in obs.items()}
-        condition = dict(zip(graph.outputs, self._condition(there), strict=True))
+        there |= frame_values(self._pieces, lambda name, given: self._once[name](given), there)
+        condition = dict(zip(graph.outputs, self._once[CONDITION](there), strict=True))
         streams = len(next(iter(obs.values())))
         contexts = Contexts(streams, condition, ({},) * self.steps)
         if self._pieces.step is None or self._step is None:

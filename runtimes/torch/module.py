@@ -22,7 +22,7 @@ from ttscompile.ir.evaluate import Evaluator
 from ttscompile.ir.graph import Graph, TensorType
 from ttscompile.ir.idle_form import idle_form
 from ttscompile.ir.pieces import LoopPiece
-from ttscompile.ir.program import Binding
+from ttscompile.ir.program import Binding, frame_values
 from ttscompile.runtimes.instructions import Instructions, instructions_of
 
 from .idle_steps import IdleSteps
@@ -176,7 +176,8 @@ class _Exported:
         self._weights, self._tables = module._kept("weight"), module._kept("table")
         self._first = self._weights | module._kept("first weight")
         self.idle = None if module._idle is None else module._idle.on(module._kept("idle"))
-        made = self._evaluators["condition"]({**self._weights, **obs})
+        seen = frame_values(self._pieces, lambda n, given: self._evaluators[n]({**self._weights, **given}), obs)
+        made = self._evaluators["condition"]({**self._weights, **obs, **seen})
         self._condition = dict(zip(self._pieces.condition.outputs, made, strict=True))
         self._by_step: dict[int, dict[str, Tensor]] = {}  # step values, of steps that read them
 

@@ -12,8 +12,8 @@ from ttscompile.artifact.load import Artifact
 from ttscompile.errors import ArtifactError
 from ttscompile.ir.graph import Graph, TensorType
 from ttscompile.ir.idle_form import idle_form
-from ttscompile.ir.pieces import LoopPiece
-from ttscompile.ir.program import Binding
+from ttscompile.ir.pieces import FRAMES, LoopPiece
+from ttscompile.ir.program import Binding, frame_values
 
 from . import devices
 from .functions import Function, write_function
@@ -67,7 +67,10 @@ class StreamsNetwork:
             self.values[name] = parts.tensor(context.type, streams, *before)
             if context.binding is Binding.TABLE:  # one row of a batch of one, for all streams
                 self.values[name].copy_(devices.placed(pieces.tables[name], parts.device))
-        self._condition = self._written(pieces.condition, list(obs.values()), streams, order=list(obs))
+        self._once: dict[str, Function] = {}
+        seen = frame_values(pieces, self._write_and_run, obs)
+        order = [*obs, *seen]
+        self._condition = self._written(pieces.condition, [*obs.values(), *seen.values()], streams, order=order)
         self._step: Function | None = None
         self.prologue()
         if pieces.step is not None:
@@ -93,7 +96,8 @@ class StreamsNetwork:
 
     def prologue(self) -> None:
         """Everything that the observation decides before the loop."""
-        made = self._condition(*self._obs.values())
+        seen = frame_values(self._parts.pieces, self._run_once, self._obs)
+        made = self._condition(*self._obs.values(), *seen.values())
         for name, value in zip(self._parts.pieces.condition.outputs, made, strict=True):
             if name in self.values:  # a network that ignores the condition has values that nobody reads
                 self.values[name].copy_(value)
@@ -105,6 +109,16 @@ class StreamsNetwork:
             front = value.movedim(axis, 0)  # from [..., K * B, ...] to [K, ..., B, ...]
             split = front.reshape(self._steps, self.streams, *front.shape[1:])
             self.values[name].copy_(split.movedim(1, axis + 1))
+
+    def _write_and_run(self, name: str, given: Mapping[str, Tensor]) -> Sequence[Tensor]:
+        """A piece that runs before the condition, written for inputs such as these."""
+        graph = self._parts.pieces.once()[name]
+        rows = self.streams if name == FRAMES else len(next(iter(given.values())))
+        self._once[name] = self._written(graph, list(given.values()), rows, order=list(given))
+        return self._run_once(name, given)
+
+    def _run_once(self, name: str, given: Mapping[str, Tensor]) -> Sequence[Tensor]:
+        return self._once[name](*given.values())
 
     def condition(self) -> Tensor:
         """What a correction reads: the features, one row of numbers a stream, ``[B, N]``."""

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ..errors import ArtifactError
-from ..ir.pieces import ADVANCE, CONDITION, OF_ALL_BLOCKS, PRUNER, STEM, block_name, part_of
+from ..ir.pieces import ADVANCE, CONDITION, FRAMES, OF_ALL_BLOCKS, PRUNER, STEM, block_name, frame_pieces, part_of
 from . import typed_json
 from .manifest import DENSE, DISTILLED, FORMAT, MANIFEST, SCHEMA_VERSION, DistilledRecord, Manifest, PrecisionRecord
 from .strict_json import REMEDY, Value, dump, dump_compact, parse
@@ -127,6 +127,10 @@ def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:
             fields["pieces"].members()[name].members()["stream"].fail(f"one of {', '.join(map(repr, piece.inputs))}")
         if not set(piece.contexts) <= set(manifest.contexts):
             fields["pieces"].fail(f"contexts of {name} that are among {list(manifest.contexts)}")
+    rows = manifest.pieces[FRAMES].outputs if FRAMES in manifest.pieces else ()
+    read = [name for piece in frame_pieces(manifest.pieces) for name in manifest.pieces[piece].inputs]
+    if sorted(read) != sorted(rows):
+        fields["pieces"].fail(f"frame pieces that read {sorted(rows)}, each once")
     has_pruner = PRUNER in manifest.pieces
     if has_pruner != (manifest.stores.pruner is not None):
         fields["stores"].fail("a file of pruner weights exactly when there is a piece called pruner")

@@ -20,7 +20,7 @@ from ..core.paths import require_path
 from ..core.spec import FP32
 from ..errors import ArtifactError, IllegalPlanError
 from ..ir.graph import Graph
-from ..ir.pieces import CONDITION, PRUNER, STEM, STEP, TAIL, LoopPiece, block_name, part_of
+from ..ir.pieces import CONDITION, FRAMES, PRUNER, STEM, STEP, TAIL, LoopPiece, block_name, frame_pieces, part_of
 from ..ir.program import Binding, Pieces
 from . import tensors
 from .archive import Unpacked, is_checkpoint, unpack
@@ -230,6 +230,8 @@ class Artifact:
             tables=self.tables,
             bindings={name: context.binding for name, context in self.manifest.contexts.items()},
             features=self.manifest.features,
+            frames=self.graphs.get(FRAMES),
+            towers=tuple(self.graph(name) for name in frame_pieces(self.graphs)),
         )
 
 

@@ -15,7 +15,7 @@ from ..core.lattice import plan_flops, sparsity
 from ..core.update import update_flops
 from ..errors import ArtifactError
 from ..ir import pieces as names
-from ..ir.flops import graph_flops
+from ..ir.flops import frames_flops, graph_flops
 from ..ir.graph import Graph
 from ..ir.joint import join
 from ..ir.layers import layers_graph
@@ -78,7 +78,7 @@ def flops_record(program: Program) -> FlopsRecord:
     read = condition_flops(steps, sample, numbers_of(types[name].at(1) for name in pieces.features))
     return FlopsRecord(
         dense=program.dense_flops,
-        prologue=graph_flops(pieces.condition) + step + read,
+        prologue=graph_flops(pieces.condition) + frames_flops(pieces) + step + read,
         pruner=0 if pieces.pruner is None else graph_flops(pieces.pruner),
         stem=graph_flops(pieces.stem.graph),
         tail=graph_flops(pieces.tail.graph) + update_flops(program.spec.sampler, sample),
@@ -216,8 +216,8 @@ def _interfaces(program: Program) -> dict[str, PieceRecord]:
     ) -> PieceRecord:
         return PieceRecord("", tuple(inputs), stream, tuple(dict.fromkeys(contexts)), outputs)
 
-    condition, step, pruner, tail, stem = pieces.condition, pieces.step, pieces.pruner, pieces.tail, pieces.stem
-    found = {names.CONDITION: record(condition.inputs, condition.outputs)}
+    step, pruner, tail, stem = pieces.step, pieces.pruner, pieces.tail, pieces.stem
+    found = {name: record(graph.inputs, graph.outputs) for name, graph in pieces.once().items()}
     if step is not None:
         found[names.STEP] = record(step.inputs, step.outputs, contexts=step.inputs)
     if pruner is not None:

@@ -96,7 +96,9 @@ def bench(
         print_json(of | {"contestants": [m.to_json() for m in measured]})
         return
     output, head = results(), ("", "ms a call", "quartiles", "calls/s", "speed-up", "GFLOP", "reused")
-    output.print(table(*head, "prologue", "pruner", rows=[_row(m, measured[0]) for m in measured]))
+    seeing = any(m.frames_ms for m in measured)
+    parts = ("prologue", *["of it frames"] * seeing, "pruner")
+    output.print(table(*head, *parts, rows=[_row(m, measured[0], seeing) for m in measured]))
     say(
         output,
         f"Medians of {runs} calls, one stream, {threads} thread{'s' * (threads > 1)}; plan {entered[0].plan!r}."
@@ -104,6 +106,11 @@ def bench(
     )
     if runtime == "onnxruntime" and precision != FP32 and artifact.manifest.precision is not None:
         say(output, f"The first row computes in {told_precision(artifact.manifest)}.")
+    if seeing:
+        say(
+            output,
+            "Every call has frames of its own; frames that are known, or prepared before it, would cost nothing.",
+        )
     if error is not None:
         say(
             output,
@@ -114,7 +121,7 @@ def bench(
     say(output, one_line(fingerprint()))
 
 
-def _row(m: Measurement, compiled: Measurement) -> tuple[str, ...]:
+def _row(m: Measurement, compiled: Measurement, seeing: bool) -> tuple[str, ...]:
     return (
         m.label,
         ms(m.median_ms, 4),
@@ -124,5 +131,6 @@ def _row(m: Measurement, compiled: Measurement) -> tuple[str, ...]:
         "" if m.flops is None else f"{m.flops / 1e9:.3f}",
         share(m.sparsity),
         "" if m.prologue_ms is None else f"{m.prologue_ms:.2f}",
+        *["" if m.frames_ms is None else f"{m.frames_ms:.2f}"] * seeing,
         "" if m.pruner_ms is None else f"{m.pruner_ms:.2f}",
     )

@@ -38,6 +38,7 @@ def print_summary(artifact: Artifact, console: Console) -> None:
         ("action", action),
         ("rollout cache", kept),
         ("precision", _told_precision(summary["precision"], len(summary["blocks"]))),
+        *((f"piece {one['piece']}", _told_frames(one, captured)) for one in summary["frames"]),
     )
     about = table("artifact", summary["path"], rows=rows)
     about.columns[1].justify = "left"
@@ -59,6 +60,11 @@ def print_summary(artifact: Artifact, console: Console) -> None:
 def _print_facts(console: Console, made: Table) -> None:
     if made.rows:
         console.print(table(*made.head, rows=made.rows))
+
+
+def _told_frames(piece: dict[str, Any], captured: float) -> str:
+    rows = f"{piece['rows']} a call of {flops(piece['flops'])} each"
+    return f"computed once a frame, {rows}: {share(piece['rows'] * piece['flops'] / captured)} of the captured policy"
 
 
 def _told_precision(precision: dict[str, Any], blocks: int) -> str:

@@ -60,6 +60,7 @@ class Measurement:
         times_ms: wall time of each call.
         prologue_ms: median of the report's timing; None without reports.
         pruner_ms: median of the pruner's own time; None without reports.
+        frames_ms: median of what depends on single frames alone, which is part of the prologue; None without reports.
         flops: median over the calls; None where they are not known.
         sparsity: mean share of reused cells.
         legalised: cells that had to be replaced because they were never computed, all calls together.
@@ -70,6 +71,7 @@ class Measurement:
     times_ms: tuple[float, ...]
     prologue_ms: float | None = None
     pruner_ms: float | None = None
+    frames_ms: float | None = None
     flops: float | None = None
     sparsity: float = 0.0
     legalised: int = 0
@@ -275,6 +277,7 @@ def _summary(contestant: Contestant, times: Times, reports: Sequence[Any]) -> Me
         times_ms=times.ms,
         prologue_ms=float(np.median([r.timings.prologue for r in reports])),
         pruner_ms=float(np.median([r.timings.pruner for r in reports])),
+        frames_ms=float(np.median([r.timings.frames for r in reports])),
         flops=float(np.median([r.flops[0] for r in reports])),
         sparsity=float(np.mean([np.mean(r.plan != Source.COMPUTE) for r in reports])),
         legalised=sum(sum(r.legalised) for r in reports),

@@ -82,6 +82,7 @@ def _call(artifact: Artifact) -> list[Finding]:
         obs: dict[str, Any] = neutral_observation(dict(policy.info.observation))
         times = []
         for _ in range(CALLS):
+            policy.forget_frames()
             policy.predict_action(obs)
             report = policy.last_report
             assert report is not None  # a call was made

@@ -4,12 +4,19 @@ from __future__ import annotations
 
 from .graph import Graph, Node
 from .operations import Types, operation
+from .program import Pieces
 
 
 def node_flops(node: Node, types: Types) -> int:
     """FLOPs of one node for one stream."""
     count = operation(node.op).flops
     return 0 if count is None else count(node, types)
+
+
+def frames_flops(pieces: Pieces) -> int:
+    """FLOPs of what is computed once a frame, for all frames of a call of one stream."""
+    before = 0 if pieces.frames is None else graph_flops(pieces.frames)
+    return before + sum(n * graph_flops(tower) for n, tower in zip(pieces.rows, pieces.towers, strict=True))
 
 
 def graph_flops(graph: Graph) -> int:

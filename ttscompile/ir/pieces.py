@@ -7,6 +7,7 @@ inputs and outputs that no denoiser has are named here.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
@@ -14,7 +15,10 @@ from ..core.spec import SamplerTable
 from .graph import Graph, TensorType
 
 CONDITION = "condition"
-"""Observations -> condition values, once a call."""
+"""Observations, and what frame pieces give -> condition values, once a call."""
+
+FRAMES: Final = "frames"
+"""Observations -> the rows of each frame piece, one a frame, by moving numbers; not every policy has it."""
 
 STEP = "step"
 """Condition values and table rows -> step values, for all K steps in one batch."""
@@ -48,6 +52,18 @@ OF_ALL_BLOCKS = (JOINT, DENSE_STEP)
 
 BLOCKS: Final = JOINT
 """The part of a policy that is all of its blocks (``part_of``)."""
+_FRAME = "frame_"
+
+
+def frame_name(index: int) -> str:
+    """``frame_00``: a piece that works on one frame of one observation at a time, whatever the others are."""
+    return f"{_FRAME}{index:02d}"
+
+
+def frame_pieces(pieces: Iterable[str]) -> tuple[str, ...]:
+    """Those of the pieces that are frame pieces, in order."""
+    return tuple(sorted(piece for piece in pieces if piece.startswith(_FRAME)))
+
 
 _BLOCK = "block_"
 _SMALL = frozenset({PRUNER, STEM, TAIL, ADVANCE, IDLE, LAYERS})

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from ..core.spec import PolicySpec, SamplerTable
 from .graph import Graph, TensorType
-from .pieces import CONDITION, PRUNER, STEM, STEP, TAIL, LoopPiece, block_name
+from .pieces import CONDITION, FRAMES, PRUNER, STEM, STEP, TAIL, LoopPiece, block_name, frame_name
+
+Value = TypeVar("Value")
+"""Whatever a runtime computes with."""
 
 DENOISER, PROLOGUE = "denoiser", "prologue"
 """Graphs that are no pieces: one whole evaluation; and what it does before it reads the sample, until it is hoisted."""
@@ -95,13 +98,16 @@ class Pieces(Loop):
     """All pieces of a hoisted program.
 
     Attributes:
-        condition: observations -> condition values, once a call.
+        condition: observations and what ``towers`` give -> condition values, once a call.
         step: condition values and table rows -> step values; run with a batch of K*B, step-major. None if there are
             no step values.
         pruner: condition values -> logits ``[B, K, blocks, 4]``; None before ``InsertPruner``.
         tables: value of each TABLE context for every step, ``[K, ...]`` with a batch of one in its batch axis.
         bindings: binding of every context of the loop pieces and of ``step``.
         features: condition values that the pruner reads.
+        frames: observations -> the rows of each tower ``[m * B, ...]``, in their order; None without towers.
+        towers: frame pieces: a row -> what depends on it alone, for any number of rows. What they give for all rows
+            are inputs of ``condition``.
     """
 
     condition: Graph
@@ -110,11 +116,25 @@ class Pieces(Loop):
     tables: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
     bindings: Mapping[str, Binding] = field(default_factory=dict)
     features: tuple[str, ...] = ()
+    frames: Graph | None = None
+    towers: tuple[Graph, ...] = ()
+
+    @property
+    def rows(self) -> tuple[int, ...]:
+        """How many rows of each tower a stream has."""
+        types = {} if self.frames is None else self.frames.types()
+        return tuple(types[next(iter(tower.inputs))].at(1)[0] for tower in self.towers)
 
     def graphs(self) -> dict[str, Graph]:
         """Every graph by the name of its piece."""
-        once = {CONDITION: self.condition, STEP: self.step, PRUNER: self.pruner}
-        return {**{name: graph for name, graph in once.items() if graph is not None}, **super().graphs()}
+        late = {STEP: self.step, PRUNER: self.pruner}
+        return {**self.once(), **{n: graph for n, graph in late.items() if graph is not None}, **super().graphs()}
+
+    def once(self) -> dict[str, Graph]:
+        """The graphs that the observation alone decides, by the name of their piece, in order."""
+        rows = {} if self.frames is None else {FRAMES: self.frames}
+        towers = {frame_name(i): tower for i, tower in enumerate(self.towers)}
+        return {**rows, **towers, CONDITION: self.condition}
 
     def mapped(self, function: Callable[[Graph], Graph]) -> Self:
         """With another graph in place of every one; inputs that carry the stream keep their names."""
@@ -123,7 +143,29 @@ class Pieces(Loop):
             condition=function(self.condition),
             step=None if self.step is None else function(self.step),
             pruner=None if self.pruner is None else function(self.pruner),
+            frames=None if self.frames is None else function(self.frames),
+            towers=tuple(map(function, self.towers)),
         )
+
+
+def frame_values(
+    pieces: Pieces, run: Callable[[str, Mapping[str, Value]], Sequence[Value]], obs: Mapping[str, Value]
+) -> dict[str, Value]:
+    """What the condition graph reads beside the observations, by name: every tower, run on all of its rows.
+
+    Args:
+        pieces: of the program.
+        run: a piece, by its name, on inputs by theirs; its outputs in order.
+        obs: normalised observations by key.
+    """
+    if pieces.frames is None:
+        return {}
+    rows = dict(zip(pieces.frames.outputs, run(FRAMES, obs), strict=True))
+    found: dict[str, Value] = {}
+    for i, tower in enumerate(pieces.towers):
+        given = {name: rows[name] for name in tower.inputs}
+        found |= zip(tower.outputs, run(frame_name(i), given), strict=True)
+    return found
 
 
 @dataclass(frozen=True)

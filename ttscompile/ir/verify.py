@@ -60,6 +60,7 @@ def verify(program: Phase) -> None:
         case Program(blocks=blocks, pieces=pieces):
             _verify_loop(pieces, blocks, denoiser.inputs[spec.sample_argument])
             _verify_bindings(pieces)
+            _verify_frames(pieces)
 
 
 def _verify_loop(loop: Loop, blocks: tuple[Block, ...], sample: TensorType) -> None:
@@ -102,6 +103,18 @@ def _verify_bindings(pieces: Pieces) -> None:
             raise PassError(f"pruner: its feature %{name} is not an output of the condition graph.")
     if pieces.pruner is not None and tuple(pieces.pruner.inputs) != pieces.features:
         raise PassError(f"pruner: reads {list(pieces.pruner.inputs)}; its features are {list(pieces.features)}.")
+
+
+def _verify_frames(pieces: Pieces) -> None:
+    """Each tower reads its rows, and the condition graph what all of them give."""
+    rows = [] if pieces.frames is None else list(pieces.frames.outputs)
+    read = [name for tower in pieces.towers for name in tower.inputs]
+    if read != rows:
+        raise PassError(f"frames: gives the rows {rows}; the towers read {read}.")
+    for tower in pieces.towers:
+        for name in tower.outputs:
+            if name not in pieces.condition.inputs:
+                raise PassError(f"frames: %{name} of a tower is no input of the condition graph.")
 
 
 def _around(graph: Graph, position: int, radius: int = 2) -> str:

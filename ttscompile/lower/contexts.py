@@ -9,7 +9,7 @@ from onnx import ModelProto
 from ..errors import LoweringError
 from ..ir.graph import TensorType
 from ..ir.pieces import CONDITION, STEP
-from ..ir.program import Binding, Pieces
+from ..ir.program import Binding, Pieces, frame_values
 from .graph_writer import GraphWriter, Weights
 
 
@@ -19,7 +19,7 @@ class Contexts:
     Args:
         main: writer of the main graph.
         pieces: of the program.
-        models: of ``condition`` and, if the program has it, ``step``.
+        models: of ``condition`` and, if the program has them, ``frames``, frame pieces and ``step``.
         weights: values of their constants.
         observations: normalised, by name.
         streams: value of B, int64 ``[1]``.
@@ -37,13 +37,20 @@ class Contexts:
         steps: int,
     ) -> None:
         self._main, self._pieces, self._streams, self._steps = main, pieces, streams, steps
+        self._models, self._weights = models, weights
         self._sizes: dict[str, str] = {}
         condition = models[CONDITION]
-        made = main.inline(condition, {v.name: observations[v.name] for v in condition.graph.input}, weights)
+        given = {**observations, **frame_values(pieces, self._inline, observations)}
+        made = self._inline(CONDITION, given)
         self._conditions: dict[str, str] = dict(zip([v.name for v in condition.graph.output], made, strict=True))
         self._rows = {name: main.constant(table, table.dtype) for name, table in pieces.tables.items()}
         if pieces.step is not None:
             self._rows.update(self._step_values(models[STEP], weights))
+
+    def _inline(self, name: str, values: Mapping[str, str]) -> list[str]:
+        """The outputs of a piece on values by the name of its input."""
+        model = self._models[name]
+        return self._main.inline(model, {v.name: values[v.name] for v in model.graph.input}, self._weights)
 
     def condition(self) -> str:
         """What a correction reads: the pruner's features, one row of numbers a stream, ``[B, N]``."""

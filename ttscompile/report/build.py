@@ -148,12 +148,14 @@ def _episode(course: Course) -> Section:
 
 
 def _latency(latencies: Sequence[Latency], given: Given, default: str) -> Section:
+    seeing = any(one.parts["frames"] for one in latencies)
     rows = tuple(
         (
             one.plan + (" (default)" if one.plan == default else ""),
             ms(one.total),
             "..".join(map(ms, one.quartiles)),
             f"{one.parts['prologue']:.2f}",
+            *[f"{one.parts['frames']:.2f}"] * seeing,
             f"{one.parts['pruner']:.2f}",
             f"{one.parts['wait_pruner']:.2f}",
             ms(one.parts["decode"]),
@@ -161,12 +163,15 @@ def _latency(latencies: Sequence[Latency], given: Given, default: str) -> Sectio
         )
         for one in latencies
     )
-    head = ("plan", "ms a call", "quartiles", "prologue", "pruner", "wait for it", "denoising loop", "FLOPs")
+    parts = ("prologue", *["of it frames"] * seeing, "pruner", "wait for it", "denoising loop")
+    head = ("plan", "ms a call", "quartiles", *parts, "FLOPs")
     text = (
         f"Medians of {given.runs} calls of each plan, which took turns; one stream,"
         f" {given.threads} thread{'s' * (given.threads != 1)}, onnxruntime. The pruner runs beside step 0: only the"
         " wait for it lengthens a call."
     )
+    if seeing:
+        text += " Every call computes all of its frames here; those that are known, or prepared before, cost nothing."
     alt = "Bars: what the calls of each plan spend their time on. The table has the figures."
     drawn = Picture(pictures.latency_picture(latencies), "What the calls of each plan spend their time on.", alt)
     return Section("Latency", (text, one_line(fingerprint())), (Table(head, rows),), (drawn,))

@@ -10,7 +10,7 @@ from typing import Any
 from ..artifact.ceiling import few_steps
 from ..artifact.load import Artifact
 from ..artifact.manifest import DENSE, BlockRecord, Manifest, PlanRecord, marked
-from ..ir.flops import graph_flops
+from ..ir.flops import frames_flops, graph_flops
 from ..ir.program import Binding
 from ..measure.units import flops, plain, share
 from ..runtimes.against_fp32 import SHARE
@@ -85,9 +85,11 @@ def hoisting(artifact: Artifact) -> Section:
         return name, when, values, flops(cost), share(cost / record.dense)
 
     tables = f"{len(artifact.tables)} tables of {steps} rows, {table_bytes / 1e6:.1f} MB"
-    batched = max(record.prologue - condition, 0)
+    frames, count = frames_flops(artifact.pieces), sum(artifact.pieces.rows)
+    batched = max(record.prologue - condition - frames, 0)
     rows = (
         row("table", "when it was compiled", tables, 0),
+        *([row("frame", "once a frame, or instruction", f"of {count} frames a call", frames)] if count else []),
         row("condition", "once a call", f"{bound[Binding.CONDITION]} values", condition),
         row("step", f"once a call, {steps} steps in one batch", f"{bound[Binding.STEP]} values", batched),
         row("loop", f"{steps} times a call", f"stem, {len(record.blocks)} blocks, tail", loop),

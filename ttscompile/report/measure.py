@@ -81,6 +81,7 @@ def measure_parts(policy: CompiledPolicy, plans: Sequence[str], runs: int) -> li
     timer = Timer(len(plans), WARM_UP)
     for _ in range(WARM_UP + runs):
         for i in timer.round():
+            policy.forget_frames()  # a call may have to compute them all
             report = _call(policy, obs, plans[i])
             if timer.counted:
                 reports[i].append(report)
@@ -88,7 +89,9 @@ def measure_parts(policy: CompiledPolicy, plans: Sequence[str], runs: int) -> li
     found = []
     for plan, made in zip(plans, reports, strict=True):
         total = Times(tuple(report.timings.total for report in made))
-        parts = {p: float(np.median([getattr(report.timings, p) for report in made])) for p in (*PARTS, "pruner")}
+        parts = {
+            p: float(np.median([getattr(report.timings, p) for report in made])) for p in (*PARTS, "pruner", "frames")
+        }
         count = float(np.median([report.flops[0] for report in made]))
         found.append(Latency(plan, total.median, total.quartiles, parts, count))
     return found

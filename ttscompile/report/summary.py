@@ -7,12 +7,14 @@ from typing import Any
 
 from ..artifact.load import Artifact
 from ..artifact.manifest import Manifest
+from ..ir.flops import graph_flops
+from ..ir.pieces import frame_name
 from ..runtimes.liveness import rollout_needs
 from .facts import plan_flops, plans_of
 
 
 def document(artifact: Artifact) -> dict[str, Any]:
-    """Everything that an artifact says of itself, as plain JSON values."""
+    """Everything that an artifact says of itself, as plain JSON values; FLOPs of a frame piece are those of a row."""
     manifest = artifact.manifest
     spec = manifest.spec
     return {
@@ -32,6 +34,10 @@ def document(artifact: Artifact) -> dict[str, Any]:
             for i, b in enumerate(manifest.blocks)
         ],
         "precision": _precision(manifest),
+        "frames": [
+            {"piece": frame_name(i), "rows": n, "flops": graph_flops(tower)}
+            for i, (n, tower) in enumerate(zip(artifact.pieces.rows, artifact.pieces.towers, strict=True))
+        ],
         "flops": _flops(manifest),
         "ceiling": {"sparsity": 1 - 1 / manifest.steps, "flops": manifest.flops.ceiling(manifest.steps)},
         "plans": {

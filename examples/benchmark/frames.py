@@ -1,0 +1,229 @@
+"""What a call of a policy with cameras waits for, from its newest frame on: real sizes, random weights, one thread.
+
+    python examples/benchmark/frames.py [--policies resnet,clip,smolvla] [--rounds 9] [--seconds 60]
+
+Each policy has two cameras. ``resnet`` and ``clip`` have a window of two frames, and compute 2 of their 40 steps;
+SmolVLA sees one frame, and computes 2 of 10. Calls take turns:
+
+- ``all``: every frame and the instruction are computed in the call, as if none had been seen;
+- ``newest``: the frame before was prepared when it came, where the window has one, and the instruction is known;
+- ``one still``: the same, and one of the cameras shows what it showed before;
+- ``still``: nothing moves.
+
+Seconds are the processor's, since the machine may be busy; ratios are those of the medians. Then an executor runs in
+real time, in turn with and without preparing frames, and its own statistics say how long calls took. It controls at 10
+Hz, and the frames of a window are 0.1 s apart, those of ``clip`` 0.5 s: calls have to leave time between them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor, nn
+
+import ttscompile
+from ttscompile import ChunkSpec, ObservationSpec, PolicySpec
+from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.write import update_calibration
+from ttscompile.frontends.clip import TextConfig, VisionConfig
+from ttscompile.frontends.encoded import EncodedDenoiser
+from ttscompile.frontends.multi_image_encoder import MultiImageEncoder, View
+from ttscompile.frontends.multi_task_dit import DiffusionTransformer, DiTConfig, ObservationEncoder
+from ttscompile.frontends.resnet import group_norm
+from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
+from ttscompile.runtimes.policy import CompiledPolicy
+from ttscompile.samplers.flow import flow_matching_table
+
+Obs = dict[str, npt.NDArray[Any]]
+
+TO, STEPS, HORIZON, EXECUTED, ACTIONS, STATE, WORDS = 2, 40, 32, 24, 14, 14, 77
+CAMERAS = ("front", "wrist")
+CONTROL_HZ = 10.0
+POLICY_HZ = {"resnet": 10.0, "clip": 2.0}
+PLAN = "two_steps"
+
+
+class Clip(nn.Module):
+    """LeRobot's multi-task DiT from observations on: CLIP B/16 on every image, and CLIP's text encoder."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        vision = VisionConfig(768, 3072, 12, 12, image_size=224, patch_size=16)
+        text = TextConfig(512, 2048, 12, 8)
+        self.encoder = ObservationEncoder(len(CAMERAS), vision, text, 512, False, TO)
+        self.width = TO * (STATE + 768 * len(CAMERAS) + 512)
+
+    def forward(self, obs: Mapping[str, Tensor]) -> Tensor:
+        images = [obs[key].flatten(0, 1) for key in CAMERAS]
+        return self.encoder(obs["state"], images, obs["tokens"], obs["mask"])  # type: ignore[no-any-return]
+
+
+class ResNets(nn.Module):
+    """Diffusion Policy's encoder: a ResNet-18 for each camera, at the size of its real robots' images."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        view = View(240, 320, None, (216, 288), (2.0,) * 3, (-1.0,) * 3)
+        views = dict.fromkeys(CAMERAS, view)
+        self.encoder = MultiImageEncoder(views, {"state": STATE}, "resnet18", group_norm, False)
+        self.width = TO * self.encoder.width
+
+    def forward(self, obs: Mapping[str, Tensor]) -> Tensor:
+        return self.encoder(obs).flatten(1)  # type: ignore[no-any-return]
+
+
+def compiled(name: str, folder: Path) -> None:
+    """Compile a policy of this name, with a plan that computes two steps."""
+    if name == "smolvla":
+        import large_smolvla
+
+        large_smolvla.save(folder.parent / "smolvla-checkpoint")
+        program = ttscompile.convert(folder.parent / "smolvla-checkpoint", folder)
+    else:
+        program = ttscompile.compile_denoiser(*network(name), folder)
+    steps = program.spec.sampler.steps
+    plan = np.full((steps, len(program.blocks)), ttscompile.Source.TIMESTEP, np.int8)
+    plan[0] = plan[steps // 2] = ttscompile.Source.COMPUTE
+    update_calibration(folder, None, {PLAN: plan}, PLAN, {})
+
+
+def network(name: str) -> tuple[nn.Module, PolicySpec]:
+    """The policy and its specification; both have the multi-task DiT's denoiser, 6 layers of width 512."""
+    torch.manual_seed(0)
+    encoder = Clip() if name == "clip" else ResNets()
+    config = DiTConfig(ACTIONS, HORIZON, 512, 6, 8, 256, False, True, 1e4)
+    size = (224, 224) if name == "clip" else (240, 320)
+    observations = {key: ObservationSpec((TO, 3, *size), bounds=(0.0, 1.0)) for key in CAMERAS}
+    observations["state"] = ObservationSpec((TO, STATE))
+    if name == "clip":
+        observations["tokens"] = ObservationSpec((WORDS,), dtype="int64", window=False, bounds=(0, 49407))
+        observations["mask"] = ObservationSpec((WORDS,), dtype="bool", window=False, bounds=(0, 1))
+    chunk = ChunkSpec(ACTIONS, TO - 1, TO - 1 + EXECUTED)
+    spec = PolicySpec((HORIZON, ACTIONS), observations, flow_matching_table(STEPS), chunk)
+    return EncodedDenoiser(encoder, DiffusionTransformer(config, encoder.width)).eval(), spec
+
+
+def frames(spec: PolicySpec, seed: int) -> Iterator[Obs]:
+    """Frames of one stream for ever, without the axes of batch and time; the instruction stays."""
+    rng = np.random.default_rng(seed)
+    words = {key: one.draw(rng)[0] for key, one in spec.observations.items() if one.dtype != "float32"}
+    measured = {key: one.one_frame if one.frames else one for key, one in spec.observations.items() if key not in words}
+    while True:
+        yield {key: one.draw(rng)[0] for key, one in measured.items()} | words
+
+
+def window(spec: PolicySpec, before: Obs, newest: Obs) -> Obs:
+    """What a call reads."""
+    return {
+        key: np.stack([before[key], newest[key]])[None] if one.frames else newest[key][None]
+        for key, one in spec.observations.items()
+    }
+
+
+def calls(policy: CompiledPolicy, spec: PolicySpec, rounds: int) -> None:
+    """Time the calls, and print a table."""
+    still = next(key for key, one in spec.observations.items() if one.image)
+    ways: dict[str, Callable[[Obs, Obs], Obs]] = {
+        "all": lambda before, newest: newest,
+        "newest": lambda before, newest: newest,
+        "one still": lambda before, newest: newest | {still: before[still]},
+        "still": lambda before, newest: before,
+    }
+    times: dict[str, list[tuple[float, float]]] = {way: [] for way in ways}
+    stream = frames(spec, 0)
+    policy.reset(seed=0)
+    for _ in range(rounds + 1):
+        for way, move in ways.items():
+            before, newest = next(stream), next(stream)
+            policy.forget_frames() if way == "all" else policy.prepare_frame({k: v[None] for k, v in before.items()})
+            obs = window(spec, before, move(before, newest))
+            start = time.process_time()
+            policy.predict_action(obs)
+            took = time.process_time() - start
+            report = policy.last_report
+            assert report is not None
+            times[way].append((took, took * report.timings.prologue / report.timings.total))
+    whole = {way: statistics.median(took for took, _ in rows[1:]) for way, rows in times.items()}
+    print("| a call in which | s | of it the prologue | of `all` |")
+    print("| --- | --- | --- | --- |")
+    for way, rows in times.items():
+        prologue = statistics.median(part for _, part in rows[1:])
+        print(f"| {way} | {whole[way]:.3f} | {prologue:.3f} | {whole[way] / whole['all']:.2f} |")
+
+
+class _Forgetful:
+    """The policy as it was before: every call computes all of its frames."""
+
+    def __init__(self, policy: CompiledPolicy) -> None:
+        self._policy = policy
+        self.info, self.reset = replace(policy.info, frames=0), policy.reset
+
+    def predict_action(self, obs_dict: Mapping[str, Any], *, plan: str) -> Mapping[str, Any]:
+        self._policy.forget_frames()
+        return self._policy.predict_action(obs_dict, plan=plan)
+
+
+def drive(policy: CompiledPolicy, spec: PolicySpec, policy_hz: float, seconds: float) -> None:
+    """Run an executor in real time, twice in each way in turn, and print how long its calls took."""
+    settings = ExecutorSettings(
+        policy_hz=policy_hz,
+        n_obs_steps=TO,
+        horizon=EXECUTED // 2,
+        refuse_infeasible=False,
+        warm_up=1,
+        measured_calls=2,
+        max_hold=10**6,
+    )
+    found: dict[str, list[float]] = {"all": [], "newest": []}
+    for _ in range(2):
+        for way, driven in (("all", _Forgetful(policy)), ("newest", policy)):
+            stream = frames(spec, 1)
+            with AsyncExecutor(driven, CONTROL_HZ, settings) as executor:
+                until = time.monotonic() + seconds / 4
+                while time.monotonic() < until:
+                    start = time.monotonic()
+                    executor.observe(next(stream))
+                    if executor.ready:
+                        executor.action()
+                    time.sleep(max(start + 1 / CONTROL_HZ - time.monotonic(), 0))
+                told = executor.statistics()
+            assert told.latency_ms is not None
+            found[way].append(told.latency_ms.p50)
+    before, now = (statistics.median(found[way]) for way in ("all", "newest"))
+    what = f"In the executor at {CONTROL_HZ:g} Hz, policy {policy_hz:g} Hz, medians of {told.calls} calls a run:"
+    print(f"{what} {before:.0f} ms without preparing frames, {now:.0f} ms with it ({now / before:.2f}).")
+
+
+def main() -> None:
+    """Compile what was asked for, and measure it."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
+    parser.add_argument("--policies", default="resnet,clip")
+    parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--seconds", type=float, default=60.0, help="of each policy in the executor")
+    parser.add_argument("--output", type=Path, help="a folder to keep the artifacts in; a temporary one otherwise")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = options.output or Path(temporary)
+        for name in options.policies.split(","):
+            if not (folder / name).is_dir():
+                compiled(name, folder / name)
+            policy, spec = ttscompile.load(folder / name), load_artifact(folder / name).manifest.spec
+            print(f"\n## {name}\n")
+            calls(policy, spec, options.rounds)
+            if name in POLICY_HZ:  # a window of one frame has none before its newest
+                print()
+                drive(policy, spec, POLICY_HZ[name], options.seconds)
+
+
+if __name__ == "__main__":
+    main()

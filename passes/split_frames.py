@@ -1,0 +1,352 @@
+"""Work that depends on one frame alone: one image of one camera, or the instruction."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from ttscompile.core.spec import ObservationSpec
+from ttscompile.ir.evaluate import Evaluator
+from ttscompile.ir.flops import node_flops
+from ttscompile.ir.graph import Argument, Batch, Graph, Node, Ref, TensorType, backward_slice
+from ttscompile.ir.operations import Movement, operation
+from ttscompile.ir.program import Program
+
+from .base import Pass, PassResult
+
+LEAST_FLOPS = 5_000_000
+"""Of a tower, for one row. With less it costs about as much to see whether a row is new as to compute it."""
+MOST_BEFORE = 0.25
+"""What is computed before the rows are there is computed at every call: this share of the tower's FLOPs at most."""
+_CLOSE = 1e-3
+"""Share of a tower's largest number by which batches of one and of two rows may differ: rounding is below it."""
+
+
+class SplitFrames(Pass[Program, Program]):
+    """Take what depends on one frame alone out of the condition graph, as a piece that runs once a frame.
+
+    Before::
+
+        %rows     : [2*B, 3, H, W] = aten.reshape.default(%camera, ...)     # camera [B, 2, 3, H, W]
+        %features : [2*B, 512]     = resnet(%rows)
+        %obs      : [B, 1024]      = aten.reshape.default(%features, ...)
+
+    After::
+
+        frames    : %rows = aten.reshape.default(%camera, ...)
+        frame_00  : %features.frame : [B, 512] = resnet(%rows : [B, 3, H, W])   # of any number of rows
+        condition : %obs = aten.reshape.default(%features.frame : [2*B, 512], ...)
+
+    A graph holds for any batch size and keeps its streams apart. So a part of it that speaks of ``m * B`` rows alone,
+    never of B, holds for any number of rows and keeps these apart: it cannot know which of them are of one stream.
+    Towers of one form with the same weights, as where one encoder looks at several cameras in turn, are one.
+
+    Args:
+        least_flops: of a tower, for one row; what costs less stays where it is.
+    """
+
+    def __init__(self, least_flops: int = LEAST_FLOPS) -> None:
+        self._least = least_flops
+
+    def call(self, program: Program) -> PassResult[Program]:
+        """Split."""
+        graph, found = program.pieces.condition, list[_Tower]()
+        if program.pieces.towers:
+            return PassResult(program)
+        observations, declined = program.spec.observations, dict[str, str]()
+        lengths = {key: spec.frames or 1 for key, spec in observations.items()}
+        alone = {key for key, spec in observations.items() if _is_frame(spec)}
+        while (tower := _largest(graph, found, alone, declined)) is not None:
+            if tower.flops < self._least * tower.rows:
+                break
+            if _one_frame_a_row(graph, tower, lengths, program.weights):
+                found.append(tower)
+            else:
+                declined[tower.entries[0]] = f"%{tower.entries[0]} is left: its rows are made of several frames"
+        if not found:
+            return PassResult(program, tuple(declined.values()))
+        order = {node.name: i for i, node in enumerate(graph.nodes)}
+        groups = _alike(sorted(found, key=lambda one: order[one.entries[0]]))
+        for group in groups:
+            _require_apart(self, group[0].graph, program.weights)
+        frames, condition = _rows_graph(graph, groups), _rest(graph, groups)
+        towers = tuple(_reading_all(group) for group in groups)
+        pieces = replace(program.pieces, frames=frames, condition=condition, towers=towers)
+        return PassResult(replace(program, pieces=pieces), (*map(_note, groups), *declined.values()))
+
+    def ensures(self, program: Program) -> None:
+        """A tower reads rows and nothing else, and gives a value a row."""
+        for tower in program.pieces.towers:
+            types = tower.types()
+            for name in (*tower.inputs, *tower.outputs):
+                if types[name].shape[:1] != (Batch(),):
+                    raise self.fail(f"%{name} : {types[name]} of a tower has no rows.")
+
+
+@dataclass(frozen=True)
+class _Tower:
+    """A part of the condition graph.
+
+    Attributes:
+        entries: the values whose rows it works on: one, or those of the instruction.
+        rows: m, how many rows a stream has.
+        inside: names of its nodes.
+        before: names of the nodes that make the rows.
+        exits: values that others read.
+        graph: of any number of rows.
+        flops: for the m rows of a stream.
+    """
+
+    entries: tuple[str, ...]
+    rows: int
+    inside: frozenset[str]
+    before: frozenset[str]
+    exits: tuple[str, ...]
+    graph: Graph
+    flops: int
+
+
+def _is_frame(spec: ObservationSpec) -> bool:
+    """Whether an observation is one picture, or an instruction: what may well be the same in the next call."""
+    axes = len(spec.shape) - (spec.frames is not None)
+    return (spec.frames or 1) == 1 and (axes >= 3 or not spec.dtype.startswith("float"))
+
+
+def _largest(
+    graph: Graph, found: Collection[_Tower], frames: Collection[str], declined: Collection[str]
+) -> _Tower | None:
+    """The tower with the most FLOPs among what is in no other."""
+    taken = {name for tower in found for name in (*tower.inside, *tower.before)}
+    observed, starts = _observed(graph), list[tuple[str, ...]]()
+    types = graph.types()
+    alone = {key: types[key] for key in graph.inputs if key in frames}
+    for node in graph.nodes:
+        if node.name in observed and node.name not in {*taken, *declined} and _begins(node, types, alone):
+            starts.append((node.name,))
+    # An instruction is several observations: tokens, and which of them count.
+    told = tuple(name for (name,) in starts if not types[name].dtype.startswith("float") and _rows(types, name) == 1)
+    towers = [_grow(graph, entries, observed, taken) for entries in (*starts, *[told] * (len(told) > 1))]
+    return max((tower for tower in towers if tower is not None), key=lambda one: one.flops, default=None)
+
+
+def _rows(types: Mapping[str, TensorType], name: str) -> int:
+    """How many rows a stream has in a value that a tower begins with."""
+    size = types[name].shape[0]
+    assert isinstance(size, Batch)
+    return size.multiple
+
+
+def _observed(graph: Graph) -> set[str]:
+    """Values that depend on an observation."""
+    found = set(graph.inputs)
+    for node in graph.nodes:
+        if not found.isdisjoint(node.refs()):
+            found.add(node.name)
+    return found
+
+
+def _begins(node: Node, types: Mapping[str, TensorType], alone: Mapping[str, TensorType]) -> bool:
+    """Whether a tower may begin with a value.
+
+    It may with an observation itself, if it is among those ``alone``, which are single frames; and with what first has
+    the rows of several frames in one axis.
+    """
+    size = node.type.shape[0] if len(node.types) == 1 and node.type.shape else None
+    if not isinstance(size, Batch) or any(isinstance(n, Batch) for n in node.type.shape[1:]):
+        return False
+    if size.multiple == 1:
+        return [alone.get(name) for name in node.refs()] == [node.type]
+    mixed = any(n.multiple % size.multiple for name in node.refs() for n in types[name].shape if isinstance(n, Batch))
+    return mixed and operation(node.op).movement is Movement.RESHAPE
+
+
+def _grow(graph: Graph, entries: tuple[str, ...], observed: Collection[str], taken: Collection[str]) -> _Tower | None:
+    """All that follows from these rows alone; None if that is nothing."""
+    types, users, banned = graph.types(), graph.users(), set(taken)
+    rows = _rows(types, entries[0])
+    while True:
+        inside, free = set(entries), set(graph.constants)
+        for node in graph.nodes:
+            read, fits = set(node.refs()), _speaks_of(node, rows)
+            if node.name not in observed and read <= free and fits:
+                free.add(node.name)
+            elif node.name not in banned and read & inside and read <= inside | free and fits:
+                inside.add(node.name)
+        inside.difference_update(entries)
+        exits = [n.name for n in graph.nodes if n.name in inside and _leaves(n.name, graph, users, inside)]
+        bad = [name for name in exits if not _is_exit(graph, name, rows)]
+        if not bad:
+            break
+        banned.update(bad)
+    own = backward_slice(graph, tuple(exits), {name: types[name] for name in entries})
+    before = backward_slice(graph, entries, {})
+    flops, spent = (sum(node_flops(node, types) for node in part.nodes) for part in (own, before))
+    if not exits or set(own.inputs) != set(entries) or spent > MOST_BEFORE * flops:
+        return None
+    names = frozenset(node.name for node in own.nodes if node.name in observed)
+    earlier = frozenset(node.name for node in before.nodes)
+    return _Tower(entries, rows, names, earlier, tuple(exits), _of_rows(own, rows, exits), flops)
+
+
+def _leaves(name: str, graph: Graph, users: Mapping[str, list[Node]], inside: Collection[str]) -> bool:
+    return name in graph.outputs or any(user.name not in inside for user in users[name])
+
+
+def _batches(node: Node) -> list[Batch]:
+    sizes = [size for type_ in node.types for size in type_.shape]
+    return [size for size in (*sizes, *node.leaves()) if isinstance(size, Batch)]
+
+
+def _speaks_of(node: Node, rows: int) -> bool:
+    """Whether all sizes of a node are multiples of the number of rows."""
+    return all(batch.multiple % rows == 0 for batch in _batches(node))
+
+
+def _is_exit(graph: Graph, name: str, rows: int) -> bool:
+    """Whether a value has a row for each row."""
+    node = graph.producers()[name]
+    axes = [axis for axis, size in enumerate(node.type.shape) if isinstance(size, Batch)]
+    return len(node.types) == 1 and axes == [0] and node.type.shape[0] == Batch(rows)
+
+
+def _crossing(name: str) -> str:
+    """The name of what a tower gives."""
+    return f"{name}.frame"
+
+
+def _of_rows(graph: Graph, rows: int, exits: Collection[str]) -> Graph:
+    """The graph of one row for each that ``rows * B`` stand for."""
+
+    def size(argument: Argument) -> Argument:
+        if isinstance(argument, tuple):
+            return tuple(map(size, argument))
+        return Batch(argument.multiple // rows) if isinstance(argument, Batch) else argument
+
+    def kind(type_: TensorType) -> TensorType:
+        return replace(type_, shape=tuple(size(n) for n in type_.shape))  # type: ignore[misc]
+
+    nodes = tuple(
+        replace(
+            node,
+            args=tuple(map(size, node.args)),
+            kwargs=tuple((name, size(value)) for name, value in node.kwargs),
+            types=tuple(map(kind, node.types)),
+        )
+        for node in graph.nodes
+    )
+    types = {node.name: node.type for node in nodes}
+    out = tuple(Node(_crossing(n), "aten.clone.default", (Ref(n),), (), (types[n],)) for n in exits)
+    inputs = {name: kind(type_) for name, type_ in graph.inputs.items()}
+    return Graph(inputs, graph.constants, (*nodes, *out), tuple(map(_crossing, exits)))
+
+
+def _alike(towers: list[_Tower]) -> list[list[_Tower]]:
+    """Towers that do the same with the same weights, together."""
+    groups: dict[tuple[int, str], list[_Tower]] = {}
+    for tower in towers:
+        groups.setdefault((tower.rows, _form(tower.graph)), []).append(tower)
+    return list(groups.values())
+
+
+def _form(graph: Graph) -> str:
+    """Equal for graphs that differ in the names of their values alone; weights have theirs."""
+    names = {name: f"%{i}" for i, name in enumerate((*graph.inputs, *(node.name for node in graph.nodes)))}
+    nodes = [replace(n.renamed(lambda v: names.get(v, v)), name=names[n.name], source="") for n in graph.nodes]
+    return "\n".join([*map(str, graph.inputs.values()), *map(str, nodes), *(names[name] for name in graph.outputs)])
+
+
+def _together(group: list[_Tower]) -> tuple[str, ...]:
+    """Names of the rows of towers that are alike, one for each entry."""
+    return group[0].entries if len(group) == 1 else tuple(f"{entry}.all" for entry in group[0].entries)
+
+
+def _rows_graph(graph: Graph, groups: list[list[_Tower]]) -> Graph:
+    """Observations to the rows of each tower, those of towers that are alike one after the other."""
+    entries = tuple(entry for group in groups for tower in group for entry in tower.entries)
+    own, types = backward_slice(graph, entries, {}), graph.types()
+    nodes = list(own.nodes)
+    for group in groups:
+        for place, (entry, name) in enumerate(zip(group[0].entries, _together(group), strict=True)):
+            if name != entry:
+                parts, (_, *row) = tuple(Ref(tower.entries[place]) for tower in group), types[entry].shape
+                type_ = replace(types[entry], shape=(Batch(len(group) * group[0].rows), *row))
+                nodes.append(Node(name, "aten.cat.default", (parts, 0), (), (type_,)))
+    return Graph(graph.inputs, own.constants, tuple(nodes), tuple(name for g in groups for name in _together(g)))
+
+
+def _reading_all(group: list[_Tower]) -> Graph:
+    """The tower of a group with its inputs called as the rows that it reads."""
+    tower, names = group[0].graph, dict(zip(group[0].entries, _together(group), strict=True))
+    nodes = tuple(node.renamed(lambda name: names.get(name, name)) for node in tower.nodes)
+    inputs = {names[entry]: tower.inputs[entry] for entry in group[0].entries}
+    return replace(tower, inputs=inputs, nodes=nodes)
+
+
+def _rest(graph: Graph, groups: list[list[_Tower]]) -> Graph:
+    """The condition graph that reads what the towers give."""
+    types, inputs, nodes = graph.types(), dict(graph.inputs), list[Node]()
+    for group in groups:
+        first, count = group[0], len(group)
+        for place, name in enumerate(first.exits):
+            kind, crossing = types[name], _crossing(name)
+            inputs[crossing] = replace(kind, shape=(Batch(count * first.rows), *kind.shape[1:]))
+            if count == 1:
+                nodes.append(Node(name, "aten.clone.default", (Ref(crossing),), (), (kind,)))
+                continue
+            apart = replace(kind, shape=(count, *kind.shape))
+            nodes.append(Node(f"{crossing}.apart", "aten.reshape.default", (Ref(crossing), apart.shape), (), (apart,)))
+            for i, tower in enumerate(group):
+                args = (Ref(f"{crossing}.apart"), 0, i)
+                nodes.append(Node(tower.exits[place], "aten.select.int", args, (), (kind,)))
+    made = {node.name for node in nodes}
+    whole = replace(graph, inputs=inputs, nodes=(*nodes, *(n for n in graph.nodes if n.name not in made)))
+    return replace(backward_slice(whole, graph.outputs, {}), inputs=inputs)
+
+
+def _one_frame_a_row(
+    graph: Graph, tower: _Tower, lengths: Mapping[str, int], weights: Mapping[str, npt.NDArray[np.generic]]
+) -> bool:
+    """Whether another frame of an observation changes no row that a third one changes."""
+    if tower.rows == 1:
+        return True
+    before, rng = backward_slice(graph, tower.entries, {}), np.random.default_rng(0)
+    run = Evaluator(before, {name: torch.from_numpy(np.asarray(weights[name])) for name in before.constants})
+    obs = {name: _drawn(type_, 1, rng) for name, type_ in before.inputs.items()}
+    with torch.no_grad():
+        (rows,) = run(obs)
+        changes = torch.zeros(len(rows))
+        for key, value in obs.items():
+            for frame in range(lengths[key]):
+                other = value.clone()
+                other[:, frame] = _drawn(before.inputs[key], 1, rng)[:, frame]
+                changes += (run({**obs, key: other})[0] != rows).flatten(1).any(1)
+    return bool((changes <= 1).all())
+
+
+def _drawn(type_: TensorType, rows: int, rng: np.random.Generator) -> torch.Tensor:
+    real = type_.dtype.startswith("float")
+    drawn = rng.standard_normal(type_.at(rows)) if real else rng.integers(0, 2, type_.at(rows))
+    return torch.from_numpy(drawn.astype(type_.dtype))
+
+
+def _require_apart(each: SplitFrames, tower: Graph, weights: Mapping[str, npt.NDArray[np.generic]]) -> None:
+    """Raise unless a row gives the same beside another and alone."""
+    run = Evaluator(tower, {name: torch.from_numpy(np.asarray(weights[name])) for name in tower.constants})
+    rng = np.random.default_rng(0)
+    rows = {name: _drawn(type_, 2, rng) for name, type_ in tower.inputs.items()}
+    with torch.no_grad():
+        both, alone = run(rows), run({name: value[1:] for name, value in rows.items()})
+    for output, one, other in zip(tower.outputs, both, alone, strict=True):
+        here, there = one[1:].double(), other.double()
+        if not torch.allclose(here, there, rtol=0, atol=_CLOSE * float(there.abs().max()), equal_nan=True):
+            raise each.fail(f"%{output} of a row depends on the other rows.")
+
+
+def _note(group: list[_Tower]) -> str:
+    count, first = len(group) * group[0].rows, group[0]
+    names = ", ".join(f"%{entry}" for tower in group for entry in tower.entries)
+    return f"of {names}: {count} rows a call, {first.flops / first.rows / 1e6:.1f} MFLOP each, once a frame"

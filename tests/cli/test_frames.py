@@ -1,0 +1,49 @@
+"""Commands tell of frame pieces where there are some."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from tests.families import cameras
+from tests.once import Once
+from ttscompile.cli import main
+
+
+@pytest.fixture(scope="module")
+def seeing(once: Once) -> Path:
+    return once.folder("seeing", cameras.compile_seeing) / "artifact"
+
+
+def run(*arguments: object) -> str:
+    result = CliRunner().invoke(main, list(map(str, arguments)), env={"COLUMNS": "200"})
+    assert result.exit_code == 0, result.stderr
+    return result.stdout
+
+
+def test_inspect_tells_what_is_computed_once_a_frame(seeing: Path, toy_compiled: Path) -> None:
+    made = json.loads(run("inspect", seeing, "--json"))
+    assert sorted(piece["rows"] for piece in made["frames"]) == [1, 4]
+    frames = sum(piece["rows"] * piece["flops"] for piece in made["frames"])
+    assert 0.9 * made["flops"]["prologue"] < frames < made["flops"]["prologue"]
+    assert "computed once a frame, 4 a call" in run("inspect", seeing)
+    assert json.loads(run("inspect", toy_compiled, "--json"))["frames"] == []
+    assert "once a frame" not in run("inspect", toy_compiled)
+
+
+def test_bench_says_how_much_of_a_call_is_frames(seeing: Path, toy_compiled: Path) -> None:
+    (measured,) = json.loads(run("bench", seeing, "--runs", 3, "--against", "", "--json"))["contestants"]
+    assert 0 < measured["frames_ms"] < measured["prologue_ms"]
+    told = "Every call has frames of its own"
+    assert told in run("bench", seeing, "--runs", 1, "--against", "")
+    assert told not in run("bench", toy_compiled, "--runs", 1, "--against", "")
+
+
+def test_the_report_has_a_row_and_a_column_for_them(seeing: Path, tmp_path: Path) -> None:
+    run("report", seeing, "-o", tmp_path / "report.html", "--runs", 2)
+    page = (tmp_path / "report.html").read_text()
+    assert "once a frame, or instruction" in page
+    assert "of it frames" in page

@@ -1,0 +1,123 @@
+"""Small policies that see: cameras and an instruction, with towers just large enough to be pieces of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+import ttscompile
+from ttscompile import ChunkSpec, ObservationSpec, PolicySpec
+from ttscompile.frontends.encoded import EncodedDenoiser
+from ttscompile.samplers.flow import flow_matching_table
+
+TO, SIDE, WORDS = 2, 24, 8
+CAMERAS = ("left", "right")
+STEPS, HORIZON, ACTIONS = 3, 6, 3
+
+
+class Tower(nn.Module):
+    """``[N, 3, 24, 24]`` -> ``[N, 8]``, 6 MFLOP an image."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList(nn.Conv2d(n, 24, 3, padding=1) for n in (3, 24))
+        self.out = nn.Linear(24, 8)
+
+    def forward(self, x: Tensor) -> Tensor:
+        for layer in self.layers:
+            x = torch.relu(layer(x))
+        return self.out(x.mean((2, 3)))  # type: ignore[no-any-return]
+
+
+class Eyes(nn.Module):
+    """What the cameras see, as ``kind`` says:
+
+    ``each``: a tower for each camera; ``shared``: one looks at all of them in turn; ``stacked``: at all at once;
+    ``mixed``: at the mean of the window's frames; ``channels``: at the window as one picture with more colours.
+    """
+
+    def __init__(self, kind: str) -> None:
+        super().__init__()
+        self.kind = kind
+        self.towers = nn.ModuleList(Tower() for _ in range(2 if kind == "each" else 1))
+        self.merge = nn.Conv2d(3 * TO, 3, 1)
+
+    def forward(self, images: list[Tensor]) -> Tensor:
+        """By camera ``[B, To, 3, H, W]`` -> ``[B, features]``."""
+        if self.kind == "mixed":
+            images = [x - x.mean(1, keepdim=True) for x in images]
+        if self.kind == "channels":
+            return torch.cat([self.towers[0](self.merge(x.flatten(1, 2))) for x in images], -1)
+        rows = [x.flatten(0, 1) for x in images]
+        if self.kind == "stacked":
+            seen = self.towers[0](torch.stack(rows, 1).flatten(0, 1))
+            return seen.reshape(-1, TO * len(images) * seen.shape[-1])  # type: ignore[no-any-return]
+        own = [self.towers[i % len(self.towers)](x) for i, x in enumerate(rows)]
+        return torch.cat([x.reshape(-1, TO * x.shape[-1]) for x in own], -1)
+
+
+class Reader(nn.Module):
+    """An instruction: tokens and which of them count -> ``[B, 8]``."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.embed, self.layers = nn.Embedding(16, 256), nn.ModuleList(nn.Linear(256, 256) for _ in range(6))
+        self.out = nn.Linear(256, 8)
+
+    def forward(self, tokens: Tensor, mask: Tensor) -> Tensor:
+        x = self.embed(tokens) * mask[..., None]
+        for layer in self.layers:
+            x = torch.relu(layer(x))
+        return self.out(x.mean(1))  # type: ignore[no-any-return]
+
+
+class Encoder(nn.Module):
+    """Observations -> ``[B, features]``."""
+
+    def __init__(self, kind: str, told: bool) -> None:
+        super().__init__()
+        self.eyes, self.reader = Eyes(kind), Reader() if told else None
+
+    def forward(self, obs: Mapping[str, Tensor]) -> Tensor:
+        parts = [self.eyes([obs[key] for key in CAMERAS]), obs["state"].flatten(1)]
+        if self.reader is not None:
+            parts.append(self.reader(obs["tokens"], obs["mask"]))
+        return torch.cat(parts, -1)
+
+
+class Denoiser(nn.Module):
+    """Residual blocks that see the features."""
+
+    def __init__(self, features: int) -> None:
+        super().__init__()
+        self.embed, self.head = nn.Linear(ACTIONS, 16), nn.Linear(16, ACTIONS)
+        self.blocks = nn.ModuleList(nn.Linear(16, 16) for _ in range(2))
+        self.read = nn.Linear(features, 16)
+
+    def forward(self, sample: Tensor, timestep: Tensor, features: Tensor) -> Tensor:
+        x, seen = self.embed(sample) + timestep.reshape(-1, 1, 1), self.read(features)[:, None]
+        for block in self.blocks:
+            x = x + torch.relu(block(x) + seen)
+        return self.head(x)  # type: ignore[no-any-return]
+
+
+def compile_seeing(folder: Path) -> None:
+    """A policy whose two cameras share a tower, with an instruction: the artifact, and the single file."""
+    module, spec = policy("shared", told=True)
+    ttscompile.compile_denoiser(module, spec, folder / "artifact", single_file=folder / "whole.onnx")
+
+
+def policy(kind: str, told: bool = False) -> tuple[nn.Module, PolicySpec]:
+    """A module and its specification."""
+    torch.manual_seed(0)
+    features = 8 * (2 if kind == "channels" else 2 * TO) + 4 * TO + 8 * told
+    observations = {key: ObservationSpec((TO, 3, SIDE, SIDE), bounds=(0.0, 1.0)) for key in CAMERAS}
+    observations["state"] = ObservationSpec((TO, 4))
+    if told:
+        observations["tokens"] = ObservationSpec((WORDS,), dtype="int64", window=False, bounds=(0, 15))
+        observations["mask"] = ObservationSpec((WORDS,), dtype="bool", window=False, bounds=(0, 1))
+    spec = PolicySpec((HORIZON, ACTIONS), observations, flow_matching_table(STEPS), ChunkSpec(ACTIONS, TO - 1, TO + 1))
+    return EncodedDenoiser(Encoder(kind, told), Denoiser(features)).eval(), spec
