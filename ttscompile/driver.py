@@ -235,7 +235,7 @@ def _lower_pieces(
     except LoweringError as reason:
         if precision != AUTO:
             raise
-        explain("lower_precision", (str(reason), *staying))
+        explain("lower_precision", (*staying, str(reason)))
         return None
     if any(map(is_block, own)):
         own |= lower_all_blocks(program.pieces.blocks, {**models, **own})
@@ -244,9 +244,8 @@ def _lower_pieces(
         write_artifact(program, models, folder, lowered)
         found = measure_parts(load_artifact(folder), choose=precision == AUTO)
     error, noise = found.error, found.other_noise
-    left = [
-        f"{part} stays fp32: actions would be {found.alone[part]:.4g} off" for part in parts if part not in found.kept
-    ]
+    off = {part: mean for part, mean in found.alone.items() if part not in found.kept}
+    left = [f"{part} stays fp32: actions would be {mean:.4g} off" for part, mean in off.items()]
     if error is None:
         told = f"fp32: other noise changes actions by {noise:.4g}, and int8 by more than {SHARE:.0%} of it"
     else:

@@ -24,7 +24,7 @@ from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import ArtifactError
 from ttscompile.ir.pieces import DENSE_STEP, JOINT
 from ttscompile.lower.joint import lower_all_blocks
-from ttscompile.lower.precision import lower_precision
+from ttscompile.lower.precision import lower_precision, quantize_model
 
 ERROR = PrecisionError(calls=8, mean=0.25, p90=0.5, largest=1.5, tolerance=0.03, other_noise=4.0)
 
@@ -92,6 +92,17 @@ def test_blocks_are_opened_in_the_precision_that_was_asked_for(int8: Path) -> No
         artifact.at_precision("bf16")
     with pytest.raises(ArtifactError, match=r"holds, \['fp32'\]. Convert .* --precision int8"):
         plain.at_precision("int8")
+
+
+def test_a_piece_of_the_prologue_has_a_model_of_its_own(tmp_path: Path) -> None:
+    program = tiny_program()
+    step, weights = quantize_model(tiny_models(program)["step"], program.weights)
+    write_artifact(program, tiny_models(program), tmp_path / "a", LoweredPieces("int8", {"step": step}, weights, ERROR))
+    artifact = load_artifact(tmp_path / "a")
+    record = artifact.manifest.precision
+    assert record is not None and (record.kept, record.parts, record.blocks) == (("step",), {"step": None}, 0)
+    assert (artifact.onnx_file("step"), artifact.onnx_file("block_00")) == ("step_int8.onnx", "block_00.onnx")
+    assert artifact.with_parts(["blocks"]).onnx_file("step") == "step.onnx"
 
 
 def test_a_calibration_keeps_the_precision(int8: Path) -> None:
@@ -162,6 +173,10 @@ def decoded(manifest: Manifest, change: Change) -> Manifest:
         (lambda p: p["models"].update(block_00="advance.onnx"), "which nothing else uses"),
         (lambda p: p["models"].update(block_00="block_00_int9.onnx"), "files: expected exactly the files"),
         (lambda p: p["models"].pop("block_00"), "files: expected exactly the files"),
+        (lambda p: p.update(models={"blocks": "blocks_int8.onnx"}), "models of some blocks beside blocks"),
+        (lambda p: p["parts"].update(stem=None), "the parts that its models belong to, and no others"),
+        (lambda p: p.update(parts={}), "the parts that its models belong to, and no others"),
+        (lambda p: p["parts"].update(blocks=-1.0), "parts.blocks: expected a number that is not negative"),
         (lambda p: p.pop("error"), "missing: ..error"),
         (lambda p: p.update(more=1), "unknown: ..more"),
         (lambda p: p.update(error=0), "precision.error: expected an object"),
@@ -170,6 +185,7 @@ def decoded(manifest: Manifest, change: Change) -> Manifest:
         (lambda p: p["error"].update(largest="1"), "error.largest: expected a number"),
         (lambda p: p["error"].update(calls=0), "error.calls: expected a 64-bit integer of at least 1"),
         (lambda p: p["error"].pop("p90"), "missing: ..p90"),
+        (lambda p: p["error"].update(other_noise=None), "error.other_noise: expected a number"),
     ],
 )
 def test_a_hostile_record_is_refused(int8: Path, change: Change, message: str) -> None:

@@ -15,7 +15,7 @@ from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.ir.program import Program
 from ttscompile.samplers.flow import flow_matching_table
 
-WIDTH, FEATURES, HORIZON, ACTIONS = 32, 64, 4, 2
+WIDTH, FEATURES, HORIZON, ACTIONS, STEPS = 32, 64, 4, 2, 4
 LARGE = 500
 """Weights of the encoder's last layer are so many times what they come as: actions depend on what is seen."""
 
@@ -45,20 +45,21 @@ class Eye(nn.Module):
 
 
 class Hand(nn.Module):
-    """Feed-forward blocks that read what was seen."""
+    """Feed-forward blocks that read what was seen, mixed with the time: one row a step, in the piece ``step``."""
 
     def __init__(self) -> None:
         super().__init__()
         self.enter, self.leave = nn.Linear(ACTIONS, WIDTH), nn.Linear(WIDTH, ACTIONS)
         self.reads = nn.ModuleList(nn.Linear(FEATURES, WIDTH) for _ in range(3))
+        self.mixes = nn.ModuleList(nn.Linear(WIDTH, WIDTH) for _ in range(3))
         inner = (nn.Sequential(nn.Linear(WIDTH, 2 * WIDTH), nn.GELU(), nn.Linear(2 * WIDTH, WIDTH)) for _ in range(3))
         self.blocks = nn.ModuleList(inner)
 
     def forward(self, sample: torch.Tensor, timestep: torch.Tensor, seen: torch.Tensor) -> torch.Tensor:
         """``[B, 4, 2]``, ``[B]`` and ``[B, 64]`` -> ``[B, 4, 2]``."""
         x = self.enter(sample)
-        for read, block in zip(self.reads, self.blocks, strict=True):
-            x = x + block(x + read(seen)[:, None] + timestep[:, None, None])
+        for read, mix, block in zip(self.reads, self.mixes, self.blocks, strict=True):
+            x = x + block(x + mix(torch.relu(read(seen) + timestep[:, None]))[:, None])
         return self.leave(x)  # type: ignore[no-any-return]
 
 
@@ -77,7 +78,7 @@ def policy(loud: float = 0.0) -> tuple[nn.Module, PolicySpec]:
     spec = PolicySpec(
         sample=(HORIZON, ACTIONS),
         observations={"image": ObservationSpec((3, 16, 16), window=False)},
-        sampler=flow_matching_table(3),
+        sampler=flow_matching_table(STEPS),
         chunk=ChunkSpec(ACTIONS, 0, HORIZON),
     )
     return EncodedDenoiser(Eye(loud), Hand()).eval(), spec

@@ -107,7 +107,7 @@ def test_it_is_the_reference_within_its_own_tolerance_whatever_the_threads(int8:
 def test_the_single_file_computes_the_same(int8: Path) -> None:
     policy = ttscompile.load(int8)
     obs, noise = inputs(policy, np.random.default_rng(0), 2)
-    found = Episode((int8.parent / "call.onnx").read_bytes(), 2).call(obs, noise, np.zeros((3, 3), np.int8))
+    found = Episode((int8.parent / "call.onnx").read_bytes(), 2).call(obs, noise, np.zeros((seeing.STEPS, 3), np.int8))
     expected = policy.predict_action(obs, noise=noise, plan="dense")
     np.testing.assert_allclose(found["action"], expected["action"], rtol=1e-4, atol=1e-4)
     exact = ttscompile.load(int8, precision="fp32").predict_action(obs, noise=noise, plan="dense")
@@ -164,20 +164,20 @@ def test_a_part_that_was_left_out_is_in_fp32_and_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("kept", "expected"),
-    [((), ("condition", "blocks")), (["condition"], ("blocks",)), ({"prologue"}, ("blocks",))],
+    [((), ("condition", "step", "blocks")), (["condition"], ("step", "blocks")), ({"prologue"}, ("blocks",))],
 )
 def test_parts_stay_by_name_and_all_of_the_prologue_together(
     program: Program, kept: Collection[str], expected: tuple[str, ...]
 ) -> None:
     found, left, _ = parts_to_lower(program, kept)
     assert found == expected
-    assert {*found, *left} == {"condition", "blocks"}
+    assert {*found, *left} == {"condition", "step", "blocks"}
 
 
 def test_what_is_no_part_and_everything_cannot_stay(program: Program) -> None:
     with pytest.raises(LoweringError, match="'encoder' is no part of this policy; expected one of .*'prologue'"):
         parts_to_lower(program, ("encoder",))
-    with pytest.raises(LoweringError, match="everything stays fp32: condition, blocks"):
+    with pytest.raises(LoweringError, match="everything stays fp32: condition, step, blocks"):
         parts_to_lower(program, ("blocks", "prologue"))
 
 
@@ -185,7 +185,7 @@ def test_a_prologue_that_is_small_beside_a_step_stays_as_it_is(program: Program)
     condition = program.pieces.condition
     small = replace(condition, nodes=(), outputs=tuple(condition.inputs))
     found, left, notes = parts_to_lower(replace(program, pieces=replace(program.pieces, condition=small)))
-    assert (found, left) == (("blocks",), ())
+    assert (found, left) == (("step", "blocks"), ())
     assert notes == ("condition stays fp32: 0.0% of the arithmetic of a step",)
 
 

@@ -19,6 +19,7 @@ from ttscompile.core.paths import on_hub, require_path
 from ttscompile.core.spec import AUTO, FP32, PRECISIONS
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends.families import FAMILIES, FORMATS, SAMPLERS, SPACINGS
+from ttscompile.report.facts import precision as told_precision
 from ttscompile.report.summary import document
 
 
@@ -144,7 +145,8 @@ def convert(
         if stage["stage"] == "narrow" and prediction_horizon is None:
             say(console, " ".join(["hint:", *stage["notes"]]))
         if stage["stage"] == "lower_precision" and precision == AUTO:
-            say(console, "; ".join(stage["notes"]))
+            why = f" ({stage['notes'][-1]})" if artifact.manifest.precision is None else ""
+            say(console, f"precision: {told_precision(artifact.manifest)}{why}")
     if of_checkpoint["sampler"] is None and (hint := many_steps(artifact.manifest)) is not None:
         say(console, f"hint: {hint}")
     if as_json:

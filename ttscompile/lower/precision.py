@@ -138,8 +138,9 @@ def lower_precision(
         notes += _notes(precision, part, pieces, lowered, new)
     if not made:
         raise LoweringError(
-            f"precision {precision!r}: no piece of {' or '.join(parts)} multiplies by a constant float32 matrix, so"
-            " there is nothing to store in eight bits. Convert with precision 'fp32'."
+            f"precision {precision!r}: no piece of {' or '.join(parts)} multiplies by a constant float32 matrix"
+            f" (in the prologue {LEAST_ROWS} rows or more), so there is nothing to store in eight bits. Convert with"
+            " precision 'fp32'."
         )
     return made, constants, tuple(notes)
 
