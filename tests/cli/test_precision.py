@@ -28,9 +28,10 @@ def run(*arguments: object) -> Any:
 def converted(one_layer_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     """A layer of the Push-T policy with eight-bit weights and few steps, and what the command said."""
     directory = tmp_path_factory.mktemp("int8") / "compiled"
-    options = ("--sampler", "ddim", "--steps", STEPS, "--precision", "int8", "--json")
+    options = ("--sampler", "ddim", "--steps", STEPS, "--precision", "auto", "--json")
     result = run("convert", one_layer_checkpoint, "-o", directory, *options)
     assert result.exit_code == 0, result.stderr
+    assert "precision: int8 in blocks\n" in result.stderr
     return directory, json.loads(result.stdout)
 
 
@@ -82,6 +83,14 @@ def test_a_precision_that_there_is_not_is_a_usage_error(tmp_path: Path) -> None:
     result = run("convert", tmp_path / "missing.ckpt", "-o", tmp_path / "compiled", "--precision", "int4")
     assert result.exit_code == 2
     assert "'int4' is not one of 'fp32', 'int8'" in result.stderr
+
+
+def test_a_part_cannot_stay_fp32_beside_fp32(tmp_path: Path) -> None:
+    (tmp_path / "empty.ckpt").touch()
+    result = run("convert", tmp_path / "empty.ckpt", "-o", tmp_path / "compiled", "--keep-fp32", "prologue")
+    assert result.exit_code == 2
+    assert "'prologue' stays fp32, as does everything in precision 'fp32'" in " ".join(result.stderr.split())
+    assert not (tmp_path / "compiled").exists()
 
 
 def test_bench_times_the_rival_in_fp32_and_names_the_precision(converted: tuple[Path, dict[str, Any]]) -> None:

@@ -138,7 +138,7 @@ def test_select_action_is_lerobots(compiled: tuple[Path, Program]) -> None:
 
 @pytest.mark.slow
 def test_the_encoder_leaves_the_loop(compiled: tuple[Path, Program]) -> None:
-    """The ResNet runs once a call; whole evaluations are what is reused."""
+    """The ResNet runs once a frame; whole evaluations are what is reused."""
     program = compiled[1]
     record(
         "LeRobot diffusion (U-Net on images)",
@@ -146,7 +146,7 @@ def test_the_encoder_leaves_the_loop(compiled: tuple[Path, Program]) -> None:
         f"{program.spec.sampler.name} {program.spec.sampler.steps}",
         program,
     )
-    images = [node for node in program.pieces.condition.nodes if "conv" in node.op]
+    images = [node for tower in program.pieces.towers for node in tower.nodes if "conv" in node.op]
     assert len(images) == 21  # 20 of ResNet-18, one of the keypoints
     loop = [node for piece in program.pieces.loop.values() for node in piece.graph.nodes]
     assert not any(len(shape) == 4 for node in loop for shape in (type_.shape for type_ in node.types))

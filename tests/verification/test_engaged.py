@@ -31,7 +31,7 @@ class Timed:
         self._policy, self._seconds, self._busy = policy, seconds, busy
         self._draw = np.random.default_rng(0)
         self.now, self.calls = 0.0, 0
-        self.reset = policy.reset
+        self.reset, self.forget_frames = policy.reset, policy.forget_frames
 
     def predict_action(self, obs: Any, *, noise: Any, plan: str) -> Any:
         self.calls += 1
