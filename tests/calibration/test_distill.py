@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from click.testing import CliRunner
 
 import ttscompile
 from tests.once import Once
@@ -28,6 +29,7 @@ from ttscompile.calibration.progress import Bar
 from ttscompile.calibration.state import StateFile
 from ttscompile.calibration.student import Student, trainable
 from ttscompile.calibration.task import Clock
+from ttscompile.cli import main
 from ttscompile.errors import ArtifactError, CalibrationError, CalibrationFailedError
 from ttscompile.runtimes.open import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy
@@ -99,6 +101,16 @@ def test_the_artifact_gets_a_plan_that_is_nearer_to_the_dense_policy(distilled: 
     assert record is not None
     assert record["distilled"] == json.loads(json.dumps(result.record()))
     assert record["plans"][DISTILLED]["error"] == result.after.error
+
+
+def test_the_command_says_what_it_did(copied: Path, recording: Path) -> None:
+    options = ["--rank", "4", "--updates", str(UPDATES), "--max-minutes", "5"]
+    done = CliRunner().invoke(main, ["distill", str(copied), "--trajectories", str(recording), *options])
+    assert done.exit_code == 0, done.stderr
+    assert f"changed by rank 4 in {UPDATES} updates" in " ".join(done.stdout.split())
+    again = CliRunner().invoke(main, ["distill", str(copied), "--trajectories", str(recording), "--plan", "other"])
+    assert again.exit_code == 2
+    assert "expected a schedule that can be distilled; found 'other'" in again.stderr
 
 
 def test_all_other_plans_are_what_they_were(scheduled: Path, distilled: tuple[Path, Distilled]) -> None:

@@ -172,7 +172,7 @@ def _errors(manifest: Manifest) -> Section:
         f"Of the actions, in their units, on recorded episodes that nothing was learned from{told}, against the dense"
         " policy with the same noise: the mean over calls, and the 90th percentile."
     )
-    return Section("Error", (text, *facts.other_noise(record)), (facts.score_table(record),))
+    return Section("Error", (text, *facts.other_noise(record), *facts.trained(record)), (facts.score_table(record),))
 
 
 def _success(found: Sequence[Success]) -> Section:

@@ -9,7 +9,7 @@ from typing import Any
 
 from ..artifact.ceiling import few_steps
 from ..artifact.load import Artifact
-from ..artifact.manifest import DENSE, BlockRecord, Manifest, PlanRecord, marked
+from ..artifact.manifest import DENSE, DISTILLED, BlockRecord, Manifest, PlanRecord, marked
 from ..ir.flops import frames_flops, graph_flops
 from ..ir.program import Binding
 from ..measure.units import flops, plain, share
@@ -17,7 +17,7 @@ from ..runtimes.against_fp32 import SHARE
 from ..runtimes.liveness import rollout_needs
 from .page import Section, Table
 
-_NOT_TOLD = ("plans", "precision", "sparsity", "flops_sparsity", "skipped", "other_noise")
+_NOT_TOLD = ("plans", "precision", "sparsity", "flops_sparsity", "skipped", "other_noise", DISTILLED)
 _ERRORS = ("error", "error_p90")
 
 
@@ -209,6 +209,21 @@ def left_out(record: Mapping[str, Any]) -> tuple[str, ...]:
         for part, times in much.items()
     )
     return (*plans, *parts)
+
+
+def trained(record: Mapping[str, Any]) -> tuple[str, ...]:
+    """What the weights of the plan ``distilled`` are."""
+    own = _mapping(record.get(DISTILLED))
+    before = scores({"plans": {"before": own.get("before")}}).get("before")
+    counts = [own.get(name) for name in ("matrices", "rank", "updates")]
+    if before is None or not all(isinstance(count, int) for count in counts):
+        return ()
+    matrices, rank, updates = counts
+    told = (
+        f"Plan {DISTILLED!r} has weights of its own after step 0: {matrices} matrices, changed by rank {rank} in"
+        f" {updates} updates. With the original's weights its schedule is {before['error']:.4g} off."
+    )
+    return (told,)
 
 
 def record_table(record: Mapping[str, Any], most: int = 200) -> Table:
