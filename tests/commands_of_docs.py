@@ -12,6 +12,8 @@ NOT_RUN = {
     ".venv/bin/pytest": "a part of this suite, or of the test of the guide's own files",
     ".venv/bin/ruff": "make lint",
     "ttscompile serve": "has no end; tests/executor/test_serve.py and test_locked.py start it",
+    "ttscompile fleet": "has no end; tests/fleet/test_command.py starts it",
+    "curl": "needs a server; tests/executor/test_metrics.py and tests/fleet ask the same of one",
     "python examples/serve": "needs a server; the same tests run it against one",
     "ttscompile convert hf://": "from the hub: tests/hub",
     "ttscompile push compiled/ org/compiled-policy --private": "to the hub: tests/hub",
