@@ -3,7 +3,7 @@
 #   make PYTHON=python3.12 test      another interpreter (3.11 or later)
 #   make PIP_FLAGS="--extra-index-url https://download.pytorch.org/whl/cpu" test
 #                                    PyTorch's small CPU build, where pip's own index has the CUDA build only
-#   make EXTRAS=dev,ray test         with Ray too, before there is a .venv: tests of --ray and examples/ray_serve skip without it
+#   make EXTRAS=dev,ray test         with Ray too, before there is a .venv: tests of --ray and of a fleet skip without it
 #   make EXTRAS=dev,examples test    with Meta-World and Fetch, likewise: 300 MB more
 
 PYTHON ?= python3.11

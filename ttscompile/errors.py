@@ -95,6 +95,10 @@ class InfeasibleError(ExecutorError):
     """The policy is too slow for its chunks at this rate; the message has the arithmetic."""
 
 
+class OverloadedError(ExecutorError):
+    """A server has as many requests under way as it may; ask again later."""
+
+
 class DeadlineMissedError(ExecutorError):
     """There is no action for the time that was asked for, and none may be held any longer."""
 

@@ -68,6 +68,11 @@ class Door:
         self._told: dict[str, float] = {}
         self._count = 0
 
+    @property
+    def clients(self) -> int:
+        """How many are connected."""
+        return sum(each.client for each in self._visits.values())
+
     def comes(self, peer: tuple[Any, ...], own: Any = None) -> bool:
         """Whether the handshake of a new connection may begin.
 
@@ -106,15 +111,15 @@ class Door:
 
         Args:
             peer: as above.
-            status: of HTTP; 101 makes it a client.
+            status: of HTTP; 101 makes it a client, and 200 is the answer to somebody who watches.
             tls: version of TLS, None without.
             own: as above.
         """
         visit = self._visits[peer, own]
         visit.answered, visit.client = True, status == HTTPStatus.SWITCHING_PROTOCOLS
-        if not visit.client and status != HTTPStatus.SERVICE_UNAVAILABLE:  # which is no fault of the client
+        if not visit.client and status not in (HTTPStatus.OK, HTTPStatus.SERVICE_UNAVAILABLE):  # no fault of theirs
             self._refuse(visit.network)
-        event = "let in" if visit.client else "refused"
+        event = "let in" if visit.client else "told" if status == HTTPStatus.OK else "refused"
         _write(event, visit.peer, connection=visit.number, status=int(status), tls=tls)
 
     def requested(self, peer: tuple[Any, ...], own: Any = None) -> None:

@@ -226,6 +226,14 @@ class AsyncExecutor:
             return self._checked().ready
 
     @property
+    def trouble(self) -> str:
+        """Why no action will come any more, for whoever watches; empty where some may."""
+        failure = self._worker.failure
+        if failure is not None:
+            return f"the thread that owns the policy has ended: a call raised {type(failure).__name__}: {failure}"
+        return "the executor was closed" if self._closed else ""
+
+    @property
     def frames(self) -> FrameSpec:
         """What ``observe`` takes: shapes and dtypes of one frame."""
         return self._resolved.frames

@@ -13,14 +13,18 @@ from ttscompile.errors import ProtocolError
 
 from .window import Array, FrameSpec
 
-METHODS: dict[str, frozenset[str]] = {
+Methods = Mapping[str, frozenset[str]]
+"""Method -> the parameters that it may have."""
+
+METHODS: Methods = {
     "info": frozenset(),
     "observe": frozenset({"obs", "t"}),
     "action": frozenset({"t", "timeout"}),
     "reset": frozenset({"seed"}),
     "statistics": frozenset(),
 }
-"""Method -> the parameters that it may have."""
+"""Of the executor's server."""
+
 DTYPES = {
     name: dtype
     for dtype in map(np.dtype, ("<i1", "<i2", "<i4", "<i8", "<u1", "<u2", "<u4", "<u8", "<f2", "<f4", "<f8"))
@@ -32,14 +36,14 @@ MOST_SECONDS = 1e15
 
 
 class Request(NamedTuple):
-    """A request: what the client called it, which is sent back; one of ``METHODS``; what it has, checked so far."""
+    """A request: what the client called it, which is sent back; one of the methods; its parameters, checked so far."""
 
     id: int | str | None
     method: str
     params: Mapping[str, Any]
 
 
-def read_request(text: str | bytes) -> Request:
+def read_request(text: str | bytes, methods: Methods = METHODS) -> Request:
     """Read one message.
 
     Raises:
@@ -57,17 +61,17 @@ def read_request(text: str | bytes) -> Request:
     if not (name is None or isinstance(name, str) or (isinstance(name, int) and not isinstance(name, bool))):
         raise ProtocolError("a request's id is a number without fraction, a string, or left out.")
     try:
-        return Request(name, *_checked(document))
+        return Request(name, *_checked(document, methods))
     except ProtocolError as error:
         error.request_id = name  # type: ignore[attr-defined]
         raise
 
 
-def _checked(document: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+def _checked(document: dict[str, Any], methods: Methods) -> tuple[str, dict[str, Any]]:
     method = document.pop("method", None)
-    allowed = METHODS.get(method) if isinstance(method, str) else None
+    allowed = methods.get(method) if isinstance(method, str) else None
     if allowed is None:
-        raise ProtocolError(f"the method is one of {', '.join(METHODS)}; found {str(method)[:40]!r}.")
+        raise ProtocolError(f"the method is one of {', '.join(methods)}; found {str(method)[:40]!r}.")
     if unexpected := sorted(document.keys() - allowed):
         raise ProtocolError(f"{method} takes {sorted(allowed)}; found {unexpected[0][:40]!r}.")
     for key in ("t", "timeout"):
@@ -77,18 +81,28 @@ def _checked(document: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     seed = document.get("seed")
     if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 1 << 63):
         raise ProtocolError("seed is a number without fraction, from 0 to 2**63 - 1.")
-    if method == "observe" and not isinstance(document.get("obs"), dict):
-        raise ProtocolError("observe needs obs, an object with an array a key.")
+    if "obs" in allowed and not isinstance(document.get("obs"), dict):
+        raise ProtocolError(f"{method} needs obs, an object with an array a key.")
+    if not isinstance(document.get("plan") or "", str):
+        raise ProtocolError("plan is the name of one, or left out.")
     return str(method), document
 
 
 def read_frame(obs: Mapping[str, Any], frames: FrameSpec) -> dict[str, Array]:
-    """The arrays of an observation; shapes are left to ``observe``.
+    """The arrays of a frame; shapes are left to ``observe``.
 
     Raises:
         ProtocolError: something is no array.
     """
-    dtypes = {key: spec.dtype for key, spec in frames.specs.items()}
+    return read_arrays(obs, {key: spec.dtype for key, spec in frames.specs.items()})
+
+
+def read_arrays(obs: Mapping[str, Any], dtypes: Mapping[str, str]) -> dict[str, Array]:
+    """The arrays of an observation, by key, of these dtypes where they are lists.
+
+    Raises:
+        ProtocolError: something is no array.
+    """
     return {key: _array(key, value, dtypes.get(key, "float32")) for key, value in obs.items()}
 
 

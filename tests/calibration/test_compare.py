@@ -18,6 +18,9 @@ from ttscompile import SamplerTable
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.write import update_calibration
 from ttscompile.calibration.compare import _require_same_policy, compare
+from ttscompile.calibration.search import plan_of
+from ttscompile.calibration.searches import Searches
+from ttscompile.calibration.state import StateFile
 from ttscompile.calibration.task import Found, Task
 from ttscompile.cli import main
 from ttscompile.cli.compare import default_sparsities
@@ -113,6 +116,118 @@ def test_nothing_is_written(planned: Path, recording: Path) -> None:
     before = {path.name: path.read_bytes() for path in planned.iterdir()}
     compare(planned, [recording], ["interval"], [0.5], calls=1)
     assert {path.name: path.read_bytes() for path in planned.iterdir()} == before
+
+
+class Gone(Exception):
+    """Stands for whatever ends a comparison: nothing of the package catches it."""
+
+
+def interrupted_after(searches: int, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The next comparison ends when it begins another search; the strategies of all searches since."""
+    begun = list[str]()
+
+    def search(strategy: str, *arguments: Any) -> Any:
+        if len(begun) == searches:
+            raise Gone
+        begun.append(strategy)
+        return plan_of(strategy, *arguments)
+
+    monkeypatch.setattr("ttscompile.calibration.compare.plan_of", search)
+    return begun
+
+
+def test_an_interrupted_comparison_goes_on_to_the_same_outcome(
+    planned: Path, frontier: Comparison, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def again(**options: Any) -> Comparison:
+        return compare(planned, [recording], ["interval", "tts"], [0.5, 0.8], calls=8, intervals=8, **options)
+
+    interrupted_after(3, monkeypatch)
+    with pytest.raises(Gone):
+        again()
+    assert (planned / "comparison-state.safetensors").exists()
+    assert ttscompile.load(planned).info.identity == load_artifact(planned).manifest.identity  # it is no part of it
+    with pytest.raises(CalibrationError, match="the comparison that was interrupted had other settings: seed was 0"):
+        again(seed=1, resume=True)
+
+    monkeypatch.setattr(
+        "ttscompile.calibration.compare.dense_rounds", lambda *given: pytest.fail("again") if given[2] < 64 else ()
+    )
+    begun = interrupted_after(9, monkeypatch)
+    found, expected = points(again(resume=True)), points(frontier)
+    assert begun == ["tts"]
+    for key, point in found.items():
+        assert (point.error, point.error_p90, point.sparsity) == (
+            expected[key].error,
+            expected[key].error_p90,
+            expected[key].sparsity,
+        )
+    assert not (planned / "comparison-state.safetensors").exists()
+
+
+def test_without_resume_it_begins_anew(planned: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    interrupted_after(1, monkeypatch)
+    with pytest.raises(Gone):
+        compare(planned, [recording], ["interval"], [0.5, 0.8], calls=1)
+    begun = interrupted_after(9, monkeypatch)
+    compare(planned, [recording], ["interval"], [0.5, 0.8], calls=1)
+    assert begun == ["interval", "interval"]
+
+
+def test_why_there_is_no_plan_is_kept_too_and_a_damaged_state_is_refused(
+    planned: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def again() -> Comparison:
+        return compare(planned, [recording], ["deepcache", "interval"], [0.8], calls=1, resume=True)
+
+    interrupted_after(1, monkeypatch)
+    with pytest.raises(Gone):
+        again()
+    state = planned / "comparison-state.safetensors"
+    content = state.read_bytes()
+    state.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    with pytest.raises(CalibrationError, match="Compare again without --resume: that begins anew"):
+        again()
+    state.write_bytes(content)
+    begun = interrupted_after(9, monkeypatch)
+    assert "computes at least 24" in again().skipped["deepcache 0.8"]
+    assert begun == ["interval"]
+
+
+@pytest.mark.parametrize(
+    ("searches", "path"),
+    [
+        ([], (0, 10, 8, 2)),
+        ({"interval 12": []}, (0, 10, 8, 2)),
+        ({"interval 12": {"interval": 3}}, (0, 10, 8, 2)),
+        ({"interval 12": {"interval": {"notes": {}, "error": "x", "cut": 0}}}, (0, 10, 8, 2)),
+        ({}, (1, 3)),
+        ({}, (9, 10, 8, 2)),
+    ],
+)
+def test_a_state_that_was_forged_is_refused(
+    planned: Path, tmp_path: Path, searches: Any, path: tuple[int, ...]
+) -> None:
+    def resumed() -> None:
+        found = Searches(tmp_path, load_artifact(planned).manifest, {}, resume=True)
+        found.dense(8, (10, 8, 2))
+        found.known("interval", 12)
+
+    state = StateFile(tmp_path, {}, "comparison")
+    state.save()
+    resumed()
+    state.progress = {"searches": searches}
+    state.put("dense", {"path": np.zeros(path, np.float32)})
+    state.save()
+    with pytest.raises(CalibrationError, match="does not fit this comparison .* Compare again without --resume"):
+        resumed()
+
+
+def test_a_zipped_artifact_is_compared_and_keeps_nothing(planned: Path, recording: Path, tmp_path: Path) -> None:
+    zipped = Path(shutil.make_archive(str(tmp_path / "compiled"), "zip", planned))
+    found = compare(zipped, [recording], ["interval"], [0.5], calls=1)
+    assert "nothing was kept for --resume: its artifact is no directory." in found.warnings
+    assert [path.name for path in tmp_path.iterdir()] == ["compiled.zip"]
 
 
 def test_it_says_when_a_search_had_too_little_time_or_too_few_calls(planned: Path, recording: Path) -> None:

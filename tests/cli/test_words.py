@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from ttscompile.cli import main
-from ttscompile.runtimes.executor import server
+from ttscompile.runtimes.executor import listener
 
 NO_TEXT = os.fsdecode(b"\xff\xfe.html")
 UNKIND = (
@@ -41,6 +43,7 @@ NEEDED = {
     "compare": ("A", "--trajectories", "calls.npz", "--strategies", "", "--calls", "1"),
     "convert": ("policy.ckpt", "-o", "out"),
     "doctor": ("A",),
+    "fleet": ("A", "--port", "0"),
     "inspect": ("A",),
     "oracle": ("A", "--trajectories", "calls.npz", "--calls", "2"),
     "push": ("A", "org/name", "--dry-run", "--runs", "1"),
@@ -96,14 +99,19 @@ def judged(result: Result, words: list[str]) -> None:
 
 @pytest.fixture
 def stops_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A server ends as soon as it listens."""
-    run = server.ExecutorServer.run
+    """A server ends as soon as it listens, and a fleet has no copies."""
+    run = listener.Listener.run
 
     async def brief(self: Any, host: str, port: int, stop: Any, on_start: Any) -> None:
         stop.set()
         await run(self, host, port, stop, on_start)
 
-    monkeypatch.setattr(server.ExecutorServer, "run", brief)
+    @contextmanager
+    def nobody(*_: Any) -> Iterator[None]:
+        yield
+
+    monkeypatch.setattr(listener.Listener, "run", brief)
+    monkeypatch.setattr(sys.modules["ttscompile.cli.fleet"], "ray_copies", nobody)
 
 
 @pytest.mark.usefixtures("stops_at_once")

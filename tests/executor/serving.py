@@ -8,7 +8,7 @@ import importlib.util
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ import numpy as np
 from ttscompile.errors import ExecutorError
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
 from ttscompile.runtimes.executor.limits import ServerLimits
+from ttscompile.runtimes.executor.listener import Listener
 from ttscompile.runtimes.executor.lock import Lock
 from ttscompile.runtimes.executor.server import ExecutorServer
 
@@ -63,20 +64,33 @@ def serving(
     lock: Lock | None = None,
 ) -> Iterator[str]:
     """A server in this process; its url."""
+    executor = AsyncExecutor(policy(FakeClock()), 20, settings, latencies={"dense": 0.01})
+    try:
+        with listening(lambda: ExecutorServer(executor, limits, lock), lock) as url:
+            yield url
+    finally:
+        try:
+            executor.close()
+        except ExecutorError:
+            assert policy is Broken
+
+
+@contextmanager
+def listening(make: Callable[[], Listener], lock: Lock | None = None) -> Iterator[str]:
+    """Any server in this process, in a thread; its url."""
     ready: list[Any] = []
     started = threading.Event()
 
-    async def run(executor: AsyncExecutor) -> None:
+    async def run() -> None:
         stop = asyncio.Event()
 
         def on_start(_: str, port: int) -> None:
             ready.extend([asyncio.get_running_loop(), stop, port])
             started.set()
 
-        await ExecutorServer(executor, limits, lock).run("127.0.0.1", 0, stop, on_start)
+        await make().run("127.0.0.1", 0, stop, on_start)
 
-    executor = AsyncExecutor(policy(FakeClock()), 20, settings, latencies={"dense": 0.01})
-    thread = threading.Thread(target=lambda: asyncio.run(run(executor)))
+    thread = threading.Thread(target=lambda: asyncio.run(run()))
     thread.start()
     assert started.wait(10)
     loop, stop, port = ready
@@ -86,10 +100,6 @@ def serving(
         loop.call_soon_threadsafe(stop.set)
         thread.join(10)
         assert not thread.is_alive()
-        try:
-            executor.close()
-        except ExecutorError:
-            assert policy is Broken
 
 
 @contextmanager

@@ -76,7 +76,7 @@ def test_a_name_s_addresses_have_one_port_and_absent_ones_are_left_out(
         )
         return await server._listen("localhost", 0)
 
-    monkeypatch.setattr("ttscompile.runtimes.executor.server.Entrance", Socket)
+    monkeypatch.setattr("ttscompile.runtimes.executor.listener.Entrance", Socket)
     with AsyncExecutor(Quick(FakeClock()), 20, latencies={"dense": 0.01}) as executor:
         server = ExecutorServer(executor)
         if left is None:

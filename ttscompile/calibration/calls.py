@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -194,3 +195,13 @@ class Actions:
         if units:
             difference = (difference.reshape(*difference.shape[:-1], -1, len(self._scale)) / self._scale).flatten(-2)
         return np.asarray(difference.mean(-1).nan_to_num(nan=LARGEST).clamp(max=LARGEST).numpy(), dtype=np.float32)
+
+
+def digest_of(episodes: Sequence[Episode]) -> str:
+    """What tells one set of recordings from another."""
+    digest = hashlib.sha256()
+    for episode in episodes:
+        for key, array in sorted(episode.observations.items()):
+            digest.update(f"{key} {array.dtype} {array.shape}".encode())
+            digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()[:16]

@@ -33,10 +33,11 @@ from ..runtimes.policy import CompiledPolicy
 from ..runtimes.random_calls import random_noise
 from ..trajectories.episodes import Episode
 from .budget import cells_of, goal_of, with_plans
-from .calls import LARGEST, Calls, Split, load_episodes, sample_calls, split_episodes
+from .calls import LARGEST, Calls, Split, digest_of, load_episodes, sample_calls, split_episodes
 from .execute import Executor
 from .pool import Pool, Work, artifact_elsewhere, opened_pool, place_of
 from .search import plan_of
+from .searches import Outcome, Searches
 from .strategies import strategy_of
 from .targets import dense_rounds, draw_calls
 from .task import Array, Found, Task
@@ -90,8 +91,9 @@ def compare(
     correct: bool = False,
     progress: Progress = lambda what, done, total: None,
     ray: str | None = None,
+    resume: bool = False,
 ) -> Comparison:
-    """Measure plans against each other. Nothing is written.
+    """Measure plans against each other. Searches that are done are kept in the artifact's directory until the end.
 
     Args:
         path: the artifact whose dense policy is the truth.
@@ -112,10 +114,13 @@ def compare(
         progress: told how far it is.
         ray: address of a Ray cluster that answers the dense calls and does the searches, or ``local``, see
             ``ttscompile.calibrate``; held-out calls are timed in this process. None does everything here.
+        resume: go on after the searches that an interrupted comparison had done, with the same arguments but for
+            strategies, sparsities, other artifacts and held-out calls; begins anew if none was.
 
     Raises:
-        ClusterError: the cluster cannot be reached, or is gone.
-        CalibrationError: an unknown strategy, a sparsity that nothing reaches, or an artifact of another policy.
+        ClusterError: the cluster cannot be reached, or is gone; what was done before can be resumed.
+        CalibrationError: an unknown strategy, a sparsity that nothing reaches, an artifact of another policy, or
+            nothing to resume with these arguments.
         TrajectoryError: the recordings do not fit the policy.
         ArtifactError: an artifact cannot be opened.
     """
@@ -139,24 +144,40 @@ def compare(
     skipped: dict[str, str] = {}
     found: dict[tuple[str, float], Found] = {}
     cut: list[str] = []
-    how = (intervals, 60 * max_minutes, correct)
-    if wished:
+    settings = {
+        "model": artifact.manifest.model_identity[:16],
+        "trajectories": digest_of(episodes),
+        "seed": seed,
+        "learned": learned,
+        "intervals": intervals,
+        "max_minutes": max_minutes,
+        "correct": correct,
+    }
+    searches = Searches(path, artifact.manifest, settings, resume)
+    names = {(strategy, budgets[sparsity]): f"{strategy} {sparsity:g}" for strategy, sparsity in wished}
+    missing = [wish for wish in names if searches.known(*wish) is None]
+    if missing:
+        how = (intervals, 60 * max_minutes, correct)
         with opened_pool(ray) as pool:
-            task = _task(artifact, episodes, split, learned, seed, progress, pool)
+            task = _task(artifact, episodes, split, learned, seed, progress, pool, searches)
             work = Work(
                 partial(_searched, task, how), _searched_elsewhere, (*place_of(artifact), task.calls, seed, how)
             )
-            outcomes = pool.map(work, [(strategy, budgets[sparsity]) for strategy, sparsity in wished])
-            for number, (strategy, sparsity) in enumerate(wished):
-                progress(f"search: {strategy} {sparsity:g}", number, len(wished))
-                for series, one in next(outcomes).items():
-                    if isinstance(one, str):
-                        skipped[f"{series} {sparsity:g}"] = one
-                    else:
-                        found[series, sparsity], short = one
-                        cut += [f"{series} {sparsity:g}"] * short
-            progress("search", len(wished), len(wished))
+            outcomes = pool.map(work, missing)
+            for number, wish in enumerate(missing, len(names) - len(missing)):
+                progress(f"search: {names[wish]}", number, len(names))
+                searches.keep(*wish, next(outcomes))
+            progress("search", len(names), len(names))
+    for strategy, sparsity in wished:
+        for series, one in (searches.known(strategy, budgets[sparsity]) or {}).items():
+            if isinstance(one, str):
+                skipped[f"{series} {sparsity:g}"] = one
+            else:
+                found[series, sparsity], short = one
+                cut += [f"{series} {sparsity:g}"] * short
     warnings = _warnings(artifact, split, compared)
+    if missing and searches.warning:
+        warnings.append(f"nothing was kept for --resume: {searches.warning}.")
     if cut:
         told = f"the limit of {max_minutes:g} minutes cut the search short of {', '.join(cut)}: see --max-minutes."
         warnings.append(told)
@@ -169,11 +190,9 @@ def compare(
     entrants = _enter(artifact, found, compared, threads)
     chosen = sample_calls(episodes, split.validation, calls, seed)
     points, yardsticks = _measure(artifact, entrants, episodes, chosen, seed, threads, progress)
+    searches.end()
     return Comparison(points, len(chosen), split.validation, threads, yardsticks, skipped, tuple(warnings))
 
-
-Outcome = dict[str, tuple[Found, bool] | str]
-"""By series: what was found and whether the time cut that short, or why there is nothing."""
 
 How = tuple[int | None, float, bool]
 """Intervals at most, seconds of a search, and whether its plan takes part with a correction too."""
@@ -210,16 +229,18 @@ def _task(
     seed: int,
     progress: Progress,
     pool: Pool,
+    searches: Searches,
 ) -> Task:
     """What strategies are given, but for the budget: calls with what the dense policy answers to them."""
     executor = Executor(artifact)
     calls = draw_calls(executor, artifact.manifest.spec, episodes, split, limit, 1, seed)["calibration"]
-    progress("dense calls to learn from", 0, calls.count)
-    paths: list[torch.Tensor] = []
-    for found in dense_rounds(executor, calls, pool=pool):
-        paths.append(found)
-        progress("dense calls to learn from", sum(map(len, paths)), calls.count)
-    return _of_schedules(Task.of(artifact, executor, replace(calls, path=torch.cat(paths)), 0, seed))
+    paths = searches.dense(calls.count, (executor.model.steps, *calls.initial.shape[1:]))
+    progress("dense calls to learn from", len(paths), calls.count)
+    for found in dense_rounds(executor, calls, len(paths), pool):
+        paths = torch.cat([paths, found])
+        searches.keep_dense(paths)
+        progress("dense calls to learn from", len(paths), calls.count)
+    return _of_schedules(Task.of(artifact, executor, replace(calls, path=paths), 0, seed))
 
 
 def _of_schedules(task: Task) -> Task:

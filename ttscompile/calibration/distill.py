@@ -27,11 +27,11 @@ from ..ir.pieces import is_block
 from ..lower.precision import quantize_model
 from ..runtimes.torch.devices import device_of, exact_arithmetic
 from ..verification.record_golden import record_plans
-from .calls import Actions, Calls, load_episodes, split_episodes
+from .calls import Actions, Calls, digest_of, load_episodes, split_episodes
 from .execute import Executor
 from .fit_correction import fit_correction
 from .judge import SCHEDULE
-from .pipeline import CALLS_A_FEATURE, EVALUATIONS_A_MINUTE, JUDGED, MOST_CALLS, MOST_NEEDED, digest
+from .pipeline import CALLS_A_FEATURE, EVALUATIONS_A_MINUTE, JUDGED, MOST_CALLS, MOST_NEEDED
 from .progress import Bar
 from .result import PlanScore
 from .state import StateFile
@@ -155,7 +155,7 @@ def distill(
             {
                 **settings,
                 "model": manifest.model_identity[:16],
-                "trajectories": digest(episodes),
+                "trajectories": digest_of(episodes),
                 "distilled": schedule[:, 0].tolist(),
                 "device": "cpu" if there is None else str(there),
             },

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import time
 from collections.abc import Mapping, Sequence
@@ -22,10 +21,9 @@ from ..core.lattice import sparsity
 from ..errors import CalibrationError
 from ..ir.pieces import PRUNER
 from ..runtimes.torch.devices import device_of, exact_arithmetic
-from ..trajectories.episodes import Episode
 from ..verification.record_golden import record_plans
 from .budget import ERROR, LATENCY, Budget, Goal, cells_of, goal_of, measure_budget
-from .calls import Calls, load_episodes, split_episodes
+from .calls import Calls, digest_of, load_episodes, split_episodes
 from .crowded import SAFE, SHARE, CrowdedSchedules, budget_of_error, named_plans
 from .execute import Executor
 from .judge import (
@@ -168,7 +166,7 @@ def calibrate(
             Path(path),
             {
                 "model": artifact.manifest.model_identity[:16],
-                "trajectories": digest(episodes),
+                "trajectories": digest_of(episodes),
                 "budget": goal.record(),
                 "strategy": strategy,
                 "seed": seed,
@@ -332,13 +330,3 @@ def _relax(
             break
         found, budget = task.whole_steps(best.steps, switches=0), replace(budget, cells=more * blocks)
     return found, budget
-
-
-def digest(episodes: Sequence[Episode]) -> str:
-    """Of everything that the episodes hold: 16 digits."""
-    digest = hashlib.sha256()
-    for episode in episodes:
-        for key, array in sorted(episode.observations.items()):
-            digest.update(f"{key} {array.dtype} {array.shape}".encode())
-            digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()[:16]

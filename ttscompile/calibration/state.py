@@ -1,4 +1,4 @@
-"""What a calibration has done so far, in one file in the artifact's directory, so that it can be killed and go on."""
+"""What a calibration, or a comparison, has done so far: one file in the artifact's directory, to go on from."""
 
 from __future__ import annotations
 
@@ -20,8 +20,10 @@ from ..errors import ArtifactError, CalibrationError
 
 Array = npt.NDArray[Any]
 
-FILE = "calibration-state.safetensors"
+CALIBRATION, COMPARISON = "calibration", "comparison"
+FILE = f"{CALIBRATION}-state.safetensors"
 """Never listed in the manifest: an artifact is complete without it, and it is removed when calibration ends."""
+_AGAIN = {CALIBRATION: "Calibrate", COMPARISON: "Compare"}
 
 MAX_TEXT_BYTES = 16 * 2**20
 
@@ -29,31 +31,32 @@ _SETTINGS, _PROGRESS, _CHECKSUM = "json/settings", "json/progress", "sha256"
 
 
 class StateFile:
-    """The state of one calibration.
+    """The state of one calibration, or of one comparison.
 
     Args:
         directory: the directory of the artifact.
         settings: everything that the outcome depends on; JSON. A state with other settings is not continued.
+        work: ``calibration`` or ``comparison``.
 
     Attributes:
         arrays: the saved arrays by name.
         progress: how far the calibration is, as JSON.
     """
 
-    def __init__(self, directory: Path, settings: Mapping[str, Any]) -> None:
-        self._path = directory / FILE
+    def __init__(self, directory: Path, settings: Mapping[str, Any], work: str = CALIBRATION) -> None:
+        self._path, self._work, self._again = directory / f"{work}-state.safetensors", work, _AGAIN[work]
         self._settings = json.dumps(settings, sort_keys=True)
         self.arrays: dict[str, Array] = {}
         self.progress: dict[str, Any] = {}
 
     def load(self) -> bool:
-        """Read what an earlier calibration left.
+        """Read what an earlier run left.
 
         Returns:
             Whether there was anything.
 
         Raises:
-            CalibrationError: it is damaged, or belongs to a calibration with other settings.
+            CalibrationError: it is damaged, or belongs to a run with other settings.
         """
         if not self._path.exists():
             return False
@@ -66,7 +69,7 @@ class StateFile:
             _check_progress(Value(progress, _PROGRESS))
         except (ArtifactError, ValueError) as error:
             raise CalibrationError(
-                f"{self._path}: cannot be read ({error}). Calibrate again without --resume: that begins anew."
+                f"{self._path}: cannot be read ({error}). {self._again} again without --resume: that begins anew."
             ) from error
         asked = json.loads(self._settings)
         if settings != asked:
@@ -74,7 +77,7 @@ class StateFile:
             differing = {key: (settings.get(key), asked.get(key)) for key in keys}
             told = "; ".join(f"{key} was {was}, now {now}" for key, (was, now) in differing.items())
             raise CalibrationError(
-                f"{self._path}: the calibration that was interrupted had other settings: {told}. Give the same ones to"
+                f"{self._path}: the {self._work} that was interrupted had other settings: {told}. Give the same ones to"
                 " resume it, or leave --resume out to begin anew."
             )
         self.arrays, self.progress = arrays, progress
@@ -93,7 +96,9 @@ class StateFile:
         try:
             replace_file(self._path, tensors.serialize(arrays))
         except OSError as error:
-            raise CalibrationError(f"{self._path}: the state of the calibration cannot be written: {error}.") from error
+            raise CalibrationError(
+                f"{self._path}: the state of the {self._work} cannot be written: {error}."
+            ) from error
 
     def remove(self) -> None:
         """Forget everything.
@@ -120,8 +125,8 @@ class StateFile:
             yield
         except (LookupError, TypeError, ValueError, RuntimeError) as error:
             raise CalibrationError(
-                f"{self._path}: does not fit this calibration ({str(error)[:200]}). Calibrate again without --resume:"
-                " that begins anew."
+                f"{self._path}: does not fit this {self._work} ({str(error)[:200]}). {self._again} again without"
+                " --resume: that begins anew."
             ) from error
 
     def put(self, prefix: str, arrays: Mapping[str, Array]) -> None:

@@ -101,6 +101,7 @@ def _sparsities(_: click.Context, __: click.Parameter, value: str | None) -> tup
 @count_option("--intervals", "Of each search, at most; for a quick look.", default=None)
 @seed_option("Of the split, the noise and the searches.")
 @ray_option
+@click.option("--resume", is_flag=True, help="Go on after the searches that an interrupted comparison had done.")
 @click.option("--plot", "picture", type=PICTURE, help="Draw into this file (.png, .svg, .pdf).")
 @json_option
 def compare(
@@ -117,7 +118,8 @@ def compare(
 ) -> None:
     """Hold plans of the artifact DIRECTORY against each other: held-out action error and measured latency.
 
-    Strategies find plans now, from the episodes that are not held out; nothing is written to the artifact. Every plan
+    Strategies find plans now, from the episodes that are not held out. Until the end, what they found is kept in a file
+    beside the artifact's own, for --resume; nothing else is written there. Every plan
     runs on the same calls, in turn, and its actions are held against those of the dense policy with the same noise.
     """
     manifests = {path: manifest_of(path) for path in (directory, *others)}  # of what is measured now

@@ -23,7 +23,7 @@ ENABLES = {
     "hub": "hf:// names, push",
     "pusht": "examples/pusht",
     "examples": "Meta-World and Fetch in examples/evaluation",
-    "ray": "--ray of calibrate and compare, and examples/ray_serve",
+    "ray": "--ray of calibrate and compare, fleet",
 }
 """What each extra of ttscompile is for. Those for its own development are not looked at."""
 

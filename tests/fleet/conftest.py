@@ -1,0 +1,23 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.runtimes.toys import toy_program, written_artifact
+from ttscompile import Source
+from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.write import update_calibration
+from ttscompile.core.lattice import uniform_plan
+
+
+@pytest.fixture(scope="session")
+def planned(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The toy policy with two plans: ``evenly``, and ``memory``, which reads the call before."""
+    artifact = written_artifact(toy_program(pruner=False), tmp_path_factory.mktemp("fleet") / "artifact")
+    evenly = uniform_plan(artifact.manifest.steps, len(artifact.manifest.groups), 2)
+    memory = np.where(evenly == Source.TIMESTEP, Source.ROLLOUT.value, evenly).astype(np.int8)
+    update_calibration(artifact.path, None, {"evenly": evenly, "memory": memory}, "evenly", {})
+    assert (load_artifact(artifact.path).schedules["memory"] == Source.ROLLOUT).any()
+    return artifact.path
