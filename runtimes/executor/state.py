@@ -244,12 +244,15 @@ class ExecutorState:
         window, schedule, start = self._window, self._schedule, self.next_start(now)
         if window.newest is None or (start is not None and start <= now):
             return []
-        runs_out, ahead = schedule.runs_out(now), 1
+        interval, runs_out = window.interval, schedule.runs_out(now)
+        expected = window.newest + interval
         if runs_out is not None:
-            latest = runs_out - self._takes - window.interval - window.delay
-            first = min(schedule.executed - window.interval / 2, latest)
-            ahead = max(ceil((first - window.newest) / window.interval - SAME_TIME), 1)
-        return window.before(window.newest + ahead * window.interval)
+            latest = runs_out - self._takes - interval - window.delay
+            if latest < schedule.executed - interval / 2:  # with the last frame that comes early enough
+                expected = window.newest + interval * max(ceil((latest - window.newest) / interval - SAME_TIME), 1)
+            elif window.newest < schedule.executed - interval / 2:
+                expected = schedule.executed
+        return window.before(expected)
 
     def begin(self, now: float) -> Job:
         """Start the call that ``next_start`` announced."""

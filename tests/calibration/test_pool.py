@@ -7,7 +7,7 @@ import os
 import shutil
 import signal
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -112,6 +112,26 @@ def test_a_cluster_that_goes_leaves_a_state_from_which_this_process_goes_on(
     cluster(Elsewhere(0, 0))
     ttscompile.calibrate(artifact, [recording], **SEARCH, resume=True)
     assert content(artifact) == content(alone)
+
+
+def test_a_comparison_whose_cluster_goes_goes_on_in_this_process(
+    artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four parts of the dense calls, then two of the four searches; the other two are done here."""
+
+    def compared(pool: Elsewhere | Here, **options: Any) -> Any:
+        monkeypatch.setattr("ttscompile.calibration.compare.opened_pool", lambda address: nullcontext(pool))
+        options = {"calls": 4, "learned": 64, "intervals": 3, "ray": "an address", **options}
+        return compare(artifact, [recording], ["tts", "interval"], [0.6, 0.7], **options)
+
+    with pytest.raises(ClusterError, match="is gone"):
+        compared(Elsewhere(3, 6))
+    rest = Elsewhere(1)
+    found, expected = compared(rest, resume=True), compared(Here())
+    assert rest.done == 2
+    here, there = ([(p.series, p.name, p.sparsity, p.error) for p in one.points] for one in (found, expected))
+    assert len(here) == 5
+    assert here == there
 
 
 def test_another_artifact_on_a_machine_of_the_cluster_is_refused(artifact: Path, tmp_path: Path) -> None:

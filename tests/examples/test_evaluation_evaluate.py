@@ -3,9 +3,13 @@
 import io
 import json
 
+import click
+import evaluate
+import jobs
 import numpy as np
 import pytest
 from bootstrap import estimate, paired_difference
+from click.testing import CliRunner
 from evaluate import evaluation_table, summarise, task_table
 from rich.console import Console
 from rollout import Episode, Rollout
@@ -129,3 +133,54 @@ def test_many_tasks_have_a_row_each():
 def test_one_task_has_no_table_of_its_own():
     dense = rollout([0.97, 0.76])
     assert summarise("dense", dense, dense).tasks == {}
+
+
+class Cluster:
+    """Stands for one of Ray's, which opens parts from what is sent."""
+
+    count = 2
+    asked = None
+
+    def __init__(self, address):
+        Cluster.asked = [address]
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        Cluster.asked.append("left")
+
+    def map(self, work, parts):
+        run = work.elsewhere(*work.given)
+        for part in parts:
+            Cluster.asked.append(list(part[1]))
+            yield run(part)
+
+
+def test_a_cluster_runs_the_episodes(monkeypatch, tmp_path, tiny_artifact):
+    def evaluated(make, opened, seeds, batch, finished, caches):
+        raise click.ClickException(f"kept: {[cache.read(seed).seed for cache in caches for seed in seeds]}")
+
+    monkeypatch.setattr(evaluate, "RayPool", Cluster)
+    monkeypatch.setattr(evaluate, "evaluate", evaluated)
+    monkeypatch.setattr(jobs, "_run", lambda _, __, part: [rollout([0.5], seed).episodes[0] for seed in part[1]])
+    words = [
+        str(tiny_artifact),
+        "--episodes",
+        "4",
+        "--first-seed",
+        "7",
+        "--cache",
+        str(tmp_path),
+        "--ray",
+        "10.0.0.1:1",
+    ]
+    assert "kept: [7, 8, 9, 10]" in CliRunner().invoke(evaluate.main, words).output
+    assert Cluster.asked == ["10.0.0.1:1", [7, 8], [9, 10], "left"]
+
+
+@pytest.mark.parametrize("other", [("--jobs", "2"), ("--no-cache",)])
+def test_a_cluster_and_what_it_cannot_have_beside_it_are_refused(tiny_artifact, other):
+    result = CliRunner().invoke(evaluate.main, [str(tiny_artifact), "--ray", "local", *other])
+    assert result.exit_code == 2
+    assert "--ray" in result.output.splitlines()[-1]

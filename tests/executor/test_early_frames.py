@@ -80,9 +80,9 @@ class SeeingPolicy(ScriptedPolicy):
         self.known.add((row, content))
 
 
-def seeing(cost: float = COST, breaks: int | None = None, hz: float = 10.0, **given: Any) -> World:
-    policy = SeeingPolicy(FakeClock(), {"dense": LATENCY}, {}, cost=cost, breaks=breaks)
-    return World(hz, ExecutorSettings(policy_hz=10.0, **given), policy)
+def seeing(cost: float = COST, breaks: int | None = None, hz: float = 10.0, reserve: int = 0) -> World:
+    policy = SeeingPolicy(FakeClock(), {"dense": LATENCY}, cost=cost, breaks=breaks, reserve=reserve)
+    return World(hz, ExecutorSettings(policy_hz=10.0), policy)
 
 
 def test_a_call_waits_for_its_newest_frame_alone() -> None:
@@ -109,6 +109,20 @@ def test_between_the_frames_of_a_window_none_is_prepared() -> None:
         policy: Any = world.policy
     assert set(policy.waited) == {ROWS}
     assert len(policy.early) <= len(policy.calls) + 1
+
+
+@pytest.mark.parametrize("reserve", [0, 7], ids=["before the actions run out", "as many actions after the last"])
+def test_frames_of_a_camera_that_is_faster_than_the_policy_and_not_punctual(reserve: int) -> None:
+    rng = np.random.default_rng(0)
+    with seeing(cost=0.01, hz=50.0, reserve=reserve) as world:
+        world.begin()
+        for _ in range(8 * 5 * TA):
+            world.observe(world.time - rng.uniform(0, 0.008))
+            world.tick(observe=False)
+        policy: Any = world.policy
+    assert len(policy.calls) >= 8
+    assert np.mean(np.array(policy.waited) == ROWS) >= 0.8, "the frames that calls read were others"
+    assert len(policy.early) <= 2 * len(policy.calls)
 
 
 def test_a_policy_without_frame_pieces_is_asked_for_none() -> None:

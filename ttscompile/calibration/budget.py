@@ -180,12 +180,12 @@ def measure_budget(artifact: Artifact, goal: Goal, pruned: bool) -> Budget:
     waited = _pruner_ms(artifact, runtime) if pruned else 0.0
     measured: dict[int, float] = {}
 
-    def call(full: int) -> None:
-        policy.forget_frames()  # a call may have to compute them all
-        policy.predict_action(obs, plan=names[full])
-
     def fits(full: int) -> bool:
-        measured[full] = waited + median_ms(lambda: call(full))
+        def call() -> None:
+            policy.forget_frames()  # a call may have to compute them all
+            policy.predict_action(obs, plan=names[full])
+
+        measured[full] = waited + median_ms(call)
         return measured[full] <= goal.value
 
     here = f"on this machine with {goal.threads} thread{'s' * (goal.threads > 1)}"
