@@ -37,6 +37,7 @@ from ttscompile.runtimes.reference.model import ReferenceModel
 from ttscompile.trajectories.episodes import Episode
 from ttscompile.verification import verify
 from ttscompile.verification.engaged import ENGAGED
+from ttscompile.verification.record_golden import record_plans
 
 from . import policies
 from .killed import killed
@@ -274,7 +275,30 @@ def test_a_change_touches_blocks_alone(compiled: Path) -> None:
     assert len(names) == 3 * policies.LAYERS
     elsewhere = {name for key, graph in artifact.graphs.items() if "block" not in key for name in graph.constants}
     assert not elsewhere & set(names)
-    assert trainable(artifact, policies.WIDTH) == ()  # nothing is so large
+
+
+def test_a_rank_for_which_nothing_is_large_enough_is_refused(scheduled: Path, recording: Path) -> None:
+    before = contents(scheduled)
+    with pytest.raises(CalibrationError, match=r"rank 17: expected matrices .* at least 34.*Give a rank of at most 16"):
+        train(scheduled, recording, rank=17)
+    assert contents(scheduled) == before
+
+
+def test_a_model_of_the_reference_is_there_for_weights_that_are_used(
+    scheduled: Path, distilled: tuple[Path, Distilled], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[Artifact] = []
+    from_artifact = ReferenceModel.from_artifact
+
+    def counted(artifact: Artifact) -> ReferenceModel:
+        opened.append(artifact)
+        return from_artifact(artifact)
+
+    monkeypatch.setattr(ReferenceModel, "from_artifact", counted)
+    assert set(record_plans(load_artifact(scheduled))) == {"schedule", "uniform"}
+    assert len(opened) == 1
+    assert set(record_plans(load_artifact(distilled[0]))) == {"schedule", "uniform", DISTILLED}
+    assert len(opened) == 3
 
 
 def test_training_learns_its_lesson(scheduled: Path) -> None:

@@ -85,6 +85,19 @@ def test_weights_that_lie_elsewhere(written: Path, place: dict[str, str]) -> Non
         load_artifact(written)
 
 
+def test_a_model_by_another_name_is_looked_at_too(written: Path) -> None:
+    external(written, "block_00.onnx", **{**INSIDE, "location": "../weights.safetensors"})
+    (written / "block_00.onnx").rename(written / "block_00.bin")
+
+    def rename(document: dict[str, Any]) -> None:
+        document["pieces"]["block_00"]["file"] = "block_00.bin"
+        document["files"]["block_00.bin"] = document["files"].pop("block_00.onnx")
+
+    forge(written, rename)
+    with pytest.raises(ArtifactError, match=r"block_00\.bin: expected a file NAME\.onnx"):
+        load_artifact(written)
+
+
 def test_weights_inside_are_accepted(written: Path) -> None:
     """The control."""
     external(written, "block_00.onnx", **INSIDE)

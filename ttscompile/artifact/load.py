@@ -315,7 +315,7 @@ def _open(path: Path, folder: Folder, stamps: Mapping[str, Stamp], manifest: Man
             f" {abbreviated(identities(manifest)[0])}. {REMEDY}"
         )
     check_size(manifest, directory)
-    for name in sorted(name for name in manifest.files if name.endswith(".onnx")):
+    for name in sorted(manifest.models):
         check_model(directory / name, manifest.files)
     stored = tensors.read(directory / manifest.stores.weights)
     tables = {n.removeprefix(TABLE_PREFIX): a for n, a in stored.items() if n.startswith(TABLE_PREFIX)}

@@ -328,6 +328,16 @@ class Manifest:
         return FP32 if self.precision is None else self.precision.name
 
     @property
+    def models(self) -> set[str]:
+        """Names of all files that onnxruntime is given as models, whatever they are called."""
+        own = {piece.file for piece in self.pieces.values()}
+        if self.precision is not None:
+            own |= set(self.precision.models.values())
+        if self.distilled is not None:
+            own |= {*self.distilled.models.values(), *self.distilled.precision_models.values()}
+        return own
+
+    @property
     def steps(self) -> int:
         """K."""
         return self.spec.sampler.steps

@@ -35,7 +35,7 @@ from .pipeline import CALLS_A_FEATURE, EVALUATIONS_A_MINUTE, JUDGED, MOST_CALLS,
 from .progress import Bar
 from .result import PlanScore
 from .state import StateFile
-from .student import Student
+from .student import Student, trainable
 from .targets import draw_calls, with_targets
 from .task import Clock
 
@@ -145,6 +145,7 @@ def distill(
         artifact = load_artifact(directory)
         manifest, spec = artifact.manifest, artifact.manifest.spec
         schedule = _schedule(artifact, plan)
+        trainable(artifact, rank)  # before minutes of work
         episodes = load_episodes(spec, trajectories, observation)
         split = split_episodes(len(episodes), validation_fraction, seed)
         fewest = min(CALLS_A_FEATURE * (FEATURES * spec.sample[0] + 1), MOST_NEEDED)

@@ -23,6 +23,7 @@ from torch import Tensor
 from ..artifact.load import Artifact
 from ..core.correction import Correction
 from ..core.lattice import PlanArray, Source
+from ..errors import CalibrationError
 from ..runtimes.reference.sampler import Carried
 from .calls import Actions, Calls, IntArray
 from .execute import Executor, State, last, workers
@@ -48,21 +49,30 @@ SMALLEST = 2
 
 
 def trainable(artifact: Artifact, rank: int) -> tuple[str, ...]:
-    """Constants that can be changed: matrices, or kernels, of residual blocks that no other piece reads."""
+    """Constants that can be changed: matrices, or kernels, of residual blocks that no other piece reads.
+
+    Raises:
+        CalibrationError: there are none for so large a rank.
+    """
     pieces = artifact.pieces
     others = {
         name for key, graph in artifact.graphs.items() if not key.startswith("block_") for name in graph.constants
     }
     mine = {name for piece in pieces.blocks for name in piece.graph.constants} - others
-    return tuple(
-        sorted(
-            name
-            for name in mine
-            if artifact.weights[name].dtype == np.float32
-            and artifact.weights[name].ndim >= 2
-            and min(_sides(artifact.weights[name].shape)) >= SMALLEST * rank
+    sizes = {
+        name: min(_sides(artifact.weights[name].shape))
+        for name in mine
+        if artifact.weights[name].dtype == np.float32 and artifact.weights[name].ndim >= 2
+    }
+    found = tuple(sorted(name for name, size in sizes.items() if size >= SMALLEST * rank))
+    if not found:
+        most = max(sizes.values(), default=0) // SMALLEST
+        remedy = f"Give a rank of at most {most}." if most else "This policy cannot be distilled."
+        raise CalibrationError(
+            f"rank {rank}: expected matrices of residual blocks whose sides are at least {SMALLEST * rank}, and that"
+            f" no other piece reads; found none of {len(sizes)}. {remedy}"
         )
-    )
+    return found
 
 
 def _sides(shape: tuple[int, ...]) -> tuple[int, int]:
@@ -98,6 +108,9 @@ class Student:
     Attributes:
         begin: the first step that is trained: the second that the schedule computes.
         done: number of updates so far.
+
+    Raises:
+        CalibrationError: see ``trainable``.
     """
 
     def __init__(

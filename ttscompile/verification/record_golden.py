@@ -142,11 +142,12 @@ def record_plans(artifact: Artifact) -> dict[str, GoldenPlan]:
         return {}
     golden, found = load_golden(artifact), dict[str, GoldenPlan]()
     obs = golden.network_observations(artifact.manifest.spec)
-    models = {plan: ReferenceModel.from_artifact(artifact.with_weights_of(plan)) for plan in (None, DISTILLED)}
-    with torch.no_grad():
-        for name in artifact.manifest.plans:
-            model = models[DISTILLED if name == DISTILLED else None]
-            found[name] = _episode(artifact, model, name, golden, obs)
+    for own in (False, True):
+        names = [name for name in artifact.manifest.plans if (name == DISTILLED) is own]
+        if names:  # one model at a time: each holds all weights
+            model = ReferenceModel.from_artifact(artifact.with_weights_of(names[0]))
+            with torch.no_grad():
+                found |= {name: _episode(artifact, model, name, golden, obs) for name in names}
     return found
 
 
