@@ -66,7 +66,7 @@ def frame_pieces(pieces: Iterable[str]) -> tuple[str, ...]:
 
 
 _BLOCK = "block_"
-_SMALL = frozenset({PRUNER, STEM, TAIL, ADVANCE, IDLE, LAYERS})
+_SMALL = frozenset({PRUNER, STEM, TAIL, ADVANCE, IDLE, LAYERS, FRAMES})
 
 
 def block_name(index: int) -> str:
