@@ -12,10 +12,12 @@ import pytest
 import ttscompile
 from tests.families import cameras
 from tests.once import Once
+from ttscompile.artifact.load import load_artifact
 from ttscompile.errors import ArtifactError, ObservationError
 from ttscompile.runtimes.frames import WINDOWS, FrameMemory, contents_of
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.verification import verify
+from ttscompile.verification.engaged import ENGAGED
 
 Array = npt.NDArray[Any]
 Obs = dict[str, Array]
@@ -232,3 +234,21 @@ def test_every_rung_of_verify_holds(compiled: Path) -> None:
     found = verify(compiled / "artifact")
     assert {rung.name: rung.status for rung in found.rungs if rung.status not in ("passed", "skipped")} == {}
     assert sum(rung.status == "passed" for rung in found.rungs) >= 6
+
+
+def test_towers_in_eight_bits(compiled: Path, tmp_path: Path) -> None:
+    """A tower has a precision of its own; a remembered frame has the bits that it would have again."""
+    ttscompile.compile_denoiser(*cameras.policy("shared", told=True), tmp_path / "int8", precision="int8")
+    policy, exact = ttscompile.load(tmp_path / "int8"), ttscompile.load(tmp_path / "int8", precision="fp32")
+    record = load_artifact(tmp_path / "int8").manifest.precision
+    assert record is not None
+    assert set(record.kept) == {"blocks", "frame_00"}  # the convolutions of these cameras are too small
+    first, second = frame(1), frame(2)
+    act(policy, window(first, first))
+    remembered = act(policy, window(first, second))
+    assert done(policy)[1] > 0
+    policy.reset()
+    np.testing.assert_array_equal(act(policy, window(first, second)), remembered)
+    wanted = act(exact, window(first, second))
+    assert 0 < np.abs(remembered - wanted).max() < 0.1 * np.abs(wanted).max()
+    assert {rung.status for rung in verify(tmp_path / "int8").rungs if rung.name != ENGAGED} <= {"passed", "skipped"}
