@@ -42,6 +42,7 @@ NEEDED = {
     "calibrate": ("A", "--trajectories", "calls.npz", "--max-minutes", "0.001"),
     "compare": ("A", "--trajectories", "calls.npz", "--strategies", "", "--calls", "1"),
     "convert": ("policy.ckpt", "-o", "out"),
+    "distill": ("A", "--trajectories", "calls.npz", "--updates", "1", "--max-minutes", "0.001"),
     "doctor": ("A",),
     "fleet": ("A", "--port", "0"),
     "inspect": ("A",),
