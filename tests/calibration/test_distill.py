@@ -29,6 +29,8 @@ from ttscompile.calibration.state import StateFile
 from ttscompile.calibration.student import Student, trainable
 from ttscompile.calibration.task import Clock
 from ttscompile.errors import ArtifactError, CalibrationError, CalibrationFailedError
+from ttscompile.report import facts
+from ttscompile.report.card import card
 from ttscompile.runtimes.open import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.runtimes.reference.model import ReferenceModel
@@ -102,6 +104,23 @@ def test_the_artifact_gets_a_plan_that_is_nearer_to_the_dense_policy(distilled: 
     assert record["plans"][DISTILLED]["error"] == result.after.error
 
 
+def test_people_are_told_that_it_is_another_network(distilled: tuple[Path, Distilled]) -> None:
+    artifact, result = load_artifact(distilled[0]), distilled[1]
+    record = artifact.manifest.calibration
+    assert record is not None and record["default_plan"] == DISTILLED
+    (remark,) = [one for one in facts.remarks(record) if "'distilled'" in one]
+    assert "the schedule of plan 'schedule' and weights of its own: 9 matrices" in remark
+    assert f"from {result.before.error:.4g} to {result.after.error:.4g}" in remark
+    steps = card(artifact, "org/name", [], [], None)
+    assert f"`ttscompile distill DIR --trajectories CALLS --plan schedule --rank 4 --updates {UPDATES}`" in steps
+    assert (
+        "distill"
+        not in card(
+            replace(artifact, manifest=replace(artifact.manifest, distilled=None)), "o/n", [], [], None
+        ).partition("How it was made")[2]
+    )
+
+
 def test_all_other_plans_are_what_they_were(scheduled: Path, distilled: tuple[Path, Distilled]) -> None:
     before, after = ttscompile.load(scheduled), ttscompile.load(distilled[0])
     assert after.info.default_plan == DISTILLED
@@ -161,7 +180,9 @@ def test_verify_knows_both_sets_of_weights(distilled: tuple[Path, Distilled], re
     exchange_weights(other)
     found = verify(other)
     (failed,) = [rung for rung in found.rungs if rung.status == "failed"]
-    assert failed.name == "plans" and "'distilled'" in failed.told
+    assert failed.name == "plans" and failed.step is None
+    assert "'distilled' is what calibration stored, but its samples differ" in failed.told
+    assert "it has a correction and weights of its own: the likely culprit" in failed.told
 
 
 def exchange_weights(directory: Path) -> None:
