@@ -21,7 +21,7 @@ from onnx import AttributeProto, ModelProto, NodeProto, TensorProto, helper, num
 from ..core.spec import AUTO, FP32, INT8, PRECISIONS
 from ..errors import LoweringError
 from ..ir.flops import graph_flops
-from ..ir.pieces import BLOCKS, OF_ALL_BLOCKS, STEP, part_of
+from ..ir.pieces import BLOCKS, OF_ALL_BLOCKS, STEP, frame_name, part_of
 from .integer_convolution import DOMAIN, INTEGER_PRODUCT, convolution_of, integer_convolution, shapes_of
 from .onnx_model import live_nodes
 
@@ -84,11 +84,11 @@ def parts_to_lower(
     Raises:
         LoweringError: ``keep_fp32`` has a name that is no part of the policy, or leaves nothing.
     """
-    flops: dict[str, int] = {}
+    flops, times = dict[str, int](), {STEP: program.spec.sampler.steps}
+    times |= {frame_name(i): rows for i, rows in enumerate(program.pieces.rows)}
     for piece, graph in program.pieces.graphs().items():
         if (part := part_of(piece)) is not None:
-            times = program.spec.sampler.steps if piece == STEP else 1
-            flops[part] = flops.get(part, 0) + graph_flops(graph) * times
+            flops[part] = flops.get(part, 0) + graph_flops(graph) * times.get(piece, 1)
     if unknown := sorted(set(keep_fp32) - {*flops, PROLOGUE}):
         known = ", ".join(map(repr, (*flops, PROLOGUE)))
         raise LoweringError(f"what stays fp32: {unknown[0]!r} is no part of this policy; expected one of {known}.")
