@@ -317,6 +317,19 @@ def test_training_learns_its_lesson(scheduled: Path) -> None:
     assert losses[-1] < 0.5 * losses[0]
 
 
+def test_what_is_judged_is_what_is_written(scheduled: Path) -> None:
+    """The whole loop of the student, step 0 with the original's weights: before training and after it."""
+    artifact = load_artifact(scheduled)
+    one, lesson = _student(artifact)
+    plan, calls = artifact.schedule("schedule"), lesson.calls
+    for updates in (0, 40):
+        for _ in range(updates):
+            one.update(lesson, 0.0)
+        written = Executor(artifact.with_weights(one.weights())).run(plan, calls)
+        torch.testing.assert_close(one.executor.run(plan, calls), written, rtol=0, atol=1e-5)
+    assert not torch.allclose(written, Executor(artifact).run(plan, calls), atol=1e-2)
+
+
 def test_an_update_follows_the_gradient_of_the_loss(scheduled: Path) -> None:
     """Gradients of the factors are those of the changes that they make, by finite differences of the loss."""
     artifact = load_artifact(scheduled)
