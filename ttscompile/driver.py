@@ -157,7 +157,7 @@ def compile_denoiser(
             precision="fp32")``. ``auto`` takes int8 and leaves out the parts that change the actions by more than a
             tenth of what other noise does.
         keep_fp32: parts that stay in fp32 whatever the precision: ``blocks``; ``prologue``, or a piece of it by name,
-            ``condition`` or ``step``.
+            ``frame_00``, ``condition`` or ``step``.
         single_file: see ``convert``.
         explain: told what each stage did.
 

@@ -80,6 +80,16 @@ class FrameSpec:
             for key in self.specs
         }
 
+    def alone(self, frame: Frame) -> dict[str, Array]:
+        """One frame as ``prepare_frame`` takes it, ``[1, ...]`` a key; of a key with another window its newest."""
+        return {key: value[None] if self.specs[key].frames is None else value[-1:] for key, value in frame.items()}
+
+    @property
+    def seen_before(self) -> bool:
+        """Whether a call reads pictures that are not of its newest frame, if it reads any."""
+        pictures = {key for key, spec in self.specs.items() if len(spec.shape) - (spec.frames is not None) >= 3}
+        return not pictures or not self.history.isdisjoint(pictures)
+
 
 class Window(NamedTuple):
     """A complete window: when its newest frame was taken, in seconds; and its To frames, oldest first."""

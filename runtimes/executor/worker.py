@@ -49,7 +49,7 @@ class Worker:
         self._policy, self._settings, self._resolved = policy, settings, resolved
         self._clock, self._trace = clock, trace
         # Of what acts like a policy, only what has frame pieces is asked to prepare frames.
-        self._prepares = bool(getattr(policy.info, "frames", 0))
+        self._prepares = bool(getattr(policy.info, "frames", 0)) and resolved.frames.seen_before
         self.lock = threading.Lock()
         self._work, self.news = threading.Condition(self.lock), threading.Condition(self.lock)
         self.process = Process()
@@ -214,7 +214,7 @@ class Worker:
                 return self._ending or self._reset_due or not self._opened.awaits(frame, now)
 
         start = self._clock.now()
-        work = self._policy.prepare_frame({key: value[None] for key, value in frame.items()}, useless)
+        work = self._policy.prepare_frame(self._resolved.frames.alone(frame), useless)
         if self._trace.on:
             self._trace.frame(start, self._clock.now(), work)
 

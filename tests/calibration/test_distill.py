@@ -31,6 +31,8 @@ from ttscompile.calibration.student import Student, trainable
 from ttscompile.calibration.task import Clock
 from ttscompile.cli import main
 from ttscompile.errors import ArtifactError, CalibrationError, CalibrationFailedError
+from ttscompile.report import facts
+from ttscompile.report.card import card
 from ttscompile.runtimes.open import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.runtimes.reference.model import ReferenceModel
@@ -108,10 +110,27 @@ def test_the_command_says_what_it_did(copied: Path, recording: Path) -> None:
     options = ["--rank", "4", "--updates", str(UPDATES), "--max-minutes", "5"]
     done = CliRunner().invoke(main, ["distill", str(copied), "--trajectories", str(recording), *options])
     assert done.exit_code == 0, done.stderr
-    assert f"changed by rank 4 in {UPDATES} updates" in " ".join(done.stdout.split())
+    assert "weights of its own: 9 matrices of blocks were trained" in " ".join(done.stdout.split())
     again = CliRunner().invoke(main, ["distill", str(copied), "--trajectories", str(recording), "--plan", "other"])
     assert again.exit_code == 2
     assert "expected a schedule that can be distilled; found 'other'" in again.stderr
+
+
+def test_people_are_told_that_it_is_another_network(distilled: tuple[Path, Distilled]) -> None:
+    artifact, result = load_artifact(distilled[0]), distilled[1]
+    record = artifact.manifest.calibration
+    assert record is not None and record["default_plan"] == DISTILLED
+    (remark,) = [one for one in facts.remarks(record) if "'distilled'" in one]
+    assert "the schedule of plan 'schedule' and weights of its own: 9 matrices" in remark
+    assert f"from {result.before.error:.4g} to {result.after.error:.4g}" in remark
+    steps = card(artifact, "org/name", [], [], None)
+    assert f"`ttscompile distill DIR --trajectories CALLS --plan schedule --rank 4 --updates {UPDATES}`" in steps
+    assert (
+        "distill"
+        not in card(
+            replace(artifact, manifest=replace(artifact.manifest, distilled=None)), "o/n", [], [], None
+        ).partition("How it was made")[2]
+    )
 
 
 def test_all_other_plans_are_what_they_were(scheduled: Path, distilled: tuple[Path, Distilled]) -> None:
@@ -173,7 +192,9 @@ def test_verify_knows_both_sets_of_weights(distilled: tuple[Path, Distilled], re
     exchange_weights(other)
     found = verify(other)
     (failed,) = [rung for rung in found.rungs if rung.status == "failed"]
-    assert failed.name == "plans" and "'distilled'" in failed.told
+    assert failed.name == "plans" and failed.step is None
+    assert "'distilled' is what calibration stored, but its samples differ" in failed.told
+    assert "it has a correction and weights of its own: the likely culprit" in failed.told
 
 
 def exchange_weights(directory: Path) -> None:
@@ -306,6 +327,19 @@ def test_training_learns_its_lesson(scheduled: Path) -> None:
     one, lesson = _student(load_artifact(scheduled))
     losses = [one.update(lesson, 0.0) for _ in range(80)]
     assert losses[-1] < 0.5 * losses[0]
+
+
+def test_what_is_judged_is_what_is_written(scheduled: Path) -> None:
+    """The whole loop of the student, step 0 with the original's weights: before training and after it."""
+    artifact = load_artifact(scheduled)
+    one, lesson = _student(artifact)
+    plan, calls = artifact.schedule("schedule"), lesson.calls
+    for updates in (0, 40):
+        for _ in range(updates):
+            one.update(lesson, 0.0)
+        written = Executor(artifact.with_weights(one.weights())).run(plan, calls)
+        torch.testing.assert_close(one.executor.run(plan, calls), written, rtol=0, atol=1e-5)
+    assert not torch.allclose(written, Executor(artifact).run(plan, calls), atol=1e-2)
 
 
 def test_an_update_follows_the_gradient_of_the_loss(scheduled: Path) -> None:

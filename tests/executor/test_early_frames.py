@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -11,11 +11,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ttscompile import ObservationSpec
 from ttscompile.errors import ExecutorError, WorkerDeadError
 from ttscompile.runtimes.executor import ExecutorSettings
 from ttscompile.runtimes.frames import FrameWork
+from ttscompile.runtimes.queues import Queues
 
-from .simulation import TA, Facts, FakeClock, ScriptedPolicy, World
+from .simulation import TA, TO, Facts, FakeClock, ScriptedPolicy, World
 
 LATENCY, COST, ROWS = 0.1, 0.06, 2
 
@@ -131,6 +133,44 @@ def test_a_policy_without_frame_pieces_is_asked_for_none() -> None:
         for _ in range(3 * TA):
             world.tick()
         assert world.executor.statistics().frames_early == 0
+
+
+@pytest.mark.parametrize(
+    ("wrist", "head", "asked"),
+    [
+        (ObservationSpec((1, 3, 2, 2), dtype="float64"), ObservationSpec((TO, 3, 2, 2), dtype="float64"), True),
+        (ObservationSpec((1, 3, 2, 2), dtype="float64"), None, False),
+        (ObservationSpec((3, 2, 2), dtype="float64", window=False), None, False),
+    ],
+)
+def test_cameras_of_another_window_than_the_policys(
+    wrist: ObservationSpec, head: ObservationSpec | None, asked: bool
+) -> None:
+    """The newest picture of each is prepared, as ``select_action`` takes it; none if no call reads older ones."""
+    policy = SeeingPolicy(FakeClock(), {"dense": LATENCY}, {})
+    own = {**policy.info.observation, "wrist": wrist, **({} if head is None else {"head": head})}
+    policy.info = replace(policy.info, observation=own)
+    given: list[dict[str, tuple[int, ...]]] = []
+    prepare = policy.prepare_frame
+
+    def prepare_frame(frame: Mapping[str, Any], stop: Callable[[], bool]) -> FrameWork:
+        given.append({key: Queues(own).after(frame)[key][0].shape for key in own})  # or it would raise
+        return prepare(frame, stop)
+
+    policy.prepare_frame = prepare_frame  # type: ignore[method-assign]
+
+    class Seen(World):
+        def frame(self, at: float | None = None) -> dict[str, np.ndarray]:
+            pictures = {"wrist": np.zeros(wrist.shape), "head": np.zeros((3, 2, 2))}
+            return {key: value for key, value in {**super().frame(at), **pictures}.items() if key in own}
+
+    with Seen(10.0, ExecutorSettings(policy_hz=10.0), policy) as world:
+        world.begin()
+        for _ in range(3 * TA):
+            world.tick()
+        assert len(policy.calls) >= 2
+    assert bool(given) is asked
+    assert all(one["wrist"] == one["head"] == (1, 3, 2, 2) for one in given)
 
 
 def test_a_call_that_is_due_is_not_kept_waiting_by_what_is_left() -> None:

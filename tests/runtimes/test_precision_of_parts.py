@@ -11,15 +11,19 @@ import onnx
 import pytest
 
 import ttscompile
+from tests.families import cameras
 from tests.lower.whole_call import Episode, inputs
 from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import Manifest
 from ttscompile.calibration.judge import precision_record
 from ttscompile.calibration.task import Found
+from ttscompile.driver import transform
 from ttscompile.errors import LoweringError
+from ttscompile.ir.flops import graph_flops
 from ttscompile.ir.pieces import part_of
 from ttscompile.ir.program import Program
+from ttscompile.lower import precision
 from ttscompile.lower.precision import parts_to_lower
 from ttscompile.report.facts import left_out, score_table
 from ttscompile.runtimes import open_runtime
@@ -187,6 +191,16 @@ def test_a_prologue_that_is_small_beside_a_step_stays_as_it_is(program: Program)
     found, left, notes = parts_to_lower(replace(program, pieces=replace(program.pieces, condition=small)))
     assert (found, left) == (("step", "blocks"), ())
     assert notes == ("condition stays fp32: 0.0% of the arithmetic of a step",)
+
+
+def test_a_frame_piece_counts_with_all_of_its_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    pieces = (seen := transform(*cameras.policy("stacked"))).pieces
+    assert pieces.rows == (4,)
+    row, blocks = graph_flops(pieces.towers[0]), sum(graph_flops(piece.graph) for piece in pieces.blocks)
+    monkeypatch.setattr(precision, "LEAST_SHARE", 3 * row / blocks)
+    assert parts_to_lower(seen)[0] == ("frame_00", "blocks")
+    monkeypatch.setattr(precision, "LEAST_SHARE", 5 * row / blocks)
+    assert parts_to_lower(seen)[0] == ("blocks",)
 
 
 @pytest.mark.parametrize(

@@ -54,6 +54,7 @@ class Artifact:
         distilled: constants that the plan ``distilled`` has in place of those of ``weights``, read-only views of the
             file; empty if there is no such plan.
         first_step: the artifact whose blocks compute step 0, where those are not its own (``with_weights_of``).
+        later: names of the constants that blocks have after step 0 only.
     """
 
     path: Path
@@ -68,6 +69,7 @@ class Artifact:
     _stamps: Mapping[str, Stamp] = field(repr=False)
     _unpacked: Unpacked | None = field(default=None, repr=False)
     first_step: Artifact | None = field(default=None, repr=False)
+    later: tuple[str, ...] = ()
 
     @property
     def files(self) -> Path:
@@ -150,8 +152,7 @@ class Artifact:
     @property
     def first_weights(self) -> Mapping[str, npt.NDArray[Any]]:
         """Constants that blocks have at step 0, where those are others."""
-        first = {} if self.first_step is None else self.first_step.weights
-        return {name: value for name, value in first.items() if value is not self.weights[name]}
+        return {} if self.first_step is None else {name: self.first_step.weights[name] for name in self.later}
 
     def with_weights(self, constants: Mapping[str, npt.NDArray[Any]]) -> Artifact:
         """The artifact with other constants after step 0, for the reference runtime, which reads no models.
@@ -159,7 +160,7 @@ class Artifact:
         Args:
             constants: of residual blocks, by name.
         """
-        return replace(self, weights={**self.weights, **constants}, first_step=self)
+        return replace(self, weights={**self.weights, **constants}, first_step=self, later=tuple(constants))
 
     def schedule(self, name: str) -> PlanArray:
         """A schedule by name, ``dense`` among them, int8 ``[K, blocks]``.

@@ -281,7 +281,12 @@ def _write(
         artifact.pruner if pruned else None,
         {**artifact.schedules, DISTILLED: schedule},
         DISTILLED,
-        {**record, "plans": {**record.get("plans", {}), **told}, "distilled": result.record()},
+        {
+            **record,
+            "plans": {**record.get("plans", {}), **told},
+            "default_plan": DISTILLED,
+            "distilled": result.record(),
+        },
         corrections={**artifact.corrections, DISTILLED: correction},
         distilled=distilled,
         model_identity=artifact.manifest.model_identity,

@@ -87,7 +87,8 @@ from ttscompile.report.summary import document
     "--keep-fp32",
     type=ANY_TEXT,
     multiple=True,
-    help="A part that stays fp32 beside int8: blocks; prologue, or a piece of it (condition, step). May be repeated.",
+    help="A part that stays fp32 beside int8: blocks; prologue, or a piece of it (frame_00, condition, step). May be"
+    " repeated.",
 )
 @click.option(
     "--single-file",

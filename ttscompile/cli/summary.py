@@ -52,7 +52,7 @@ def print_summary(artifact: Artifact, console: Console) -> None:
         console.print("Not calibrated: every call is dense. Run 'ttscompile calibrate' to give it a plan.")
         return
     _print_facts(console, facts.score_table(record))
-    for line in (*facts.other_noise(record), *facts.trained(record), *facts.left_out(record)):
+    for line in facts.remarks(record):
         console.print(Padding(line, (0, 0, 0, 2)))  # as a row it would squeeze the figures
     _print_facts(console, facts.record_table(record, most=90))
 

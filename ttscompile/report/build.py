@@ -212,7 +212,7 @@ def _calibration(record: Mapping[str, Any] | None) -> Section:
     text = "Errors on episodes that nothing was learned from, against the dense policy with the same noise."
     return Section(
         "Calibration",
-        (*((text,) if scores else ()), *facts.other_noise(record), *facts.trained(record), *facts.left_out(record)),
+        (*((text,) if scores else ()), *facts.remarks(record)),
         tables,
         drawn,
     )

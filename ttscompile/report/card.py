@@ -172,7 +172,7 @@ def _errors(manifest: Manifest) -> Section:
         f"Of the actions, in their units, on recorded episodes that nothing was learned from{told}, against the dense"
         " policy with the same noise: the mean over calls, and the 90th percentile."
     )
-    return Section("Error", (text, *facts.other_noise(record), *facts.trained(record)), (facts.score_table(record),))
+    return Section("Error", (text, *facts.remarks(record)), (facts.score_table(record),))
 
 
 def _success(found: Sequence[Success]) -> Section:
@@ -225,6 +225,10 @@ def _made(manifest: Manifest, base: HubName | None) -> Section:
         asked = {k: budget[k] for k in goals if isinstance(budget, Mapping) and isinstance(budget.get(k), int | float)}
         words = " ".join(f"--{k.replace('_', '-')} {_word(v)}" for k, v in (asked | told).items())
         lines.append(f"ttscompile calibrate DIR --trajectories CALLS {words}")
+    if manifest.distilled is not None:
+        trained = facts.distillation(record)
+        words = " ".join(f"--{key} {_word(trained[key])}" for key in ("plan", "rank", "updates") if key in trained)
+        lines.append(f"ttscompile distill DIR --trajectories CALLS {words}".rstrip())
     lines.append("ttscompile verify DIR")
     text = (
         f"With ttscompile {manifest.ttscompile_version}, by commands like these, from what the artifact records;"

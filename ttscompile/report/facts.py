@@ -170,7 +170,7 @@ def score_table(record: Mapping[str, Any]) -> Table:
 
     of_precision = _mapping(record.get("precision"))
     parts, against = _mapping(of_precision.get("parts")), f"{of_precision.get('name')} against fp32"
-    alone = {f"dense, {part} alone": error for part, error in parts.items() if len(parts) > 1}
+    alone = {f"dense, {n} alone": e for n, e in parts.items() if len(parts) > 1 and isinstance(e, int | float)}
     rows = [
         *(row(marked(name), s, share(s["sparsity"]), share(s["flops_saved"])) for name, s in scores(record).items()),
         *(row(f"{name}: {against}", s) for name, s in scores(of_precision, _ERRORS).items()),
@@ -179,6 +179,30 @@ def score_table(record: Mapping[str, Any]) -> Table:
     beside = ("/ other noise",) if told else ()
     head = ("held-out episodes", "mean action error", *beside, "90th percentile", "cells reused", "FLOPs saved")
     return Table(head, tuple(rows))
+
+
+def remarks(record: Mapping[str, Any]) -> tuple[str, ...]:
+    """What the figures of a calibration mean, in words."""
+    return (*other_noise(record), *own_weights(record), *left_out(record))
+
+
+def own_weights(record: Mapping[str, Any]) -> tuple[str, ...]:
+    """That a plan is another network, and what that gained."""
+    told = distillation(record)
+    if not told:
+        return ()
+    before, after = (_mapping(told.get(key)).get("error") for key in ("before", "after"))
+    trained = (
+        f"Plan {DISTILLED!r} has the schedule of plan {plain(told.get('plan'))!r} and weights of its own:"
+        f" {plain(told.get('matrices'))} matrices of blocks were trained, which took its error from {plain(before)} to"
+        f" {plain(after)}. So its errors say less about it than those of other plans: evaluate it on your task."
+    )
+    return (trained,)
+
+
+def distillation(record: Mapping[str, Any] | None) -> Mapping[str, Any]:
+    """What a distillation noted down; empty if there was none."""
+    return _mapping((record or {}).get(DISTILLED))
 
 
 def other_noise(record: Mapping[str, Any]) -> tuple[str, ...]:
@@ -209,21 +233,6 @@ def left_out(record: Mapping[str, Any]) -> tuple[str, ...]:
         for part, times in much.items()
     )
     return (*plans, *parts)
-
-
-def trained(record: Mapping[str, Any]) -> tuple[str, ...]:
-    """What the weights of the plan ``distilled`` are."""
-    own = _mapping(record.get(DISTILLED))
-    before = scores({"plans": {"before": own.get("before")}}).get("before")
-    counts = [own.get(name) for name in ("matrices", "rank", "updates")]
-    if before is None or not all(isinstance(count, int) for count in counts):
-        return ()
-    matrices, rank, updates = counts
-    told = (
-        f"Plan {DISTILLED!r} has weights of its own after step 0: {matrices} matrices, changed by rank {rank} in"
-        f" {updates} updates. With the original's weights its schedule is {before['error']:.4g} off."
-    )
-    return (told,)
 
 
 def record_table(record: Mapping[str, Any], most: int = 200) -> Table:

@@ -147,8 +147,12 @@ def check_plans(
         worst = max(worst, error)
         if not error <= SAMPLE:
             correction = artifact.corrections.get(name)
-            step, cause = _where(artifact, golden, probe, record.plan[0], correction, record.path[0])
-            more = "; it has a correction, which is the likely culprit where dense calls hold" if correction else ""
+            own = ["a correction"] * (correction is not None)
+            if artifact.with_weights_of(name) is artifact:
+                step, cause = _where(artifact, golden, probe, record.plan[0], correction, record.path[0])
+            else:  # the probe has the original's
+                step, cause, own = None, "its samples differ", [*own, "weights of its own"]
+            more = f"; it has {' and '.join(own)}: the likely culprit where dense calls hold" if own else ""
             failures.append((f"plan {name!r} is what calibration stored, but {cause}{more}", step, ()))
     if failures:
         told = "; ".join(told for told, _, _ in failures)
