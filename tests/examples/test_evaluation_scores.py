@@ -44,6 +44,18 @@ def test_calls_are_timed_in_turn_with_equal_noise():
     assert len({call[2] for call in calls}) == 5
 
 
+def test_no_call_is_spared_the_frames_of_the_one_before():
+    log = []
+
+    class Seeing(Sleeper):
+        def forget_frames(self):
+            self.log.append((self.name, "forgets"))
+
+    shape = NoiseShape(3, (4, 2), True)
+    time_calls([Variant("a", Seeing(log, "a"), None, shape)], {"obs": np.zeros((7, 2, 20), np.float32)}, calls=2)
+    assert [one[1] for one in log] == ["reset", *["forgets", "default"] * 4]
+
+
 def test_the_picture_is_the_same_file_twice(tmp_path):
     scores = [Estimate(0.9, 0.85, 0.95), Estimate(0.8, 0.7, 0.88)]
     for name in ("one.png", "two.png"):

@@ -129,7 +129,7 @@ def contestants(
     chosen = plan or manifest.default_plan
 
     def compiled(label: str, plan: str, how: Compiled) -> Contestant:
-        policy = open_policy(artifact, how.runtime, threads, precision=how.precision, device=how.device)
+        policy = open_policy(artifact, how.runtime, threads, precision=how.precision, plan=plan, device=how.device)
         policy.reset()
         found = policy.info.precision
         return plan_contestant(label + f", {found}" * (found != FP32), policy, plan, manifest.spec)
