@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ttscompile.artifact.load import Artifact
-from ttscompile.artifact.manifest import DENSE
+from ttscompile.artifact.manifest import DENSE, DISTILLED
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import BoolArray, PlanArray, Source, check_plan, require_legal
 from ttscompile.core.spec import FloatArray, Noise
@@ -223,9 +223,9 @@ class Runtime:
 
     def _opened_for(self, plan: str | None) -> _Opened:
         """What computes the plan of this name, with its weights."""
-        artifact = self._artifact.with_weights_of(plan)
-        own = artifact is not self._artifact
+        own = plan == DISTILLED and self._manifest.distilled is not None
         if own not in self._opened:
+            artifact = self._artifact.with_weights_of(plan)
             self._opened[own] = _Opened(artifact, self._open_backend(artifact))
         return self._opened[own]
 

@@ -263,6 +263,9 @@ def test_in_eight_bits(once: Once, recording: Path, tmp_path: Path) -> None:
     wanted, found = actions(exact, DISTILLED), actions(own, DISTILLED)
     between = np.abs(wanted - actions(exact, "schedule")).max()
     assert 0 < np.abs(found - wanted).max() < 0.5 * between
+    view = load_artifact(directory).with_weights_of(DISTILLED)
+    for plain in (view.at_precision("fp32"), view.with_parts([])):
+        assert plain.first_step is not None and plain.first_step.manifest.precision is None
 
 
 @pytest.mark.parametrize(

@@ -121,14 +121,16 @@ class Artifact:
             )
         if name == own:
             return self
-        return replace(self, manifest=replace(self.manifest, precision=None))
+        first = None if self.first_step is None else self.first_step.at_precision(name)
+        return replace(self, manifest=replace(self.manifest, precision=None), first_step=first)
 
     def with_parts(self, parts: Collection[str]) -> Artifact:
         """The same artifact with only these parts (``ir.pieces.part_of``) in its precision."""
         record = self.manifest.precision
         models = {} if record is None else {n: file for n, file in record.models.items() if part_of(n) in parts}
         own = replace(record, models=models) if record is not None and models else None
-        return replace(self, manifest=replace(self.manifest, precision=own))
+        first = None if self.first_step is None else self.first_step.with_parts(parts)
+        return replace(self, manifest=replace(self.manifest, precision=own), first_step=first)
 
     def with_weights_of(self, plan: str | None) -> Artifact:
         """The artifact whose blocks are those that a plan computes after step 0: itself, but for ``distilled``.
