@@ -42,7 +42,7 @@ def timed(
     """Medians of the right size; ``floor`` is what the plan's cells take at the speed of the blocks."""
 
     def one(label: str, ms: float, flops: float = 1.0) -> Measurement:
-        return Measurement(label, "", (ms,), 0.5, 0.0, flops)
+        return Measurement(label, "", (ms,), 0.5, 0.0, flops=flops)
 
     cells = 4.0 * sum(of.artifact.manifest.flops.blocks)
     alone = one(FLOOR, floor, cells)
