@@ -178,6 +178,7 @@ def compare(
         times.setdefault(f"eager: {parts}", []).append(split)
         for precision, policy in policies.items():
             for name, plan in plans.items():
+                policy.forget_frames()  # every call sees the same observation
                 start = time.process_time()
                 found = policy.predict_action(obs, noise=noise, plan=plan)["action"]
                 took, timings = time.process_time() - start, policy.last_report.timings
