@@ -32,7 +32,7 @@ from bootstrap import Estimate, paired_difference
 from environments.pusht import PushT
 from episodes import Episodes
 from evaluate import Evaluation, evaluate, evaluation_table
-from jobs import fill_cache
+from jobs import Processes, fill_cache
 from record import save_trajectories
 from rollout import run_episodes
 from variants import Variant, first_seed_option, open_variant, results_console, run, threads_option
@@ -76,7 +76,7 @@ def compare(original: Path, artifact: Path, seeds: Sequence[int], batch: int, jo
         def finished(text: str, count: int) -> None:
             progress.update(tasks[text], completed=count)
 
-        fill_cache(name, list(texts), seeds, batch, runtime, cache, jobs, finished)
+        fill_cache(name, list(texts), seeds, batch, runtime, cache, Processes(jobs), finished)
     opened = [open_variant(text, runtime, 1) for text in texts]
     caches = [Episodes(cache, name, variant, runtime) for variant in opened]
     variants = [Variant(texts[v.label], v.policy, v.plan, v.noise) for v in opened]

@@ -1,18 +1,25 @@
 """The tables that the demo ends with; ``make demo`` runs the rest."""
 
 import io
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 from benchmark import Measurement
-from demo import calibration_table, conclusion, final_table
+from demo import COMPILED, DENSE, ORIGINAL, calibration_table, compare, conclusion, final_table
+from episodes import Episodes
 from evaluate import summarise
 from rich.console import Console
 from rollout import Episode, Rollout
+from variants import open_variant
 
+from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.write import update_calibration
 from ttscompile.calibration.result import CalibrationResult, PlanScore
+from ttscompile.core.lattice import uniform_plan
 
 
 def printed(table):
@@ -22,9 +29,9 @@ def printed(table):
     return [[cell.strip() for cell in line.split("│")[1:-1]] for line in lines]
 
 
-def rollout(coverage):
+def rollout(coverage, seed=0):
     one = Episode(
-        0,
+        seed,
         "",
         {"obs": np.zeros((1, 2, 20), np.float32)},
         np.zeros((1, 2)),
@@ -80,6 +87,22 @@ def test_the_conclusion_says_whether_success_was_kept():
     assert "Its success is lower than that of the original." in lost
     assert "not told apart from that of the same 16 steps, all computed:" in lost
     assert "Its success is higher than that of the same 16 steps" in conclusion(SPEEDS, evaluations(0.97, 0.5, 0.96))
+
+
+@pytest.mark.slow
+def test_episodes_that_were_run_before_are_compared(compiled_pusht, tmp_path):
+    """Without running any: the three policies, from the files of their episodes to the figures."""
+    original, artifact = (shutil.copytree(compiled_pusht, tmp_path / name) for name in ("original", "compiled"))
+    manifest = load_artifact(artifact).manifest
+    plan = uniform_plan(manifest.steps, len(manifest.blocks), 1)
+    update_calibration(artifact, None, {"one": plan}, "one", {"strategy": "interval"})
+    for text, coverage in ((f"{original}:dense", 0.8), (str(artifact), 0.7)):  # both compute all with the same weights
+        cache = Episodes(tmp_path / "episodes", "pusht", open_variant(text, "onnxruntime", 1), "onnxruntime")
+        for seed in (7, 8):
+            cache.write(rollout(coverage, seed).episodes[0])
+    found = compare(original, artifact, (7, 8), 2, 2)
+    assert [one.label for one in found] == [ORIGINAL, DENSE, COMPILED]
+    assert [round(one.score.mean * 0.95, 6) for one in found] == [0.8, 0.8, 0.7]
 
 
 def test_calibration_table_names_the_default_and_the_baseline():
