@@ -5,7 +5,8 @@ Its loop (``decode``, ``workspace``) shares nothing with the reference's on purp
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from ttscompile.runtimes.instructions import Instructions, instructions_of
 from ttscompile.runtimes.liveness import readable_rollout
 
 from .decode import decode_first, decode_rest
-from .sessions import Array, open_blocks, open_sessions, run_named
+from .sessions import open_blocks, open_sessions, run_piece
 from .workspace import Workspace
 
 
@@ -49,6 +50,7 @@ class OnnxBackend:
         self._pruned = any(plan.pruned for plan in self._manifest.plans.values())
         self._blocks = self._pruned or any(one.partial for one in self._schedules)  # whether these have sessions
         self.sessions = open_sessions(artifact, threads, self._blocks)
+        self._run = partial(run_piece, self.sessions, self._manifest.pieces)  # which does not keep the backend alive
         self.frames = FramePieces(self._manifest.pieces, self._run)
         self.keeps = readable_rollout(artifact)
         self.workspace: Workspace | None = self._open_workspace(1)
@@ -95,9 +97,6 @@ class OnnxBackend:
         """See ``Backend.other_steps``."""
         decode_rest(self._work, plans, self._keep)
         return self._work.result()
-
-    def _run(self, piece: str, feed: Mapping[str, Array]) -> tuple[Array, ...]:
-        return tuple(run_named(self.sessions[piece], self._manifest.pieces[piece].outputs, feed).values())
 
     @property
     def _work(self) -> Workspace:

@@ -294,6 +294,17 @@ def run_named(session: Any, outputs: Sequence[str], inputs: Mapping[str, Array])
         raise _failed(error) from error
 
 
+def run_piece(
+    sessions: Mapping[str, Any], pieces: Mapping[str, PieceRecord], name: str, inputs: Mapping[str, Array]
+) -> tuple[Array, ...]:
+    """Run a piece on arrays of the moment; its outputs in order. For who must not hold on to a backend, see ``frames``.
+
+    Raises:
+        ArtifactError: the graph does not do what the manifest says.
+    """
+    return tuple(run_named(sessions[name], pieces[name].outputs, inputs).values())
+
+
 def _failed(error: Exception) -> ArtifactError:
     """The error of a graph that onnxruntime loads and cannot run."""
     return ArtifactError(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 from pathlib import Path
 from typing import Any
+from weakref import ref
 
 import numpy as np
 import numpy.typing as npt
@@ -188,6 +190,19 @@ def test_a_piece_that_fails_ends_the_call_and_leaves_nothing(policy: CompiledPol
         act(policy, obs)
     np.testing.assert_array_equal(act(policy, obs), expected)
     assert done(policy)[0] < 5, "what was computed before the failure is right, and stays"
+
+
+def test_a_policy_that_nobody_holds_gives_its_memory_back_at_once(compiled: Path) -> None:
+    """Its sessions hold all weights; a collector that comes some time later has them twice."""
+    opened = ttscompile.load(compiled / "artifact", seed=0)
+    act(opened, window(frame(1), frame(2)))
+    backend = ref(opened._runtime.backend)
+    gc.disable()
+    try:
+        del opened
+        assert backend() is None
+    finally:
+        gc.enable()
 
 
 def test_memory_is_bounded(policy: CompiledPolicy) -> None:

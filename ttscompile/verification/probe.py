@@ -7,6 +7,7 @@ this goes right, the pieces are sound and the loop over them is not.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from ..core.update import clips, matrices
 from ..ir.pieces import ADVANCE, CONDITION, LAYERS, PREDICTION, STEM, STEP, STREAM, TAIL, advance_context, block_name
 from ..ir.program import Binding
 from ..runtimes.frames import FramePieces
-from ..runtimes.onnxruntime.sessions import open_layers, open_sessions, repeat_streams, run_named
+from ..runtimes.onnxruntime.sessions import open_layers, open_sessions, repeat_streams, run_named, run_piece
 
 Array = npt.NDArray[Any]
 
@@ -46,7 +47,8 @@ class Probe:
         piece = self._manifest.pieces[CONDITION]
         arguments = self._manifest.spec.arguments
         named = {**obs, **{arguments[key]: value for key, value in obs.items()}}
-        named |= FramePieces(self._manifest.pieces, self._outputs).values(named)
+        run = partial(run_piece, self._sessions, self._manifest.pieces)
+        named |= FramePieces(self._manifest.pieces, run).values(named)
         feed = {name: np.ascontiguousarray(named[name]) for name in piece.inputs}
         condition = run_named(self._sessions[CONDITION], piece.outputs, feed) if piece.outputs else {}
         types = {name: artifact.manifest.contexts[name].type for name in artifact.manifest.features}
@@ -57,9 +59,6 @@ class Probe:
             one.name: np.zeros([n if isinstance(n, int) else self.streams for n in one.shape], np.float32)
             for one in self._sessions[ADVANCE].get_inputs()
         }
-
-    def _outputs(self, piece: str, feed: Mapping[str, Array]) -> tuple[Array, ...]:
-        return tuple(run_named(self._sessions[piece], self._manifest.pieces[piece].outputs, feed).values())
 
     def evaluate(self, sample: FloatArray, k: int) -> FloatArray:
         """The network's prediction at step k, ``[B, T, D]`` of ``[B, T, D]``."""
