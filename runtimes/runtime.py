@@ -170,21 +170,20 @@ class Runtime:
         """
         spec, streams = self._manifest.spec, len(next(iter(obs.values())))
         self.require_streams(streams)
-        before, self._used = self._used, self._opened_for(plan_name)
-        if before is not self._used and self._written is not None:
-            self._written = self._dropped = np.zeros_like(self._written)
-        backend = self._used.backend
         noise = check_noise(noise, streams, spec)
         known = None if prefix is None else known_samples(spec, prefix, noise.initial)
         cells = (streams, self._manifest.steps, len(self._groups))
-        written = np.zeros(cells, dtype=np.bool_) if self._written is None else self._written
-        dropped = np.zeros(cells, dtype=np.bool_) if self._dropped is None else self._dropped
+        opened = self._opened_for(plan_name)
+        same = opened is self._used  # else what earlier calls kept was computed with other weights
+        written = self._written if same and self._written is not None else np.zeros(cells, dtype=np.bool_)
+        dropped = self._dropped if same and self._dropped is not None else np.zeros(cells, dtype=np.bool_)
         if plan is None and PRUNER not in self._manifest.pieces:
             remedy = "Give plan='dense', the name of a plan, or a matrix; or calibrate with strategy='tts'."
             raise IllegalPlanError(f"no plan was given and the artifact has no pruner to make one. {remedy}")
-        settled = None if plan is None else self._settle(plan, written, dropped, repair)
+        settled = None if plan is None else self._settle(opened.lowering, plan, written, dropped, repair)
         if plan_name not in (DENSE, *self._manifest.plans):
             self._matrices = True
+        self._used, backend = opened, opened.backend
         keep = np.ones_like(backend.keeps) if self._matrices or plan_name == DENSE else backend.keeps
         backend.prepare(streams, None if settled is None else settled.lowered)
 
@@ -240,7 +239,14 @@ class Runtime:
         finally:
             wait([pruning])  # it reads the backend's memory: nobody may go on before it is done, not even with an error
 
-    def _settle(self, plan: npt.ArrayLike, written: BoolArray, dropped: BoolArray, repair: bool) -> _Settled:
+    def _settle(
+        self,
+        lowering: LoweringCache[Any],
+        plan: npt.ArrayLike,
+        written: BoolArray,
+        dropped: BoolArray,
+        repair: bool,
+    ) -> _Settled:
         """The plan of a caller.
 
         Whether a plan that was lowered before is legal depends on its ROLLOUT reads alone, which is quickly checked.
@@ -261,7 +267,7 @@ class Runtime:
         check = partial(require_legal, plans, self._groups, written)
         if (rollout & ~written).any():
             check()
-        return _Settled(plans, tuple(self._used.lowering.lower(one, check) for one in plans), legalised)
+        return _Settled(plans, tuple(lowering.lower(one, check) for one in plans), legalised)
 
 
 def _prune(backend: Backend[Any], lowering: LoweringCache[Any], written: BoolArray) -> _Settled:

@@ -50,6 +50,13 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def scheduled(compiled: Path, recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """``compiled`` with a schedule that computes two of its ten steps; not to be changed."""
+    directory = shutil.copytree(compiled, tmp_path_factory.mktemp("scheduled") / "compiled")
+    return policies.whole_steps(Path(directory), recording)
+
+
+@pytest.fixture(scope="session")
 def make_task(compiled: Path, recording: Path) -> tasks.MakeTask:
     """Makes tasks on ``compiled``."""
     return partial(tasks.make_task, compiled, recording)

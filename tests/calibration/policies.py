@@ -11,6 +11,7 @@ from torch import nn
 import ttscompile
 from tests.once import Once
 from ttscompile import Affine, ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
+from ttscompile.calibration.pipeline import calibrate
 
 STEPS, HORIZON, CHANNELS, WIDTH, LAYERS = 10, 8, 2, 32, 3
 
@@ -83,3 +84,9 @@ def record(path: Path, episodes: int = 6, seed: int = 0) -> Path:
     walks = [np.cumsum(draw.standard_normal((n, 2, 3)), 0).astype(np.float32) for n in lengths]
     np.savez(path, obs=np.concatenate(walks), episode_ends=np.cumsum(lengths))
     return path
+
+
+def whole_steps(directory: Path, recording: Path) -> Path:
+    """The artifact with a schedule that computes two of its ten steps."""
+    calibrate(directory, [recording], 0.8, "interval", progress=False)
+    return directory

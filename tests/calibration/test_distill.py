@@ -21,14 +21,9 @@ from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import DENSE, DISTILLED, MANIFEST
 from ttscompile.artifact.write import update_calibration
 from ttscompile.calibration import student
-from ttscompile.calibration.calls import prepare_calls
-from ttscompile.calibration.distill import Distilled, _train, distill
-from ttscompile.calibration.execute import Executor
+from ttscompile.calibration.distill import Distilled, distill
 from ttscompile.calibration.pipeline import calibrate
-from ttscompile.calibration.progress import Bar
-from ttscompile.calibration.state import StateFile
-from ttscompile.calibration.student import Student, trainable
-from ttscompile.calibration.task import Clock
+from ttscompile.calibration.state import FILE
 from ttscompile.cli import main
 from ttscompile.errors import ArtifactError, CalibrationError, CalibrationFailedError
 from ttscompile.report import facts
@@ -36,7 +31,6 @@ from ttscompile.report.card import card
 from ttscompile.runtimes.open import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.runtimes.reference.model import ReferenceModel
-from ttscompile.trajectories.episodes import Episode
 from ttscompile.verification import verify
 from ttscompile.verification.engaged import ENGAGED
 from ttscompile.verification.record_golden import record_plans
@@ -50,18 +44,6 @@ UPDATES = 24
 
 def train(directory: Path, recording: Path, **changes: Any) -> Distilled:
     return distill(directory, [recording], **{"rank": 4, "updates": UPDATES, "progress": False, **changes})
-
-
-def whole_steps(directory: Path, recording: Path) -> Path:
-    """The artifact with a schedule that computes two of its ten steps."""
-    calibrate(directory, [recording], 0.8, "interval", progress=False)
-    return directory
-
-
-@pytest.fixture(scope="module")
-def scheduled(compiled: Path, recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    directory = shutil.copytree(compiled, tmp_path_factory.mktemp("scheduled") / "compiled")
-    return whole_steps(Path(directory), recording)
 
 
 @pytest.fixture(scope="module")
@@ -179,6 +161,9 @@ def test_nothing_is_reused_between_calls_with_different_weights(distilled: tuple
     rollout[0] = 0
     policy.predict_action(obs, noise=noise, plan=everything)
     policy.predict_action(obs, noise=noise, plan=rollout)  # reads what the call before computed
+    with pytest.raises(ttscompile.TtscompileError, match="noise"):
+        policy.predict_action(obs, noise=Noise(noise.initial), plan=DISTILLED)
+    policy.predict_action(obs, noise=noise, plan=rollout)  # a refused call changes nothing
     policy.predict_action(obs, noise=noise, plan=DISTILLED)
     with pytest.raises(ttscompile.TtscompileError, match="ROLLOUT"):
         policy.predict_action(obs, noise=noise, plan=rollout)
@@ -222,6 +207,20 @@ def test_a_distillation_that_was_killed_goes_on_to_the_same_bytes(
     assert contents(copied) == contents(distilled[0])
 
 
+def test_an_interrupted_calibration_and_an_interrupted_distillation_do_not_know_each_other(
+    copied: Path, recording: Path
+) -> None:
+    with killed():
+        calibrate(copied, [recording], 0.8, "interval", progress=False)
+    with killed():
+        train(copied, recording, resume=True)  # there is nothing of its own to resume
+    assert (copied / FILE).exists()
+    with pytest.raises(
+        CalibrationError, match="the distillation that was interrupted had other settings: rank was 4, now 2"
+    ):
+        train(copied, recording, rank=2, resume=True)
+
+
 def test_the_outcome_does_not_depend_on_the_number_of_threads(
     distilled: tuple[Path, Distilled], copied: Path, recording: Path
 ) -> None:
@@ -242,14 +241,8 @@ def test_what_is_no_better_is_not_kept(copied: Path, recording: Path, monkeypatc
     assert {name: one for name, one in contents(copied).items() if name in before} == before
 
 
-def test_the_time_limit_ends_training(scheduled: Path, tmp_path: Path) -> None:
-    one, lesson = _student(load_artifact(scheduled))
-    _train(one, lesson.calls, StateFile(tmp_path, {}), Clock(0.0), Bar(False), 100)
-    assert one.done == 1  # the first update is not asked how long it will take
-
-
 def test_calibrating_again_drops_it(distilled: tuple[Path, Distilled], recording: Path, tmp_path: Path) -> None:
-    directory = whole_steps(Path(shutil.copytree(distilled[0], tmp_path / "compiled")), recording)
+    directory = policies.whole_steps(Path(shutil.copytree(distilled[0], tmp_path / "compiled")), recording)
     artifact = load_artifact(directory)
     assert artifact.manifest.distilled is None and DISTILLED not in artifact.manifest.plans
     assert not list(directory.glob("distilled*"))
@@ -257,7 +250,7 @@ def test_calibrating_again_drops_it(distilled: tuple[Path, Distilled], recording
 
 def test_in_eight_bits(once: Once, recording: Path, tmp_path: Path) -> None:
     directory = Path(shutil.copytree(policies.compiled(once, "int8"), tmp_path / "compiled"))
-    train(whole_steps(directory, recording), recording)
+    train(policies.whole_steps(directory, recording), recording)
     assert {rung.status for rung in verify(directory).rungs if rung.name != ENGAGED} <= {"passed", "skipped"}
     exact, own = ttscompile.load(directory, precision="fp32"), ttscompile.load(directory)
     wanted, found = actions(exact, DISTILLED), actions(own, DISTILLED)
@@ -293,14 +286,6 @@ def test_an_artifact_that_is_not_calibrated_is_refused(compiled: Path, recording
         train(compiled, recording)
 
 
-def test_a_change_touches_blocks_alone(compiled: Path) -> None:
-    artifact = load_artifact(compiled)
-    names = trainable(artifact, 4)
-    assert len(names) == 3 * policies.LAYERS
-    elsewhere = {name for key, graph in artifact.graphs.items() if "block" not in key for name in graph.constants}
-    assert not elsewhere & set(names)
-
-
 def test_a_rank_for_which_nothing_is_large_enough_is_refused(scheduled: Path, recording: Path) -> None:
     before = contents(scheduled)
     with pytest.raises(CalibrationError, match=r"rank 17: expected matrices .* at least 34.*Give a rank of at most 16"):
@@ -323,58 +308,6 @@ def test_a_model_of_the_reference_is_there_for_weights_that_are_used(
     assert len(opened) == 1
     assert set(record_plans(load_artifact(distilled[0]))) == {"schedule", "uniform", DISTILLED}
     assert len(opened) == 3
-
-
-def test_training_learns_its_lesson(scheduled: Path) -> None:
-    """Eight calls by heart: what it is judged on otherwise is other calls, of a network that nobody trained."""
-    one, lesson = _student(load_artifact(scheduled))
-    losses = [one.update(lesson, 0.0) for _ in range(80)]
-    assert losses[-1] < 0.5 * losses[0]
-
-
-def test_what_is_judged_is_what_is_written(scheduled: Path) -> None:
-    """The whole loop of the student, step 0 with the original's weights: before training and after it."""
-    artifact = load_artifact(scheduled)
-    one, lesson = _student(artifact)
-    plan, calls = artifact.schedule("schedule"), lesson.calls
-    for updates in (0, 40):
-        for _ in range(updates):
-            one.update(lesson, 0.0)
-        written = Executor(artifact.with_weights(one.weights())).run(plan, calls)
-        torch.testing.assert_close(one.executor.run(plan, calls), written, rtol=0, atol=1e-5)
-    assert not torch.allclose(written, Executor(artifact).run(plan, calls), atol=1e-2)
-
-
-def test_an_update_follows_the_gradient_of_the_loss(scheduled: Path) -> None:
-    """Gradients of the factors are those of the changes that they make, by finite differences of the loss."""
-    artifact = load_artifact(scheduled)
-    one, lesson = _student(artifact)
-    for _ in range(3):
-        one.update(lesson, 0.0)
-    numbers = np.arange(8)
-    loss, gradients = one._gradients(lesson, 8, numbers)
-    name = next(iter(gradients))
-    factor, direction = one._factors[name], torch.sign(gradients[name])
-    width = 1e-3
-    losses = []
-    for sign in (1, -1):
-        factor += sign * width * direction
-        one._write()
-        losses.append(one._gradients(lesson, 8, numbers)[0])
-        factor -= sign * width * direction
-    slope = (losses[0] - losses[1]) / (2 * width)
-    assert slope == pytest.approx(float(gradients[name].abs().sum()), rel=0.05)
-    assert loss < losses[0]
-
-
-def _student(artifact: Artifact) -> tuple[Student, Any]:
-    spec, executor = artifact.manifest.spec, Executor(artifact)
-    draw = np.random.default_rng(0)
-    episode = Episode("test", {"obs": draw.standard_normal((8, 2, 3)).astype(np.float32)})
-    calls = prepare_calls(executor.model, spec, [episode], [(0, i) for i in range(8)], (0,))
-    calls = replace(calls, path=executor.run_dense(calls))
-    one = Student(artifact, artifact.schedule("schedule"), None, 4, 0, 100)
-    return one, one.lesson(calls)
 
 
 @pytest.mark.parametrize("change", [{"rank": 0}, {"updates": 0}, {"max_minutes": 0.0}, {"validation_fraction": 1.0}])

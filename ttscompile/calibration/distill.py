@@ -19,7 +19,7 @@ from ..artifact.distilled import DistilledWeights
 from ..artifact.load import Artifact, load_artifact
 from ..artifact.manifest import DISTILLED
 from ..artifact.write import locked, update_calibration
-from ..core.correction import FEATURES, Correction
+from ..core.correction import Correction
 from ..core.given import integer
 from ..core.lattice import PlanArray, Source, whole_steps_plan
 from ..errors import CalibrationError, CalibrationFailedError
@@ -27,14 +27,14 @@ from ..ir.pieces import is_block
 from ..lower.precision import quantize_model
 from ..runtimes.torch.devices import device_of, exact_arithmetic
 from ..verification.record_golden import record_plans
+from .arguments import JUDGED, calls_to_learn_from, require_directory, require_limits
 from .calls import Actions, Calls, digest_of, load_episodes, split_episodes
 from .execute import Executor
 from .fit_correction import fit_correction
 from .judge import SCHEDULE
-from .pipeline import CALLS_A_FEATURE, EVALUATIONS_A_MINUTE, JUDGED, MOST_CALLS, MOST_NEEDED
 from .progress import Bar
 from .result import PlanScore
-from .state import StateFile
+from .state import DISTILLATION, StateFile
 from .student import Student, trainable
 from .targets import draw_calls, with_targets
 from .task import Clock
@@ -131,48 +131,36 @@ def distill(
     seed = integer(seed, "seed", CalibrationError)
     rank = integer(rank, "rank", CalibrationError, 1)
     updates = integer(updates, "updates", CalibrationError, 1)
-    if not 0 < validation_fraction < 1 or not max_minutes > 0:
-        raise CalibrationError(
-            f"expected validation_fraction between 0 and 1 and max_minutes above 0; found {validation_fraction} and"
-            f" {max_minutes}."
-        )
+    require_limits(validation_fraction, max_minutes)
     there = None if device is None else device_of(device)
     directory = Path(path)
-    if not directory.is_dir():
-        load_artifact(directory)  # says what is wrong, if it is no zipped artifact
-        raise CalibrationError(f"{path}: only a directory can be changed. Unzip the artifact and give the directory.")
+    require_directory(directory)
     with locked(directory), exact_arithmetic(there):
         artifact = load_artifact(directory)
-        manifest, spec = artifact.manifest, artifact.manifest.spec
-        schedule = _schedule(artifact, plan)
+        spec, schedule = artifact.manifest.spec, _schedule(artifact, plan)
         trainable(artifact, rank)  # before minutes of work
         episodes = load_episodes(spec, trajectories, observation)
         split = split_episodes(len(episodes), validation_fraction, seed)
-        fewest = min(CALLS_A_FEATURE * (FEATURES * spec.sample[0] + 1), MOST_NEEDED)
-        limit = int(np.clip(EVALUATIONS_A_MINUTE / spec.sampler.steps * max_minutes, fewest, MOST_CALLS))
-        settings = {"rank": rank, "updates": updates, "seed": seed, "validation_fraction": validation_fraction}
-        state = StateFile(
-            directory,
-            {
-                **settings,
-                "model": manifest.model_identity[:16],
-                "trajectories": digest_of(episodes),
-                "distilled": schedule[:, 0].tolist(),
-                "device": "cpu" if there is None else str(there),
-            },
-        )
+        fewest, limit = calls_to_learn_from(spec, max_minutes, corrects=True)
+        settings = {
+            "model": artifact.manifest.model_identity[:16],
+            "trajectories": digest_of(episodes),
+            "steps": np.flatnonzero(schedule[:, 0] == Source.COMPUTE).tolist(),
+            "rank": rank,
+            "updates": updates,
+            "seed": seed,
+            "validation_fraction": validation_fraction,
+            "device": "cpu" if there is None else str(there),
+        }
+        state = StateFile(directory, settings, DISTILLATION)
         if not (resume and state.load()):
             state.remove()
         limit = state.progress.setdefault("calls", limit)
         clock = Clock(60 * max_minutes, float(state.progress.get("seconds", 0.0)), begun)
         executor = Executor(artifact, there)
         with Bar(progress) as bar:
-            sets = {
-                name: with_targets(executor, name, calls, fewest, state, clock, bar)
-                for name, calls in draw_calls(
-                    executor, spec, episodes, split, limit, min(JUDGED, limit // 2), seed
-                ).items()
-            }
+            drawn = draw_calls(executor, spec, episodes, split, limit, min(JUDGED, limit // 2), seed)
+            sets = {name: with_targets(executor, name, c, fewest, state, clock, bar) for name, c in drawn.items()}
             known = artifact.corrections.get(plan)
             correction = fit_correction(executor, schedule, sets["calibration"], known is None or known.reads > 0)
             student = Student(artifact, schedule, correction, rank, seed, updates, there)
@@ -197,14 +185,8 @@ def distill(
             stopped="finished" if student.done == updates else "time limit",
             seconds=clock.elapsed(),
         )
-        _write(
-            directory,
-            artifact,
-            result,
-            schedule,
-            correction,
-            DistilledWeights(weights, _in_precision(artifact, weights)),
-        )
+        distilled = DistilledWeights(weights, _in_precision(artifact, weights))
+        _write(directory, artifact, result, schedule, correction, distilled)
         state.remove()
         return result
 
@@ -269,12 +251,9 @@ def _write(
 ) -> None:
     """Add the plan to those of the artifact."""
     record = dict(artifact.manifest.calibration or {})
-    scores = {DISTILLED: result.after}
-    yardstick = record.get("other_noise")
-    told = {
-        name: {**asdict(one), **({"of_other_noise": one.error / yardstick} if yardstick else {})}
-        for name, one in scores.items()
-    }
+    score, yardstick = asdict(result.after), record.get("other_noise")
+    if yardstick:
+        score["of_other_noise"] = result.after.error / yardstick
     pruned = any(plan.pruned for plan in artifact.manifest.plans.values())
     update_calibration(
         directory,
@@ -283,9 +262,9 @@ def _write(
         DISTILLED,
         {
             **record,
-            "plans": {**record.get("plans", {}), **told},
+            "plans": {**record.get("plans", {}), DISTILLED: score},
             "default_plan": DISTILLED,
-            "distilled": result.record(),
+            DISTILLED: result.record(),
         },
         corrections={**artifact.corrections, DISTILLED: correction},
         distilled=distilled,

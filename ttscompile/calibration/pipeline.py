@@ -9,19 +9,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ..artifact.ceiling import few_steps, usual_sparsity
 from ..artifact.load import Artifact, load_artifact
 from ..artifact.manifest import UNIFORM
 from ..artifact.write import locked, update_calibration
-from ..core.correction import FEATURES
 from ..core.given import integer
 from ..core.lattice import sparsity
 from ..errors import CalibrationError
 from ..ir.pieces import PRUNER
 from ..runtimes.torch.devices import device_of, exact_arithmetic
 from ..verification.record_golden import record_plans
+from .arguments import JUDGED, calls_to_learn_from, require_directory, require_limits
 from .budget import ERROR, LATENCY, Budget, Goal, cells_of, goal_of, measure_budget
 from .calls import Calls, digest_of, load_episodes, split_episodes
 from .crowded import SAFE, SHARE, CrowdedSchedules, budget_of_error, named_plans
@@ -44,21 +42,6 @@ from .state import StateFile
 from .strategies import DEFAULT, FITTED, Strategy, strategy_of
 from .targets import draw_calls, with_targets
 from .task import Clock, Found, Search, Task
-
-EVALUATIONS_A_MINUTE = 6400
-"""Of the network, to make the calls to learn from, for each minute of the time limit."""
-
-FEWEST_CALLS, MOST_CALLS = 64, 3072
-
-MOST_NEEDED = 1024
-"""Calls that a correction needs at most, however much it reads: these are answered whatever the time."""
-
-CALLS_A_FEATURE = 3
-"""Calls to learn from at least, for each number that a correction reads. On Push-T (97 of them, 95 %) one that is
-fitted on 30 calls does harm, on 64 it lowers the held-out error from 19 to 6 px, on 128 to 2.7."""
-
-JUDGED = 128
-"""Calls of the held-out episodes at most that plans are judged on."""
 
 
 def calibrate(
@@ -144,11 +127,8 @@ def calibrate(
     there = None if device is None else device_of(device)
     asked = (target_sparsity, target_flops, latency_ms, max_action_error, threads)
     goal_of(*asked)  # what cannot be is refused before anything is read
-    if not Path(path).is_dir():
-        load_artifact(Path(path))  # says what is wrong, if it is no zipped artifact
-        raise CalibrationError(
-            f"{path}: only a directory can be calibrated. Unzip the artifact and give the directory."
-        )
+    require_limits(validation_fraction, max_minutes)
+    require_directory(Path(path))
     # All the while: a second calibration would undo the first.
     with locked(Path(path)), opened_pool(ray) as pool, exact_arithmetic(there):
         artifact = load_artifact(Path(path))
@@ -156,12 +136,10 @@ def calibrate(
         spec, chosen = artifact.manifest.spec, strategy_of(strategy)
         if correct and chosen.fits_correction:
             raise CalibrationError(f"strategy {strategy!r} fits a correction of its own. Leave --correct out.")
-        budget = _known_budget(artifact, goal, chosen, validation_fraction, max_minutes)
+        budget = _known_budget(artifact, goal, chosen)
         episodes = load_episodes(spec, trajectories, observation)
         split = split_episodes(len(episodes), validation_fraction, seed)
-        features = FEATURES * spec.sample[0] + 1
-        fewest = min(CALLS_A_FEATURE * features, MOST_NEEDED) if chosen.fits_correction or correct else FEWEST_CALLS
-        limit = int(np.clip(EVALUATIONS_A_MINUTE / spec.sampler.steps * max_minutes, fewest, MOST_CALLS))
+        fewest, limit = calls_to_learn_from(spec, max_minutes, chosen.fits_correction or correct)
         state = StateFile(
             Path(path),
             {
@@ -257,12 +235,8 @@ def _write(
     )
 
 
-def _known_budget(artifact: Artifact, goal: Goal, strategy: Strategy, fraction: float, minutes: float) -> Budget | None:
+def _known_budget(artifact: Artifact, goal: Goal, strategy: Strategy) -> Budget | None:
     """The budget where nothing has to be run for it; refuses what cannot be satisfied before any work."""
-    if not 0 < fraction < 1 or not minutes > 0:
-        raise CalibrationError(
-            f"expected validation_fraction between 0 and 1 and max_minutes above 0; found {fraction} and {minutes}."
-        )
     if goal.kind == ERROR and not strategy.fits_correction:
         raise CalibrationError(
             f"max_action_error needs strategy {' or '.join(map(repr, FITTED))}; found {strategy.name!r}. Give this"

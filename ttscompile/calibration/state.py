@@ -1,4 +1,4 @@
-"""What a calibration, or a comparison, has done so far: one file in the artifact's directory, to go on from."""
+"""What a calibration, distillation or comparison has done so far: a file each in the artifact's directory."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from ..errors import ArtifactError, CalibrationError
 
 Array = npt.NDArray[Any]
 
-CALIBRATION, COMPARISON = "calibration", "comparison"
+CALIBRATION, DISTILLATION, COMPARISON = "calibration", "distillation", "comparison"
 FILE = f"{CALIBRATION}-state.safetensors"
 """Never listed in the manifest: an artifact is complete without it, and it is removed when calibration ends."""
-_AGAIN = {CALIBRATION: "Calibrate", COMPARISON: "Compare"}
+_AGAIN = {CALIBRATION: "Calibrate", DISTILLATION: "Distil", COMPARISON: "Compare"}
 
 MAX_TEXT_BYTES = 16 * 2**20
 
@@ -31,16 +31,16 @@ _SETTINGS, _PROGRESS, _CHECKSUM = "json/settings", "json/progress", "sha256"
 
 
 class StateFile:
-    """The state of one calibration, or of one comparison.
+    """The state of one calibration, distillation or comparison.
 
     Args:
         directory: the directory of the artifact.
         settings: everything that the outcome depends on; JSON. A state with other settings is not continued.
-        work: ``calibration`` or ``comparison``.
+        work: ``calibration``, ``distillation`` or ``comparison``.
 
     Attributes:
         arrays: the saved arrays by name.
-        progress: how far the calibration is, as JSON.
+        progress: how far the work is, as JSON.
     """
 
     def __init__(self, directory: Path, settings: Mapping[str, Any], work: str = CALIBRATION) -> None:
@@ -160,11 +160,11 @@ def _members(array: Array | None, name: str) -> dict[str, Any]:
 
 
 def _check_progress(progress: Value) -> None:
-    """Raise unless the numbers that every calibration reads are such numbers."""
+    """Raise unless the numbers that all work of a kind reads are such numbers."""
     members = progress.members()
     if "seconds" in members and members["seconds"].number() < 0:
         members["seconds"].fail("a time that is not negative")
-    for name in {"calls", "intervals", "calibration targets", "validation targets"} & set(members):
+    for name in {"calls", "intervals", "updates", "calibration targets", "validation targets"} & set(members):
         members[name].integer()
     if "latency" in members:
         fields = members["latency"].keys("cells", "measured")
