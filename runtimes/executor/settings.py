@@ -42,8 +42,12 @@ class Policy(Protocol):
     def predict_action(self, obs_dict: Mapping[str, Any], *, plan: str) -> Mapping[str, Any]:
         """``{"action": [1, Ta, Da], "action_pred": [1, T, Da]}``."""
 
+
+class SeeingPolicy(Policy, Protocol):
+    """A policy whose ``info.frames`` is there, and not 0: the executor has it prepare frames while nothing waits."""
+
     def prepare_frame(self, frame: Mapping[str, Any], stop: Callable[[], bool]) -> FrameWork:
-        """Compute what depends on one frame alone; called only where ``info.frames`` is there, and not 0."""
+        """Compute what depends on one frame alone, by key ``[1, ...]``, until ``stop`` says so."""
 
 
 @dataclass(frozen=True)

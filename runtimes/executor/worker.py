@@ -10,6 +10,7 @@ import atexit
 import os
 import threading
 from collections.abc import Mapping
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +20,7 @@ from ttscompile.measure.process import LONGEST_WAIT, Process
 
 from .feasibility import Feasibility, LatencyWindow, fast_enough
 from .measure import Clock, measure_latencies
-from .settings import ExecutorSettings, Policy, Resolved
+from .settings import ExecutorSettings, Policy, Resolved, SeeingPolicy
 from .state import ExecutorState, Job
 from .trace import Trace
 from .window import Frame
@@ -48,8 +49,8 @@ class Worker:
     ) -> None:
         self._policy, self._settings, self._resolved = policy, settings, resolved
         self._clock, self._trace = clock, trace
-        # Of what acts like a policy, only what has frame pieces is asked to prepare frames.
-        self._prepares = bool(getattr(policy.info, "frames", 0)) and resolved.frames.seen_before
+        prepares = bool(getattr(policy.info, "frames", 0)) and resolved.frames.seen_before
+        self._seeing = cast("SeeingPolicy", policy) if prepares else None
         self.lock = threading.Lock()
         self._work, self.news = threading.Condition(self.lock), threading.Condition(self.lock)
         self.process = Process()
@@ -106,7 +107,7 @@ class Worker:
         if self._waiting and self._state is not None:
             start = self._state.next_start(now)
             sooner = start is not None and (start == now or not self._timed)
-            if sooner or (self._prepares and self._state.early(now) is not None):
+            if sooner or (self._seeing and self._state.early(now) is not None):
                 self._work.notify()
 
     def reset(self, seed: int | None) -> None:
@@ -197,7 +198,7 @@ class Worker:
                 start = state.next_start(now)
                 if start is not None and start <= now:
                     return state.begin(now)
-                if self._prepares and (frame := state.early(now)) is not None:
+                if self._seeing and (frame := state.early(now)) is not None:
                     state.begin_early(frame)
                     return frame
                 self._waiting, self._timed = True, start is not None
@@ -214,7 +215,8 @@ class Worker:
                 return self._ending or self._reset_due or not self._opened.awaits(frame, now)
 
         start = self._clock.now()
-        work = self._policy.prepare_frame(self._resolved.frames.alone(frame), useless)
+        assert self._seeing is not None  # or there was none to prepare
+        work = self._seeing.prepare_frame(self._resolved.frames.alone(frame), useless)
         if self._trace.on:
             self._trace.frame(start, self._clock.now(), work)
 
@@ -239,7 +241,7 @@ class Worker:
         if self._trace.on:
             args = {"plan": job.plan, "epoch": job.epoch, "chunk": outcome}
             report = getattr(self._policy, "last_report", None)
-            if self._prepares and report is not None:
+            if self._seeing and report is not None:
                 frames = report.frames
                 args |= {"frames": frames.computed, "frames known": frames.remembered, "hidden ms": frames.saved}
             self._trace.call(job.started, now, args, None if report is None else report.timings)

@@ -34,12 +34,15 @@ BATCH, PART = 64, 16
 """Calls of one update, and how many of them a thread differentiates at once: gradients are summed in this order,
 however many threads there are."""
 
-WARM_UP = 20
-"""Updates in which the rate grows to what it is."""
+RATE, WARM_UP = 1e-3, 20
+"""Of Adam, and the updates in which it grows to that."""
 
-RATE = 1e-3
 SCALE = 4.0
+"""Of a change, over the root of its number of columns: with it the rate that suits one size of a matrix suits others."""
+
 LARGEST_GRADIENT = 1.0
+"""Norm of the gradients of all factors together, above which they are made smaller."""
+
 PREDICTED = 0.1
 """Weight of the whole prediction in the loss, beside 1 of what is executed: an executor plays what follows when a call
 is late."""
@@ -254,5 +257,5 @@ class Student:
 
 
 def _scale(right: Tensor) -> float:
-    """Of a change, for so many columns: with it the rate that suits one size of a matrix suits others."""
+    """What a change is multiplied by, given its right factor."""
     return SCALE / math.sqrt(right.shape[1])

@@ -8,14 +8,12 @@ from typing import Any
 import click
 
 import ttscompile
-from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.strategies import DEFAULT, NAMES, STRATEGIES
 from ttscompile.cli.options import artifact_argument, json_option, ray_option, seed_option, threads_option
-from ttscompile.cli.output import manifest_of, only_results_on_stdout, print_json, results
+from ttscompile.cli.output import manifest_of, only_results_on_stdout
 from ttscompile.cli.recordings import FilesCommand, Sources, require_recordings, trajectories_options
-from ttscompile.cli.summary import print_summary
+from ttscompile.cli.summary import print_written
 from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT
-from ttscompile.report.summary import document
 
 
 @click.command(cls=FilesCommand)
@@ -88,8 +86,4 @@ def calibrate(
     require_recordings(trajectories)
     with only_results_on_stdout():
         ttscompile.calibrate(directory, trajectories=list(trajectories), observation=sources, **budget_and_search)
-    artifact = load_artifact(directory)
-    if as_json:
-        print_json(document(artifact))
-    else:
-        print_summary(artifact, results())
+    print_written(directory, as_json)

@@ -8,13 +8,11 @@ from typing import Any
 import click
 
 import ttscompile
-from ttscompile.artifact.load import load_artifact
 from ttscompile.cli.options import artifact_argument, count_option, json_option, seed_option
-from ttscompile.cli.output import manifest_of, only_results_on_stdout, print_json, results
+from ttscompile.cli.output import manifest_of, only_results_on_stdout
 from ttscompile.cli.recordings import FilesCommand, Sources, require_recordings, trajectories_options
-from ttscompile.cli.summary import print_summary
+from ttscompile.cli.summary import print_written
 from ttscompile.cli.types import MINUTES, TEXT
-from ttscompile.report.summary import document
 
 
 @click.command(cls=FilesCommand)
@@ -45,8 +43,4 @@ def distill(
     require_recordings(trajectories)
     with only_results_on_stdout():
         ttscompile.distill(directory, trajectories=list(trajectories), observation=sources, **training)
-    artifact = load_artifact(directory)
-    if as_json:
-        print_json(document(artifact))
-    else:
-        print_summary(artifact, results())
+    print_written(directory, as_json)

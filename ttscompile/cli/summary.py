@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.padding import Padding
 
-from ttscompile.artifact.load import Artifact
-from ttscompile.cli.output import table
+from ttscompile.artifact.load import Artifact, load_artifact
+from ttscompile.cli.output import print_json, results, table
 from ttscompile.measure.units import flops, share
 from ttscompile.report import Table, facts
 from ttscompile.report.summary import document
+
+
+def print_written(directory: Path, as_json: bool) -> None:
+    """What the artifact in a directory is now: as tables, or as one JSON document."""
+    artifact = load_artifact(directory)
+    if as_json:
+        print_json(document(artifact))
+    else:
+        print_summary(artifact, results())
 
 
 def print_summary(artifact: Artifact, console: Console) -> None:
