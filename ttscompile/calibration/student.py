@@ -38,7 +38,7 @@ RATE, WARM_UP = 1e-3, 20
 """Of Adam, and the updates in which it grows to that."""
 
 SCALE = 4.0
-"""Of a change, over the root of its number of columns: with it the rate that suits one size of a matrix suits others."""
+"""Of a change, over the root of its number of columns: so a rate that suits one size of a matrix suits others."""
 
 LARGEST_GRADIENT = 1.0
 """Norm of the gradients of all factors together, above which they are made smaller."""
