@@ -7,6 +7,7 @@ import itertools
 import json
 import shutil
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -122,7 +123,16 @@ def as_lerobot_with_videos(path: Path, version: int = 3, codec: str = "libx264")
 
 
 def write_video(file: Path, begin: int, end: int, codec: str = "libx264") -> None:
-    """Frames of one colour each, which ``shade`` gives."""
+    """Frames of one colour each, which ``shade`` gives.
+
+    In a thread of its own: where it may, libsvtav1 gives the thread that calls it the highest real-time priority, and
+    leaves it there, so that all tests after it would take the processor from every other process.
+    """
+    with ThreadPoolExecutor(1) as thread:
+        thread.submit(_write_video, file, begin, end, codec).result()
+
+
+def _write_video(file: Path, begin: int, end: int, codec: str) -> None:
     import av
 
     file.parent.mkdir(parents=True, exist_ok=True)

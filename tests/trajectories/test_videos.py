@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -42,6 +43,13 @@ def test_frames_are_those_of_their_rows(tmp_path: Path, version: int, codec: str
         np.testing.assert_allclose(found[:, 1], wanted, atol=SHADES)
         before = np.array([shade(first + max(0, 2 * call - 1)) for call in range(episode.calls)], np.float32) / 255
         np.testing.assert_allclose(found[:, 0, :, 7, 9], before, atol=SHADES)
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getscheduler"), reason="this system has no scheduling policies")
+def test_an_encoder_leaves_the_priority_of_the_tests_alone(tmp_path: Path) -> None:
+    before = os.sched_getscheduler(0)
+    write_video(tmp_path / "one.mp4", 0, 3, "libsvtav1")
+    assert os.sched_getscheduler(0) == before
 
 
 def _episodes(root: Path, **columns: list[Any]) -> None:
