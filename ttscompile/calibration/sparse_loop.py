@@ -117,7 +117,7 @@ class SparseLoop:
             read, missing = (torch.cat(column, 1) for column in zip(*map(_Lane.missing, fitted), strict=True))
             solved = (*solved, solve(read.double(), self._components.values, missing.double(), self._groups))
             added = solved[-1].bias + torch.einsum("nf,fdt->dnt", self._known, solved[-1].observed)
-            parts = added.split([len(lane.sample) for lane in lanes], dim=1)
+            parts = torch.split(added, [len(lane.sample) for lane in lanes], dim=1)
             for lane, part in zip(lanes, parts, strict=True):
                 lane.correct(solved[-1].weight, part, anchor)
         return Place(place.step + 1, fitted, judged, solved, (*place.anchors, anchor))
