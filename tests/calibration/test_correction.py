@@ -11,8 +11,9 @@ import torch
 
 from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile.artifact.load import load_artifact
-from ttscompile.calibration import fit_correction as fitting
-from ttscompile.calibration.fit_correction import anchors_of, fit_correction
+from ttscompile.calibration import regression
+from ttscompile.calibration.fit_correction import fit_correction
+from ttscompile.calibration.sparse_loop import anchors_of
 from ttscompile.calibration.task import Found, Task
 from ttscompile.calibration.whole_steps import _set_apart
 from ttscompile.core.lattice import PlanArray, Source, dense_plan, uniform_plan
@@ -50,7 +51,7 @@ def test_a_linear_policy_is_corrected_to_its_own_noise(
     linear_policy: Path, recording: Path, plan: PlanArray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Everything between anchors is linear in the features, but for how the observation enters: nearly exact."""
-    monkeypatch.setattr(fitting, "RIDGE", 1e-9)
+    monkeypatch.setattr(regression, "RIDGE", 1e-9)
     task = tasks.make_task(linear_policy, recording, calls=300)
     assert fitted(task, plan).error(plan, task.calls) < 0.05 * task.error(plan, task.calls)
 
@@ -130,7 +131,7 @@ def test_schedules_are_compared_on_other_episodes_than_they_were_fitted_on() -> 
 
 @pytest.mark.parametrize("groups", [1, 3])
 def test_the_regression_finds_what_made_the_numbers(monkeypatch: pytest.MonkeyPatch, groups: int) -> None:
-    monkeypatch.setattr(fitting, "RIDGE", 1e-12)
+    monkeypatch.setattr(regression, "RIDGE", 1e-12)
     draw = torch.Generator().manual_seed(0)
     read, seen, weight, observed, bias = (
         torch.randn(*shape, generator=draw, dtype=torch.float64)
@@ -138,6 +139,6 @@ def test_the_regression_finds_what_made_the_numbers(monkeypatch: pytest.MonkeyPa
     )
     seen = seen - seen.mean(0)
     missing = read @ weight + seen @ observed + bias
-    found = fitting._solve(read, seen, missing, groups)
+    found = regression.solve(read, seen, missing, groups)
     for ours, made in ((found.weight, weight), (found.observed, observed.transpose(0, 1)), (found.bias, bias)):
         torch.testing.assert_close(ours, made.float(), rtol=0, atol=1e-4)

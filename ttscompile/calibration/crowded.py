@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
+from math import comb
 
 import numpy as np
 
@@ -27,6 +29,9 @@ COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 
 TRIED = (1.0, 2.0, 3.0, 4.0)
 """Those of ``CROWDING`` that are tried while only the number of steps is in question."""
+
+FEW = 128
+"""Where there are no more placements, a search tries them all: those of three steps among 16 are 105."""
 
 SAFE, FAST = "safe", "fast"
 """Plans beside the target: one computes twice as many cells, the other half as many; the robot chooses."""
@@ -54,6 +59,14 @@ def crowded_steps(steps: int, full_steps: int, crowding: float) -> tuple[int, ..
 def crowded_family(steps: int, full_steps: int, crowding: Sequence[float] = CROWDING) -> list[tuple[int, ...]]:
     """The different schedules that compute ``full_steps`` of the steps."""
     return list(dict.fromkeys(crowded_steps(steps, full_steps, one) for one in crowding))
+
+
+def other_placements(steps: int, full_steps: int) -> list[tuple[int, ...]] | None:
+    """All other schedules of ``full_steps`` of the steps, step 0 among them; None if there are more than ``FEW``."""
+    if comb(steps - 1, full_steps - 1) > FEW:
+        return None
+    every = ((0, *rest) for rest in combinations(range(1, steps), full_steps - 1))
+    return sorted(set(every) - set(crowded_family(steps, full_steps)), reverse=True)  # late steps first, see CROWDING
 
 
 @dataclass(frozen=True)

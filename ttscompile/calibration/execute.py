@@ -196,6 +196,12 @@ class State:
         self.forward: dict[int, Tensor] = {}
         self.timestep: dict[int, Tensor] = {}
 
+    def copy(self) -> State:
+        """Another one with the same residuals; what is written to one of the two is not written to the other."""
+        other = State()
+        other.forward, other.timestep = dict(self.forward), dict(self.timestep)
+        return other
+
     def reused(self, b: int, group: int, forwarding: BoolArray, axis: int) -> Tensor:
         """What block b adds where it is not computed."""
         own, other = self.timestep[b], self.forward[group]

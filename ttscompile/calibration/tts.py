@@ -2,9 +2,10 @@
 
 The search places whole steps, because with a correction (``fit_correction``) it is they that carry information
 about the observation and the noise, and everything in between is nearly linear. Every candidate gets a correction of
-its own, fitted on some of the calls, and is judged by the true error of its actions on others. It starts with the best
-of a family of crowded schedules, and then moves one step at a time, far at first, until no move helps. The winner's
-correction is fitted again, on all calls. Then ``pruner.adaptation`` lets the pruner depart from the schedule.
+its own, fitted on some of the calls, and is judged by the true error of its actions on others. It starts with a family
+of crowded schedules. Where there are few others, it tries them all; else it moves one step of the best at a time, far
+at first, until no move helps. The winner's correction is fitted again, on all calls. Then ``pruner.adaptation`` lets
+the pruner depart from the schedule.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..core.lattice import PlanArray
-from .crowded import crowded_family
+from .crowded import crowded_family, other_placements
 from .pruner.adaptation import Adaptation
 from .pruner.switches import has_head
 from .task import Array, Found, Task
@@ -40,10 +41,11 @@ class Tts:
         self._full = min(max(1, task.budget // model.blocks), model.steps)
         self._steps: tuple[int, ...] = tuple(range(self._full))
         self.loss = float("nan")
-        self._crowded = crowded_family(model.steps, self._full)
-        self._moves = [(distance, i) for distance in DISTANCES for i in range(1, self._full)]
+        others = other_placements(model.steps, self._full)
+        self._family = [*crowded_family(model.steps, self._full), *(others or ())]
+        self._moves = [(distance, i) for distance in DISTANCES for i in range(1, self._full)] if others is None else []
         self.closing = Adaptation.INTERVALS if has_head(task.pruner) else 0
-        self.intervals = len(self._crowded) + len(self._moves) + self.closing
+        self.intervals = len(self._family) + len(self._moves) + self.closing
         self._adaptation: Adaptation | None = None
         self._settled: Found | None = None
 
@@ -74,14 +76,14 @@ class Tts:
         if self._adaptation is not None:
             self._adaptation.advance()
             return
-        if interval < len(self._crowded):
-            self._whole.expect(self._crowded[interval:])
-            self._try([self._crowded[interval]])
+        if interval < len(self._family):
+            self._whole.expect(self._family[interval:])
+            self._try([self._family[interval]])
         else:
-            moves = self._moves[interval - len(self._crowded) :]
+            moves = self._moves[interval - len(self._family) :]
             self._whole.expect(steps for move in moves for steps in self._candidates(*move))  # if none of them helps
             self._try(self._candidates(*moves[0]))
-        if interval + 1 >= len(self._crowded) + len(self._moves):
+        if interval + 1 >= len(self._family) + len(self._moves):
             self.close()
 
     def state(self) -> dict[str, Array]:

@@ -8,13 +8,16 @@ from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
+from torch import Tensor
 
 from ..core.correction import Correction
 from ..core.lattice import BoolArray, PlanArray, whole_steps_plan
 from .calls import Actions, Calls, IntArray
 from .execute import Executor
-from .fit_correction import anchors_of, fit_correction
+from .fit_correction import fit_correction
 from .pool import Here, Pool, Work, artifact_elsewhere, place_of
+from .sparse_loop import SparseLoop, anchors_of, is_whole
+from .trails import Trails
 
 FITTED, COMPARED = 384, 128
 """Calls on which a candidate's correction is fitted, and others on which its error is measured; fewer if there are
@@ -53,6 +56,7 @@ class WholeSteps:
         self._executor, self._actions, self._calls = executor, actions, calls
         self._reading: dict[int, bool] = {}
         self._known: dict[tuple[int, ...], Errors] = {}
+        self._trails: dict[bool | None, Trails] = {}
         self._pool = pool or Here()
         self._work = Work(self.measured, _measured_elsewhere, (*place_of(executor.artifact), calls, seed))
         order = np.random.default_rng((seed, 3, 0)).permutation(calls.count)
@@ -92,7 +96,11 @@ class WholeSteps:
 
     def measured(self, steps: Sequence[int]) -> tuple[Errors, float]:
         """The errors of a schedule, and ``_pace``: what is done for a candidate, wherever that is."""
-        return min(self._with_and_without(self.plan(steps)), key=lambda errors: errors.normalised), self._pace
+        reads = self.reads(len(steps))
+        begun = time.monotonic()
+        errors = min((self._error_of(steps, with_) for with_ in (reads, None)), key=lambda found: found.normalised)
+        self._pace = max(self._pace, (time.monotonic() - begun) / len(steps))
+        return errors, self._pace
 
     def correction(self, steps: Sequence[int]) -> Correction | None:
         """The correction of a schedule, fitted on all calls; None where the schedule is better without."""
@@ -100,10 +108,14 @@ class WholeSteps:
 
     def correction_of(self, plan: PlanArray) -> Correction | None:
         """The same for any plan ``[K, blocks]`` that reads no rollout cache: calls stand alone here."""
-        corrected, plain = self._with_and_without(plan)
+        reads, whole = self.reads(_full_steps(plan)), is_whole(plan)
+        corrected, plain = (
+            self._errors(SparseLoop(self._executor, fitted, self._compared, reads=reads, whole=whole).end(plan).samples)
+            for fitted in (self._fitted, None)
+        )
         if plain.normalised <= corrected.normalised:
             return None
-        return fit_correction(self._executor, plan, self._calls, self.reads(_full_steps(plan)))
+        return fit_correction(self._executor, plan, self._calls, reads)
 
     def reads(self, count: int) -> bool:
         """Whether corrections of schedules of so many steps read the observation.
@@ -115,17 +127,22 @@ class WholeSteps:
         if count not in self._reading:
             halving = [self.steps - (self.steps >> i) for i in range(1, 6) if self.steps >> i > 1]
             more = max(0, min(count - 1, len(halving)))
-            plans = [self.plan([0, *some]) for some in (halving[:more], halving[len(halving) - more :])]
-            self._reading[count] = len(np.unique(self._fitted.episodes)) > 1 and (
-                min(self._error_of(plan, reads=True) for plan in plans)
-                < min(self._error_of(plan, reads=False) for plan in plans)
-            )
+            tried = [(0, *some) for some in (halving[:more], halving[len(halving) - more :])]
+            best = {
+                reads: min(self._error_of(steps, reads).normalised for steps in tried)
+                for reads in (True, False)
+                if len(np.unique(self._fitted.episodes)) > 1
+            }
+            self._reading[count] = bool(best) and best[True] < best[False]
         return self._reading[count]
 
-    def _error_of(self, plan: PlanArray, reads: bool) -> float:
-        """Normalised error of a schedule with a correction that may, or may not, read the observation."""
-        fitted = fit_correction(self._executor, plan, self._fitted, reads)
-        return self._errors(plan, fitted).normalised
+    def _error_of(self, steps: Sequence[int], reads: bool | None) -> Errors:
+        """Errors of a schedule with a correction that may, or may not, read the observation; None: without one."""
+        if reads not in self._trails:
+            fitted = None if reads is None else self._fitted
+            loop = SparseLoop(self._executor, fitted, self._compared, reads=bool(reads), whole=True)
+            self._trails[reads] = Trails(loop, self.steps, self._executor.model.blocks)
+        return self._errors(self._trails[reads].end(steps).samples)
 
     def comparing(self, full_steps: int) -> float:
         """Seconds that ``errors`` of a schedule takes, by those so far; 0 before any."""
@@ -136,20 +153,12 @@ class WholeSteps:
         share = self._calls.count / (self._fitted.count + 2 * self._compared.count)
         return (1 + share) * self.comparing(full_steps)
 
-    def _with_and_without(self, plan: PlanArray) -> tuple[Errors, Errors]:
-        full = _full_steps(plan)
-        reads = self.reads(full)
-        begun = time.monotonic()
-        fitted = fit_correction(self._executor, plan, self._fitted, reads)
-        errors = self._errors(plan, fitted), self._errors(plan, None)
-        self._pace = max(self._pace, (time.monotonic() - begun) / full)
-        return errors
-
-    def _errors(self, plan: PlanArray, correction: Correction | None) -> Errors:
-        calls = self._compared
-        samples = self._executor.corrected(correction).run(plan, calls)
-        normalised, units = (self._actions.errors(samples, calls.targets, units=u).mean() for u in (False, True))
-        return Errors(float(normalised), float(units))
+    def _errors(self, samples: Tensor) -> Errors:
+        """Of the samples that the calls to compare on end with."""
+        normalised, units = (
+            float(self._actions.errors(samples, self._compared.targets, units=u).mean()) for u in (False, True)
+        )
+        return Errors(normalised, units)
 
 
 def _measured_elsewhere(

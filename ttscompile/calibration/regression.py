@@ -1,0 +1,96 @@
+"""The regression that gives the correction of a step: on features of the loop, and on components of the condition."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..core.spec import FloatArray
+
+RIDGE = 1e-4
+"""Times the mean square of a feature, for each call. That of a component of the condition is 1."""
+
+ROWS = 512
+"""Calls whose conditions give the directions of the components, at most."""
+
+SMALLEST = 1e-4
+"""A component is mostly rounding, and not read, if its deviation is below this share of the largest one, or of a tenth
+of the mean."""
+
+
+@dataclass(frozen=True)
+class Components:
+    """Principal components of the condition of some calls.
+
+    Attributes:
+        reading: ``[N, F]``, from the condition to them.
+        center: ``[F]``, their mean over the calls, which ``values`` are without.
+        values: ``[n, F]``, float64, of mean square 1.
+    """
+
+    reading: FloatArray
+    center: FloatArray
+    values: Tensor
+
+    @classmethod
+    def of(cls, condition: Tensor, most: int) -> Components:
+        """The largest ones of ``[n, N]``, as many at most."""
+        rows = condition[:, : condition.shape[1] if most else 0].double()
+        mean, some = rows.mean(0), rows[:: -(-len(rows) // ROWS)]
+        _, lengths, directions = torch.linalg.svd(some - mean, full_matrices=False)
+        deviations = lengths / len(some) ** 0.5
+        floor = SMALLEST * max(float(deviations.max()) if most else 0.0, 0.1 * float(mean.norm()), 1e-6)
+        count = min(most, int((deviations > floor).sum()))
+        reading = (directions[:count] / deviations[:count, None]).T.float()
+        center = mean @ reading.double()
+        return cls(reading.numpy(), center.float().numpy(), rows @ reading.double() - center)
+
+    def of_others(self, condition: Tensor) -> Tensor:
+        """Those of other calls, ``[n, F]``, from their condition ``[n, N]``."""
+        reading = torch.from_numpy(self.reading).double()
+        return condition[:, : len(reading)].double() @ reading - torch.from_numpy(self.center).double()
+
+
+class Solved(NamedTuple):
+    """The correction of one step.
+
+    Attributes:
+        weight: ``[G, 6 T, T]``.
+        bias: ``[D, 1, T]``.
+        observed: of components, ``[F, D, T]``.
+    """
+
+    weight: Tensor
+    bias: Tensor
+    observed: Tensor
+
+
+def solve(read: Tensor, components: Tensor, missing: Tensor, groups: int) -> Solved:
+    """Ridge regression with a bias, of each action dimension on features and components; float32.
+
+    For given weights of the features the best ones of the components are known, so the former are the regression on
+    what the components leave over.
+
+    Args:
+        read: features ``[D, n, 6 T]``.
+        components: ``[n, F]``, of mean 0.
+        missing: ``[D, n, T]``.
+        groups: D, or 1 where all dimensions share the weights of features.
+    """
+    mean, offset = read.mean(1, keepdim=True), missing.mean(1, keepdim=True)
+    features, targets = read - mean, missing - offset
+    calls, width = features.shape[1:]
+    own = components.T @ components + RIDGE * calls * torch.eye(components.shape[1], dtype=components.dtype)
+    seen, wanted = components.T @ features, components.T @ targets
+    gram = features.transpose(1, 2) @ features
+    scale = gram.diagonal(dim1=1, dim2=2).reshape(groups, -1, width).sum(1).mean(1)[:, None, None]
+    gram = gram - seen.transpose(1, 2) @ torch.linalg.solve(own, seen)
+    product = features.transpose(1, 2) @ targets - seen.transpose(1, 2) @ torch.linalg.solve(own, wanted)
+    if groups == 1:
+        gram, product = gram.sum(0, keepdim=True), product.sum(0, keepdim=True)
+    weight = torch.linalg.solve(gram + (RIDGE * scale + 1e-9) * torch.eye(width, dtype=gram.dtype), product)
+    observed = torch.linalg.solve(own, wanted - seen @ weight)
+    return Solved(weight.float(), (offset - mean @ weight).float(), observed.transpose(0, 1).float())

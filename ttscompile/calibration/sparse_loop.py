@@ -1,0 +1,199 @@
+"""The sparse loop, step by step, on calls that its corrections are fitted on while it goes, and on others beside them.
+
+A place in the loop is a value: several schedules can go on from one, and what they have in common is gone once.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from copy import copy
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..core.correction import Correction, components_of, groups_of, numbers_of
+from ..core.lattice import BoolArray, PlanArray, Source
+from ..runtimes.reference.sampler import correct, features
+from .calls import Calls
+from .execute import Executor, State, workers
+from .regression import Components, Solved, solve
+
+STREAMS = 64
+"""Calls that go through the loop at once."""
+
+ANCHOR_SHARE = 0.5
+"""Of the blocks that a step computes, from which on it is an anchor."""
+
+
+def anchors_of(plan: PlanArray) -> BoolArray:
+    """Steps of a plan ``[K, blocks]`` that compute at least half of their blocks, ``[K]``."""
+    return np.asarray((plan == Source.COMPUTE).mean(axis=1) >= ANCHOR_SHARE)
+
+
+def is_whole(plan: PlanArray) -> bool:
+    """Whether every step of a plan ``[K, blocks]`` computes all blocks, or reads TIMESTEP in all of them."""
+    return bool((plan == plan[:, :1]).all() and np.isin(plan, (Source.COMPUTE, Source.TIMESTEP)).all())
+
+
+@dataclass(frozen=True)
+class Place:
+    """Before a step of a sparse loop.
+
+    Attributes:
+        step: the number of the step.
+        fitted: calls that corrections are fitted on, at this place.
+        judged: others, that only go along.
+        solved: the corrections of the steps before.
+        anchors: whether these steps are anchors.
+    """
+
+    step: int
+    fitted: tuple[_Lane, ...]
+    judged: tuple[_Lane, ...]
+    solved: tuple[Solved, ...] = ()
+    anchors: tuple[bool, ...] = ()
+
+    @property
+    def samples(self) -> Tensor:
+        """Those of the judged calls, ``[N, T, D]``."""
+        return torch.cat([lane.sample for lane in self.judged])
+
+    @property
+    def held(self) -> list[Tensor]:
+        """The samples and residuals of it; places share those that nothing changed between them."""
+        return [tensor for lane in (*self.fitted, *self.judged) for tensor in lane.held]
+
+
+class SparseLoop:
+    """The sparse loop of some calls.
+
+    Args:
+        executor: runs the policy; its own correction is not used.
+        fitted: calls with their dense paths, that corrections are fitted on; None for a loop without corrections.
+        judged: others; None for none.
+        reads: whether corrections may read the observation.
+        whole: whether all plans are whole, see ``is_whole``; then places are small.
+
+    Attributes:
+        begin: the place before step 0.
+    """
+
+    def __init__(
+        self, executor: Executor, fitted: Calls | None, judged: Calls | None, *, reads: bool, whole: bool
+    ) -> None:
+        self._components: Components | None = None
+        self._groups, self._known = 0, torch.empty(0, 0)
+        if fitted is not None:
+            steps, sample = executor.model.steps, (fitted.initial.shape[1], fitted.initial.shape[2])
+            condition = executor.model.condition(fitted.contexts)
+            most = components_of(steps, sample, numbers_of([tuple(condition.shape[1:])])) if reads else 0
+            self._components, self._groups = Components.of(condition, most), groups_of(steps, sample)
+            others = [] if judged is None else [self._components.of_others(executor.model.condition(judged.contexts))]
+            self._known = torch.cat([self._components.values, *others]).float()
+
+        def lanes(calls: Calls | None) -> tuple[_Lane, ...]:
+            if calls is None:
+                return ()
+            parts = [np.arange(i, min(i + STREAMS, calls.count)) for i in range(0, calls.count, STREAMS)]
+            return tuple(_Lane(executor, executor.select(calls, part), whole and executor.alike) for part in parts)
+
+        self.begin = Place(0, lanes(fitted), lanes(judged))
+
+    def after(self, place: Place, row: PlanArray, pool: ThreadPoolExecutor) -> Place:
+        """The place after one step more.
+
+        Args:
+            place: before it.
+            row: of the plan, ``[blocks]``, which reads no rollout cache.
+            pool: see ``execute.workers``; the lanes go through the network beside each other.
+        """
+        lanes, anchor = [lane.fork() for lane in (*place.fitted, *place.judged)], bool(anchors_of(row[None])[0])
+        list(pool.map(partial(_Lane.predict, k=place.step, row=row), lanes))
+        fitted, judged, solved = tuple(lanes[: len(place.fitted)]), tuple(lanes[len(place.fitted) :]), place.solved
+        if self._components is not None:
+            read, missing = (torch.cat(column, 1) for column in zip(*map(_Lane.missing, fitted), strict=True))
+            solved = (*solved, solve(read.double(), self._components.values, missing.double(), self._groups))
+            added = solved[-1].bias + torch.einsum("nf,fdt->dnt", self._known, solved[-1].observed)
+            parts = torch.split(added, [len(lane.sample) for lane in lanes], dim=1)
+            for lane, part in zip(lanes, parts, strict=True):
+                lane.correct(solved[-1].weight, part, anchor)
+        return Place(place.step + 1, fitted, judged, solved, (*place.anchors, anchor))
+
+    def end(self, plan: PlanArray) -> Place:
+        """The place after the last step of a plan ``[K, blocks]``."""
+        place = self.begin
+        with workers() as pool:
+            for row in plan:
+                place = self.after(place, row, pool)
+        return place
+
+    def correction(self, place: Place) -> Correction:
+        """What was fitted, at the place after the last step of a loop with corrections."""
+        assert self._components is not None
+        columns = zip(*place.solved, strict=True)
+        weights, biases, observed = (np.stack([each.numpy() for each in column]) for column in columns)
+        observed = np.ascontiguousarray(observed.transpose(1, 0, 2, 3))
+        biases = biases - np.einsum("f,fkdt->kdt", self._components.center, observed)[:, :, None]
+        anchors, reading = np.array(place.anchors), self._components.reading
+        return Correction(anchors, weights, biases.astype(np.float32), reading, observed)
+
+
+class _Lane:
+    """Some of the calls at a place.
+
+    Args:
+        executor: runs the policy.
+        calls: the calls.
+        sums: keep of residuals what all blocks added together, which is enough for whole steps.
+    """
+
+    def __init__(self, executor: Executor, calls: Calls, sums: bool) -> None:
+        self._executor, self._calls, self._sums = executor, calls, sums
+        self._state, self._total = State(), calls.initial
+        self._carried = self._before = executor.model.sampler.begin(calls.initial)
+        self._k, self._prediction = 0, calls.initial
+
+    @property
+    def sample(self) -> Tensor:
+        """``[n, T, D]``."""
+        return self._carried.sample
+
+    @property
+    def held(self) -> list[Tensor]:
+        """See ``Place``."""
+        return [*self._carried, self._total, *self._state.timestep.values()]
+
+    def fork(self) -> _Lane:
+        """Another one at the same place; what happens to one of the two does not happen to the other."""
+        other = copy(self)
+        other._state = self._state.copy()
+        return other
+
+    def predict(self, k: int, row: PlanArray) -> None:
+        """Go through step k, without a correction."""
+        model, calls, self._before = self._executor.model, self._calls, self._carried
+
+        def blocks(k: int, stem: Tensor) -> Tensor:
+            if self._sums and row[0] != Source.COMPUTE:
+                return stem + self._total
+            stream = self._executor.step(row[None], k, stem, calls, self._state)
+            if self._sums:
+                self._total, self._state = stream - stem, State()
+            return stream
+
+        self._k, self._prediction = k, model.predict(self._before.sample, k, calls.contexts, blocks)
+        noise = None if calls.noise is None else calls.noise[k]
+        self._carried = model.sampler.advance(self._before, self._prediction, noise, k)
+
+    def missing(self) -> tuple[Tensor, Tensor]:
+        """Features of the step, ``[D, n, 6 T]``, and what is missing after it, ``[D, n, T]``."""
+        assert self._calls.path is not None
+        missing = (self._calls.path[:, self._k] - self._carried.sample).permute(2, 0, 1)
+        return features(self._before, self._prediction), missing
+
+    def correct(self, weight: Tensor, added: Tensor, anchor: bool) -> None:
+        """Correct the step: weights ``[G, 6 T, T]``, and what is added beside, ``[D, n, T]``."""
+        self._carried = correct(self._before, self._prediction, self._carried, weight, added, anchor)
