@@ -22,6 +22,7 @@ from ..core.spec import AUTO, FP32, INT8, PRECISIONS
 from ..errors import LoweringError
 from ..ir.flops import graph_flops
 from ..ir.pieces import BLOCKS, OF_ALL_BLOCKS, STEP, frame_name, part_of
+from .integer_attention import HEADS, attention_of, integer_attention
 from .integer_convolution import DOMAIN, INTEGER_PRODUCT, convolution_of, integer_convolution, shapes_of
 from .onnx_model import live_nodes
 
@@ -156,7 +157,8 @@ def _notes(
         convolved = f", {kinds[INTEGER_PRODUCT]} of convolutions" if kinds[INTEGER_PRODUCT] else ""
         count = kinds[_PRODUCT] + kinds[INTEGER_PRODUCT]
         megabytes = sum(value.nbytes for value in constants.values()) / 1e6
-        yield f"{precision}: {count} matrices of {where}, {megabytes:.1f} MB{convolved}"
+        attending = f", and {kinds[HEADS]} attentions" if kinds[HEADS] else ""
+        yield f"{precision}: {count} matrices of {where}, {megabytes:.1f} MB{convolved}{attending}"
     for name in pieces:
         if name not in lowered:
             yield f"{name} stays fp32: no product with constant weights" + " and many rows" * (part != BLOCKS)
@@ -213,6 +215,8 @@ def quantize_model(
         elif (convolution := convolution_of(node, _attributes(node), known, shapes)) is not None:
             integers, scales = _integers(convolution.weight, convolution.matrix, constants)
             nodes += integer_convolution(node, convolution, integers, scales, keep)
+        elif (attention := attention_of(node, _attributes(node), shapes)) is not None:
+            nodes += integer_attention(node, attention, keep)
         else:
             nodes.append(node)
     nodes = live_nodes(nodes, {value.name for value in model.graph.output})
