@@ -41,16 +41,18 @@ ANCHOR_SHARE = 0.5
 
 
 def anchors_of(plan: PlanArray) -> BoolArray:
-    """Steps of a plan ``[K, blocks]`` that compute at least half of their blocks, ``[K]``."""
-    return np.asarray((plan == Source.COMPUTE).mean(axis=1) >= ANCHOR_SHARE)
+    """Steps of a plan ``[K, blocks]``, or on average of plans ``[N, K, blocks]``, that compute half of their blocks."""
+    computed = (plan == Source.COMPUTE).reshape(-1, *plan.shape[-2:])
+    return np.asarray(computed.mean(axis=(0, 2)) >= ANCHOR_SHARE)
 
 
 def fit_correction(executor: Executor, plan: PlanArray, calls: Calls, reads: bool) -> Correction:
-    """The correction of a schedule.
+    """The correction of a schedule, or one for all plans of a pruner.
 
     Args:
         executor: runs the policy; its own correction is not used.
-        plan: ``[K, blocks]``, which reads no rollout cache.
+        plan: ``[K, blocks]``, or ``[N, K, blocks]`` for each call one of its own. It may read the rollout cache where
+            the calls are windows.
         calls: to fit it on, with their dense paths.
         reads: whether it may read the observation.
     """
@@ -60,8 +62,10 @@ def fit_correction(executor: Executor, plan: PlanArray, calls: Calls, reads: boo
     condition = executor.model.condition(calls.contexts)
     most = components_of(steps, sample, numbers_of([tuple(condition.shape[1:])])) if reads else 0
     components = _Components.of(condition, most)
-    parts = [np.arange(i, min(i + STREAMS, calls.count)) for i in range(0, calls.count, STREAMS)]
-    lanes = [_Lane(executor, plan, executor.select(calls, part)) for part in parts]
+    size = max(1, STREAMS // calls.window) * calls.window
+    parts = [np.arange(i, min(i + size, calls.count)) for i in range(0, calls.count, size)]
+    plans = plan.reshape(-1, *plan.shape[-2:])
+    lanes = [_Lane(executor, plans if len(plans) == 1 else plans[part], executor.select(calls, part)) for part in parts]
     solved = []
     with workers() as pool:
         for k in range(steps):
@@ -106,11 +110,11 @@ class _Components:
 
 
 class _Lane:
-    """Some of the calls on their way through the sparse loop."""
+    """Some of the calls on their way through the sparse loop; ``plans`` is ``[n, K, blocks]``, or of one for all."""
 
-    def __init__(self, executor: Executor, plan: PlanArray, calls: Calls) -> None:
+    def __init__(self, executor: Executor, plans: PlanArray, calls: Calls) -> None:
         assert calls.path is not None
-        self._executor, self._plan, self._calls, self._path = executor, plan, calls, calls.path
+        self._executor, self._plans, self._calls, self._path = executor, plans, calls, calls.path
         self._state = State()
         self._carried = self._following = executor.model.sampler.begin(calls.initial)
         self._prediction = calls.initial
@@ -120,7 +124,7 @@ class _Lane:
         model, calls = self._executor.model, self._calls
 
         def blocks(k: int, stem: Tensor) -> Tensor:
-            return self._executor.step(self._plan[k][None], k, stem, calls, self._state)
+            return self._executor.step(self._plans[:, k], k, stem, calls, self._state)
 
         self._prediction = model.predict(self._carried.sample, k, calls.contexts, blocks)
         noise = None if calls.noise is None else calls.noise[k]

@@ -55,11 +55,16 @@ class WholeSteps:
         self._known: dict[tuple[int, ...], Errors] = {}
         self._pool = pool or Here()
         self._work = Work(self.measured, _measured_elsewhere, (*place_of(executor.artifact), calls, seed))
-        order = np.random.default_rng((seed, 3, 0)).permutation(calls.count)
-        apart = _set_apart(calls.episodes[order])
-        self._compared = self._fitted = executor.select(calls, order[apart][:COMPARED])
+        order = np.random.default_rng((seed, 3, 0)).permutation(calls.count // calls.window)
+        apart = _set_apart(calls.episodes[:: calls.window][order])
+
+        def some(windows: IntArray, most: int) -> Calls:
+            chosen = windows[: max(1, most // calls.window), None] * calls.window + np.arange(calls.window)
+            return executor.select(calls, chosen.reshape(-1))
+
+        self._compared = self._fitted = some(order[apart], COMPARED)
         if not apart.all():
-            self._fitted = executor.select(calls, order[~apart][:FITTED])
+            self._fitted = some(order[~apart], FITTED)
 
     @property
     def steps(self) -> int:
@@ -98,12 +103,13 @@ class WholeSteps:
         """The correction of a schedule, fitted on all calls; None where the schedule is better without."""
         return self.correction_of(self.plan(steps))
 
-    def correction_of(self, plan: PlanArray) -> Correction | None:
-        """The same for any plan ``[K, blocks]`` that reads no rollout cache: calls stand alone here."""
+    def correction_of(self, plan: PlanArray | Callable[[Calls], PlanArray]) -> Correction | None:
+        """The same for any plan ``[K, blocks]``, or for whatever makes plans ``[N, K, blocks]`` of N calls."""
         corrected, plain = self._with_and_without(plan)
         if plain.normalised <= corrected.normalised:
             return None
-        return fit_correction(self._executor, plan, self._calls, self.reads(_full_steps(plan)))
+        plans = _plans(plan, self._calls)
+        return fit_correction(self._executor, plans, self._calls, self.reads(_full_steps(plans)))
 
     def reads(self, count: int) -> bool:
         """Whether corrections of schedules of so many steps read the observation.
@@ -136,18 +142,19 @@ class WholeSteps:
         share = self._calls.count / (self._fitted.count + 2 * self._compared.count)
         return (1 + share) * self.comparing(full_steps)
 
-    def _with_and_without(self, plan: PlanArray) -> tuple[Errors, Errors]:
-        full = _full_steps(plan)
+    def _with_and_without(self, plan: PlanArray | Callable[[Calls], PlanArray]) -> tuple[Errors, Errors]:
+        plans = _plans(plan, self._fitted)
+        full = _full_steps(plans)
         reads = self.reads(full)
         begun = time.monotonic()
-        fitted = fit_correction(self._executor, plan, self._fitted, reads)
+        fitted = fit_correction(self._executor, plans, self._fitted, reads)
         errors = self._errors(plan, fitted), self._errors(plan, None)
         self._pace = max(self._pace, (time.monotonic() - begun) / full)
         return errors
 
-    def _errors(self, plan: PlanArray, correction: Correction | None) -> Errors:
+    def _errors(self, plan: PlanArray | Callable[[Calls], PlanArray], correction: Correction | None) -> Errors:
         calls = self._compared
-        samples = self._executor.corrected(correction).run(plan, calls)
+        samples = self._executor.corrected(correction).run(_plans(plan, calls), calls)
         normalised, units = (self._actions.errors(samples, calls.targets, units=u).mean() for u in (False, True))
         return Errors(float(normalised), float(units))
 
@@ -159,8 +166,13 @@ def _measured_elsewhere(
     return WholeSteps(Executor(artifact), Actions(artifact.manifest.spec), calls, seed).measured
 
 
+def _plans(plan: PlanArray | Callable[[Calls], PlanArray], calls: Calls) -> PlanArray:
+    """The plan that all calls have, or those that are made for them."""
+    return plan(calls) if callable(plan) else plan
+
+
 def _full_steps(plan: PlanArray) -> int:
-    """How many steps of a plan are anchors: those of a schedule of whole steps that are computed."""
+    """How many steps of a plan, or of plans, are anchors: those of a schedule of whole steps that are computed."""
     return max(1, int(anchors_of(plan).sum()))
 
 
