@@ -6,11 +6,16 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from ttscompile.artifact.load import load_artifact
-from ttscompile.calibration.calls import prepare_calls, sample_calls
+from ttscompile.calibration.calls import Calls, prepare_calls, sample_calls
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.task import Task
 from ttscompile.trajectories import load_trajectories
+from ttscompile.trajectories.episodes import Episode
+
+WINDOW = 4
 
 MakeTask = Callable[..., Task]
 """``make_task`` on the nonlinear policy."""
@@ -27,3 +32,13 @@ def make_task(
     prepared = prepare_calls(executor.model, spec, recorded, chosen, (0, episodes.start))
     prepared = replace(prepared, path=executor.run_dense(prepared))
     return Task.of(artifact, executor, prepared, budget, seed)
+
+
+def in_windows(task: Task, windows: int, window: int = WINDOW, pinned: bool = False) -> Calls:
+    """Consecutive calls of made-up episodes, with targets."""
+    spec, model = task.executor.artifact.manifest.spec, task.executor.model
+    walk = np.cumsum(np.random.default_rng(5).standard_normal((windows, window, 2, 3)), 1).astype(np.float32)
+    episodes = [Episode("made up", {"obs": one}) for one in walk]
+    chosen = [(n, row) for n in range(windows) for row in range(window)]
+    calls = prepare_calls(model, spec, episodes, chosen, (0, 9), window, pinned)
+    return replace(calls, path=task.executor.run_dense(calls))

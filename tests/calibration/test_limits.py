@@ -81,7 +81,7 @@ def test_a_limit_holds_within_an_interval(
     task, clock, block = make_task(budget=34, calls=8), _Hand(limit), ReferenceModel.block
 
     def slow(self: ReferenceModel, b: int, k: int, stream: Any, contexts: Contexts, *streams: Any) -> torch.Tensor:
-        clock.now += len(streams[0]) if streams else contexts.streams
+        clock.now += len(streams[0]) if streams and streams[0] is not None else contexts.streams
         return block(self, b, k, stream, contexts, *streams)
 
     monkeypatch.setattr(ReferenceModel, "block", slow)

@@ -102,7 +102,7 @@ def test_one_call_is_enough(make_task: MakeTask, name: str) -> None:
 
 
 def test_an_unknown_name_is_refused() -> None:
-    with pytest.raises(CalibrationError, match="'magic'; expected one of tts, interval, bac"):
+    with pytest.raises(CalibrationError, match="'magic'; expected one of tts, tts-paper, interval"):
         strategy_of("magic")
 
 

@@ -97,7 +97,9 @@ def test_what_was_not_of_use_for_longest_is_forgotten_first(task: Task, counted:
     assert counted(small, [(0, 2, 6)])[1] == 2
 
 
-@pytest.mark.parametrize(("steps", "count", "placements"), [(16, 3, 105), (16, 2, 15), (9, 9, 1), (9, 1, 1), (16, 4, 0)])
+@pytest.mark.parametrize(
+    ("steps", "count", "placements"), [(16, 3, 105), (16, 2, 15), (9, 9, 1), (9, 1, 1), (16, 4, 0)]
+)
 def test_where_there_are_few_placements_all_are_tried(steps: int, count: int, placements: int) -> None:
     others = other_placements(steps, count)
     if not placements:

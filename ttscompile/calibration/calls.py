@@ -75,9 +75,16 @@ def load_episodes(
     return episodes
 
 
+WINDOW = 8
+"""Consecutive calls of an episode that stand together, where plans may read the rollout cache; fewer where episodes are
+shorter."""
+
+
 @dataclass(frozen=True)
 class Calls:
-    """N calls, independent of each other.
+    """N calls: independent of each other, or in windows of consecutive calls of one episode.
+
+    The first call of a window is treated as the first of its episode: nothing of an earlier one is in the caches.
 
     Attributes:
         contexts: what the loop reads beside the stream.
@@ -86,6 +93,7 @@ class Calls:
         episodes: the number of the episode that each call is from, ``[N]``.
         path: the sample of the dense policy after each step with the same noise, ``[N, K, T, D]``; None before it is
             known.
+        window: how many calls, one after the other, are a window; 1 for calls that are independent of each other.
     """
 
     contexts: Contexts
@@ -93,6 +101,7 @@ class Calls:
     noise: Tensor | None
     episodes: IntArray
     path: Tensor | None = None
+    window: int = 1
 
     @property
     def count(self) -> int:
@@ -129,22 +138,55 @@ def sample_calls(
     return [places[i] for i in order[:limit]]
 
 
+def window_of(episodes: Sequence[Episode], split: Split) -> int:
+    """How many consecutive calls are a window: ``WINDOW``, or the most that an episode of either part has."""
+    longest = (max(episodes[n].calls for n in part) for part in (split.calibration, split.validation))
+    return min(WINDOW, *longest)
+
+
+def sample_windows(
+    episodes: Sequence[Episode], numbers: Sequence[int], limit: int, window: int, seed: int, repeats: int = 1
+) -> list[tuple[int, int]]:
+    """The same as ``sample_calls``, by windows: the calls of a window one after the other, at most ``limit`` in all.
+
+    The windows of an episode do not overlap, and cover it from its first call on; calls that are left over at its end
+    are not drawn.
+    """
+    draw = np.random.default_rng((seed, 1, *numbers))
+    places = [(n, row) for n in numbers for row in range(0, episodes[n].calls - window + 1, window)]
+    order = np.concatenate([draw.permutation(len(places)) for _ in range(repeats)])
+    chosen = [places[i] for i in order[: max(1, limit // window)]]
+    return [(n, row + i) for n, row in chosen for i in range(window)]
+
+
 def prepare_calls(
     model: ReferenceModel,
     spec: PolicySpec,
     episodes: Sequence[Episode],
     chosen: Sequence[tuple[int, int]],
     seed: tuple[int, ...],
+    window: int = 1,
+    pinned: bool = False,
 ) -> Calls:
     """Calls without targets: draw their noise and run the prologue.
 
-    ``chosen`` has the number of the episode, and the row in it, of each call.
+    Args:
+        model: of the policy.
+        spec: of the policy.
+        episodes: all recorded episodes.
+        chosen: the number of the episode, and the row in it, of each call; those of a window one after the other.
+        seed: the seed of the noise.
+        window: see ``Calls``.
+        pinned: whether all calls of a window have the noise of its first; else each has noise of its own.
     """
     initial, noise = draw_noise(spec, len(chosen), seed)
+    if pinned:
+        first = torch.arange(len(chosen)) // window * window
+        initial, noise = initial[first], None if noise is None else noise[:, first]
     observed = {key: np.stack([episodes[n].observations[key][row] for n, row in chosen]) for key in spec.observations}
     with torch.no_grad():
         contexts = model.prologue({key: torch.from_numpy(one) for key, one in normalized(spec, observed).items()})
-    return Calls(contexts, initial, noise, np.array([n for n, _ in chosen], np.int64))
+    return Calls(contexts, initial, noise, np.array([n for n, _ in chosen], np.int64), window=window)
 
 
 def draw_noise(spec: PolicySpec, count: int, seed: tuple[int, ...]) -> tuple[Tensor, Tensor | None]:

@@ -1,8 +1,9 @@
-"""Plans on many calls at once: the meaning of the reference runtime for calls that are independent of each other.
+"""Plans on many calls at once: the meaning of the reference runtime.
 
 A search tries thousands of plans, on calls that go through the loop together; a step in which nothing is computed costs
-one addition. No plan here reads the rollout cache: what one call leaves for the next is the reference runtime's
-business. Tests hold this against ``ReferenceModel.denoise``.
+one addition. Consecutive calls of an episode (``Calls.window``) go through it together, too: what a call reads of an
+earlier one is a residual of the same step and the same block, so that it is there when the block has been computed for
+all calls. Tests hold this against ``ReferenceModel.denoise``.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from ..runtimes.reference.model import Blocks, Contexts, ReferenceModel
 from .calls import Calls, IntArray
 
 STREAMS = 256
-"""Calls with plans of their own that go through the loop at once."""
+"""Calls with plans of their own that go through the loop at once, about: windows stay whole."""
 
 
 class Executor:
@@ -70,8 +71,12 @@ class Executor:
         return other
 
     def select(self, calls: Calls, streams: Sequence[int] | IntArray) -> Calls:
-        """These calls, in this order; a call may be taken several times."""
-        index, contexts = torch.as_tensor(np.asarray(streams, dtype=np.int64)), calls.contexts
+        """These calls, in this order; a call may be taken several times.
+
+        They are windows still if whole windows were taken; else they are independent of each other.
+        """
+        chosen_calls = np.asarray(streams, dtype=np.int64)
+        index, contexts = torch.as_tensor(chosen_calls), calls.contexts
         there = index.to(self.model.device)
 
         def take(values: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -85,27 +90,32 @@ class Executor:
             noise=None if calls.noise is None else calls.noise[:, index],
             episodes=calls.episodes[index.numpy()],
             path=None if calls.path is None else calls.path[index],
+            window=calls.window if whole_windows(chosen_calls, calls.window) else 1,
         )
 
     def run(self, plan: PlanArray, calls: Calls) -> Tensor:
         """The denoised sample of every call.
 
         Args:
-            plan: ``[K, blocks]``, or ``[N, K, blocks]`` for each call one of its own; legal without a rollout cache.
+            plan: ``[K, blocks]``, or ``[N, K, blocks]`` for each call one of its own. A cell that reads of an earlier
+                call what no earlier one of its window computed reads TIMESTEP, as legalised plans do.
             calls: N of them.
 
         Returns:
             ``[N, T, D]``.
 
         Raises:
-            IllegalPlanError: a plan reads the rollout cache, or step 0 is not dense.
+            IllegalPlanError: a plan reads the rollout cache and calls are independent, or step 0 is not dense.
         """
-        if (plan == Source.ROLLOUT).any() or (plan[..., 0, :] != Source.COMPUTE).any():
-            raise IllegalPlanError("expected plans with a dense step 0 that read nothing of an earlier call.")
+        if (plan[..., 0, :] != Source.COMPUTE).any():
+            raise IllegalPlanError("expected plans with a dense step 0.")
+        if calls.window == 1 and (plan == Source.ROLLOUT).any():
+            raise IllegalPlanError("expected consecutive calls, or plans that read nothing of an earlier call.")
         with torch.no_grad():
             if plan.ndim == 2:
                 return last(self._samples(plan[None], calls))
-            parts = [np.arange(i, min(i + STREAMS, len(plan))) for i in range(0, len(plan), STREAMS)]
+            size = max(1, STREAMS // calls.window) * calls.window
+            parts = [np.arange(i, min(i + size, len(plan))) for i in range(0, len(plan), size)]
             return torch.cat([last(self._samples(plan[part], self.select(calls, part))) for part in parts])
 
     def run_dense(self, calls: Calls) -> Tensor:
@@ -180,6 +190,10 @@ class Executor:
                     part = self.model.block(b, k, stream, calls.contexts, streams.tolist())
                     residual = residual.index_copy(axis, streams, part)
                     state.write(b, group, axis, streams, part)
+                    reading, read = rollout_reads(column, calls.window)
+                    if len(reading):
+                        there = torch.from_numpy(np.stack([reading, read])).to(stream.device)
+                        residual = residual.index_copy(axis, there[0], residual.index_select(axis, there[1]))
             stream = stream + residual
         return stream
 
@@ -216,6 +230,33 @@ class State:
         """Put computed residuals of some streams into the caches."""
         self.timestep[b] = self.timestep[b].index_copy(axis, streams, residual)
         self.forward[group] = self.forward[group].index_copy(axis, streams, residual)
+
+
+def rollout_reads(column: PlanArray, window: int) -> tuple[IntArray, IntArray]:
+    """Which calls read ROLLOUT in a cell, and from which call each: from the last before it that computed the cell.
+
+    Args:
+        column: ``[N]``, the cell of each call's plan; or ``[1]`` for all calls, of which none then reads another.
+        window: consecutive calls.
+
+    Returns:
+        Numbers of calls, twice ``[n]``. A call whose cell no earlier one of its window computed is not among them.
+    """
+    if len(column) % window or not (column == Source.ROLLOUT).any():
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    numbers = np.arange(len(column))
+    computed = np.where(column == Source.COMPUTE, numbers, -1).reshape(-1, window)
+    latest = np.maximum.accumulate(computed, axis=1).reshape(-1)
+    reading = np.flatnonzero((column == Source.ROLLOUT) & (latest >= 0))
+    return reading, latest[reading]
+
+
+def whole_windows(numbers: IntArray, window: int) -> bool:
+    """Whether numbers of calls are those of whole windows, in order."""
+    if window == 1 or len(numbers) % window:
+        return False
+    rows = numbers.reshape(-1, window)
+    return bool((rows[:, :1] % window == 0).all() and (rows == rows[:, :1] + np.arange(window)).all())
 
 
 def last(samples: Iterable[Tensor]) -> Tensor:

@@ -16,11 +16,12 @@ from .sparse_loop import SparseLoop, is_whole
 
 
 def fit_correction(executor: Executor, plan: PlanArray, calls: Calls, reads: bool) -> Correction:
-    """The correction of a schedule.
+    """The correction of a schedule, or one for all plans of a pruner.
 
     Args:
         executor: runs the policy; its own correction is not used.
-        plan: ``[K, blocks]``, which reads no rollout cache.
+        plan: ``[K, blocks]``, or ``[N, K, blocks]`` for each call one of its own. It may read the rollout cache where
+            the calls are windows.
         calls: to fit it on, with their dense paths.
         reads: whether it may read the observation.
     """

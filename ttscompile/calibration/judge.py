@@ -11,6 +11,7 @@ import torch
 
 from ..artifact.load import Artifact
 from ..artifact.manifest import DENSE, UNIFORM, Manifest
+from ..core.correction import Correction
 from ..core.lattice import PlanArray, uniform_plan
 from ..core.spec import FP32
 from ..errors import CalibrationFailedError
@@ -50,21 +51,22 @@ def uniform_of(manifest: Manifest, budget: int) -> Found:
 def judge(artifact: Artifact, executor: Executor, plans: Mapping[str, Found], calls: Calls) -> dict[str, PlanScore]:
     """Scores of plans, and of those of the pruner that belongs to the one that is called ``schedule``, by name.
 
-    ``calls`` are of episodes that nothing was learned from, with targets.
+    ``calls`` are of episodes that nothing was learned from, with targets; windows of consecutive ones if a plan may
+    read what an earlier call computed.
     """
     flops, actions = artifact.manifest.flops, Actions(artifact.manifest.spec)
 
-    def errors(found: Found, plan: PlanArray) -> FloatArray:
-        return actions.errors(executor.corrected(found.correction).run(plan, calls), calls.targets, units=True)
+    def errors(correction: Correction | None, plan: PlanArray) -> FloatArray:
+        return actions.errors(executor.corrected(correction).run(plan, calls), calls.targets, units=True)
 
     scores = {
-        name: PlanScore.of(errors(found, found.schedule), found.schedule[None], flops, pruned=False)
+        name: PlanScore.of(errors(found.correction, found.schedule), found.schedule[None], flops, pruned=False)
         for name, found in plans.items()
     }
     found = plans[SCHEDULE]
     if found.pruner is not None:
         made = pruner_plan(executor.logits(calls, found.pruner))
-        scores[PRUNER] = PlanScore.of(errors(found, made), made, flops, pruned=True)
+        scores[PRUNER] = PlanScore.of(errors(found.pruner_correction, made), made, flops, pruned=True)
     return scores
 
 

@@ -21,7 +21,7 @@ from ..runtimes.torch.devices import device_of, exact_arithmetic
 from ..verification.record_golden import record_plans
 from .arguments import JUDGED, calls_to_learn_from, require_directory, require_limits
 from .budget import ERROR, LATENCY, Budget, Goal, cells_of, goal_of, measure_budget
-from .calls import Calls, digest_of, load_episodes, split_episodes
+from .calls import Calls, digest_of, load_episodes, split_episodes, window_of
 from .crowded import SAFE, SHARE, CrowdedSchedules, budget_of_error, named_plans
 from .execute import Executor
 from .judge import (
@@ -161,7 +161,8 @@ def calibrate(
         if goal.kind == LATENCY:
             budget = _timed_budget(artifact, goal, chosen, state, clock)
         executor = Executor(artifact, there)
-        sets = draw_calls(executor, spec, episodes, split, limit, min(JUDGED, limit // 2), seed)
+        window = window_of(episodes, split) if chosen.consecutive else 1
+        sets = draw_calls(executor, spec, episodes, split, limit, min(JUDGED, limit // 2), seed, window)
         with Bar(progress) as bar:
             if (warning := few_steps(artifact.manifest)) is not None:
                 bar.warn(warning)
@@ -219,8 +220,8 @@ def _write(
     """Put the plans into the artifact."""
     found = plans[SCHEDULE]
     corrections = {name: one.correction for name, one in plans.items() if one.correction is not None}
-    if found.pruner is not None and found.correction is not None:
-        corrections[PRUNER] = found.correction
+    if found.pruner is not None and found.pruner_correction is not None:
+        corrections[PRUNER] = found.pruner_correction
     steps = {name: one.notes["steps"] for name, one in plans.items() if name not in (SCHEDULE, UNIFORM)}
     update_calibration(
         path,

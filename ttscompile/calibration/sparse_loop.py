@@ -29,13 +29,15 @@ ANCHOR_SHARE = 0.5
 
 
 def anchors_of(plan: PlanArray) -> BoolArray:
-    """Steps of a plan ``[K, blocks]`` that compute at least half of their blocks, ``[K]``."""
-    return np.asarray((plan == Source.COMPUTE).mean(axis=1) >= ANCHOR_SHARE)
+    """Steps of a plan ``[K, blocks]``, or on average of plans ``[N, K, blocks]``, that compute half of their blocks."""
+    computed = (plan == Source.COMPUTE).reshape(-1, *plan.shape[-2:])
+    return np.asarray(computed.mean(axis=(0, 2)) >= ANCHOR_SHARE)
 
 
 def is_whole(plan: PlanArray) -> bool:
-    """Whether every step of a plan ``[K, blocks]`` computes all blocks, or reads TIMESTEP in all of them."""
-    return bool((plan == plan[:, :1]).all() and np.isin(plan, (Source.COMPUTE, Source.TIMESTEP)).all())
+    """Whether this is one plan ``[K, blocks]`` whose steps compute all blocks, or read TIMESTEP in all of them."""
+    known = np.isin(plan, (Source.COMPUTE, Source.TIMESTEP)).all()
+    return plan.ndim == 2 and bool(known and (plan == plan[:, :1]).all())
 
 
 @dataclass(frozen=True)
@@ -97,37 +99,39 @@ class SparseLoop:
         def lanes(calls: Calls | None) -> tuple[_Lane, ...]:
             if calls is None:
                 return ()
-            parts = [np.arange(i, min(i + STREAMS, calls.count)) for i in range(0, calls.count, STREAMS)]
+            size = max(1, STREAMS // calls.window) * calls.window
+            parts = [np.arange(i, min(i + size, calls.count)) for i in range(0, calls.count, size)]
             return tuple(_Lane(executor, executor.select(calls, part), whole and executor.alike) for part in parts)
 
         self.begin = Place(0, lanes(fitted), lanes(judged))
 
-    def after(self, place: Place, row: PlanArray, pool: ThreadPoolExecutor) -> Place:
+    def after(self, place: Place, rows: PlanArray, pool: ThreadPoolExecutor) -> Place:
         """The place after one step more.
 
         Args:
             place: before it.
-            row: of the plan, ``[blocks]``, which reads no rollout cache.
+            rows: of the plan of all calls, ``[1, blocks]``, or of the plan of each.
             pool: see ``execute.workers``; the lanes go through the network beside each other.
         """
-        lanes, anchor = [lane.fork() for lane in (*place.fitted, *place.judged)], bool(anchors_of(row[None])[0])
-        list(pool.map(partial(_Lane.predict, k=place.step, row=row), lanes))
+        lanes, anchor = [lane.fork() for lane in (*place.fitted, *place.judged)], bool(anchors_of(rows[:, None])[0])
+        ends = np.cumsum([len(lane.sample) for lane in lanes])[:-1]
+        own = [rows] * len(lanes) if len(rows) == 1 else np.split(rows, ends)
+        list(pool.map(partial(_Lane.predict, k=place.step), lanes, own))
         fitted, judged, solved = tuple(lanes[: len(place.fitted)]), tuple(lanes[len(place.fitted) :]), place.solved
         if self._components is not None:
             read, missing = (torch.cat(column, 1) for column in zip(*map(_Lane.missing, fitted), strict=True))
             solved = (*solved, solve(read.double(), self._components.values, missing.double(), self._groups))
             added = solved[-1].bias + torch.einsum("nf,fdt->dnt", self._known, solved[-1].observed)
-            parts = torch.split(added, [len(lane.sample) for lane in lanes], dim=1)
-            for lane, part in zip(lanes, parts, strict=True):
+            for lane, part in zip(lanes, added.tensor_split(ends.tolist(), dim=1), strict=True):
                 lane.correct(solved[-1].weight, part, anchor)
         return Place(place.step + 1, fitted, judged, solved, (*place.anchors, anchor))
 
     def end(self, plan: PlanArray) -> Place:
-        """The place after the last step of a plan ``[K, blocks]``."""
-        place = self.begin
+        """The place after the last step of a plan ``[K, blocks]``, or of one for each call, ``[N, K, blocks]``."""
+        place, plans = self.begin, plan.reshape(-1, *plan.shape[-2:])
         with workers() as pool:
-            for row in plan:
-                place = self.after(place, row, pool)
+            for k in range(plans.shape[1]):
+                place = self.after(place, plans[:, k], pool)
         return place
 
     def correction(self, place: Place) -> Correction:
@@ -172,14 +176,14 @@ class _Lane:
         other._state = self._state.copy()
         return other
 
-    def predict(self, k: int, row: PlanArray) -> None:
-        """Go through step k, without a correction."""
+    def predict(self, rows: PlanArray, k: int) -> None:
+        """Go through step k, without a correction; ``rows`` of plans, ``[1 or n, blocks]``."""
         model, calls, self._before = self._executor.model, self._calls, self._carried
 
         def blocks(k: int, stem: Tensor) -> Tensor:
-            if self._sums and row[0] != Source.COMPUTE:
+            if self._sums and rows[0, 0] != Source.COMPUTE:
                 return stem + self._total
-            stream = self._executor.step(row[None], k, stem, calls, self._state)
+            stream = self._executor.step(rows, k, stem, calls, self._state)
             if self._sums:
                 self._total, self._state = stream - stem, State()
             return stream

@@ -33,6 +33,8 @@ class Strategy:
         fits_correction: whether its schedule is of whole steps, with a correction of the sampler that is fitted to it.
             Only then are there plans for an error budget, and plans beside the target.
         uses_pruner: whether the pruner may depart from its schedule.
+        consecutive: whether it learns from, and is judged on, consecutive calls of episodes, so that its plans may read
+            what an earlier call computed.
         baseline: whether it is the uniform schedule, which every other strategy has to beat.
     """
 
@@ -42,6 +44,7 @@ class Strategy:
     least: Callable[[int, int], int] = lambda steps, blocks: blocks
     fits_correction: bool = False
     uses_pruner: bool = False
+    consecutive: bool = False
     baseline: bool = False
 
     def make(self) -> Callable[[Task], Search]:
@@ -77,6 +80,13 @@ STRATEGIES = (
         "tts:Tts",
         fits_correction=True,
         uses_pruner=True,
+    ),
+    Strategy(
+        "tts-paper",
+        "test-time sparsity as published: gates trained for each observation, arXiv 2605.13316",
+        "published.paper:Paper",
+        uses_pruner=True,
+        consecutive=True,
     ),
     Strategy(
         "interval",

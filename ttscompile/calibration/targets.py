@@ -10,7 +10,7 @@ import torch
 
 from ..core.spec import PolicySpec
 from ..trajectories.episodes import Episode
-from .calls import Calls, Split, prepare_calls, sample_calls
+from .calls import Calls, Split, prepare_calls, sample_calls, sample_windows
 from .execute import Executor, workers
 from .pool import Here, Pool, Work, artifact_elsewhere, place_of
 from .progress import Bar
@@ -59,6 +59,7 @@ def with_targets(
         bar.update(len(path), "", clock.left())
     state.progress[key] = len(path)
     if len(path) < calls.count:
+        path = path[: max(len(path) // calls.window, 1) * calls.window]
         calls = executor.select(calls, np.arange(len(path)))
     return replace(calls, path=path)
 
@@ -91,17 +92,31 @@ def _dense_elsewhere(path: str, identity: str) -> Callable[[Calls], torch.Tensor
 
 
 def draw_calls(
-    executor: Executor, spec: PolicySpec, episodes: Sequence[Episode], split: Split, limit: int, judged: int, seed: int
+    executor: Executor,
+    spec: PolicySpec,
+    episodes: Sequence[Episode],
+    split: Split,
+    limit: int,
+    judged: int,
+    seed: int,
+    window: int = 1,
 ) -> dict[str, Calls]:
     """The calls to learn from, ``calibration``, and those that plans are judged on, ``validation``, without targets.
 
-    There are at most ``limit`` and ``judged`` of them; the seed is that of their choice and of their noise.
+    There are at most ``limit`` and ``judged`` of them, in windows of so many; the seed is that of their choice and of
+    their noise.
     """
+
+    def chosen_of(numbers: Sequence[int], most: int, repeats: int = 1) -> list[tuple[int, int]]:
+        if window == 1:
+            return sample_calls(episodes, numbers, most, seed, repeats)
+        return sample_windows(episodes, numbers, most, window, seed, repeats)
+
     drawn = {
-        "calibration": sample_calls(episodes, split.calibration, limit, seed, REPEATS),
-        "validation": sample_calls(episodes, split.validation, judged, seed),
+        "calibration": chosen_of(split.calibration, limit, REPEATS),
+        "validation": chosen_of(split.validation, judged),
     }
     return {
-        name: prepare_calls(executor.model, spec, episodes, chosen, (seed, 2, number))
+        name: prepare_calls(executor.model, spec, episodes, chosen, (seed, 2, number), window)
         for number, (name, chosen) in enumerate(drawn.items())
     }

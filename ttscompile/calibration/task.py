@@ -16,6 +16,7 @@ from ..artifact.load import Artifact
 from ..core.correction import Correction
 from ..core.lattice import PlanArray, Source
 from ..errors import CalibrationError
+from ..runtimes.settle import pruner_plan
 from .calls import Actions, Calls
 from .execute import Executor
 from .pool import Pool
@@ -80,8 +81,9 @@ class Found:
     Attributes:
         schedule: int8 ``[K, blocks]``, within the budget.
         notes: what is worth keeping about how it was found; JSON.
-        correction: of the sampler's steps, for the schedule and the pruner's plans; None for none.
+        correction: of the sampler's steps, for the schedule; None for none.
         pruner: all constants of the pruner, by name, for plans that depend on the observation; None for none.
+        pruner_correction: of the sampler's steps, for the pruner's plans; None for none.
         error: of the schedule on calls to learn from, normalised; NaN where it was not measured.
     """
 
@@ -89,6 +91,7 @@ class Found:
     notes: Mapping[str, Any] = field(default_factory=dict)
     correction: Correction | None = None
     pruner: Mapping[str, Array] | None = None
+    pruner_correction: Correction | None = None
     error: float = math.nan
 
 
@@ -132,8 +135,10 @@ class Task:
         return np.random.default_rng((self.seed, 3, *stage))
 
     def some_calls(self, count: int) -> Calls:
-        """Some of the calls to learn from, always the same ones; all if there are fewer."""
-        return self.executor.select(self.calls, self.draw(0).permutation(self.calls.count)[:count])
+        """Some of the calls to learn from, always the same ones, in whole windows; all if there are fewer."""
+        window = self.calls.window
+        chosen = self.draw(0).permutation(self.calls.count // window)[: max(1, count // window)]
+        return self.executor.select(self.calls, (chosen[:, None] * window + np.arange(window)).reshape(-1))
 
     def error(self, plan: PlanArray, calls: Calls) -> float:
         """Mean error of the executed actions of a plan on some calls, normalised; see ``Executor.run``."""
@@ -153,20 +158,26 @@ class Task:
         )
 
     def corrected(self, found: Found) -> Found:
-        """The schedule that a strategy found, with a correction where that is better; see ``whole_steps``.
+        """What a strategy found, with corrections where they are better: of the schedule, and of the pruner's plans.
+
+        The pruner's plans share one correction, fitted along the plan that each call has.
 
         Raises:
-            CalibrationError: the schedule reads the rollout cache, or comes with a pruner.
+            CalibrationError: the schedule reads the rollout cache, and the calls are independent of each other.
         """
-        if (found.schedule == Source.ROLLOUT.value).any() or found.pruner is not None:
+        if self.calls.window == 1 and (found.schedule == Source.ROLLOUT.value).any():
             raise CalibrationError(
-                "a correction is fitted to a schedule on calls of their own; this one reads residuals of earlier calls,"
-                " or comes with a pruner. Leave --correct out, or take another strategy."
+                "a correction is fitted to a schedule on calls of their own; this one reads residuals of earlier calls."
+                " Leave --correct out, or take another strategy."
             )
         correction = self.whole.correction_of(found.schedule)
         reads = 0 if correction is None else correction.reads
         notes = {**found.notes, "corrected": correction is not None, "numbers_read_of_the_observation": reads}
-        return replace(found, correction=correction, notes=notes)
+        if (weights := found.pruner) is None:
+            return replace(found, correction=correction, notes=notes)
+        own = self.whole.correction_of(lambda calls: pruner_plan(self.executor.logits(calls, weights)))
+        notes["pruner_corrected"] = own is not None
+        return replace(found, correction=correction, pruner_correction=own, notes=notes)
 
 
 class Search(Protocol):

@@ -31,8 +31,8 @@ class Trails:
 
     def __init__(self, loop: SparseLoop, steps: int, blocks: int, bytes_: int = BYTES) -> None:
         self._loop, self._steps, self._bytes = loop, steps, bytes_
-        self._computed: PlanArray = np.full(blocks, Source.COMPUTE, np.int8)
-        self._idle: PlanArray = np.full(blocks, Source.TIMESTEP, np.int8)
+        self._computed: PlanArray = np.full((1, blocks), Source.COMPUTE, np.int8)
+        self._idle: PlanArray = np.full((1, blocks), Source.TIMESTEP, np.int8)
         self._kept: dict[tuple[int, ...], list[Place]] = {}
 
     def end(self, steps: Sequence[int]) -> Place:

@@ -105,7 +105,8 @@ class Tts:
         assert self._adaptation is not None
         assert self._settled is not None
         notes = {**self._settled.notes, "switches": self._adaptation.switches}
-        return replace(self._settled, notes=notes, pruner=self._adaptation.pruner)
+        pruner, correction = self._adaptation.pruner, self._settled.correction
+        return replace(self._settled, notes=notes, pruner=pruner, pruner_correction=correction)
 
     def _candidates(self, distance: int, i: int) -> list[tuple[int, ...]]:
         """The schedules with the i-th step moved in either direction, where it can be."""

@@ -16,12 +16,16 @@ from .calls import Actions, Calls, IntArray
 from .execute import Executor
 from .fit_correction import fit_correction
 from .pool import Here, Pool, Work, artifact_elsewhere, place_of
-from .sparse_loop import SparseLoop, anchors_of, is_whole
+from .sparse_loop import SparseLoop, anchors_of
 from .trails import Trails
 
 FITTED, COMPARED = 384, 128
 """Calls on which a candidate's correction is fitted, and others on which its error is measured; fewer if there are
 fewer."""
+
+
+MakePlans = Callable[[Calls], PlanArray]
+"""Makes plans ``[N, K, blocks]`` of N calls."""
 
 
 @dataclass(frozen=True)
@@ -59,11 +63,16 @@ class WholeSteps:
         self._trails: dict[bool | None, Trails] = {}
         self._pool = pool or Here()
         self._work = Work(self.measured, _measured_elsewhere, (*place_of(executor.artifact), calls, seed))
-        order = np.random.default_rng((seed, 3, 0)).permutation(calls.count)
-        apart = _set_apart(calls.episodes[order])
-        self._compared = self._fitted = executor.select(calls, order[apart][:COMPARED])
+        order = np.random.default_rng((seed, 3, 0)).permutation(calls.count // calls.window)
+        apart = _set_apart(calls.episodes[:: calls.window][order])
+
+        def some(windows: IntArray, most: int) -> Calls:
+            chosen = windows[: max(1, most // calls.window), None] * calls.window + np.arange(calls.window)
+            return executor.select(calls, chosen.reshape(-1))
+
+        self._compared = self._fitted = some(order[apart], COMPARED)
         if not apart.all():
-            self._fitted = executor.select(calls, order[~apart][:FITTED])
+            self._fitted = some(order[~apart], FITTED)
 
     @property
     def steps(self) -> int:
@@ -106,16 +115,18 @@ class WholeSteps:
         """The correction of a schedule, fitted on all calls; None where the schedule is better without."""
         return self.correction_of(self.plan(steps))
 
-    def correction_of(self, plan: PlanArray) -> Correction | None:
-        """The same for any plan ``[K, blocks]`` that reads no rollout cache: calls stand alone here."""
-        reads, whole = self.reads(_full_steps(plan)), is_whole(plan)
-        corrected, plain = (
-            self._errors(SparseLoop(self._executor, fitted, self._compared, reads=reads, whole=whole).end(plan).samples)
-            for fitted in (self._fitted, None)
+    def correction_of(self, plan: PlanArray | MakePlans) -> Correction | None:
+        """The same for any plan ``[K, blocks]``, or for whatever makes plans ``[N, K, blocks]`` of N calls."""
+        plans = _plans(plan, self._calls)
+        reads = self.reads(_full_steps(plans))
+        fitted = fit_correction(self._executor, _plans(plan, self._fitted), self._fitted, reads)
+        tried = (
+            self._executor.corrected(one).run(_plans(plan, self._compared), self._compared) for one in (fitted, None)
         )
+        corrected, plain = map(self._errors, tried)
         if plain.normalised <= corrected.normalised:
             return None
-        return fit_correction(self._executor, plan, self._calls, reads)
+        return fit_correction(self._executor, plans, self._calls, reads)
 
     def reads(self, count: int) -> bool:
         """Whether corrections of schedules of so many steps read the observation.
@@ -168,8 +179,13 @@ def _measured_elsewhere(
     return WholeSteps(Executor(artifact), Actions(artifact.manifest.spec), calls, seed).measured
 
 
+def _plans(plan: PlanArray | MakePlans, calls: Calls) -> PlanArray:
+    """The plan that all calls have, or those that are made for them."""
+    return plan(calls) if callable(plan) else plan
+
+
 def _full_steps(plan: PlanArray) -> int:
-    """How many steps of a plan are anchors: those of a schedule of whole steps that are computed."""
+    """How many steps of a plan, or of plans, are anchors: those of a schedule of whole steps that are computed."""
     return max(1, int(anchors_of(plan).sum()))
 
 

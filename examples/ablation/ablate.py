@@ -1,0 +1,276 @@
+"""What decides a plan, and where residuals come from: all combinations on one policy, at one budget.
+
+    python examples/ablation/ablate.py compiled/ --trajectories calls.npz --computed-steps 3 --minutes 2
+
+Every row is a way to spend the same number of computed cells a call, mean over the calls: evenly spaced or searched
+steps, switches, gates trained for all calls, and a head trained to decide for each observation, with one direction of
+reuse or with all. Each is measured with and without a correction of the sampler, on windows of consecutive calls of
+episodes that nothing was learned from, against the dense policy with the same noise. ``ttscompile oracle`` says what
+choosing among schedules could gain.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from ttscompile.artifact.load import load_artifact
+from ttscompile.calibration.calls import (
+    Actions,
+    Calls,
+    load_episodes,
+    prepare_calls,
+    sample_windows,
+    split_episodes,
+    window_of,
+)
+from ttscompile.calibration.execute import Executor
+from ttscompile.calibration.judge import dense_with_other_noise, uniform_of
+from ttscompile.calibration.published.paper import Paper
+from ttscompile.calibration.search import search_plan
+from ttscompile.calibration.targets import REPEATS, dense_rounds
+from ttscompile.calibration.task import Clock, Search, Task
+from ttscompile.calibration.tts import Tts
+from ttscompile.core.correction import Correction
+from ttscompile.core.lattice import PlanArray, Source
+from ttscompile.runtimes.settle import pruner_plan
+
+FRACTION = 0.25
+"""Share of the episodes to judge on, as in ``ttscompile calibrate``."""
+
+RESAMPLED = 2000
+"""Samples of the bootstrap over episodes."""
+
+DIRECTIONS = {
+    "TIMESTEP": (Source.TIMESTEP,),
+    "FORWARD": (Source.FORWARD,),
+    "ROLLOUT": (Source.ROLLOUT,),
+    "all": (Source.FORWARD, Source.TIMESTEP, Source.ROLLOUT),
+}
+"""What a trained plan may read, beside TIMESTEP in the first call of an episode: a cell has to add something there."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One way to spend the budget.
+
+    Attributes:
+        decided: how a plan comes about.
+        reads: what cells read that are not computed.
+        corrected: whether a correction was kept.
+        error: mean absolute difference of the executed actions from those of the dense policy.
+        interval: 95 % interval of the error, over episodes.
+        other_noise: the error as a share of what other noise changes.
+        cells: computed, mean over the calls.
+        most: computed in the call that computes most.
+        rollout: share of the cells that read ROLLOUT.
+        forward: share of the cells that read FORWARD.
+        plans: how many different plans the judged calls had.
+        seconds: of the search.
+    """
+
+    decided: str
+    reads: str
+    corrected: bool
+    error: float
+    interval: tuple[float, float]
+    other_noise: float
+    cells: float
+    most: int
+    rollout: float
+    forward: float
+    plans: int
+    seconds: float
+
+
+Maker = Callable[[Task], Search]
+
+
+def rows_of(directions: Sequence[str], ways: Sequence[str]) -> list[tuple[str, str, Maker]]:
+    """What is measured: how a plan comes about, what it reads, and the search."""
+    rows: list[tuple[str, str, Maker]] = []
+    if "searched" in ways:
+        rows.append(("searched steps", "TIMESTEP", lambda task: Tts(replace(task, pruner={}))))
+    if "switched" in ways:
+        rows.append(("searched steps, switches", "TIMESTEP", Tts))
+    for name in directions:
+        sources = DIRECTIONS[name]
+        if "gates" in ways and name != "ROLLOUT":  # a plan for all calls never computes what it would read
+            rows.append(("gates for all calls", name, lambda task, s=sources: Paper(task, s, observes=False)))
+        if "head" in ways:
+            rows.append(("head for each call", name, lambda task, s=sources: Paper(task, s)))
+    return rows
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Measures plans on held-out calls; see ``Row``."""
+
+    executor: Executor
+    actions: Actions
+    calls: Calls
+    other_noise: float
+
+    def row(self, decided: str, reads: str, plans: PlanArray, correction: Correction | None, seconds: float) -> Row:
+        """Plans ``[N, K, blocks]`` of the judged calls, or ``[K, blocks]`` for all of them."""
+        calls = self.calls
+        samples = self.executor.corrected(correction).run(plans, calls)
+        errors = self.actions.errors(samples, calls.targets, units=True)
+        each = np.broadcast_to(plans, (calls.count, *plans.shape[-2:]))
+        computed = (each == Source.COMPUTE).sum((1, 2))
+        return Row(
+            decided,
+            reads,
+            correction is not None,
+            float(errors.mean()),
+            interval(errors, calls.episodes),
+            float(errors.mean()) / self.other_noise,
+            float(computed.mean()),
+            int(computed.max()),
+            float((each == Source.ROLLOUT).mean()),
+            float((each == Source.FORWARD).mean()),
+            len({plan.tobytes() for plan in each}),
+            seconds,
+        )
+
+
+def interval(errors: np.ndarray, episodes: np.ndarray) -> tuple[float, float]:
+    """95 % interval of the mean, over episodes."""
+    names = np.unique(episodes)
+    sums = np.array([errors[episodes == one].sum() for one in names])
+    counts = np.array([(episodes == one).sum() for one in names])
+    picks = np.random.default_rng(0).integers(0, len(names), (RESAMPLED, len(names)))
+    low, high = np.quantile(sums[picks].sum(1) / counts[picks].sum(1), (0.025, 0.975))
+    return float(low), float(high)
+
+
+def measured(task: Task, judge: Judge, decided: str, reads: str, maker: Maker, minutes: float) -> list[Row]:
+    """What a search finds, with and without corrections."""
+    begun, clock = time.monotonic(), Clock(60 * minutes)
+    found, _, _ = search_plan(maker(replace(task, clock=clock)), clock)
+    plain = replace(found, correction=None, pruner_correction=None)
+    corrected = found if found.correction is not None else task.corrected(found)
+    seconds = time.monotonic() - begun
+    rows = []
+    for one in (plain, corrected):
+        plans, correction = one.schedule, one.correction
+        if one.pruner is not None:
+            plans = pruner_plan(task.executor.logits(judge.calls, one.pruner))
+            correction = one.pruner_correction
+        rows.append(judge.row(decided, reads, plans, correction, seconds))
+    return rows
+
+
+def drawn(
+    executor: Executor,
+    episodes: Sequence[Any],
+    numbers: Sequence[int],
+    most: int,
+    window: int,
+    seed: int,
+    stage: int,
+    pinned: bool,
+) -> Calls:
+    """Windows of consecutive calls, with what the dense policy answers."""
+    spec = executor.artifact.manifest.spec
+    chosen = sample_windows(episodes, numbers, most, window, seed, REPEATS if stage == 0 else 1)
+    calls = prepare_calls(executor.model, spec, episodes, chosen, (seed, 9, stage), window, pinned)
+    return replace(calls, path=torch.cat(list(dense_rounds(executor, calls))))
+
+
+def show(rows: Sequence[Row], title: str) -> None:
+    """Print the table."""
+    table = Table(title=title)
+    for name in ("decided by", "reads", "correction", "error [95 %]", "/ other noise", "cells", "most", "plans"):
+        table.add_column(name, justify="left" if name in ("decided by", "reads") else "right")
+    for row in rows:
+        low, high = row.interval
+        table.add_row(
+            row.decided,
+            row.reads,
+            "yes" if row.corrected else "no",
+            f"{row.error:.4g} [{low:.4g}, {high:.4g}]",
+            f"{row.other_noise:.2f}",
+            f"{row.cells:.1f}",
+            str(row.most),
+            str(row.plans),
+        )
+    Console(width=140).print(table)
+
+
+@click.command(context_settings={"show_default": True})
+@click.argument("directory", type=click.Path(exists=True, path_type=Path))
+@click.option("--trajectories", multiple=True, required=True, type=click.Path(exists=True, path_type=Path))
+@click.option("--computed-steps", default=3.0, help="The budget: computed cells of a call, in whole steps.")
+@click.option("--minutes", default=2.0, help="Of each search, at most.")
+@click.option("--learned", default=512, help="Calls to learn from, at most.")
+@click.option("--judged", default=256, help="Held-out calls, at most.")
+@click.option("--direction", "directions", multiple=True, type=click.Choice(list(DIRECTIONS)), default=list(DIRECTIONS))
+@click.option(
+    "--way",
+    "ways",
+    multiple=True,
+    type=click.Choice(["searched", "switched", "gates", "head"]),
+    default=["searched", "switched", "gates", "head"],
+)
+@click.option("--pinned", is_flag=True, help="All calls of a window have the noise of its first.")
+@click.option("--seed", default=0)
+@click.option("--json", "path", type=click.Path(path_type=Path), help="Write the rows there, too.")
+def main(
+    directory: Path,
+    trajectories: Sequence[Path],
+    computed_steps: float,
+    minutes: float,
+    learned: int,
+    judged: int,
+    directions: Sequence[str],
+    ways: Sequence[str],
+    pinned: bool,
+    seed: int,
+    path: Path | None,
+) -> None:
+    """Measure all rows on the artifact in DIRECTORY."""
+    artifact = load_artifact(directory)
+    spec, executor, progress = artifact.manifest.spec, Executor(artifact), Console(stderr=True)
+    budget = round(computed_steps * executor.model.blocks)
+    episodes = load_episodes(spec, trajectories, None)
+    split = split_episodes(len(episodes), FRACTION, seed)
+    window = window_of(episodes, split)
+    sets = [
+        drawn(executor, episodes, numbers, most, window, seed, stage, pinned)
+        for stage, (numbers, most) in enumerate(((split.calibration, learned), (split.validation, judged)))
+    ]
+    task = Task.of(artifact, executor, sets[0], budget, seed)
+    judge = Judge(executor, task.actions, sets[1], dense_with_other_noise(artifact, executor, sets[1], seed))
+    rows = [judge.row("even steps", "TIMESTEP", uniform_of(artifact.manifest, budget).schedule, None, 0.0)]
+    for decided, reads, maker in rows_of(directions, ways):
+        rows += measured(task, judge, decided, reads, maker, minutes)
+        progress.print(rows[-2], rows[-1], sep="\n")
+        if path is not None:
+            told: Mapping[str, Any] = {
+                "computed_steps": computed_steps,
+                "cells": executor.model.steps * executor.model.blocks,
+                "calls": [one.count for one in sets],
+                "window": window,
+                "pinned": pinned,
+                "pruner_share": artifact.manifest.flops.pruner / artifact.manifest.flops.dense,
+                "rows": [asdict(row) for row in rows],
+            }
+            path.write_text(json.dumps(told, indent=2))
+    flops = artifact.manifest.flops
+    show(rows, f"{budget} of {executor.model.steps * executor.model.blocks} cells, windows of {window} calls")
+    print(f"A head costs {flops.pruner / flops.dense:.4%} of the FLOPs of a dense call.")
+
+
+if __name__ == "__main__":
+    main()

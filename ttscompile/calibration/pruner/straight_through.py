@@ -1,0 +1,125 @@
+"""Sparse calls whose gates have gradients: what training the plan head needs, at the price of the sparse calls.
+
+A gate's gradient is the product of what it would add and the gradient of the sum (``runtimes.reference.reuse``). For
+FORWARD, TIMESTEP and ROLLOUT that is in the caches. For a cell that is not computed, what its block would compute is
+taken from the dense call with the same noise, which is known: it costs nothing, does not depend on the plan so far, and
+is what the sparse call should come to. So an update computes the cells of its plans, and no others.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...core.lattice import BoolArray, PlanArray, Source
+from ...runtimes.reference.model import Contexts
+from ...runtimes.reference.reuse import Caches, Cell, reuse
+from ..calls import Calls, IntArray
+from ..execute import Executor, State, rollout_reads
+
+BYTES = 2**28
+"""Memory for what the blocks compute in the dense calls, as bfloat16. It decides how many calls are learned from."""
+
+
+class Practice:
+    """Calls to learn from, in windows of consecutive ones, and what the blocks compute in them when all is computed.
+
+    Args:
+        executor: runs the policy; its correction is used.
+        calls: with targets; as many windows of them are taken as there is memory for.
+
+    Attributes:
+        calls: those that are taken.
+    """
+
+    def __init__(self, executor: Executor, calls: Calls) -> None:
+        model = executor.model
+        each = 2 * model.steps * sum(math.prod(type_.at(1)) for type_ in executor.types) * calls.window
+        windows = min(calls.count // calls.window, max(1, BYTES // each))
+        self._executor = executor
+        self.calls = executor.select(calls, np.arange(windows * calls.window))
+        self._dense: list[list[Tensor]] = []
+        state, whole = State(), np.full((1, model.blocks), Source.COMPUTE, np.int8)
+
+        def blocks(k: int, stem: Tensor) -> Tensor:
+            stream = executor.step(whole, k, stem, self.calls, state)
+            self._dense.append([state.timestep[b].to(torch.bfloat16) for b in range(model.blocks)])
+            return stream
+
+        with torch.no_grad():
+            for _ in executor.corrected(None).samples(self.calls, blocks):
+                pass
+
+    def samples(self, plans: PlanArray, gates: Tensor, numbers: IntArray) -> list[Tensor]:
+        """The sample after each step, ``[N, T, D]`` each, with gradients of the gates.
+
+        Args:
+            plans: legal, int8 ``[N, K, blocks]``, step 0 dense.
+            gates: the same one-hot, ``[N, K, blocks, 4]``.
+            numbers: of N of the calls, whole windows.
+        """
+        executor, model, caches = self._executor, self._executor.model, Caches({})
+        calls, there = executor.select(self.calls, numbers), torch.from_numpy(numbers)
+        gates = gates.to(model.device)
+
+        def blocks(k: int, stream: Tensor) -> Tensor:
+            for b, axis in enumerate(executor.axes):
+                column = plans[:, k, b]
+                computed = self._dense[k][b].index_select(axis, there.to(stream.device)).to(stream.dtype)
+                takers = np.flatnonzero(column == Source.COMPUTE)
+                if len(takers):
+                    part = _block(executor, b, k, stream, calls.contexts, takers)
+                    computed = computed.index_copy(axis, torch.from_numpy(takers).to(stream.device), part)
+                if (before := _earlier(column, computed.detach(), axis, calls.window)) is not None:
+                    caches.rollout[k, b] = before
+                cell = Cell(k, b, model.groups[b], column, gates[:, k, b], executor.types[b])
+                stream = stream + reuse(cell, computed, caches, write_gradients=True)
+                caches.rollout.pop((k, b), None)  # nobody reads it after this cell
+            return stream
+
+        return list(executor.samples(calls, blocks))
+
+
+def legal(wished: PlanArray, window: int) -> PlanArray:
+    """Plans ``[N, K, blocks]`` of calls in windows as a runtime executes them.
+
+    ROLLOUT is TIMESTEP where no earlier call of the window computed the cell.
+    """
+    plans = wished.copy()
+    plans[:, 0] = Source.COMPUTE
+    plans[(plans == Source.ROLLOUT) & ~written(plans, window)] = Source.TIMESTEP
+    return plans
+
+
+def written(plans: PlanArray, window: int) -> BoolArray:
+    """Which cells an earlier call of its window computed, bool ``[N, K, blocks]``."""
+    computed: BoolArray = (plans == Source.COMPUTE).reshape(-1, window, *plans.shape[1:])
+    earlier = np.zeros_like(computed)
+    earlier[:, 1:] = np.logical_or.accumulate(computed, axis=1)[:, :-1]
+    return np.asarray(earlier.reshape(plans.shape))
+
+
+def _block(executor: Executor, b: int, k: int, stream: Tensor, contexts: Contexts, takers: IntArray) -> Tensor:
+    """What the block computes for the streams that take it; for all, nothing has to be picked."""
+    streams = None if len(takers) == contexts.streams else takers.tolist()
+    return executor.model.block(b, k, stream, contexts, streams)
+
+
+def _earlier(column: PlanArray, computed: Tensor, axis: int, window: int) -> Tensor | None:
+    """For each call what the last earlier one of its window computed; rubbish where none did. None if none did at all.
+
+    Every call is asked, not only those that read it: the gate of ROLLOUT has a gradient in all of them.
+    """
+    asked = np.full_like(column, Source.ROLLOUT)
+    latest = np.full(len(column), -1)
+    for place in range(1, window):  # the call at this place of each window reads; those before it say what they did
+        of = np.arange(len(column)) % window
+        reading, read = rollout_reads(np.where(of == place, asked, column), window)
+        mine = of[reading] == place
+        latest[reading[mine]] = read[mine]
+    if (latest < 0).all():
+        return None
+    return computed.index_select(axis, torch.from_numpy(np.maximum(latest, 0)).to(computed.device))
