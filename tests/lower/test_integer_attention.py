@@ -107,6 +107,21 @@ def test_it_is_exactly_the_quantised_attention_and_near_to_float32(
         assert 0 < np.abs(made - true).mean() < 0.01 * size
 
 
+def test_an_axis_of_heads_makes_no_difference() -> None:
+    inputs = drawn("usual", FEWEST, FEWEST)
+    node = make_node("Attention", ["q", "k", "v"], ["y"], "n0")
+    ends = [make_tensor_value_info(name, TensorProto.FLOAT, ["B", COUNT, FEWEST, CHANNELS]) for name in "qkv"]
+    model = model_of(node, dict.fromkeys("qkv", FEWEST))
+    del model.graph.input[:]
+    model.graph.input.extend([*ends, make_tensor_value_info("x", TensorProto.FLOAT, ["B", WIDTH])])
+    model.graph.node[1].input[0] = "x"
+    made, constants = quantize_model(model, WEIGHTS)
+    assert HEADS in {each.op_type for each in made.graph.node}
+    given = {name: heads(value) for name, value in inputs.items()}
+    found = session(made, {**WEIGHTS, **constants}).run(["y"], {**given, "x": np.zeros((2, WIDTH), np.float32)})[0]
+    np.testing.assert_array_equal(found, heads(both(FEWEST, FEWEST, inputs)[0]))
+
+
 def test_streams_and_heads_do_not_see_each_other() -> None:
     inputs = drawn("usual", FEWEST, FEWEST)
     together = both(FEWEST, FEWEST, inputs)[0]

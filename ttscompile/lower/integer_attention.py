@@ -46,6 +46,7 @@ class Attention:
 
     Attributes:
         inputs: names of query ``[B, T, heads * C]``, key and value ``[B, S, heads * C]`` in float32.
+        flat: they are as above, as is the result; else ``[B, heads, tokens, C]``.
         heads: how many.
         queries: T.
         keys: S.
@@ -54,6 +55,7 @@ class Attention:
     """
 
     inputs: tuple[str, str, str]
+    flat: bool
     heads: int
     queries: int
     keys: int
@@ -67,17 +69,21 @@ def attention_of(
     """What a node attends to, if integers can do that, and are faster."""
     if node.op_type != "Attention" or any(node.input[3:]) or len(node.output) != 1:
         return None
-    heads = attributes.get("q_num_heads", 0)
     known = {*_PLAIN, "q_num_heads", "kv_num_heads", "scale"}
     plain = all(attributes.get(name, value) == value for name, value in _PLAIN.items()) and known.issuperset(attributes)
-    query, key, value = (shapes.get(name, ()) for name in node.input)
-    if not plain or not heads or attributes.get("kv_num_heads") != heads or not len(query) == len(key) == 3:
+    given = [tuple(shapes.get(name, ())) for name in node.input[:3]]
+    flat = all(len(shape) == 3 for shape in given)
+    if flat:
+        counts = (attributes.get("q_num_heads", 0), *[attributes.get("kv_num_heads", 0)] * 2)
+        given = [(b, n, t, c // n) if n else () for n, (b, t, c) in zip(counts, given, strict=True)]
+    if not plain or any(len(shape) != 4 or 0 in shape[1:] for shape in given):
         return None
-    if len(value) != 3 or 0 in (*query[1:], *key[1:], *value[1:]) or min(query[1], key[1]) < FEWEST:
+    (_, heads, queries, channels), (_, others, keys, _), (_, _, _, last) = given
+    if others != heads or min(queries, keys) < FEWEST:
         return None
-    each = (query[2] // heads, value[2] // heads)
     inputs = (node.input[0], node.input[1], node.input[2])
-    return Attention(inputs, heads, query[1], key[1], each, attributes.get("scale", each[0] ** -0.5))
+    scale = attributes.get("scale", channels**-0.5)
+    return Attention(inputs, flat, heads, queries, keys, (channels, last), scale)
 
 
 def integer_attention(node: NodeProto, of: Attention, keep: Callable[[str, Array], str]) -> list[NodeProto]:
@@ -95,14 +101,16 @@ def integer_attention(node: NodeProto, of: Attention, keep: Callable[[str, Array
 
     parts = [own + name for name in ("query", "key", "value")]
     for x, part, (tokens, channels) in zip(of.inputs, parts, sizes, strict=True):
-        reshape(x, f"{part}.tokens", -1, tokens, of.heads, channels)
-        turn(f"{part}.tokens", f"{part}.heads")
-        reshape(f"{part}.heads", part, -1, tokens, channels)
+        if of.flat:
+            reshape(x, f"{part}.tokens", -1, tokens, of.heads, channels)
+            turn(f"{part}.tokens", f"{part}.heads")
+        reshape(f"{part}.heads" if of.flat else x, part, -1, tokens, channels)
     each, heads, rows = own + "each", own + "heads", own + "tokens"
     nodes.append(helper.make_node(HEADS, parts, [each], each, body=_head(own, of, sizes, result), num_scan_inputs=3))
-    reshape(each, heads, -1, of.heads, *result)
-    turn(heads, rows)
-    reshape(rows, node.output[0], -1, of.queries, of.heads * of.channels[1])
+    reshape(each, heads if of.flat else node.output[0], -1, of.heads, *result)
+    if of.flat:
+        turn(heads, rows)
+        reshape(rows, node.output[0], -1, of.queries, of.heads * of.channels[1])
     return nodes
 
 

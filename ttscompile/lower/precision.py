@@ -2,8 +2,8 @@
 
 Blocks of a policy stream their weights from memory once a step, which is what they wait for; a quarter of the bytes,
 and the processor's integer dot product, make them faster. An image encoder waits for arithmetic, of which the integer
-dot product does four times as much. Everything beside these products stays in float32: layer norms, attention,
-activations, biases, and the residual itself.
+dot product does four times as much. Everything beside these products stays in float32: layer norms, softmax,
+activations, biases, the residual itself, and attention among few tokens (``integer_attention``).
 """
 
 from __future__ import annotations
