@@ -77,6 +77,7 @@ class Row:
         forward: share of the cells that read FORWARD.
         plans: how many different plans the judged calls had.
         seconds: of the search.
+        updates: of the training; 0 where nothing is trained.
     """
 
     decided: str
@@ -91,6 +92,7 @@ class Row:
     forward: float
     plans: int
     seconds: float
+    updates: int = 0
 
 
 Maker = Callable[[Task], Search]
@@ -177,7 +179,8 @@ def measured(task: Task, judge: Judge, decided: str, reads: str, maker: Maker, m
         if one.pruner is not None:
             plans = pruner_plan(task.executor.logits(judge.calls, one.pruner))
             correction = one.pruner_correction
-        rows.append(judge.row(decided, reads, plans, correction, seconds))
+        row = judge.row(decided, reads, plans, correction, seconds)
+        rows.append(replace(row, updates=int(found.notes.get("updates", 0))))
     return rows
 
 
