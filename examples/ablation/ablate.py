@@ -40,7 +40,7 @@ from ttscompile.calibration.published.paper import Paper
 from ttscompile.calibration.search import search_plan
 from ttscompile.calibration.targets import REPEATS, dense_rounds
 from ttscompile.calibration.task import Clock, Search, Task
-from ttscompile.calibration.tts import Tts
+from ttscompile.calibration.tts import Tts, switched
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import PlanArray, Source
 from ttscompile.runtimes.settle import pruner_plan
@@ -77,6 +77,7 @@ class Row:
         forward: share of the cells that read FORWARD.
         plans: how many different plans the judged calls had.
         seconds: of the search.
+        updates: of the training; 0 where nothing is trained.
     """
 
     decided: str
@@ -91,22 +92,33 @@ class Row:
     forward: float
     plans: int
     seconds: float
+    updates: int = 0
 
 
 Maker = Callable[[Task], Search]
+
+
+def from_corrected(task: Task) -> Search:
+    """A head that departs from searched steps, trained with their correction."""
+    clock = task.clock.until(0.5)
+    found, _, _ = search_plan(Tts(replace(task, clock=clock)), clock)
+    executor = task.executor.corrected(found.correction)
+    return Paper(replace(task, executor=executor), begin=found.notes["steps"])
 
 
 def rows_of(directions: Sequence[str], ways: Sequence[str]) -> list[tuple[str, str, Maker]]:
     """What is measured: how a plan comes about, what it reads, and the search."""
     rows: list[tuple[str, str, Maker]] = []
     if "searched" in ways:
-        rows.append(("searched steps", "TIMESTEP", lambda task: Tts(replace(task, pruner={}))))
+        rows.append(("searched steps", "TIMESTEP", Tts))
     if "switched" in ways:
-        rows.append(("searched steps, switches", "TIMESTEP", Tts))
+        rows.append(("searched steps, switches", "TIMESTEP", switched))
     for name in directions:
         sources = DIRECTIONS[name]
         if "gates" in ways and name != "ROLLOUT":  # a plan for all calls never computes what it would read
             rows.append(("gates for all calls", name, lambda task, s=sources: Paper(task, s, observes=False)))
+        if "refined" in ways and name == "all":
+            rows.append(("head from searched steps", name, from_corrected))
         if "head" in ways:
             rows.append(("head for each call", name, lambda task, s=sources: Paper(task, s)))
     return rows
@@ -167,7 +179,8 @@ def measured(task: Task, judge: Judge, decided: str, reads: str, maker: Maker, m
         if one.pruner is not None:
             plans = pruner_plan(task.executor.logits(judge.calls, one.pruner))
             correction = one.pruner_correction
-        rows.append(judge.row(decided, reads, plans, correction, seconds))
+        row = judge.row(decided, reads, plans, correction, seconds)
+        rows.append(replace(row, updates=int(found.notes.get("updates", 0))))
     return rows
 
 
@@ -220,8 +233,8 @@ def show(rows: Sequence[Row], title: str) -> None:
     "--way",
     "ways",
     multiple=True,
-    type=click.Choice(["searched", "switched", "gates", "head"]),
-    default=["searched", "switched", "gates", "head"],
+    type=click.Choice(["searched", "switched", "gates", "head", "refined"]),
+    default=["searched", "switched", "gates", "head", "refined"],
 )
 @click.option("--pinned", is_flag=True, help="All calls of a window have the noise of its first.")
 @click.option("--seed", default=0)

@@ -25,10 +25,10 @@ from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.progress import Bar
 from ttscompile.calibration.search import open_search, search_plan
 from ttscompile.calibration.state import FILE, StateFile
-from ttscompile.calibration.strategies import NAMES
+from ttscompile.calibration.strategies import FITTED, NAMES
 from ttscompile.calibration.targets import draw_calls, with_targets
 from ttscompile.calibration.task import Clock
-from ttscompile.calibration.tts import Tts
+from ttscompile.calibration.tts import Tts, switched
 from ttscompile.core.lattice import PlanArray, Source, uniform_plan
 from ttscompile.errors import CalibrationError, CalibrationFailedError
 from ttscompile.runtimes.reference.model import Contexts, ReferenceModel
@@ -93,7 +93,7 @@ def test_a_limit_holds_within_an_interval(
         found, _, stopped = search_plan(search, clock)
         assert np.count_nonzero(found.schedule == Source.COMPUTE) <= 34
         assert (stopped == "time limit") == (name not in ("interval", "deepcache"))  # which have one candidate
-    assert clock.now <= limit + (2 + (name == "tts")) * 480
+    assert clock.now <= limit + (2 + (name in FITTED)) * 480
 
 
 def test_a_family_is_not_begun_that_cannot_be_finished(make_task: MakeTask, tmp_path: Path) -> None:
@@ -142,8 +142,9 @@ def test_only_corrections_need_many_calls(artifact: Path, recording: Path) -> No
 
 def test_without_a_pruner_no_time_is_kept_for_it(make_task: MakeTask) -> None:
     task = make_task(20, calls=4)
-    with_head, without = (Tts(one) for one in (task, replace(task, pruner={})))
-    assert (with_head.closing, without.closing) == (5 if task.pruner else 0, 0)
+    with_head, without = (switched(one) for one in (task, replace(task, pruner={})))
+    assert (with_head.closing, without.closing) == (5, 0)
+    assert Tts(task).closing == 0  # the default leaves the pruner alone
 
 
 def test_errors_that_are_no_numbers_are_large_ones(compiled: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import ttscompile
-from ttscompile.calibration.published import evo, gates, online
+from ttscompile.calibration.published import evo, gates, online, paper
 from ttscompile.calibration.search import open_search, plan_of
 from ttscompile.calibration.strategies import DEFAULT, FITTED, NAMES, STRATEGIES, Strategy, strategy_of
 from ttscompile.calibration.task import Found, Search
@@ -28,6 +28,7 @@ BUDGET = 34
 def short_searches(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gates.Gates, "intervals", 4)
     monkeypatch.setattr(evo.Evo, "intervals", 4)
+    monkeypatch.setattr(paper.Paper, "intervals", 4)
     monkeypatch.setattr(evo, "POPULATION", 16)
     monkeypatch.setattr(online, "HALVINGS", 5)
 
@@ -102,7 +103,7 @@ def test_one_call_is_enough(make_task: MakeTask, name: str) -> None:
 
 
 def test_an_unknown_name_is_refused() -> None:
-    with pytest.raises(CalibrationError, match="'magic'; expected one of tts, tts-paper, interval"):
+    with pytest.raises(CalibrationError, match="'magic'; expected one of tts, tts-switches, tts-paper, interval"):
         strategy_of("magic")
 
 
@@ -127,7 +128,7 @@ def test_every_strategy_has_a_maker_that_is_described(make_task: MakeTask, name:
 
 def test_names_are_given_once_and_the_first_is_the_default() -> None:
     assert len(set(NAMES)) == len(MAKERS) == len(STRATEGIES)
-    assert (DEFAULT, FITTED) == ("tts", ("tts",))
+    assert (DEFAULT, FITTED) == ("tts", ("tts", "tts-switches"))
     assert [one.name for one in STRATEGIES if one.baseline] == ["interval"]
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from tests.once import Once
 
-for _folder in ("benchmark", "evaluation", "pusht"):
+for _folder in ("ablation", "benchmark", "evaluation", "pusht"):
     sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / _folder))
 
 

@@ -303,5 +303,5 @@ def _relax(
         best = crowded.best(more, f"{more} steps") if more <= steps // 2 else None
         if best is None:
             break
-        found, budget = task.whole_steps(best.steps, switches=0), replace(budget, cells=more * blocks)
+        found, budget = task.whole_steps(best.steps), replace(budget, cells=more * blocks)
     return found, budget

@@ -79,6 +79,12 @@ STRATEGIES = (
         "test-time sparsity, arXiv 2605.13316; this project's own",
         "tts:Tts",
         fits_correction=True,
+    ),
+    Strategy(
+        "tts-switches",
+        "the same, and single cells moved by the observation",
+        "tts:switched",
+        fits_correction=True,
         uses_pruner=True,
     ),
     Strategy(

@@ -104,8 +104,9 @@ def written(plans: PlanArray, window: int) -> BoolArray:
 
 def _block(executor: Executor, b: int, k: int, stream: Tensor, contexts: Contexts, takers: IntArray) -> Tensor:
     """What the block computes for the streams that take it; for all, nothing has to be picked."""
-    streams = None if len(takers) == contexts.streams else takers.tolist()
-    return executor.model.block(b, k, stream, contexts, streams)
+    if len(takers) == contexts.streams:
+        return executor.model.block(b, k, stream, contexts)
+    return executor.model.block(b, k, stream, contexts, takers.tolist())
 
 
 def _earlier(column: PlanArray, computed: Tensor, axis: int, window: int) -> Tensor | None:

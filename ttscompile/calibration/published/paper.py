@@ -11,8 +11,8 @@ What differs from the authors' training, and why:
 - *The budget.* They add ``|reuse - target|`` to the loss. In the few hundred updates that there is time for, that
   holds no budget. Here COMPUTE has a price, which is set in every update so that the calls of the batch keep the budget
   on average: what such a term comes to where it is strong enough.
-- *The start.* A crowded schedule with more steps than the budget has, which shrinks to it: the head does not have to
-  find out that late steps matter.
+- *The start.* The best of some schedules of whole steps that keep the budget, from which the head departs. From a dense
+  plan that shrinks, or from more steps than the budget has, it ended with an error of twice that of even steps.
 - *The optimiser.* Adam with one size for each array of the head, as ``gates`` has it: a cell that hardly matters must
   not move as far as one that does.
 
@@ -23,16 +23,16 @@ comes with the head is its plans frozen: the cells that it computes most often.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ...core.lattice import PlanArray, Source
+from ...core.lattice import PlanArray, Source, whole_steps_plan
 from ...runtimes.settle import pruner_plan
 from ..calls import Calls, IntArray
-from ..crowded import crowded_steps
+from ..crowded import crowded_family
 from ..pruner.straight_through import Practice, legal, written
 from ..pruner.switches import has_head
 from ..task import Array, Found, NothingAfter, Task
@@ -43,22 +43,13 @@ UPDATES = 240
 BATCH = 16
 """Calls of an update, about: whole windows."""
 
-SHRINKING = 0.3
-"""Share of the updates during which more cells are computed than the budget has."""
-
-START = 2.0
-"""Times the budget: what is computed at first after step 0."""
-
-CROWDING = 2.0
-"""Of the schedule that the training starts from."""
-
 FIRST = 2.0, 1.0
 """Logits at first: of COMPUTE at the steps of that schedule, of TIMESTEP everywhere. The others are 0."""
 
-APART = 1e-2, 1e-4
-"""Deviation of the logits of COMPUTE at first, by step and by cell: whole steps are left out first, one by one."""
+APART = 1e-3
+"""Deviation of the logits of COMPUTE at first: no two cells are equal."""
 
-RATE = 0.1
+RATE = 0.05
 """Of what does not depend on the observation."""
 
 RELATIVE_RATE = 0.15
@@ -91,6 +82,7 @@ class Paper(NothingAfter):
         sources: what cells may read that are not computed, beside TIMESTEP: what reads ROLLOUT in the first call of an
             episode reads TIMESTEP instead.
         observes: whether the head reads the observation. Else one plan is trained for all calls.
+        begin: the steps that are computed at first; None for the best of a family.
 
     Attributes:
         loss: error of the best head so far on calls that it was not trained on, at the budget.
@@ -99,12 +91,18 @@ class Paper(NothingAfter):
 
     intervals = UPDATES
 
-    def __init__(self, task: Task, sources: Collection[Source] = tuple(Source), observes: bool = True) -> None:
+    def __init__(
+        self,
+        task: Task,
+        sources: Collection[Source] = tuple(Source),
+        observes: bool = True,
+        begin: Sequence[int] | None = None,
+    ) -> None:
         self._task, self._observes = task, observes and has_head(task.pruner)
         practised, compared = _divided(task)
         self._practised, self._compared = (task.executor.select(task.calls, one) for one in (practised, compared))
         self._practice: Practice | None = None
-        self._values = {BASE: self._base(sources)}
+        self._values = {BASE: self._base(sources, self._best_steps() if begin is None else begin)}
         if self._observes:
             self._values |= {name: np.array(task.pruner[name], np.float32) for name in TRAINED}
         self._rates = {name: RELATIVE_RATE * (_rms(value) or 1.0) for name, value in self._values.items()}
@@ -119,11 +117,13 @@ class Paper(NothingAfter):
         if self._practice is None:
             self._practice = Practice(self._task.executor, self._practised)
         window = self._practice.calls.window
+        if interval == 0:
+            self._compare()  # nothing that is worse than the start is kept
         order = self._task.draw(interval, 4).permutation(self._practice.calls.count // window)
         chosen = order[: max(1, BATCH // window), None] * window + np.arange(window)
         self._update(self._practice, chosen.reshape(-1), interval)
         self._interval = interval + 1
-        if interval % EVERY == 0 or self._interval == self.intervals:
+        if self._interval % EVERY == 0 or self._interval == self.intervals:
             self._compare()
 
     def state(self) -> dict[str, Array]:
@@ -155,26 +155,27 @@ class Paper(NothingAfter):
         pruner = {**self._task.pruner, **self._best} if self._observes else None
         return Found(self.plan, notes, pruner=pruner, error=self.loss)
 
-    def _base(self, sources: Collection[Source]) -> Array:
+    def _best_steps(self) -> Sequence[int]:
+        """The schedule with the lowest error, as far as there is time to try."""
+        task, model = self._task, self._task.executor.model
+        family = crowded_family(model.steps, max(1, min(task.budget // model.blocks, model.steps)))
+        tried = [
+            (task.error(whole_steps_plan(model.steps, model.blocks, steps), self._compared), steps)
+            for steps in task.clock.in_time(family)
+        ]
+        return min(tried)[1]
+
+    def _base(self, sources: Collection[Source], begin: Sequence[int]) -> Array:
         """What does not depend on the observation, at first, ``[K, blocks, 4]``."""
         model, draw = self._task.executor.model, self._task.draw(0, 5)
-        steps, cells = (draw.standard_normal(shape) for shape in ((model.steps, 1), (model.steps, model.blocks)))
         base = np.zeros((model.steps, model.blocks, len(Source)))
-        begin = min(-(-self._room(-1) // model.blocks), model.steps)
-        base[list(crowded_steps(model.steps, begin, CROWDING)), :, Source.COMPUTE] = FIRST[0]
-        base[..., Source.COMPUTE] += APART[0] * steps + APART[1] * cells
+        base[list(begin), :, Source.COMPUTE] = FIRST[0]
+        base[..., Source.COMPUTE] += APART * draw.standard_normal(base.shape[:2])
         base[..., Source.TIMESTEP] = FIRST[1]
         alone = {Source.ROLLOUT} if self._task.calls.window == 1 else set[Source]()
         for source in {Source.FORWARD, Source.ROLLOUT} - (set(sources) - alone):
             base[..., source] = FORBIDDEN
         return base.astype(np.float32)
-
-    def _room(self, interval: int) -> int:
-        """Computed cells of a call at this interval: geometrically to the budget."""
-        model, budget = self._task.executor.model, self._task.budget
-        begin = min(max(round(START * budget), model.blocks), model.steps * model.blocks)
-        left = max(0.0, 1 - (interval + 1) / max(1.0, SHRINKING * self.intervals))
-        return round(float(budget * (begin / budget) ** left))
 
     def _logits(self, values: Mapping[str, Array] | Mapping[str, Tensor], calls: Calls) -> Tensor:
         """What the head says, ``[N, K, blocks, 4]``."""
@@ -189,7 +190,7 @@ class Paper(NothingAfter):
         leaves = {name: torch.from_numpy(value.copy()).requires_grad_() for name, value in self._values.items()}
         logits = self._logits(leaves, calls)
         price = torch.zeros(len(Source))
-        price[Source.COMPUTE] = _price(logits.detach().numpy(), self._room(interval))
+        price[Source.COMPUTE] = _price(logits.detach().numpy(), self._task.budget)
         logits = logits - price
         plans = legal(pruner_plan(logits.detach().numpy()), calls.window)
         hard = torch.nn.functional.one_hot(torch.from_numpy(plans.astype(np.int64)), len(Source)).float()

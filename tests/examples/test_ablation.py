@@ -1,0 +1,50 @@
+"""The ablation from end to end on a small policy, and what its rows hold."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ablate import DIRECTIONS, interval, main, rows_of
+from click.testing import CliRunner
+
+from tests.calibration import policies
+from tests.once import Once
+from ttscompile.calibration import tts
+from ttscompile.calibration.published.paper import Paper
+
+WAYS = ["searched", "switched", "gates", "head", "refined"]
+
+
+def test_every_way_and_direction_is_a_row_once() -> None:
+    rows = [(decided, reads) for decided, reads, _ in rows_of(list(DIRECTIONS), WAYS)]
+    assert len(rows) == len(set(rows)) == 2 + 3 + 4 + 1  # a plan for all calls has no use for ROLLOUT
+
+
+def test_an_interval_is_over_episodes() -> None:
+    """Calls of one episode are no evidence of their own: ten of each of two episodes leave the mean open."""
+    episodes = np.repeat([0, 1], 10)
+    assert interval(np.where(episodes == 0, 1.0, 3.0), episodes) == (1.0, 3.0)
+    assert interval(np.full(20, 2.0), episodes) == (2.0, 2.0)
+
+
+def test_it_runs_and_every_row_keeps_the_budget(once: Once, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Paper, "intervals", 2)
+    monkeypatch.setattr(tts, "DISTANCES", (1,))
+    calls, found = policies.record(tmp_path / "calls.npz", episodes=8), tmp_path / "rows.json"
+    sizes = ["--learned", "70", "--judged", "14", "--minutes", "0.02", "--pinned"]
+    chosen = ["--way", "searched", "--way", "head", "--direction", "all"]
+    arguments = [str(policies.compiled(once)), "--trajectories", str(calls), "--json", str(found)]
+    result = CliRunner().invoke(main, [*arguments, *sizes, *chosen], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    told = json.loads(found.read_text())
+    assert (told["cells"], told["window"], told["pinned"]) == (60, 7, True)
+    assert [(row["decided"], row["reads"]) for row in told["rows"]] == [
+        ("even steps", "TIMESTEP"),
+        *[("searched steps", "TIMESTEP")] * 2,
+        *[("head for each call", "all")] * 2,
+    ]
+    for row in told["rows"]:
+        assert row["cells"] <= 18
+        assert row["interval"][0] - 1e-6 <= row["error"] <= row["interval"][1] + 1e-6
+    assert "head for each call" in result.output
