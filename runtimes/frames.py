@@ -164,6 +164,11 @@ class FramePieces:
     def __len__(self) -> int:
         return len(self._pieces)
 
+    @property
+    def reuses_tokens(self) -> bool:
+        """Whether of some frames only some tokens are computed."""
+        return bool(self._tokens)
+
     def forget(self) -> None:
         """Forget all frames."""
         for memory in self._memory.values():

@@ -45,7 +45,7 @@ for _command, _what in (
     (convert, "Compile a checkpoint into an artifact."),
     (calibrate, "Learn from recorded episodes what an artifact may leave out."),
     (distill, "Train weights for a plan of very few steps, as a last resort."),
-    (reuse_tokens, "Compute of new pictures what changed, in encoders that allow it."),
+    (reuse_tokens, "Compute of new pictures the parts that changed."),
     (inspect, "What is in an artifact; a picture of a plan."),
     (verify, "Does it do what the original did, and do its plans engage?"),
     (report, "All about an artifact on one page."),
