@@ -7,11 +7,12 @@ that would be computed again.
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import astuple, dataclass
+from types import MappingProxyType
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -20,14 +21,29 @@ import numpy.typing as npt
 from ttscompile.artifact.manifest import PieceRecord
 from ttscompile.ir.pieces import FRAMES, frame_pieces
 
+from .tokens import Lane, Run, TokenTower
+
 Array: TypeAlias = npt.NDArray[Any]
 Content: TypeAlias = tuple[bytes, ...]
-"""The bytes of one frame, of each input of the piece that reads it."""
-Run: TypeAlias = Callable[[str, Mapping[str, Array]], tuple[Array, ...]]
-"""A piece, by its name, on inputs by theirs; its outputs in order."""
+"""The bytes of one frame, of each input of the piece that reads it; before them those of its lane, if it has one."""
 Stop: TypeAlias = Callable[[], bool]
-Compute: TypeAlias = Callable[[Sequence[Array]], tuple[Array, ...]]
-"""One row of each input of a frame piece, ``[1, ...]``, to what it gives for it, ``[1, ...]`` each."""
+Compute: TypeAlias = Callable[[int], "Computed"]
+"""The number of a row to what a frame piece gives for it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Computed:
+    """What a frame piece gave for a row.
+
+    Attributes:
+        values: ``[1, ...]`` each.
+        tokens: for how many tokens it was computed.
+        of: how many tokens it has; 0 where the whole frame is the unit.
+    """
+
+    values: tuple[Array, ...]
+    tokens: int = 0
+    of: int = 0
 
 
 def _never() -> bool:
@@ -47,20 +63,19 @@ class FrameWork:
         remembered: frames that were known.
         waited: ms that computing took.
         saved: ms that those remembered took when they were computed.
+        tokens: that were computed of the frames that were.
+        of: how many tokens these frames have; 0 where tokens are not reused.
     """
 
     computed: int = 0
     remembered: int = 0
     waited: float = 0.0
     saved: float = 0.0
+    tokens: int = 0
+    of: int = 0
 
     def __add__(self, other: FrameWork) -> FrameWork:
-        return FrameWork(
-            self.computed + other.computed,
-            self.remembered + other.remembered,
-            self.waited + other.waited,
-            self.saved + other.saved,
-        )
+        return FrameWork(*(mine + theirs for mine, theirs in zip(astuple(self), astuple(other), strict=True)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,14 +97,11 @@ class FrameMemory:
         """Forget all."""
         self._known.clear()
 
-    def learn(
-        self, contents: Sequence[Content], rows: Sequence[Array], compute: Compute, stop: Stop = _never
-    ) -> FrameWork:
+    def learn(self, contents: Sequence[Content], compute: Compute, stop: Stop = _never) -> FrameWork:
         """Compute the rows that are not known; nothing is kept of one whose computing fails.
 
         Args:
             contents: of the rows.
-            rows: of each input of the piece ``[N, ...]``.
             compute: asked once for each new row.
             stop: asked before each; the rest is left out if it says so.
         """
@@ -103,10 +115,10 @@ class FrameMemory:
             if stop():
                 break
             start = time.perf_counter()
-            values = compute([each[i : i + 1] for each in rows])
+            made = compute(i)
             took = 1000.0 * (time.perf_counter() - start)
-            self._known[content] = _Known(values, took)
-            work += FrameWork(computed=1, waited=took)
+            self._known[content] = _Known(made.values, took)
+            work += FrameWork(computed=1, waited=took, tokens=made.tokens, of=made.of)
         while len(self._known) > WINDOWS * len(contents):
             self._known.popitem(last=False)
         return work
@@ -117,9 +129,15 @@ class FrameMemory:
         return tuple(np.concatenate(each) for each in zip(*found, strict=True))
 
 
-def contents_of(rows: Sequence[Array]) -> list[Content]:
-    """The content of each row, of the inputs of a piece ``[N, ...]``."""
-    return [tuple(row.tobytes() for row in one) for one in zip(*rows, strict=True)]
+def contents_of(rows: Sequence[Array], lanes: Sequence[Lane] = ()) -> list[Content]:
+    """The content of each row, of the inputs of a piece ``[N, ...]``.
+
+    Args:
+        rows: of each input.
+        lanes: of the rows, where what is given for one depends on the frames of its lane before it.
+    """
+    own = [[lane] for lane in lanes] or [[] for _ in rows[0]]
+    return [(*lane, *(row.tobytes() for row in one)) for lane, *one in zip(own, *rows, strict=True)]
 
 
 class FramePieces:
@@ -128,40 +146,52 @@ class FramePieces:
     Args:
         pieces: of the artifact; without frame pieces nothing is done.
         run: executes one of them.
+        tokens: by frame piece, those of which only some tokens are computed.
 
     Attributes:
         work: what the last ``values`` did.
     """
 
-    def __init__(self, pieces: Mapping[str, PieceRecord], run: Run) -> None:
-        self._rows, self._run = pieces.get(FRAMES), run
+    def __init__(
+        self, pieces: Mapping[str, PieceRecord], run: Run, tokens: Mapping[str, TokenTower] = MappingProxyType({})
+    ) -> None:
+        self._rows, self._run, self._tokens = pieces.get(FRAMES), run, tokens
         self._pieces = {name: pieces[name] for name in frame_pieces(pieces)}
         self._memory = {name: FrameMemory() for name in self._pieces}
+        self._lanes: dict[tuple[str, int], Sequence[Lane]] = {}  # by piece and number of streams
         self.work = FrameWork()
 
     def __len__(self) -> int:
         return len(self._pieces)
 
+    @property
+    def reuses_tokens(self) -> bool:
+        """Whether of some frames only some tokens are computed."""
+        return bool(self._tokens)
+
     def forget(self) -> None:
         """Forget all frames."""
         for memory in self._memory.values():
             memory.forget()
+        for tower in self._tokens.values():
+            tower.forget()
 
     def learn(self, obs: Mapping[str, Array], stop: Stop = _never) -> FrameWork:
         """Compute what is new in normalised observations ``[B, ...]``, until ``stop`` says so."""
         rows, work = self._rows_of(obs), FrameWork()
         for name, piece in self._pieces.items():
             own = [rows[n] for n in piece.inputs]
-            work += self._memory[name].learn(contents_of(own), own, partial(self._compute, name), stop)
+            lanes = self._lanes_of(name, obs)
+            work += self._memory[name].learn(contents_of(own, lanes), self._compute(name, own, lanes), stop)
         return work
 
     def values(self, obs: Mapping[str, Array]) -> dict[str, Array]:
         """What the condition piece reads beside normalised observations ``[B, ...]``; nothing without frame pieces."""
         rows, found, self.work = self._rows_of(obs), dict[str, Array](), FrameWork()
         for name, piece in self._pieces.items():
-            own, memory = [rows[n] for n in piece.inputs], self._memory[name]
-            contents = contents_of(own)
-            self.work += memory.learn(contents, own, partial(self._compute, name))
+            own, memory, lanes = [rows[n] for n in piece.inputs], self._memory[name], self._lanes_of(name, obs)
+            contents = contents_of(own, lanes)
+            self.work += memory.learn(contents, self._compute(name, own, lanes))
             found |= zip(piece.outputs, memory.values(contents), strict=True)
         return found
 
@@ -171,8 +201,39 @@ class FramePieces:
         feed = {name: np.ascontiguousarray(obs[name]) for name in self._rows.inputs}
         return dict(zip(self._rows.outputs, self._run(FRAMES, feed), strict=True))
 
-    def _compute(self, name: str, row: Sequence[Array]) -> tuple[Array, ...]:
-        return self._run(name, dict(zip(self._pieces[name].inputs, row, strict=True)))
+    def _compute(self, name: str, rows: Sequence[Array], lanes: Sequence[Lane]) -> Compute:
+        """What computes one of the rows, of each input of the piece ``[N, ...]``."""
+        piece, tower = self._pieces[name], self._tokens.get(name)
+
+        def compute(i: int) -> Computed:
+            row = {n: each[i : i + 1] for n, each in zip(piece.inputs, rows, strict=True)}
+            if tower is None:
+                return Computed(self._run(name, row))
+            values, count = tower.compute(lanes[i], row)
+            return Computed(values, count, tower.tokens)
+
+        return compute
+
+    def _lanes_of(self, name: str, obs: Mapping[str, Array]) -> Sequence[Lane]:
+        """The lane of each row of a frame piece that reuses tokens: of frames of one camera of one stream the same.
+
+        Rows are made by moving numbers. So if every camera of every stream shows one number, the rows tell which.
+        """
+        streams = len(next(iter(obs.values())))
+        if name not in self._tokens or (name, streams) in self._lanes:
+            return self._lanes.get((name, streams), ())
+        shown = {}
+        for i, (key, value) in enumerate(obs.items()):
+            numbers = np.arange(i * streams, (i + 1) * streams) + 1
+            shares = numbers / (len(obs) * streams + 1) if value.dtype.kind == "f" else numbers
+            one = shares.astype(value.dtype).reshape(-1, *[1] * (value.ndim - 1))
+            shown[key] = np.broadcast_to(one, value.shape)
+        (own,) = (self._rows_of(shown)[n] for n in self._pieces[name].inputs)
+        lanes = [hashlib.sha256(row.tobytes()).digest() for row in own]
+        if len(set(lanes)) % streams:  # an integer that cannot hold them: then each row is a lane
+            lanes = [str(i).encode() for i in range(len(own))]
+        self._lanes[name, streams] = lanes
+        return lanes
 
 
 NO_FRAMES = FramePieces({}, lambda name, feed: ())

@@ -41,6 +41,7 @@ class PolicyInfo:
         prefix_refusal: why ``predict_action`` takes no ``prefix``; None if it does.
         frames: how many pieces depend on one frame alone, and are remembered by its content; 0 where there are none, or
             where the runtime computes all of them in every call.
+        reuses_tokens: whether of new frames only some tokens are computed, so that a call depends on the frames before.
     """
 
     K: int
@@ -59,3 +60,4 @@ class PolicyInfo:
     rollout: RolloutNeeds
     prefix_refusal: str | None
     frames: int = 0
+    reuses_tokens: bool = False

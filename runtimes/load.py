@@ -30,6 +30,7 @@ def load(
     plan: str | None = None,
     device: str | None = None,
     tokenizer: str | Path | None = None,
+    reuse_tokens: bool = True,
 ) -> CompiledPolicy:
     """Load a compiled policy.
 
@@ -50,6 +51,8 @@ def load(
         device: where torch computes: ``cpu``, ``cuda``, ``cuda:1``, ``mps``. None for the CPU.
         tokenizer: ``tokenizer.json`` of the policy's language model, or its folder: observations may then have the text
             ``task`` in place of tokens. Needs the package tokenizers. None: the caller gives tokens.
+        reuse_tokens: of new frames compute the tokens whose patches changed, as ``ttscompile.reuse_tokens`` has settled
+            it for the artifact; where it has not, and in other runtimes, all are computed. False computes all.
 
     Raises:
         IllegalPlanError: the artifact has no plan of this name.
@@ -67,7 +70,9 @@ def load(
         path, origin = fetched.path, fetched.origin
 
     def once() -> CompiledPolicy:
-        return open_policy(load_artifact(path), runtime, threads, seed, precision, plan, device, tokenizer, origin)
+        artifact = load_artifact(path)
+        artifact = artifact if reuse_tokens else artifact.with_reuse(None)
+        return open_policy(artifact, runtime, threads, seed, precision, plan, device, tokenizer, origin)
 
     for _ in range(TRIES - 1):
         with suppress(ArtifactChangedError):

@@ -111,6 +111,7 @@ class CompiledPolicy:
             rollout=rollout_needs(self._artifact),
             prefix_refusal=self._prefix_refusal,
             frames=self._runtime.frame_pieces,
+            reuses_tokens=self._runtime.reuses_tokens,
         )
 
     @property

@@ -106,6 +106,11 @@ class Runtime:
         """How many pieces are computed for new frames only; 0 of a backend that computes all frames in every call."""
         return len(self._used.frames)
 
+    @property
+    def reuses_tokens(self) -> bool:
+        """Whether of new frames only some tokens are computed."""
+        return self._used.frames.reuses_tokens
+
     def reset(self) -> None:
         """Forget the rollout cache and all frames: a new episode, of any number of streams. Its memory is kept."""
         self._end_episode()

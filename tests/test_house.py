@@ -60,6 +60,7 @@ COMPILES = (
     "ttscompile.frontends",
     "ttscompile.ir.evaluate",
     "ttscompile.ir.idle_form",
+    "ttscompile.ir.tokens",
     "ttscompile.lower",
     "ttscompile.passes",
     "ttscompile.runtimes.reference",

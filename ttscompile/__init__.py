@@ -15,6 +15,8 @@ from .measure.versions import VERSION as __version__
 if TYPE_CHECKING:
     from .calibration.distill import distill as distill
     from .calibration.pipeline import calibrate as calibrate
+    from .calibration.tokens import TokenCalibration as TokenCalibration
+    from .calibration.tokens import reuse_tokens as reuse_tokens
     from .core.lattice import Source as Source
     from .core.lattice import legalize as legalize
     from .core.spec import Affine as Affine
@@ -46,6 +48,7 @@ _HOMES = {
     for home, names in {
         "calibration.distill": ("distill",),
         "calibration.pipeline": ("calibrate",),
+        "calibration.tokens": ("TokenCalibration", "reuse_tokens"),
         "core.lattice": ("Source", "legalize"),
         "core.spec": ("Affine", "ChunkSpec", "Noise", "ObservationSpec", "PolicySpec", "SamplerTable"),
         "driver": ("compile_denoiser", "convert"),

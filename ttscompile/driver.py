@@ -45,6 +45,7 @@ from .passes.move_skip import MoveSkip, skips_network
 from .passes.one_block import OneBlock
 from .passes.partition import Partition
 from .passes.regroup_sums import RegroupSums
+from .passes.reuse_tokens import ReuseTokens
 from .passes.split_features import SplitFeatures
 from .passes.split_frames import SplitFrames
 from .passes.split_tokens import SplitTokens
@@ -275,7 +276,7 @@ def transform(module: nn.Module, spec: PolicySpec, *, explain: Explain = _silent
     for split in (UnfoldBatch(), SplitTokens(), SplitFeatures(), CleanUp[Cut]()):
         cut = _run(split, cut, explain)
     program = _run(Hoist(), cut, explain)
-    for finish in (InsertPruner(), SplitFrames(), CleanUp[Program]()):
+    for finish in (InsertPruner(), SplitFrames(), CleanUp[Program](), ReuseTokens()):
         program = _run(finish, program, explain)
     return program
 

@@ -23,8 +23,8 @@ class Episodes:
     """Episodes of one variant in one environment, a file each.
 
     The key is the environment and what the variant computes: for the dense plan weights, sampler and normalisers, which
-    calibration does not touch; for any other plan the artifact's whole identity; and the runtime, whose sums are
-    ordered differently.
+    calibration does not touch; for any other plan, and where tokens are reused, the artifact's whole identity; and the
+    runtime, whose sums are ordered differently.
 
     Args:
         root: folder of all variants.
@@ -36,7 +36,7 @@ class Episodes:
     def __init__(self, root: Path, environment: str, variant: Variant, runtime: str) -> None:
         info = variant.policy.info
         plan = variant.plan or info.default_plan
-        identity = info.model_identity if plan == "dense" else info.identity
+        identity = info.model_identity if plan == "dense" and not info.reuses_tokens else info.identity
         key = "\n".join((FORMAT, environment, identity, info.precision, plan, runtime))
         self._folder = root / hashlib.sha256(key.encode()).hexdigest()[:16]
 

@@ -17,6 +17,7 @@ from ttscompile.runtimes.backend import Call
 from ttscompile.runtimes.frames import FramePieces
 from ttscompile.runtimes.instructions import Instructions, instructions_of
 from ttscompile.runtimes.liveness import readable_rollout
+from ttscompile.runtimes.tokens import token_towers
 
 from .decode import decode_first, decode_rest
 from .sessions import open_blocks, open_sessions, run_piece
@@ -51,7 +52,7 @@ class OnnxBackend:
         self._blocks = self._pruned or any(one.partial for one in self._schedules)  # whether these have sessions
         self.sessions = open_sessions(artifact, threads, self._blocks)
         self._run = partial(run_piece, self.sessions, self._manifest.pieces)  # which does not keep the backend alive
-        self.frames = FramePieces(self._manifest.pieces, self._run)
+        self.frames = self._open_frames()
         self.keeps = readable_rollout(artifact)
         self.workspace: Workspace | None = self._open_workspace(1)
 
@@ -98,6 +99,10 @@ class OnnxBackend:
         decode_rest(self._work, plans, self._keep)
         return self._work.result()
 
+    def _open_frames(self) -> FramePieces:
+        """Frame pieces that remember nothing yet."""
+        return FramePieces(self._manifest.pieces, self._run, token_towers(self._manifest, self._run))
+
     @property
     def _work(self) -> Workspace:
         assert self.workspace is not None  # ``prepare``
@@ -120,7 +125,7 @@ class OnnxBackend:
         spec = self._manifest.spec
         obs = {key: np.zeros((streams, *one.shape), one.dtype) for key, one in spec.observations.items()}
         with np.errstate(all="ignore"):  # zeros need not be in the range of the policy
-            seen = FramePieces(self._manifest.pieces, self._run).values(obs)  # none of these is to be remembered
+            seen = self._open_frames().values(obs)  # none of these is to be remembered
             work.start({**obs, **seen}, Noise(np.zeros((streams, *spec.sample), np.float32)), None)
             decode_first(work, np.zeros_like(self.keeps))
             for k in range(spec.sampler.steps):

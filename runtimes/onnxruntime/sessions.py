@@ -44,6 +44,7 @@ from ttscompile.ir.pieces import (
     STEM,
     STREAM,
     block_name,
+    of_tokens,
 )
 from ttscompile.measure.machine import has_integer_dot_product
 
@@ -86,8 +87,11 @@ def open_sessions(artifact: Artifact, threads: int, blocks: bool = True) -> dict
             has it ignore options.
         ArtifactError: onnxruntime refuses a graph.
     """
-    single = {block_name(b) for b in range(len(artifact.manifest.blocks))}
-    sessions = _open(artifact, set(artifact.manifest.pieces) - single - {JOINT, LAYERS}, threads)
+    manifest = artifact.manifest
+    single = {block_name(b) for b in range(len(manifest.blocks))}
+    # A tower that reuses tokens computes all of them with the same session, so that its weights are there once.
+    unused = filter(of_tokens, manifest.pieces) if manifest.reuse is None else manifest.tokens
+    sessions = _open(artifact, set(manifest.pieces) - single - {JOINT, LAYERS} - set(unused), threads)
     first = artifact.first_step
     sessions[FIRST_STEP] = sessions[DENSE_STEP] if first is None else _open(first, [DENSE_STEP], threads)[DENSE_STEP]
     return sessions | _open_blocks(artifact, threads) if blocks else sessions

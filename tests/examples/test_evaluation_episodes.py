@@ -12,6 +12,7 @@ from ttscompile import ChunkSpec, ObservationSpec
 
 class Info:
     model_identity, identity, precision, default_plan = "m" * 64, "i" * 64, "fp32", "schedule"
+    reuses_tokens = False
     observation, action = {"obs": ObservationSpec((2, 20))}, ChunkSpec(2, 1, 9)
 
 
@@ -98,6 +99,7 @@ def test_calibration_does_not_change_the_dense_policy(tmp_path):
     cached(tmp_path, variant("dense")).write(episode())
     assert cached(tmp_path, variant("dense", identity="j" * 64)).read(7) is not None
     assert cached(tmp_path, variant("dense", model_identity="n" * 64)).read(7) is None
+    assert cached(tmp_path, variant("dense", reuses_tokens=True)).read(7) is None, "it may act otherwise"
 
 
 def test_a_damaged_file_is_as_good_as_none(tmp_path):

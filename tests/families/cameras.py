@@ -10,7 +10,9 @@ from torch import Tensor, nn
 
 import ttscompile
 from ttscompile import ChunkSpec, ObservationSpec, PolicySpec
+from ttscompile.frontends.clip import ClipVision, VisionConfig
 from ttscompile.frontends.encoded import EncodedDenoiser
+from ttscompile.frontends.siglip import Siglip, SiglipConfig
 from ttscompile.samplers.flow import flow_matching_table
 
 TO, SIDE, WORDS = 2, 24, 8
@@ -32,17 +34,38 @@ class Tower(nn.Module):
         return self.out(x.mean((2, 3)))  # type: ignore[no-any-return]
 
 
+class Patches(nn.Module):
+    """``[N, 3, 24, 24]`` -> ``[N, 8]`` by a vision transformer of 36 patches; ``clip`` has a class token, too."""
+
+    def __init__(self, kind: str) -> None:
+        super().__init__()
+        sizes = {"hidden_size": 64, "intermediate_size": 256, "num_hidden_layers": 3, "num_attention_heads": 2}
+        clip = VisionConfig(**sizes, image_size=SIDE, patch_size=4)
+        siglip = SiglipConfig(**sizes, image_size=SIDE, patch_size=4)
+        self.tower = ClipVision(clip) if kind == "clip" else Siglip(siglip, (SIDE, SIDE))
+        self.out = nn.Linear(64, 8)
+        self.pooled = kind == "clip"
+        with torch.no_grad():
+            self.tower.embeddings.patch_embedding.weight *= 10  # else what is seen is little beside positions
+
+    def forward(self, x: Tensor) -> Tensor:
+        seen = self.tower(2 * x - 1)
+        return self.out(seen if self.pooled else seen.mean(1))  # type: ignore[no-any-return]
+
+
 class Eyes(nn.Module):
     """What the cameras see, as ``kind`` says:
 
     ``each``: a tower for each camera; ``shared``: one looks at all of them in turn; ``stacked``: at all at once;
-    ``mixed``: at the mean of the window's frames; ``channels``: at the window as one picture with more colours.
+    ``mixed``: at the mean of the window's frames; ``channels``: at the window as one picture with more colours;
+    ``clip``, ``siglip``: one that is a vision transformer looks at all at once.
     """
 
     def __init__(self, kind: str) -> None:
         super().__init__()
         self.kind = kind
-        self.towers = nn.ModuleList(Tower() for _ in range(2 if kind == "each" else 1))
+        sees = kind in ("clip", "siglip")
+        self.towers = nn.ModuleList(Patches(kind) if sees else Tower() for _ in range(2 if kind == "each" else 1))
         self.merge = nn.Conv2d(3 * TO, 3, 1)
 
     def forward(self, images: list[Tensor]) -> Tensor:
@@ -52,7 +75,7 @@ class Eyes(nn.Module):
         if self.kind == "channels":
             return torch.cat([self.towers[0](self.merge(x.flatten(1, 2))) for x in images], -1)
         rows = [x.flatten(0, 1) for x in images]
-        if self.kind == "stacked":
+        if self.kind in ("stacked", "clip", "siglip"):
             seen = self.towers[0](torch.stack(rows, 1).flatten(0, 1))
             return seen.reshape(-1, TO * len(images) * seen.shape[-1])  # type: ignore[no-any-return]
         own = [self.towers[i % len(self.towers)](x) for i, x in enumerate(rows)]

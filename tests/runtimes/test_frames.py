@@ -16,7 +16,7 @@ from tests.families import cameras
 from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.errors import ArtifactError, ObservationError
-from ttscompile.runtimes.frames import WINDOWS, FrameMemory, contents_of
+from ttscompile.runtimes.frames import WINDOWS, Computed, FrameMemory, contents_of
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.verification import verify
 from ttscompile.verification.engaged import ENGAGED
@@ -216,14 +216,14 @@ def test_memory_is_bounded(policy: CompiledPolicy) -> None:
 def test_frames_that_differ_in_one_number_are_two() -> None:
     memory, asked = FrameMemory(), list[float]()
 
-    def double(row: Any) -> tuple[Array, ...]:
-        asked.append(float(row[0].sum()))
-        return (2 * row[0],)
+    def double(i: int) -> Computed:
+        asked.append(float(rows[i].sum()))
+        return Computed((2 * rows[i : i + 1],))
 
     rows = np.zeros((3, 4), np.float32)
     rows[1, 2], rows[2, 2] = np.float32(1e-30), np.float32(-0.0)
     contents = contents_of([rows])
-    memory.learn(contents, [rows], double)
+    memory.learn(contents, double)
     np.testing.assert_array_equal(memory.values(contents)[0], 2 * rows)
     assert len(asked) == 3
 

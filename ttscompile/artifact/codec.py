@@ -10,7 +10,22 @@ from collections.abc import Mapping
 from typing import Any
 
 from ..errors import ArtifactError
-from ..ir.pieces import ADVANCE, CONDITION, FRAMES, OF_ALL_BLOCKS, PRUNER, STEM, block_name, frame_pieces, part_of
+from ..ir.pieces import (
+    ADVANCE,
+    CONDITION,
+    FRAMES,
+    INDEX,
+    OF_ALL_BLOCKS,
+    PIXELS,
+    PRUNER,
+    STEM,
+    block_name,
+    frame_pieces,
+    of_tokens,
+    part_of,
+    pixels_name,
+    tokens_name,
+)
 from . import typed_json
 from .manifest import DENSE, DISTILLED, FORMAT, MANIFEST, SCHEMA_VERSION, DistilledRecord, Manifest, PrecisionRecord
 from .strict_json import REMEDY, Value, dump, dump_compact, parse
@@ -79,9 +94,9 @@ def identities(manifest: Manifest) -> tuple[str, str]:
     """Identity and model identity of what a manifest describes; its own two fields are not read.
 
     The model identity covers weights, tables, graphs, sampler, normalisers, observations, chunk and block table. The
-    identity covers that, the pruner's weights, all plans, which of them is the default, and weights of another
-    precision: a calibration, which computes in fp32, belongs to the model with or without them. Neither covers what
-    people are told: source, FLOPs, reasons, sparsities, errors, calibration record, versions.
+    identity covers that, the pruner's weights, all plans, which of them is the default, how tokens are reused, and
+    weights of another precision: a calibration, which computes in fp32, belongs to the model with or without them.
+    Neither covers what people are told: source, FLOPs, reasons, sparsities, errors, calibration record, versions.
 
     Returns:
         Two sha256 of 64 digits.
@@ -96,6 +111,7 @@ def identities(manifest: Manifest) -> tuple[str, str]:
         "pieces": pieces,
         "contexts": document["contexts"],
         "features": document["features"],
+        "tokens": document["tokens"],
         "program": hashes[manifest.stores.program],
         "weights": hashes[manifest.stores.weights],
     }
@@ -112,6 +128,8 @@ def identities(manifest: Manifest) -> tuple[str, str]:
         whole["precision"] = {"name": record.name, "weights": hashes[record.weights], "models": models}
     if manifest.distilled is not None:
         whole["distilled"] = sorted(hashes[file] for file in manifest.distilled.files)
+    if manifest.reuse is not None:
+        whole["reuse"] = [manifest.reuse.threshold, manifest.reuse.refresh]
     return _checksum(whole), model_identity
 
 
@@ -131,6 +149,7 @@ def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:
     read = [name for piece in frame_pieces(manifest.pieces) for name in manifest.pieces[piece].inputs]
     if sorted(read) != sorted(rows):
         fields["pieces"].fail(f"frame pieces that read {sorted(rows)}, each once")
+    _check_tokens(manifest, fields)
     has_pruner = PRUNER in manifest.pieces
     if has_pruner != (manifest.stores.pruner is not None):
         fields["stores"].fail("a file of pruner weights exactly when there is a piece called pruner")
@@ -152,6 +171,25 @@ def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:
     scheduled = any(not plan.pruned for plan in manifest.plans.values())
     if scheduled != (manifest.stores.plans is not None):
         fields["stores"].fail("a file of plans exactly when there are schedules")
+
+
+def _check_tokens(manifest: Manifest, fields: Mapping[str, Value]) -> None:
+    """Each tower with tokens has its two pieces, which fit it and what is kept; and there are no others."""
+    known = {name: i for i, name in enumerate(frame_pieces(manifest.pieces))}
+    if not set(manifest.tokens) <= set(known):
+        fields["tokens"].fail(f"some of the frame pieces {sorted(known)}")
+    wanted = [make(known[name]) for name in manifest.tokens for make in (pixels_name, tokens_name)]
+    if sorted(wanted) != sorted(filter(of_tokens, manifest.pieces)):
+        fields["pieces"].fail(f"for the sake of tokens exactly {sorted(wanted)}")
+    for name, record in manifest.tokens.items():
+        frame, pixels, part = (manifest.pieces[p] for p in (name, pixels_name(known[name]), tokens_name(known[name])))
+        rows = [kind.at(1)[:1] for kind in record.kept.values()]
+        fits = pixels.inputs == frame.inputs and pixels.outputs == (PIXELS,) and 0 <= record.fixed < record.tokens
+        fits = fits and sorted(part.inputs) == sorted((PIXELS, INDEX, *record.kept))
+        if not fits or len(part.outputs) != len(frame.outputs) + len(rows) or set(rows) != {(record.tokens,)}:
+            fields["tokens"].members()[name].fail("what the pieces of its tokens read and give")
+    if manifest.reuse is not None and not manifest.tokens:
+        fields["reuse"].fail("none, because no frame piece has tokens")
 
 
 def _check_precision(manifest: Manifest, record: PrecisionRecord, value: Value) -> None:

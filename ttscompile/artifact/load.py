@@ -33,6 +33,7 @@ from .onnx_files import check_model
 from .requires import check_runtime
 from .size import check_size
 from .strict_json import REMEDY, Value, parse
+from .tokens import ReuseRecord
 
 TABLE_PREFIX = "table/"
 CORRECTION_PREFIX = "correction/"
@@ -131,6 +132,11 @@ class Artifact:
         own = replace(record, models=models) if record is not None and models else None
         first = None if self.first_step is None else self.first_step.with_parts(parts)
         return replace(self, manifest=replace(self.manifest, precision=own), first_step=first)
+
+    def with_reuse(self, reuse: ReuseRecord | None) -> Artifact:
+        """The same artifact, reusing tokens in another way; None for not at all."""
+        first = None if self.first_step is None else self.first_step.with_reuse(reuse)
+        return replace(self, manifest=replace(self.manifest, reuse=reuse), first_step=first)
 
     def with_weights_of(self, plan: str | None) -> Artifact:
         """The artifact whose blocks are those that a plan computes after step 0: itself, but for ``distilled``.

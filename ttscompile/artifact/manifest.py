@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 from ..core.correction import numbers_of
@@ -17,9 +17,10 @@ from ..core.spec import FP32, PolicySpec
 from ..ir.graph import TensorType
 from ..ir.pieces import PRUNER, is_block, part_of
 from ..ir.program import Binding
+from .tokens import ReuseRecord, TokensRecord
 
 FORMAT = "ttscompile artifact"
-SCHEMA_VERSION = 7
+SCHEMA_VERSION = 8
 MANIFEST = "manifest.json"
 DENSE = "dense"
 """The plan that computes every cell; every artifact has it without listing it."""
@@ -289,7 +290,8 @@ class Manifest:
         spec: the policy beside its network.
         blocks: block table, in order of execution.
         pieces: ONNX graphs: ``condition``, ``step``, ``pruner``, ``stem``, ``advance``, ``block_00``...; those that the
-            policy has; ``blocks``, all of its blocks in one (``ir.joint``); and of one block alone ``layers``.
+            policy has; ``blocks``, all of its blocks in one (``ir.joint``); of one block alone ``layers``; and
+            ``pixels_00`` and ``tokens_00`` of each frame piece in ``tokens``.
         contexts: binding and type of every context.
         features: condition values that the pruner reads, and corrections.
         flops: see ``FlopsRecord``.
@@ -301,6 +303,8 @@ class Manifest:
         files: every file but the manifest.
         precision: of blocks and prologue where it is not fp32. The reference runtime computes in fp32 always.
         distilled: weights of the plan of this name; None where there is no such plan.
+        tokens: by frame piece, the tokens of those that are vision transformers.
+        reuse: how the onnxruntime runtime reuses them; None for not at all.
     """
 
     schema_version: int
@@ -321,6 +325,8 @@ class Manifest:
     files: Mapping[FileName, FileRecord]
     precision: PrecisionRecord | None = None
     distilled: DistilledRecord | None = None
+    tokens: Mapping[str, TokensRecord] = field(default_factory=dict)
+    reuse: ReuseRecord | None = None
 
     @property
     def precision_name(self) -> str:

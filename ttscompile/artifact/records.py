@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -23,8 +24,18 @@ from ..ir.program import Binding, Program
 from . import tensors
 from .bind import REPORT, interface
 from .load import check_schedule
-from .manifest import DENSE, BlockRecord, ContextRecord, FlopsRecord, Manifest, PieceRecord, PlanRecord, Requires
+from .manifest import (
+    DENSE,
+    BlockRecord,
+    ContextRecord,
+    FlopsRecord,
+    Manifest,
+    PieceRecord,
+    PlanRecord,
+    Requires,
+)
 from .strict_json import Value, dump_compact, parse
+from .tokens import TokensRecord
 from .typed_json import from_json
 
 if TYPE_CHECKING:
@@ -84,6 +95,22 @@ def flops_record(program: Program) -> FlopsRecord:
         tail=graph_flops(pieces.tail.graph) + update_flops(program.spec.sampler, sample),
         blocks=tuple(graph_flops(piece.graph) for piece in pieces.blocks),
     )
+
+
+def tokens_records(program: Program) -> dict[str, TokensRecord]:
+    """The tokens of each tower that has a form for some of them, by its frame piece."""
+    records, pieces = {}, program.pieces
+    for i in range(len(pieces.towers)):
+        if (graph := pieces.tokens.get(names.tokens_name(i))) is None:
+            continue
+        kept = {n: kind for n, kind in graph.inputs.items() if n not in (names.PIXELS, names.INDEX)}
+        patches = next(node for node in graph.nodes if node.op.startswith("aten.conv"))
+        _, weight = list(patches.refs())[:2]
+        high, wide = graph.constants[weight].at(1)[2:]
+        tokens = next(iter(kept.values())).at(1)[0]
+        fixed = tokens - math.prod(patches.type.at(1)[2:])
+        records[names.frame_name(i)] = TokensRecord(tokens, fixed, (high, wide), kept)
+    return records
 
 
 def context_records(program: Program) -> dict[str, ContextRecord]:
@@ -217,7 +244,7 @@ def _interfaces(program: Program) -> dict[str, PieceRecord]:
         return PieceRecord("", tuple(inputs), stream, tuple(dict.fromkeys(contexts)), outputs)
 
     step, pruner, tail, stem = pieces.step, pieces.pruner, pieces.tail, pieces.stem
-    found = {name: record(graph.inputs, graph.outputs) for name, graph in pieces.once().items()}
+    found = {name: record(graph.inputs, graph.outputs) for name, graph in {**pieces.once(), **pieces.tokens}.items()}
     if step is not None:
         found[names.STEP] = record(step.inputs, step.outputs, contexts=step.inputs)
     if pruner is not None:

@@ -256,6 +256,7 @@ def _fill(
             requires=requires,
             files={path.name: describe(path) for path in sorted(folder.iterdir())},
             precision=precision,
+            tokens=records.tokens_records(program),
         )
     )
     write_synced(folder / MANIFEST, encode(manifest))

@@ -22,6 +22,7 @@ from ttscompile.cli.oracle import oracle
 from ttscompile.cli.push import push
 from ttscompile.cli.realtime import realtime
 from ttscompile.cli.report import report
+from ttscompile.cli.reuse_tokens import reuse_tokens
 from ttscompile.cli.serve import serve
 from ttscompile.cli.verify import verify
 
@@ -44,6 +45,7 @@ for _command, _what in (
     (convert, "Compile a checkpoint into an artifact."),
     (calibrate, "Learn from recorded episodes what an artifact may leave out."),
     (distill, "Train weights for a plan of very few steps, as a last resort."),
+    (reuse_tokens, "Compute of new pictures the parts that changed."),
     (inspect, "What is in an artifact; a picture of a plan."),
     (verify, "Does it do what the original did, and do its plans engage?"),
     (report, "All about an artifact on one page."),

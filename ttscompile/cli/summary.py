@@ -49,6 +49,7 @@ def print_summary(artifact: Artifact, console: Console) -> None:
         ("rollout cache", kept),
         ("precision", _told_precision(summary["precision"], len(summary["blocks"]))),
         *((f"piece {one['piece']}", _told_frames(one, captured)) for one in summary["frames"]),
+        *facts.tokens(manifest),
     )
     about = table("artifact", summary["path"], rows=rows)
     about.columns[1].justify = "left"

@@ -65,6 +65,33 @@ def frame_pieces(pieces: Iterable[str]) -> tuple[str, ...]:
     return tuple(sorted(piece for piece in pieces if piece.startswith(_FRAME)))
 
 
+_PIXELS, _TOKENS = "pixels_", "tokens_"
+
+PIXELS, INDEX = "tokens.pixels", "tokens.index"
+"""What a piece for some tokens reads beside what is kept: what patches are cut from, and the numbers of the tokens. No
+captured value has a dot in its name."""
+
+
+def pixels_name(index: int) -> str:
+    """``pixels_00``: the row of a frame piece to what its patches are cut from."""
+    return f"{_PIXELS}{index:02d}"
+
+
+def tokens_name(index: int) -> str:
+    """``tokens_00``: a frame piece for some of its tokens."""
+    return f"{_TOKENS}{index:02d}"
+
+
+def of_tokens(piece: str) -> bool:
+    """Whether a piece is there for the sake of single tokens: no call needs it that computes whole frames."""
+    return piece.startswith((_PIXELS, _TOKENS))
+
+
+def is_tokens(piece: str) -> bool:
+    """Whether a piece is a frame piece for some of its tokens."""
+    return piece.startswith(_TOKENS)
+
+
 _BLOCK = "block_"
 _SMALL = frozenset({PRUNER, STEM, TAIL, ADVANCE, IDLE, LAYERS, FRAMES})
 
@@ -84,10 +111,13 @@ def part_of(piece: str) -> str | None:
 
     Returns:
         ``blocks`` for blocks and the pieces that hold all of them; the name of a piece of the prologue; and None for
-        pieces that are always in fp32: they are small, or no call needs them.
+        pieces that are always in fp32: they are small, or no call needs them. A frame piece for some tokens belongs to
+        the part of the frame piece.
     """
     if is_block(piece) or piece in OF_ALL_BLOCKS:
         return BLOCKS
+    if of_tokens(piece):
+        return _FRAME + piece.removeprefix(_TOKENS) if is_tokens(piece) else None
     return None if piece in _SMALL else piece
 
 

@@ -108,6 +108,8 @@ class Pieces(Loop):
         frames: observations -> the rows of each tower ``[m * B, ...]``, in their order; None without towers.
         towers: frame pieces: a row -> what depends on it alone, for any number of rows. What they give for all rows
             are inputs of ``condition``.
+        tokens: for towers that have tokens, by name: ``pixels_00``, row -> what patches are cut from; and
+            ``tokens_00``, the tower for some of its tokens, of one row. There the symbolic size is their number.
     """
 
     condition: Graph
@@ -118,6 +120,7 @@ class Pieces(Loop):
     features: tuple[str, ...] = ()
     frames: Graph | None = None
     towers: tuple[Graph, ...] = ()
+    tokens: Mapping[str, Graph] = field(default_factory=dict)
 
     @property
     def rows(self) -> tuple[int, ...]:
@@ -128,7 +131,8 @@ class Pieces(Loop):
     def graphs(self) -> dict[str, Graph]:
         """Every graph by the name of its piece."""
         late = {STEP: self.step, PRUNER: self.pruner}
-        return {**self.once(), **{n: graph for n, graph in late.items() if graph is not None}, **super().graphs()}
+        after = {n: graph for n, graph in late.items() if graph is not None}
+        return {**self.once(), **after, **self.tokens, **super().graphs()}
 
     def once(self) -> dict[str, Graph]:
         """The graphs that the observation alone decides, by the name of their piece, in order."""
@@ -145,6 +149,7 @@ class Pieces(Loop):
             pruner=None if self.pruner is None else function(self.pruner),
             frames=None if self.frames is None else function(self.frames),
             towers=tuple(map(function, self.towers)),
+            tokens={name: function(graph) for name, graph in self.tokens.items()},
         )
 
 

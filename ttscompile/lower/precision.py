@@ -21,7 +21,7 @@ from onnx import AttributeProto, ModelProto, NodeProto, TensorProto, helper, num
 from ..core.spec import AUTO, FP32, INT8, PRECISIONS
 from ..errors import LoweringError
 from ..ir.flops import graph_flops
-from ..ir.pieces import BLOCKS, OF_ALL_BLOCKS, STEP, frame_name, part_of
+from ..ir.pieces import BLOCKS, OF_ALL_BLOCKS, STEP, frame_name, is_tokens, part_of
 from .integer_attention import HEADS, attention_of, integer_attention
 from .integer_convolution import DOMAIN, INTEGER_PRODUCT, convolution_of, integer_convolution, shapes_of
 from .onnx_model import live_nodes
@@ -89,7 +89,7 @@ def parts_to_lower(
     rows = {frame_name(i): count for i, count in enumerate(program.pieces.rows)}
     times = {STEP: program.spec.sampler.steps, **rows}
     for piece, graph in program.pieces.graphs().items():
-        if (part := part_of(piece)) is not None:
+        if (part := part_of(piece)) is not None and not is_tokens(piece):
             flops[part] = flops.get(part, 0) + graph_flops(graph) * times.get(piece, 1)
     if unknown := sorted(set(keep_fp32) - {*flops, PROLOGUE}):
         known = ", ".join(map(repr, (*flops, PROLOGUE)))
@@ -131,13 +131,16 @@ def lower_precision(
         lowered: dict[str, ModelProto] = {}
         new: dict[str, Array] = {}
         for name in pieces:
-            model, own = quantize_model(models[name], weights, 0 if part == BLOCKS else LEAST_ROWS)
+            # A product has as many rows as there are tokens where the whole frame has enough of them.
+            streams = LEAST_ROWS if is_tokens(name) else 1
+            model, own = quantize_model(models[name], weights, 0 if part == BLOCKS else LEAST_ROWS, streams)
             if own:
                 lowered[name] = model
                 new.update(own)
         made |= lowered
         constants |= new
-        notes += _notes(precision, part, pieces, lowered, new)
+        told = [name for name in pieces if not is_tokens(name)]
+        notes += _notes(precision, part, told, {name: lowered[name] for name in told if name in lowered}, new)
     if not made:
         raise LoweringError(
             f"precision {precision!r}: no piece of {' or '.join(parts)} multiplies by a constant float32 matrix"
@@ -183,21 +186,22 @@ def require_precision(precision: str, keep_fp32: Collection[str] = ()) -> None:
 
 
 def quantize_model(
-    model: ModelProto, weights: Mapping[str, Array], least_rows: int = 0
+    model: ModelProto, weights: Mapping[str, Array], least_rows: int = 0, streams: int = 1
 ) -> tuple[ModelProto, dict[str, Array]]:
     """One model with its products by constants in integers; inputs and outputs stay as they are.
 
     Args:
         model: from ``lower``: constants are initializers without data.
         weights: values of constants, by name. Only these are quantised.
-        least_rows: of one stream, that a product has to have; a product whose rows are not known has none.
+        least_rows: that a product has to have; a product whose rows are not known has none.
+        streams: for which rows are counted.
 
     Returns:
         A new model, and the constants that it has and ``model`` has not, by name: int8 ``[rows, columns]`` and
         float32 ``[columns]``. No constants if there was nothing to replace.
     """
     known = {t.name: weights[t.name] for t in model.graph.initializer if t.name in weights}
-    matrices, shapes = _matrices(model, known), shapes_of(model)
+    matrices, shapes = _matrices(model, known), shapes_of(model, streams)
     constants: dict[str, Array] = {}
     small: list[TensorProto] = []
 

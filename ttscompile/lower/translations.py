@@ -4,6 +4,7 @@
                  Here the groups are the channels of an InstanceNormalization, which has a kernel.
     conv1d       onnxruntime multiplies the weights by columns of the input, one a position. With few of them most of
                  its kernel's width is empty. Here few positions are rows, multiplied by the weights.
+    index_copy   The exporter takes it apart into single numbers. Here whole rows are copied, along the first axis.
 
 ``docs/decisions.md`` has the figures.
 """
@@ -78,8 +79,19 @@ def conv1d(
     return op.Transpose(result, perm=[0, 2, 1])
 
 
+def index_copy(self: Any, dim: int, index: Any, source: Any) -> Any:
+    """``aten.index_copy``: along the first axis ScatterND, which copies rows; else between transpositions."""
+    if dim == 0:
+        return op.ScatterND(self, op.Unsqueeze(index, op.Constant(value_ints=[-1])), source)
+    order = list(range(len(self.shape)))
+    order[0], order[dim] = order[dim], order[0]
+    moved, rows = (op.Transpose(value, perm=order) for value in (self, source))
+    return op.Transpose(index_copy(moved, 0, index, rows), perm=order)
+
+
 TRANSLATIONS: Mapping[Any, Callable[..., Any]] = {
     torch.ops.aten.group_norm.default: group_norm,
     torch.ops.aten.conv1d.default: conv1d,
+    torch.ops.aten.index_copy.default: index_copy,
 }
 """As ``torch.onnx.export`` takes them."""

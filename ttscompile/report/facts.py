@@ -10,6 +10,7 @@ from typing import Any
 from ..artifact.ceiling import few_steps
 from ..artifact.load import Artifact
 from ..artifact.manifest import DENSE, DISTILLED, BlockRecord, Manifest, PlanRecord, marked
+from ..artifact.tokens import ReuseRecord
 from ..ir.flops import frames_flops, graph_flops
 from ..ir.program import Binding
 from ..measure.units import flops, plain, share
@@ -57,9 +58,26 @@ def policy(manifest: Manifest) -> Section:
         ("denoising steps K", f"{sampler.steps}, timesteps {sampler.timesteps[0]:g}..{sampler.timesteps[-1]:g}"),
         ("clip of the denoised sample", "none" if sampler.clip is None else f"{sampler.clip:g}"),
         ("precision", precision(manifest)),
+        *tokens(manifest),
         ("default plan", manifest.default_plan),
     ]
     return Section("Policy", (), (Table(("", ""), tuple(rows), prose=True),))
+
+
+def told_reuse(reuse: ReuseRecord) -> str:
+    """How tokens are reused, in words."""
+    return (
+        f"of new frames {reuse.computed:.0%} of the tokens were computed, actions off by {reuse.error:.4g} on"
+        f" {reuse.calls} held-out calls, other noise by {reuse.other_noise:.4g}; a patch has changed above"
+        f" {reuse.threshold:g}, one frame of {reuse.refresh} is whole"
+    )
+
+
+def tokens(manifest: Manifest) -> list[tuple[str, str]]:
+    """Of each image encoder that has tokens, whether they are reused."""
+    settled = "all of them are computed ('ttscompile reuse-tokens' can change that)"
+    settled = settled if manifest.reuse is None else told_reuse(manifest.reuse)
+    return [(f"tokens of {name}", f"{one.tokens} a frame; {settled}") for name, one in manifest.tokens.items()]
 
 
 def precision(manifest: Manifest) -> str:

@@ -38,6 +38,8 @@ def document(artifact: Artifact) -> dict[str, Any]:
             {"piece": frame_name(i), "rows": n, "flops": graph_flops(tower)}
             for i, (n, tower) in enumerate(zip(artifact.pieces.rows, artifact.pieces.towers, strict=True))
         ],
+        "tokens": {name: {"tokens": one.tokens, "fixed": one.fixed} for name, one in manifest.tokens.items()},
+        "reuse": None if manifest.reuse is None else dict(vars(manifest.reuse)),
         "flops": _flops(manifest),
         "ceiling": {"sparsity": 1 - 1 / manifest.steps, "flops": manifest.flops.ceiling(manifest.steps)},
         "plans": {

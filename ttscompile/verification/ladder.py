@@ -38,6 +38,7 @@ from .episodes import SPARSITY, Progress, check_episodes, choose
 from .network import BLOCK, EVALUATION, PREPROCESSING, check_blocks, check_evaluation, check_preprocessing
 from .probe import Probe
 from .rung import FAILED, PASSED, ErrorMap, Rung, Verification
+from .tokens import TOKENS, check_tokens
 
 INTEGRITY = "integrity"
 
@@ -144,7 +145,8 @@ def _climb(
 ) -> tuple[list[Rung], ErrorMap | None]:
     """All rungs above integrity."""
     golden = load_golden(artifact)
-    recorded = load_golden_plans(artifact, golden.streams)
+    recorded, reusing = load_golden_plans(artifact, golden.streams), artifact
+    artifact = artifact.with_reuse(None)  # what is recorded knows of no frames before
     plain = artifact.at_precision(FP32)
     try:
         probe = Probe(plain, golden.network_observations(artifact.manifest.spec))
@@ -184,6 +186,7 @@ def _climb(
     climb(EVALUATION, lambda: check_evaluation(plain, golden, probe, rungs[-1]))
     climb(DENSE_CALL, lambda: check_dense(exact, plain, golden, probe))
     climb(PRECISION, lambda: check_precision(artifact, golden))
+    climb(TOKENS, lambda: check_tokens(reusing, golden))
     climb(RUNTIMES, lambda: check_runtimes(plain, golden, runtime))
     climb(PLANS, plans)
     climb(PLANS_PRECISION, lambda: check_plans_precision(artifact, golden, recorded, own_runtime))

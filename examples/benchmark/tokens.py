@@ -1,0 +1,131 @@
+"""New frames of a vision transformer when only an arm moves: real sizes, random weights, one thread.
+
+    python examples/benchmark/tokens.py [--only clip,siglip] [--precision fp32,int8] [--rounds 12]
+
+An arm swings in front of a fixed picture. Three policies are shown frames in turn: one computes every frame whole, one
+the tokens whose patches changed, and one that reuses tokens too, but whose pictures are noisy, so that every patch
+changes in every frame. Milliseconds are the processor's, medians: the machine may be busy.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor, nn
+from towers import SIGLIP
+
+import ttscompile
+from ttscompile import ChunkSpec, ObservationSpec, PolicySpec
+from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.tokens import ReuseRecord
+from ttscompile.frontends.clip import ClipVision, VisionConfig
+from ttscompile.frontends.encoded import EncodedDenoiser
+from ttscompile.frontends.multi_task_dit import DiffusionTransformer, DiTConfig
+from ttscompile.frontends.siglip import Siglip
+from ttscompile.runtimes.load import open_policy
+from ttscompile.samplers.flow import flow_matching_table
+
+Array = npt.NDArray[np.float32]
+
+ACTIONS, HORIZON, STEPS, WIDTH = 4, 8, 4, 768
+THRESHOLD = 0.02
+TOWERS = {"clip": ("CLIP B/16, 224 x 224", 224), "siglip": ("SigLIP of SmolVLA, 512 x 512", 512)}
+
+
+class Eye(nn.Module):
+    """One camera: ``[B, 3, size, size]`` in -1..1 to 768 features."""
+
+    def __init__(self, name: str, size: int) -> None:
+        super().__init__()
+        self.pooled = name == "clip"
+        self.tower = ClipVision(VisionConfig(patch_size=16)) if self.pooled else Siglip(SIGLIP, (size, size))
+        for label, weight in self.named_parameters():
+            if weight.ndim > 1:
+                flat = weight.ndim == 2 and "embedding" in label
+                nn.init.normal_(weight, 0, 0.02 if flat else weight[0].numel() ** -0.5)
+
+    def forward(self, obs: Mapping[str, Tensor]) -> Tensor:
+        seen = self.tower(2 * obs["image"] - 1)
+        return seen if self.pooled else seen.mean(1)
+
+
+def compiled(name: str, precision: str, folder: Path) -> None:
+    """A policy that sees with this encoder."""
+    torch.manual_seed(0)
+    size = TOWERS[name][1]
+    network = DiffusionTransformer(DiTConfig(ACTIONS, HORIZON, 64, 2, 2, 64, False, True, 1e4), WIDTH)
+    observations = {"image": ObservationSpec((3, size, size), window=False, bounds=(0.0, 1.0))}
+    spec = PolicySpec((HORIZON, ACTIONS), observations, flow_matching_table(STEPS), ChunkSpec(ACTIONS, 0, HORIZON))
+    ttscompile.compile_denoiser(EncodedDenoiser(Eye(name, size), network).eval(), spec, folder, precision=precision)
+
+
+def arm(still: Array, angle: float) -> Array:
+    """The picture with an arm of two links in front of it, a tenth of it wide."""
+    size = still.shape[-1]
+    y, x = np.mgrid[:size, :size] / size
+    image, foot, turn = still.copy(), np.array([0.95, 0.5]), -np.pi / 2 + angle
+    for length in (0.4, 0.35):
+        way = length * np.array([np.sin(turn), np.cos(turn)])
+        along = np.clip(((y - foot[0]) * way[0] + (x - foot[1]) * way[1]) / length**2, 0, 1)
+        near = (y - foot[0] - along * way[0]) ** 2 + (x - foot[1] - along * way[1]) ** 2 < 0.05**2
+        image[:, near] = 0.9
+        foot, turn = foot + way, turn + 1.5 * angle
+    return image
+
+
+def measure(name: str, precision: str, rounds: int) -> str:
+    """One row of the table."""
+    title, size = TOWERS[name]
+    with tempfile.TemporaryDirectory() as folder:
+        compiled(name, precision, Path(folder))
+        artifact = load_artifact(folder)
+        reusing = artifact.with_reuse(ReuseRecord(THRESHOLD, 10**6, 1.0, 0.0, 0.0, 1))
+        policies = [open_policy(each, seed=0) for each in (artifact, reusing, reusing)]
+    rng = np.random.default_rng(0)
+    still = rng.random((3, 8, 8)).repeat(size // 8, 1).repeat(size // 8, 2).astype(np.float32)
+    times: list[list[float]] = [[], [], []]
+    shares, off = list[float](), list[float]()
+    noise = ttscompile.Noise(rng.standard_normal((1, HORIZON, ACTIONS), dtype=np.float32))
+    for number in range(rounds + 2):
+        image = arm(still, 0.05 * number)
+        shaken = np.clip(image + 0.1 * rng.standard_normal(image.shape), 0, 1).astype(np.float32)
+        works = []
+        for policy, own, seen in zip(policies, times, (image, image, shaken), strict=True):
+            start = time.process_time()
+            works.append(policy.prepare_frame({"image": seen[None]}))
+            own.append(1000 * (time.process_time() - start))
+        if number > 1:  # the first is whole, and the second is the first of its size
+            shares.append(works[1].tokens / works[1].of)
+            assert works[2].tokens == works[2].of
+            made = [policy.predict_action({"image": image[None]}, noise=noise)["action"] for policy in policies[:2]]
+            off.append(float(np.abs(made[1] - made[0]).mean()))
+    whole, some, shaking = (statistics.median(own[2:]) for own in times)
+    figures = (f"{whole:.1f}", f"{some:.1f}", f"{statistics.mean(shares):.0%}", f"{whole / some:.1f}")
+    return f"| {title}, {precision} | {' | '.join(figures)} | {shaking / whole:.2f} | {statistics.mean(off):.2g} |"
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
+    parser.add_argument("--only", default=",".join(TOWERS), help="names of encoders")
+    parser.add_argument("--precision", default="fp32,int8")
+    parser.add_argument("--rounds", type=int, default=12)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    print("| | Whole, ms | Arm moves, ms | Tokens computed | Times faster | All moves / whole | Actions off |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
+    for name in options.only.split(","):
+        for precision in options.precision.split(","):
+            print(measure(name, precision, options.rounds), flush=True)
+
+
+if __name__ == "__main__":
+    main()

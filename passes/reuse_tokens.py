@@ -1,0 +1,226 @@
+"""A tower for some of its tokens: those whose patches changed; the others keep what they gave."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+
+from ttscompile.ir.graph import Argument, Batch, Graph, Node, Ref, Size, TensorType, backward_slice
+from ttscompile.ir.operations import Movement, operation
+from ttscompile.ir.pieces import INDEX, PIXELS, frame_name, pixels_name, tokens_name
+from ttscompile.ir.program import Program
+from ttscompile.ir.tokens import ATTENTION, TokenStream, evaluator, find_tokens
+
+from .base import Pass, PassResult
+
+_CLOSE = 1e-3
+"""Share of the largest number by which the tower and all of its tokens may differ: rounding is below it."""
+_ROWLESS = 1  # rows run one by one, so that the one symbolic size can be the number of tokens
+
+
+class ReuseTokens(Pass[Program, Program]):
+    """Give each tower that is a vision transformer a second form, for any of its tokens.
+
+    Before::
+
+        frame_00  : %row : [B, 3, 64, 64] -> %feature
+            %patches = aten.conv2d.default(%pixels, ..., [16, 16])
+            %tokens : [B, 17, 128] = ...
+            %k      : [B, 17, 128] = aten.linear.default(%normed, ...)
+
+    After, beside it; in ``tokens_00`` there is one row, and B is the number of tokens::
+
+        pixels_00 : %row -> %pixels                       # what patches are cut from
+        tokens_00 : %pixels, %index : [B], %k.kept : [17, 128] -> %feature, %k.rows : [B, 128]
+            %tokens.changed : [1, B, 128] = aten.index_select.default(%tokens, 1, %index)
+            %k.changed      : [1, B, 128] = aten.linear.default(%normed.changed, ...)
+            %k              = %k.kept with %k.rows in the rows %index
+
+    A value has a row for each token as long as nothing but attention brings tokens together. What attention reads of
+    all tokens, and what follows after the last layer, is kept from frame to frame, and written anew for the tokens in
+    ``index``. With all of them it is the tower. Which token is of which patch is found on numbers.
+    """
+
+    def call(self, program: Program) -> PassResult[Program]:
+        """Add the forms, or say why there is none."""
+        pieces, found, notes = program.pieces, dict[str, Graph](), list[str]()
+        if pieces.tokens:
+            return PassResult(program)
+        for i, tower in enumerate(pieces.towers):
+            stream = find_tokens(tower, program.weights)
+            if isinstance(stream, str):
+                notes.append(f"{frame_name(i)}: the whole frame is the unit: {stream}")
+                continue
+            graph = _Changed(tower, stream).graph()
+            found |= {pixels_name(i): _pixels_graph(tower, stream), tokens_name(i): graph}
+            kept = sum(math.prod(type_.at(1)) for name, type_ in graph.inputs.items() if name not in (PIXELS, INDEX))
+            notes.append(f"{frame_name(i)}: {stream.tokens} tokens, of which {kept * 4 / 1e6:.1f} MB are kept")
+        if not found:
+            return PassResult(program, tuple(notes))
+        return PassResult(replace(program, pieces=replace(pieces, tokens=found)), tuple(notes))
+
+    def ensures(self, program: Program) -> None:
+        """With all of its tokens the second form gives what the tower gives."""
+        pieces, rng = program.pieces, np.random.default_rng(0)
+        for i, tower in enumerate(pieces.towers):
+            if tokens_name(i) not in pieces.tokens:
+                continue
+            (name,) = tower.inputs
+            row = torch.from_numpy(rng.standard_normal(tower.inputs[name].at(1), dtype=np.float32))
+            graph = pieces.tokens[tokens_name(i)]
+            kept = {n: torch.full(t.at(1), torch.nan) for n, t in graph.inputs.items() if n not in (PIXELS, INDEX)}
+            tokens = torch.arange(next(iter(kept.values())).shape[0])
+            with torch.no_grad():
+                whole = evaluator(tower, program.weights)({name: row})
+                (pixels,) = evaluator(pieces.tokens[pixels_name(i)], program.weights)({name: row})
+                parts = evaluator(graph, program.weights)({PIXELS: pixels, INDEX: tokens, **kept})
+            for output, one, other in zip(tower.outputs, whole, parts, strict=False):
+                if not torch.allclose(one, other, rtol=0, atol=_CLOSE * float(one.abs().max()), equal_nan=True):
+                    raise self.fail(f"%{output} of all tokens is not what the tower gives.")
+
+
+def _rowless(argument: Argument) -> Argument:
+    """An argument for one row."""
+    if isinstance(argument, tuple):
+        return tuple(map(_rowless, argument))
+    return argument.multiple * _ROWLESS if isinstance(argument, Batch) else argument
+
+
+def _rowless_type(type_: TensorType) -> TensorType:
+    return replace(type_, shape=type_.at(_ROWLESS))
+
+
+def _rowless_node(node: Node) -> Node:
+    kwargs = tuple((name, _rowless(value)) for name, value in node.kwargs)
+    return replace(
+        node, args=tuple(map(_rowless, node.args)), kwargs=kwargs, types=tuple(map(_rowless_type, node.types))
+    )
+
+
+def _pixels_graph(tower: Graph, stream: TokenStream) -> Graph:
+    """The row to what patches are cut from, under a name of its own."""
+    graph, type_ = backward_slice(tower, (stream.pixels,), {}), tower.types()[stream.pixels]
+    copy = Node(PIXELS, "aten.clone.default", (Ref(stream.pixels),), (), (type_,))
+    return replace(graph, inputs=tower.inputs, nodes=(*graph.nodes, copy), outputs=(PIXELS,))
+
+
+@dataclass
+class _Changed:
+    """Writes the graph for some tokens: of a value ``v`` with a row for each, ``v.changed`` has theirs, and ``v`` all.
+
+    Attributes:
+        tower: what it does.
+        stream: its tokens.
+        nodes: written so far.
+        inputs: what is kept, by name.
+        outputs: the rows that have to be kept.
+        there: values that are written whole.
+    """
+
+    tower: Graph
+    stream: TokenStream
+    nodes: list[Node] = field(default_factory=list)
+    inputs: dict[str, TensorType] = field(default_factory=dict)
+    outputs: list[str] = field(default_factory=list)
+    there: set[str] = field(default_factory=set)
+
+    def graph(self) -> Graph:
+        """All of it."""
+        types, stream, axes = self.tower.types(), self.stream, self.stream.axes
+        own = backward_slice(self.tower, self.tower.outputs, {stream.pixels: types[stream.pixels]})
+        self.makers, self.types = own.producers(), types
+        index, pixels = {INDEX: TensorType((Batch(),), "int64")}, _rowless_type(types[stream.pixels])
+        self.nodes.append(Node(stream.pixels, "aten.clone.default", (Ref(PIXELS),), (), (pixels,)))
+        for node in own.nodes:
+            if node.name in axes and node.name != stream.entry:
+                self._changed(node)
+                continue
+            for name in node.refs():
+                self._whole(name)
+            self.nodes.append(_rowless_node(node))
+            self.there.add(node.name)
+            if node.name == stream.entry:
+                self._gather(node.name, axes[node.name])
+        for name in own.outputs:
+            self._whole(name)
+        graph = Graph(
+            {PIXELS: pixels, **index, **self.inputs},
+            own.constants,
+            tuple(self.nodes),
+            (*own.outputs, *self.outputs),
+        )
+        return graph
+
+    def _part(self, type_: TensorType, axis: int) -> TensorType:
+        """The type of a value with the rows of some tokens alone."""
+        sizes: list[Size] = list(_rowless_type(type_).shape)
+        sizes[axis] = Batch()
+        return replace(type_, shape=tuple(sizes))
+
+    def _gather(self, name: str, axis: int) -> Ref:
+        """The rows of some tokens, of a value that has them all."""
+        if not any(node.name == f"{name}.changed" for node in self.nodes):
+            args = (Ref(name), axis, Ref(INDEX))
+            type_ = self._part(self.types[name], axis)
+            self.nodes.append(Node(f"{name}.changed", "aten.index_select.default", args, (), (type_,)))
+        return Ref(f"{name}.changed")
+
+    def _changed(self, node: Node) -> None:
+        """A node for the rows of some tokens."""
+        axes, axis = self.stream.axes, self.stream.axes[node.name]
+        types = tuple(self._part(type_, axis) for type_ in node.types)
+        elementwise, behind = operation(node.op).elementwise, len(node.type.shape) - axis
+
+        def operand(place: int, argument: Argument) -> Argument:
+            if isinstance(argument, tuple):
+                return tuple(operand(place, item) for item in argument)
+            if not isinstance(argument, Ref):
+                return _rowless(argument)
+            if node.op == ATTENTION and place in (1, 2):
+                self._whole(argument.name)
+                return argument
+            if argument.name in axes:
+                return Ref(f"{argument.name}.changed")
+            sizes = self.types[argument.name].shape
+            if elementwise and len(sizes) >= behind and sizes[-behind] == self.stream.tokens:
+                return self._gather(argument.name, len(sizes) - behind)
+            return argument
+
+        args = tuple(operand(place, argument) for place, argument in enumerate(node.args))
+        if node.op == "aten.reshape.default":
+            args = (args[0], types[0].shape)
+        kwargs = tuple((name, operand(-1, value)) for name, value in node.kwargs)
+        self.nodes.append(replace(node, name=f"{node.name}.changed", args=args, kwargs=kwargs, types=types))
+
+    def _whole(self, name: str) -> None:
+        """See that a value is there with the rows of all tokens."""
+        if name in self.there or name not in self.stream.axes:
+            return
+        self.there.add(name)
+        node, axis = self.makers[name], self.stream.axes[name]
+        type_ = _rowless_type(node.type)
+        if operation(node.op).movement in (Movement.RESHAPE, Movement.PERMUTE):
+            for read in node.refs():
+                self._whole(read)
+            self.nodes.append(_rowless_node(node))
+            return
+        front = (axis, *(a for a in range(len(type_.shape)) if a != axis))
+        rest = tuple(type_.shape[a] for a in front[1:])
+        kept, rows = replace(type_, shape=(self.stream.tokens, *rest)), replace(type_, shape=(Batch(), *rest))
+        back = tuple(front.index(a) for a in range(len(front)))
+        self.inputs[f"{name}.kept"] = kept
+        self.outputs.append(f"{name}.rows")
+        self.nodes += [
+            Node(f"{name}.rows", "aten.permute.default", (Ref(f"{name}.changed"), front), (), (rows,)),
+            Node(
+                f"{name}.all",
+                "aten.index_copy.default",
+                (Ref(f"{name}.kept"), 0, Ref(INDEX), Ref(f"{name}.rows")),
+                (),
+                (kept,),
+            ),
+            Node(name, "aten.permute.default", (Ref(f"{name}.all"), back), (), (type_,)),
+        ]

@@ -1,0 +1,145 @@
+"""A tower computed for the tokens whose patches changed: ``docs/design.md`` section 2, tokens.
+
+What a token gave is kept by camera and stream of the batch, with the pixels that it was computed for. A new frame is
+held against these pixels, not against the frame before, so that slow changes add up until they are seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from ttscompile.artifact.manifest import Manifest
+from ttscompile.artifact.tokens import ReuseRecord, TokensRecord
+from ttscompile.ir.pieces import INDEX, PIXELS, frame_pieces, pixels_name, tokens_name
+
+Array: TypeAlias = npt.NDArray[Any]
+Run: TypeAlias = Callable[[str, Mapping[str, Array]], tuple[Array, ...]]
+"""A piece, by its name, on inputs by theirs; its outputs in order."""
+Lane: TypeAlias = bytes
+"""One camera of one stream."""
+
+PARTS = (8, 4, 2)
+"""A frame is computed for an eighth, a quarter or half of its tokens, or for all: few shapes, each with its memory."""
+
+
+def sizes_of(tokens: int) -> tuple[int, ...]:
+    """For how many of a tower's tokens a frame may be computed, ascending."""
+    return (*(-(-tokens // part) for part in PARTS), tokens)
+
+
+@dataclass
+class _Kept:
+    """What is kept of a lane.
+
+    Attributes:
+        pixels: that each token was computed for, ``[C, H, W]``.
+        arrays: rows ``[T, ...]`` by input of the piece.
+        values: what the tower gave last.
+        age: new frames since all tokens were computed.
+    """
+
+    pixels: Array
+    arrays: dict[str, Array]
+    values: tuple[Array, ...]
+    age: int = 0
+
+
+class TokenTower:
+    """A frame piece that computes some of its tokens.
+
+    Args:
+        pixels: name of the piece that makes of a row what patches are cut from.
+        part: name of the piece for some tokens.
+        record: of the tokens.
+        reuse: when a token is computed.
+        run: a piece, by its name, on inputs by theirs; its outputs in order.
+    """
+
+    def __init__(
+        self,
+        pixels: str,
+        part: str,
+        record: TokensRecord,
+        reuse: ReuseRecord,
+        run: Run,
+    ) -> None:
+        self._pixels, self._part, self._run = pixels, part, run
+        self._record, self._reuse = record, reuse
+        self._lanes: dict[Lane, _Kept] = {}
+        self._blank = {name: np.zeros(kind.at(1), kind.dtype) for name, kind in record.kept.items()}
+
+    @property
+    def tokens(self) -> int:
+        """T."""
+        return self._record.tokens
+
+    def forget(self) -> None:
+        """Forget all lanes: the next frame of each is computed whole."""
+        self._lanes.clear()
+
+    def compute(self, lane: Lane, row: Mapping[str, Array]) -> tuple[tuple[Array, ...], int]:
+        """What the tower gives for a new frame, and for how many tokens it was computed.
+
+        Args:
+            lane: of the frame. What is kept of it is gone if this fails.
+            row: ``[1, ...]``, by the input of the frame piece.
+        """
+        (pixels,) = self._run(self._pixels, row)
+        kept = self._lanes.pop(lane, None)
+        index = self._changed(kept, pixels[0])
+        if kept is not None and not index.size:
+            kept.age += 1
+            self._lanes[lane] = kept
+            return kept.values, 0
+        arrays = self._blank if kept is None else kept.arrays
+        made = self._run(self._part, {PIXELS: pixels, INDEX: index, **arrays})
+        count = len(made) - len(self._record.kept)
+        values, rows = made[:count], dict(zip(self._record.kept, made[count:], strict=True))
+        if kept is None or len(index) == self.tokens:
+            kept = _Kept(pixels[0].copy(), rows, values)
+        else:
+            for name, array in kept.arrays.items():
+                array[index] = rows[name]
+            theirs, ours = self._patches(kept.pixels), self._patches(pixels[0])
+            y, x = np.divmod(index[self._record.fixed :] - self._record.fixed, ours.shape[2])
+            theirs[:, y, x] = ours[:, y, x]
+            kept.values, kept.age = values, kept.age + 1
+        self._lanes[lane] = kept
+        return values, len(index)
+
+    def _changed(self, kept: _Kept | None, pixels: Array) -> Array:
+        """Numbers of the tokens to compute, int64; none where no patch changed."""
+        fixed, tokens = self._record.fixed, self.tokens
+        if kept is None or kept.age + 1 >= self._reuse.refresh:
+            return np.arange(tokens)
+        both = self._patches(pixels), self._patches(kept.pixels)
+        off = np.abs(np.subtract(*both)).mean(axis=(0, 3, 4)).ravel()
+        changed = np.count_nonzero(off > self._reuse.threshold)
+        if not changed:
+            return np.arange(0)
+        size = next((size for size in sizes_of(tokens) if size >= fixed + changed), tokens)
+        most = np.argpartition(-off, size - fixed - 1)[: size - fixed] if size < tokens else np.arange(tokens - fixed)
+        return np.concatenate([np.arange(fixed), fixed + np.sort(most)])
+
+    def _patches(self, pixels: Array) -> Array:
+        """A view ``[C, rows, columns, height, width]`` of the patches of ``[C, H, W]``."""
+        high, wide = self._record.patch
+        rows, columns = pixels.shape[1] // high, pixels.shape[2] // wide
+        cut = pixels[:, : rows * high, : columns * wide]
+        return cut.reshape(len(cut), rows, high, columns, wide).swapaxes(2, 3)
+
+
+def token_towers(manifest: Manifest, run: Run) -> dict[str, TokenTower]:
+    """By frame piece, those that reuse tokens; none where the artifact does not."""
+    if manifest.reuse is None:
+        return {}
+    return {
+        name: TokenTower(pixels_name(i), tokens_name(i), manifest.tokens[name], manifest.reuse, run)
+        for i, name in enumerate(frame_pieces(manifest.pieces))
+        if name in manifest.tokens
+    }

@@ -1,0 +1,50 @@
+"""What reusing tokens means, literally: every value of the tower is computed whole, and then most of it is thrown away.
+
+In a value that has a row for each token, the rows of tokens that are not computed are those that it had when they were.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from ttscompile.ir.evaluate import evaluate
+from ttscompile.ir.graph import Graph
+from ttscompile.ir.tokens import find_tokens
+
+
+class LiteralTokens:
+    """A tower of one frame after the other.
+
+    Args:
+        tower: of a program.
+        weights: of its constants.
+    """
+
+    def __init__(self, tower: Graph, weights: Mapping[str, npt.NDArray[np.generic]]) -> None:
+        stream = find_tokens(tower, weights)
+        assert not isinstance(stream, str)
+        self.tower, self.stream = tower, stream
+        self.weights = {name: torch.from_numpy(np.array(weights[name])) for name in tower.constants}
+        self.kept: dict[str, torch.Tensor] = {}
+
+    def __call__(
+        self, row: npt.NDArray[np.float32], computed: Sequence[int] | npt.NDArray[np.int64]
+    ) -> list[npt.NDArray[np.float32]]:
+        """What the tower gives for a row ``[1, ...]``, of which these tokens are computed."""
+        values = {**self.weights, **{name: torch.from_numpy(row) for name in self.tower.inputs}}
+        chosen = torch.zeros(self.stream.tokens, dtype=torch.bool)
+        chosen[torch.as_tensor(computed)] = True
+        types = self.tower.types()
+        for node in self.tower.nodes:
+            alone = Graph({name: types[name] for name in node.refs()}, {}, (node,), (node.name,))
+            (value,) = evaluate(alone, {}, values)
+            axis = self.stream.axes.get(node.name)
+            if axis is not None and node.name in self.kept:
+                mask = chosen.reshape(-1, *[1] * (value.ndim - axis - 1))
+                value = torch.where(mask, value, self.kept[node.name])
+            values[node.name] = self.kept[node.name] = value
+        return [values[name].numpy() for name in self.tower.outputs]

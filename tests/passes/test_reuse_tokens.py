@@ -1,0 +1,144 @@
+"""A tower that is a vision transformer has a form for some of its tokens."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from tests.families import cameras
+from tests.literal_tokens import LiteralTokens
+from ttscompile.capture.export import capture
+from ttscompile.core.spec import ChunkSpec, ObservationSpec, PolicySpec
+from ttscompile.driver import transform
+from ttscompile.errors import PassError
+from ttscompile.ir.evaluate import evaluate
+from ttscompile.ir.graph import Node, Ref, backward_slice
+from ttscompile.ir.pieces import INDEX, PIXELS
+from ttscompile.ir.program import Program
+from ttscompile.ir.tokens import find_tokens
+from ttscompile.ir.verify import verify
+from ttscompile.passes.reuse_tokens import ReuseTokens
+from ttscompile.samplers.flow import flow_matching_table
+
+
+@cache
+def compiled(kind: str) -> Program:
+    return transform(*cameras.policy(kind))
+
+
+@pytest.mark.parametrize(("kind", "tokens", "fixed"), [("clip", 37, 1), ("siglip", 36, 0)])
+def test_some_tokens_give_what_they_literally_give(kind: str, tokens: int, fixed: int) -> None:
+    program = compiled(kind)
+    literal = LiteralTokens(program.pieces.towers[0], program.weights)
+    assert (literal.stream.tokens, literal.stream.fixed) == (tokens, fixed)
+    weights = {name: torch.from_numpy(np.array(value)) for name, value in program.weights.items()}
+    pixels, part = program.pieces.tokens["pixels_00"], program.pieces.tokens["tokens_00"]
+    kept = {name: torch.full(t.at(1), torch.nan) for name, t in part.inputs.items() if name not in (PIXELS, INDEX)}
+    rng, (name,) = np.random.default_rng(0), program.pieces.towers[0].inputs
+    for computed in (range(tokens), [0, 3, 4], [35, 7, 2, 20, 11], range(tokens), [5]):
+        row = rng.random((1, 3, cameras.SIDE, cameras.SIDE), dtype=np.float32)
+        (cut,) = evaluate(pixels, weights, {name: torch.from_numpy(row)})
+        index = torch.tensor(list(computed))
+        value, *rows = evaluate(part, weights, {PIXELS: cut, INDEX: index, **kept})
+        for name_kept, new in zip(kept, rows, strict=True):
+            kept[name_kept] = kept[name_kept].index_copy(0, index, new)
+        np.testing.assert_allclose(value, literal(row, list(computed))[0], rtol=0, atol=1e-5)
+    whole = evaluate(program.pieces.towers[0], weights, {name: torch.from_numpy(row)})[0]
+    assert (whole - value).abs().max() > 1e-3, "tokens that were not computed keep what they gave"
+
+
+def test_a_second_run_changes_nothing() -> None:
+    assert ReuseTokens()(compiled("clip")).program is compiled("clip")
+
+
+def test_of_a_convolutional_tower_the_frame_is_the_unit() -> None:
+    program = compiled("shared")
+    assert program.pieces.tokens == {}
+    assert (
+        ReuseTokens()(program).notes[0].startswith("frame_00: the whole frame is the unit: it is convolutional: %conv")
+    )
+
+
+def test_a_form_that_gives_something_else_is_refused() -> None:
+    program = compiled("clip")
+    part = program.pieces.tokens["tokens_00"]
+    *nodes, last = part.nodes
+    source = next(iter(last.refs()))
+    wrong = Node("wrong", "aten.neg.default", (Ref(source),), (), (part.types()[source],))
+    broken = replace(part, nodes=(*nodes, wrong, last.renamed(lambda name: "wrong" if name == source else name)))
+    pieces = replace(program.pieces, tokens={**program.pieces.tokens, "tokens_00": broken})
+    verify(replace(program, pieces=pieces))
+    with pytest.raises(PassError, match=r"ReuseTokens: %.*\.frame of all tokens is not what the tower gives"):
+        ReuseTokens().ensures(replace(program, pieces=pieces))
+
+
+class Small(nn.Module):
+    """A vision transformer of one layer, with one thing that may be otherwise."""
+
+    def __init__(self, change: str) -> None:
+        super().__init__()
+        self.change = change
+        stride, width = (2, 8) if change == "overlap" else (4, 8)
+        self.patch = nn.Conv2d(3, width, 4, stride=stride)
+        self.place = nn.Parameter(torch.randn(16, width))
+        self.qkv, self.out, self.head = nn.Linear(width, 3 * width), nn.Linear(width, width), nn.Linear(width, 8)
+
+    def forward(self, sample: Tensor, timestep: Tensor, image: Tensor) -> Tensor:
+        seen = 2 * image - 1
+        x = self.patch(seen[..., :10, :10] if self.change == "overlap" else seen)
+        if self.change == "transposed":
+            x = x.transpose(2, 3)
+        x = x.flatten(2).transpose(1, 2) + self.place
+        if self.change == "smeared":
+            x = x + image.mean((1, 2, 3))[:, None, None]
+        q, k, v = self.qkv(functional.layer_norm(x, (8,))).unflatten(-1, (3, 8)).unbind(2)
+        mask = torch.ones(16, 16).tril() if self.change == "masked" else None
+        mixed = functional.scaled_dot_product_attention(
+            q[:, None], k[:, None], v[:, None], attn_mask=mask, is_causal=self.change == "causal"
+        )
+        if self.change == "written out":
+            mixed = torch.softmax(q @ k.transpose(1, 2), -1)[:, None] @ v[:, None]
+        x = x + self.out(mixed[:, 0])
+        if self.change == "averaged":
+            x = x + self.out(x.mean(1, keepdim=True))
+        for _ in range(20):  # else cutting patches is most of it
+            x = x + self.out(x)
+        return sample + self.head(x).mean(1)[:, :8].unflatten(1, (4, 2))
+
+
+def found(change: str) -> object:
+    torch.manual_seed(0)
+    spec = PolicySpec(
+        (4, 2), {"image": ObservationSpec((3, 16, 16), window=False)}, flow_matching_table(1), ChunkSpec(2, 0, 4)
+    )
+    graph, weights = capture(Small(change).eval(), spec)
+    sample = next(node for node in reversed(graph.nodes) if node.op == "aten.slice.Tensor")
+    return find_tokens(backward_slice(graph, (next(iter(sample.refs())),), {}), weights)
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ("overlap", "kernel [4, 4], stride (2, 2)"),
+        ("transposed", "has not a row for each patch, in their order"),
+        ("smeared", "depends on more than the patches"),
+        ("masked", "tokens come together otherwise than by attention"),
+        ("causal", "tokens come together otherwise than by attention"),
+        ("written out", "tokens come together otherwise than by attention"),
+        ("averaged", "tokens come together otherwise than by attention"),
+    ],
+)
+def test_near_misses_are_left_whole(change: str, why: str) -> None:
+    said = found(change)
+    assert isinstance(said, str)
+    assert why in said
+
+
+def test_without_the_miss_it_is_one() -> None:
+    assert not isinstance(found(""), str)

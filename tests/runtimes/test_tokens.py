@@ -1,0 +1,220 @@
+"""Tokens whose patches did not change keep what they gave."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+import ttscompile
+from tests.families import cameras
+from tests.literal_tokens import LiteralTokens
+from tests.once import Once
+from ttscompile.artifact.load import Artifact, load_artifact
+from ttscompile.artifact.reuse import update_reuse
+from ttscompile.artifact.tokens import ReuseRecord
+from ttscompile.errors import ArtifactError
+from ttscompile.ir.pieces import INDEX
+from ttscompile.runtimes.load import open_policy
+from ttscompile.runtimes.onnxruntime.backend import OnnxBackend
+from ttscompile.runtimes.policy import CompiledPolicy
+from ttscompile.runtimes.tokens import TokenTower, sizes_of, token_towers
+
+Array = npt.NDArray[Any]
+SIDE, PATCH, TOKENS = cameras.SIDE, 4, 37
+REUSE = ReuseRecord(threshold=0.0, refresh=1000, computed=0.3, error=0.0, other_noise=1.0, calls=1)
+
+
+@pytest.fixture(scope="module")
+def compiled(once: Once) -> Path:
+    return once.folder(
+        "tokens",
+        lambda folder: ttscompile.compile_denoiser(*cameras.policy("clip"), folder / "artifact", precision="int8"),
+    )
+
+
+@pytest.fixture
+def artifact(compiled: Path) -> Artifact:
+    return load_artifact(compiled / "artifact").with_reuse(REUSE).at_precision("fp32")
+
+
+@pytest.fixture
+def policy(artifact: Artifact) -> CompiledPolicy:
+    return open_policy(artifact, seed=0)
+
+
+def picture(number: int) -> Array:
+    return 0.1 + 0.5 * np.random.default_rng(number).random((3, SIDE, SIDE), dtype=np.float32)
+
+
+def moved(image: Array, patch: int, by: float = 0.3) -> Array:
+    """The picture with another patch in this place."""
+    image, (y, x) = image.copy(), divmod(patch, SIDE // PATCH)
+    image[:, y * PATCH : (y + 1) * PATCH, x * PATCH : (x + 1) * PATCH] += np.float32(by)
+    return image
+
+
+def frame(*streams: tuple[Array, Array]) -> dict[str, Array]:
+    """What the two cameras of each stream show."""
+    seen = {key: np.stack([pair[i] for pair in streams]) for i, key in enumerate(cameras.CAMERAS)}
+    return {**seen, "state": np.zeros((len(streams), 4), np.float32)}
+
+
+def act(policy: CompiledPolicy, before: dict[str, Array], newest: dict[str, Array]) -> Array:
+    noise = ttscompile.Noise(np.ones((len(newest["state"]), cameras.HORIZON, cameras.ACTIONS), np.float32))
+    window = {key: np.stack([before[key], value], 1) for key, value in newest.items()}
+    return np.asarray(policy.predict_action(window, noise=noise)["action_pred"])
+
+
+def counted(policy: CompiledPolicy) -> tuple[int, int]:
+    """Tokens that the last call computed, of how many."""
+    assert policy.last_report is not None
+    return policy.last_report.frames.tokens, policy.last_report.frames.of
+
+
+def tower_of(artifact: Artifact, threshold: float = 0.0, refresh: int = 1000) -> TokenTower:
+    reuse = replace(REUSE, threshold=threshold, refresh=refresh)
+    (tower,) = token_towers(artifact.with_reuse(reuse).manifest, OnnxBackend(artifact)._run).values()
+    return tower
+
+
+def test_what_it_gives_is_what_the_tokens_literally_give(artifact: Artifact) -> None:
+    literal = LiteralTokens(artifact.graph("frame_00"), artifact.weights)
+    tower, rng, image = tower_of(artifact, refresh=6), np.random.default_rng(0), picture(0)
+    (name,) = artifact.graph("frame_00").inputs
+    seen, asked, run = [], list[Array](), tower._run
+
+    def heard(piece: str, feed: Any) -> Any:
+        asked.extend([feed[INDEX]] if INDEX in feed else [])
+        return run(piece, feed)
+
+    tower._run = heard
+    for number in range(9):
+        for patch in rng.choice(36, size=(0, 3, 12, 1, 6, 30, 0, 17, 2)[number], replace=False):
+            image = moved(image, patch, rng.uniform(0.1, 1.0))
+        (value, *_), count = tower.compute(b"", {name: image[None]})
+        if count:
+            np.testing.assert_allclose(value, literal(image[None], asked[-1])[0], rtol=0, atol=1e-5)
+            assert len(asked[-1]) == count
+            assert asked[-1][0] == 0, "the class token is always computed"
+        seen.append(count)
+    # A frame is computed for an eighth, a quarter, half or all of its tokens; every sixth new frame for all.
+    assert seen == [37, 5, 19, 5, 10, 37, 0, 19, 5]
+    assert sizes_of(37) == (5, 10, 19, 37)
+
+
+def test_it_is_off_until_it_was_settled(compiled: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(compiled / "artifact", tmp_path / "own")
+    first, other = frame((picture(0), picture(1))), frame((moved(picture(0), 7), picture(1)))
+
+    def tokens(**options: Any) -> tuple[int, int]:
+        policy = ttscompile.load(folder, **options)
+        act(policy, first, first)
+        act(policy, first, other)
+        return counted(policy)
+
+    identity = load_artifact(folder).manifest.identity
+    assert tokens() == (0, 0)
+    assert update_reuse(folder, REUSE).identity != identity
+    assert tokens() == (5, 37)
+    assert tokens(reuse_tokens=False) == tokens(runtime="reference") == (0, 0)
+    assert update_reuse(folder, None).identity == identity
+    assert tokens() == (0, 0)
+
+
+def test_cameras_and_streams_share_nothing(policy: CompiledPolicy) -> None:
+    """Two streams that see the same for a while act as each of them does alone."""
+    same, one, other = (picture(0), picture(0)), (moved(picture(0), 3), picture(0)), (picture(5), picture(0))
+    both = [frame(same, same), frame(one, other), frame((moved(picture(0), 9), picture(0)), one)]
+    together = [act(policy, both[max(i - 1, 0)], both[i]) for i in range(3)]
+    assert counted(policy) == (5 + 37, 74), "two patches, and a picture that changed as a whole"
+    for stream in range(2):
+        policy.reset()
+        alone = [{key: value[stream : stream + 1] for key, value in each.items()} for each in both]
+        for i in range(3):
+            found = act(policy, alone[max(i - 1, 0)], alone[i])
+            np.testing.assert_allclose(found, together[i][stream : stream + 1], rtol=0, atol=1e-5)
+
+
+def test_a_frame_that_was_prepared_is_computed_the_same_way(policy: CompiledPolicy, artifact: Artifact) -> None:
+    frames = [frame((moved(picture(0), i), picture(1))) for i in range(3)]
+    found = [act(policy, frames[max(i - 1, 0)], frames[i]) for i in range(3)]
+    other = open_policy(artifact, seed=0)
+    for i in range(3):
+        work = other.prepare_frame(frames[i])
+        assert (work.tokens, work.of) == ((74, 74) if i == 0 else (5, 37))
+        np.testing.assert_array_equal(act(other, frames[max(i - 1, 0)], frames[i]), found[i])
+        assert counted(other) == (0, 0)
+
+
+@pytest.mark.parametrize("forget", ["reset", "forget_frames"])
+def test_nothing_is_kept_afterwards(policy: CompiledPolicy, forget: str) -> None:
+    first, other = frame((picture(0), picture(1))), frame((moved(picture(0), 7), picture(1)))
+    act(policy, first, first)
+    getattr(policy, forget)()
+    act(policy, other, other)
+    assert counted(policy) == (74, 74)
+
+
+def test_after_a_failure_nothing_stale_is_read(policy: CompiledPolicy, artifact: Artifact) -> None:
+    first, other = frame((picture(0), picture(1))), frame((moved(picture(0), 7), picture(1)))
+    act(policy, first, first)
+    frames: Any = policy._runtime._used.frames  # type: ignore[attr-defined]
+    (tower,) = frames._tokens.values()
+    plain = tower._run
+
+    def failing(name: str, feed: Any) -> Any:
+        if name == "tokens_00":
+            raise ArtifactError("out of memory")
+        return plain(name, feed)
+
+    tower._run = failing
+    with pytest.raises(ArtifactError, match="out of memory"):
+        act(policy, first, other)
+    tower._run = plain
+    found = act(policy, first, other)
+    assert counted(policy) == (37, 37), "what was kept of this camera is gone; the other one is known"
+    exact = open_policy(artifact.with_reuse(None))
+    np.testing.assert_allclose(found, act(exact, first, other), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("change", ["camera motion", "noise", "light"])
+def test_where_everything_changes_nothing_is_reused(policy: CompiledPolicy, artifact: Artifact, change: str) -> None:
+    exact, rng, image = open_policy(artifact.with_reuse(None), seed=0), np.random.default_rng(0), picture(0)
+    act(policy, frame((image, image)), frame((image, image)))
+    for _ in range(3):
+        before = frame((image, image))
+        if change == "camera motion":
+            image = np.roll(image, 1, axis=2)
+        else:
+            image = image + np.float32(0.1 if change == "light" else rng.standard_normal(image.shape) * 0.02)
+        newest = frame((image, image))
+        np.testing.assert_allclose(act(policy, before, newest), act(exact, before, newest), rtol=0, atol=1e-5)
+        assert counted(policy) == (74, 74)
+
+
+def test_slow_changes_add_up(artifact: Artifact) -> None:
+    """A patch is held against what its token was computed for, however many frames ago that was."""
+    tower, (name,) = tower_of(artifact, threshold=0.1), artifact.graph("frame_00").inputs
+    counts = [
+        tower.compute(b"", {name: moved(2 * picture(0) - 1, 4, by)[None]})[1] for by in (0.0, 0.02, 0.04, 0.06, 0.08)
+    ]
+    assert counts == [37, 0, 0, 5, 0], "pixels are read as 2 x - 1, so that 0.06 is 0.12"
+
+
+def test_in_eight_bits(compiled: Path) -> None:
+    artifact = load_artifact(compiled / "artifact")
+    record = artifact.manifest.precision
+    assert record is not None
+    assert {"frame_00", "tokens_00"} <= set(record.models)
+    whole, some = open_policy(artifact, seed=0), open_policy(artifact.with_reuse(REUSE), seed=0)
+    first, other = frame((picture(0), picture(1))), frame((moved(picture(0), 7), picture(1)))
+    np.testing.assert_allclose(act(some, first, first), act(whole, first, first), rtol=0, atol=1e-4)
+    near, far = act(whole, first, other), act(whole, other, frame((picture(8), picture(9))))
+    assert np.abs(act(some, first, other) - near).max() < 0.2 * np.abs(far - near).max()
+    assert counted(some) == (5, 37)

@@ -1,0 +1,200 @@
+"""The tokens of a vision transformer: which values of a tower have a row for each patch, and which row is of which."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from .evaluate import Evaluator
+from .flops import graph_flops, node_flops
+from .graph import GETITEM, Argument, Graph, Node, Ref, TensorType, backward_slice
+from .operations import Movement, axes_along, operation, permutation
+
+LEAST_TOKENS = 16
+"""Of a tower: with fewer there is hardly a part of them to compute."""
+MOST_WHOLE = 0.25
+"""Share of a tower's FLOPs that may be spent on what is computed for every new frame, whatever changed in it."""
+ATTENTION = "aten.scaled_dot_product_attention.default"
+_CONVOLUTION = "aten.conv2d.default"
+
+Weights = Mapping[str, npt.NDArray[np.generic]]
+
+
+@dataclass(frozen=True)
+class TokenStream:
+    """The tokens of a tower.
+
+    Attributes:
+        pixels: the value that patches are cut from, ``[B, C, H, W]``.
+        entry: the first value with a row for each token, ``[B, T, D]``.
+        tokens: T.
+        fixed: how many tokens, the first ones, are of no patch.
+        axes: by value that has a row for each token, from ``entry`` on: in which axis.
+    """
+
+    pixels: str
+    entry: str
+    tokens: int
+    fixed: int
+    axes: Mapping[str, int]
+
+
+def find_tokens(tower: Graph, weights: Weights) -> TokenStream | str:
+    """The tokens of a tower; or why and where it is none that reads a picture patch by patch."""
+    types, observed = tower.types(), _reached(tower, tower.inputs)
+    patches = [n for n in tower.nodes if n.name in observed and n.op.startswith("aten.conv")]
+    if len(tower.inputs) != 1 or not patches:
+        return "it cuts no picture into patches"
+    first, *others = patches
+    if others:
+        return f"it is convolutional: %{others[0].name} convolves features"
+    if (wrong := _not_patches(first, types)) is not None:
+        return f"%{first.name} cuts no patches: {wrong}"
+    (pixels, *_) = first.refs()
+    if set(backward_slice(tower, tower.outputs, {pixels: types[pixels]}).inputs) != {pixels}:
+        return f"what it gives depends on more than the patches of %{pixels}"
+    entry = _entry(tower, first.name)
+    if entry is None:
+        return f"no value holds what the patches of %{first.name} give, and all that follows from them"
+    placed = _patches_of(tower, pixels, entry, weights)
+    shape = types[first.name].shape
+    fixed = len(placed) - shape[2] * shape[3] if isinstance(shape[2], int) and isinstance(shape[3], int) else 0
+    if fixed < 0 or placed != [-1] * fixed + list(range(len(placed) - fixed)):
+        return f"%{entry} has not a row for each patch, in their order"
+    if len(placed) < LEAST_TOKENS:
+        return f"%{entry} has {len(placed)} tokens, fewer than {LEAST_TOKENS}"
+    stream = TokenStream(pixels, entry, len(placed), fixed, _axes(tower, entry, len(placed)))
+    total = graph_flops(tower)
+    whole = total - sum(node_flops(node, types) for node in tower.nodes if node.name in stream.axes)
+    if whole > MOST_WHOLE * total:
+        where = next(n for n in tower.nodes if n.name not in stream.axes and stream.axes.keys() & set(n.refs()))
+        return f"at %{where.name} ({where.op}) tokens come together otherwise than by attention"
+    return stream
+
+
+def evaluator(graph: Graph, weights: Weights) -> Evaluator:
+    """The graph with its weights, to be run."""
+    return Evaluator(graph, {name: torch.from_numpy(np.array(weights[name])) for name in graph.constants})
+
+
+def _reached(graph: Graph, names: Iterable[str]) -> set[str]:
+    """Values that depend on some of these, themselves among them."""
+    found = set(names)
+    for node in graph.nodes:
+        if not found.isdisjoint(node.refs()):
+            found.add(node.name)
+    return found
+
+
+def _not_patches(node: Node, types: Mapping[str, TensorType]) -> str | None:
+    """Why a convolution does not see each pixel once at most; None if it does."""
+    defaults: tuple[Argument, ...] = (None, (1, 1), (0, 0), (1, 1), 1)
+    weight, _, stride, padding, dilation, groups = (*node.args[1:], *defaults[len(node.args) - 2 :])
+    if node.op != _CONVOLUTION or not isinstance(weight, Ref) or weight.name not in types:
+        return f"it is {node.op}"
+    kernel = types[weight.name].shape[2:]
+    if (stride, padding, dilation, groups) != (kernel, (0, 0), (1, 1), 1):
+        return f"kernel {list(kernel)}, stride {stride}, padding {padding}, dilation {dilation}, groups {groups}"
+    return None
+
+
+def _entry(tower: Graph, patches: str) -> str | None:
+    """The one value through which all goes that moving and element-wise work makes of the patches."""
+    free, observed = {patches}, _reached(tower, {patches})
+    for node in tower.nodes:
+        read, row = observed & set(node.refs()), operation(node.op)
+        joins = row.name in ("pad", "constant_pad_nd", "cat", "stack")
+        if read and read <= free and len(node.types) == 1 and (row.movement or row.elementwise or joins):
+            free.add(node.name)
+    left = [name for name in free if any(user.name not in free for user in tower.users()[name])]
+    return left[0] if len(left) == 1 and not free & set(tower.outputs) else None
+
+
+def _patches_of(tower: Graph, pixels: str, entry: str, weights: Weights) -> list[int]:
+    """Of each row of ``entry`` the number of the one patch that changes it; -1 of none, -2 of several or half a row."""
+    types = tower.types()
+    graph = backward_slice(tower, (entry,), {pixels: types[pixels]})
+    run, rng = evaluator(graph, weights), np.random.default_rng(0)
+    node = next(n for n in graph.nodes if n.op == _CONVOLUTION)
+    _, _, rows, columns = node.type.at(1)
+    _, weight = list(node.refs())[:2]
+    kernel = types[weight].at(1)[2:]
+    before = torch.from_numpy(rng.standard_normal(types[pixels].at(1), dtype=np.float32))
+    numbers = torch.arange(rows * columns).reshape(rows, columns)
+    if len(types[entry].shape) != 3:
+        return []
+
+    def changed(which: torch.Tensor) -> torch.Tensor:
+        """Which rows change with these patches."""
+        after, mask = before.clone(), which.repeat_interleave(kernel[0], 0).repeat_interleave(kernel[1], 1)
+        part = after[..., : mask.shape[0], : mask.shape[1]]
+        part[..., mask] = part[..., mask] + 1.0 + torch.rand(part[..., mask].shape, generator=drawn)
+        with torch.no_grad():
+            return (run({pixels: after})[0] != run({pixels: before})[0]).any(-1)[0]
+
+    drawn = torch.Generator().manual_seed(0)
+    found = torch.zeros(types[entry].at(1)[1], dtype=torch.int64)
+    several, ever = torch.zeros_like(found, dtype=torch.bool), changed(torch.ones_like(numbers, dtype=torch.bool))
+    for bit in range(max(1, (rows * columns - 1).bit_length())):
+        chosen = (numbers >> bit & 1).bool()
+        one, other = changed(chosen), changed(~chosen)
+        found += one.long() << bit
+        several |= ever & ~(one ^ other)
+    return torch.where(several, -2, torch.where(ever, found, -1)).tolist()
+
+
+def _axes(tower: Graph, entry: str, tokens: int) -> dict[str, int]:
+    """In which axis each value has a row for each token; those that have not are left out."""
+    types, observed, axes = tower.types(), _reached(tower, {entry}), {entry: 1}
+    for node in tower.nodes:
+        read = [name for name in node.refs() if name in observed]
+        if node.name == entry or not read or not axes.keys() >= set(read):
+            continue
+        axis = _axis_after(node, read, axes, types)
+        if axis is not None and axis >= 0 and all(type_.shape[axis : axis + 1] == (tokens,) for type_ in node.types):
+            axes[node.name] = axis
+    return axes
+
+
+def _axis_after(node: Node, read: list[str], axes: Mapping[str, int], types: Mapping[str, TensorType]) -> int | None:
+    """The axis of tokens in what a node gives; None if it brings tokens together, or nobody knows.
+
+    Args:
+        node: of one result, or of several with the same axes.
+        read: the values that it reads and that depend on tokens; each has an axis of them.
+        axes: of these.
+        types: of all values.
+    """
+    row, rank = operation(node.op), len(types[read[0]].shape)
+    axis, result = axes[read[0]], node.type.shape
+    if node.op == ATTENTION:
+        plain = len(read) == 3 and all(value in (None, 0.0, False) for value in node.args[3:])
+        inner = all(axes[name] == len(types[name].shape) - 2 for name in read)
+        known = {name for name, _ in node.kwargs} <= {"scale"}
+        return len(result) - 2 if plain and inner and known else None
+    if row.elementwise:
+        behind = {len(types[name].shape) - axes[name] for name in read}
+        return len(result) - behind.pop() if len(behind) == 1 else None
+    if read != list(node.refs())[:1]:
+        return None  # the token's own row is to be the first factor, and nothing else
+    if row.movement is Movement.RESHAPE:
+        before = math.prod(types[read[0]].at(1)[:axis])
+        sizes = node.type.at(1)
+        places = [
+            a for a in range(len(sizes)) if math.prod(sizes[:a]) == before and sizes[a] == types[read[0]].shape[axis]
+        ]
+        return places[0] if places else None
+    if row.movement is Movement.PERMUTE:
+        return permutation(node, rank).index(axis)
+    if row.mixes is not None and (mixed := row.mixes(node, types)) is not None:
+        return axis if axis < rank - mixed else None
+    if node.op == GETITEM:
+        return axis
+    if row.along is not None and axis not in (along := axes_along(node, rank)):
+        return axis - (len(result) < rank and min(along) < axis)  # select and unbind take their axis away
+    return None
