@@ -14,10 +14,11 @@ from tests.calibration.policies import record
 from tests.calibration.tasks import MakeTask, in_windows
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration import judge
+from ttscompile.calibration.crowded import crowded_family
 from ttscompile.calibration.published import paper
 from ttscompile.calibration.published.paper import Paper
 from ttscompile.calibration.task import Task
-from ttscompile.core.lattice import Source
+from ttscompile.core.lattice import Source, whole_steps_plan
 from ttscompile.runtimes.settle import pruner_plan
 
 BUDGET = 20
@@ -38,8 +39,8 @@ def task(make_task: MakeTask, monkeypatch: pytest.MonkeyPatch) -> Task:
 
 
 def test_training_lowers_the_error_and_keeps_the_budget(task: Task) -> None:
-    search = trained(task, 1)
-    before, after = search.loss, trained(task, 40)
+    search = trained(task, 1, begin=[0, 1, 2])
+    before, after = search.loss, trained(task, 20, begin=[0, 1, 2])
     found = after.found()
     assert after.loss < before
     assert found.notes["computed_cells"]["mean"] <= BUDGET
@@ -50,6 +51,14 @@ def test_training_lowers_the_error_and_keeps_the_budget(task: Task) -> None:
     assert (made[:, 0] == Source.COMPUTE).all()
     for name in paper.TRAINED:
         assert not np.array_equal(found.pruner[name], task.pruner[name]), name
+
+
+def test_nothing_is_kept_that_is_worse_than_whole_steps(task: Task) -> None:
+    search = trained(task, 1)
+    family = crowded_family(10, 3)
+    best = min(task.error(whole_steps_plan(10, 6, steps), search._compared) for steps in family)
+    assert search.loss <= best * (1 + 1e-5)
+    assert trained(task, 11).loss <= search.loss
 
 
 def test_a_call_may_compute_more_than_others_within_the_mean() -> None:

@@ -11,8 +11,10 @@ What differs from the authors' training, and why:
 - *The budget.* They add ``|reuse - target|`` to the loss. In the few hundred updates that there is time for, that
   holds no budget. Here COMPUTE has a price, which is set in every update so that the calls of the batch keep the budget
   on average: what such a term comes to where it is strong enough.
-- *The start.* The best of some schedules of whole steps that keep the budget, from which the head departs. From a dense
-  plan that shrinks, or from more steps than the budget has, it ended with an error of twice that of even steps.
+- *The start.* A schedule of whole steps that computes more than the budget has, and shrinks to it. From one that keeps
+  the budget every first move of a single cell does harm, and training does not get past that.
+- *What is kept.* The head at its best, on calls that it was not trained on; or the best of some schedules of whole
+  steps that keep the budget, if no head was better.
 - *The optimiser.* Adam with one size for each array of the head, as ``gates`` has it: a cell that hardly matters must
   not move as far as one that does.
 
@@ -42,6 +44,12 @@ UPDATES = 240
 
 BATCH = 16
 """Calls of an update, about: whole windows."""
+
+START = 2.0
+"""Times the budget: what is computed at first."""
+
+SHRINKING = 0.3
+"""Share of the updates during which more is computed than the budget has."""
 
 FIRST = 2.0, 1.0
 """Logits at first: of COMPUTE at the steps of that schedule, of TIMESTEP everywhere. The others are 0."""
@@ -82,7 +90,7 @@ class Paper(NothingAfter):
         sources: what cells may read that are not computed, beside TIMESTEP: what reads ROLLOUT in the first call of an
             episode reads TIMESTEP instead.
         observes: whether the head reads the observation. Else one plan is trained for all calls.
-        begin: the steps that are computed at first; None for the best of a family.
+        begin: the steps from which it departs, within the budget; None for the best of a family, and for more at first.
 
     Attributes:
         loss: error of the best head so far on calls that it was not trained on, at the budget.
@@ -102,7 +110,11 @@ class Paper(NothingAfter):
         practised, compared = _divided(task)
         self._practised, self._compared = (task.executor.select(task.calls, one) for one in (practised, compared))
         self._practice: Practice | None = None
-        self._values = {BASE: self._base(sources, self._best_steps() if begin is None else begin)}
+        self._values = {BASE: self._base(sources, self._best_steps(task.budget) if begin is None else begin)}
+        self._most, self._start = task.budget, self._values[BASE]
+        if begin is None:
+            self._most = min(round(START * task.budget), self._start[..., 0].size)
+            self._start = self._base(sources, self._best_steps(self._most))
         if self._observes:
             self._values |= {name: np.array(task.pruner[name], np.float32) for name in TRAINED}
         self._rates = {name: RELATIVE_RATE * (_rms(value) or 1.0) for name, value in self._values.items()}
@@ -116,9 +128,10 @@ class Paper(NothingAfter):
         """One update; after every few of them, and after the last, the head is held against the best."""
         if self._practice is None:
             self._practice = Practice(self._task.executor, self._practised)
-        window = self._practice.calls.window
         if interval == 0:
-            self._compare()  # nothing that is worse than the start is kept
+            self._compare()  # nothing is kept that is worse than whole steps
+            self._values[BASE] = self._start.copy()
+        window = self._practice.calls.window
         order = self._task.draw(interval, 4).permutation(self._practice.calls.count // window)
         chosen = order[: max(1, BATCH // window), None] * window + np.arange(window)
         self._update(self._practice, chosen.reshape(-1), interval)
@@ -155,10 +168,10 @@ class Paper(NothingAfter):
         pruner = {**self._task.pruner, **self._best} if self._observes else None
         return Found(self.plan, notes, pruner=pruner, error=self.loss)
 
-    def _best_steps(self) -> Sequence[int]:
-        """The schedule with the lowest error, as far as there is time to try."""
+    def _best_steps(self, cells: int) -> Sequence[int]:
+        """The schedule of so many cells with the lowest error, as far as there is time to try."""
         task, model = self._task, self._task.executor.model
-        family = crowded_family(model.steps, max(1, min(task.budget // model.blocks, model.steps)))
+        family = crowded_family(model.steps, max(1, min(cells // model.blocks, model.steps)))
         tried = [
             (task.error(whole_steps_plan(model.steps, model.blocks, steps), self._compared), steps)
             for steps in task.clock.in_time(family)
@@ -177,6 +190,11 @@ class Paper(NothingAfter):
             base[..., source] = FORBIDDEN
         return base.astype(np.float32)
 
+    def _room(self, interval: int) -> int:
+        """Computed cells of a call at this interval: geometrically to the budget."""
+        left = max(0.0, 1 - (interval + 1) / max(1.0, SHRINKING * self.intervals))
+        return round(float(self._task.budget * (self._most / self._task.budget) ** left))
+
     def _logits(self, values: Mapping[str, Array] | Mapping[str, Tensor], calls: Calls) -> Tensor:
         """What the head says, ``[N, K, blocks, 4]``."""
         tensors = {name: torch.as_tensor(value) for name, value in values.items()}
@@ -190,7 +208,7 @@ class Paper(NothingAfter):
         leaves = {name: torch.from_numpy(value.copy()).requires_grad_() for name, value in self._values.items()}
         logits = self._logits(leaves, calls)
         price = torch.zeros(len(Source))
-        price[Source.COMPUTE] = _price(logits.detach().numpy(), self._task.budget)
+        price[Source.COMPUTE] = _price(logits.detach().numpy(), self._room(interval))
         logits = logits - price
         plans = legal(pruner_plan(logits.detach().numpy()), calls.window)
         hard = torch.nn.functional.one_hot(torch.from_numpy(plans.astype(np.int64)), len(Source)).float()
