@@ -156,6 +156,25 @@ class Judge:
         )
 
 
+def refreshed(task: Task, judge: Judge, steps: PlanArray) -> list[Row]:
+    """The first call of a window dense, the others with a schedule: what they read then is there in either direction.
+
+    The dense calls count, so that more cells are computed than the budget has; in all of these rows as many.
+    """
+    window, rows = task.calls.window, list[Row]()
+    for source in (Source.TIMESTEP, Source.ROLLOUT):
+        reading = np.where(steps == Source.COMPUTE, steps, np.int8(source.value))
+
+        def made(calls: Calls, reading: PlanArray = reading) -> PlanArray:
+            plans = np.repeat(reading[None], calls.count, 0)
+            plans[::window] = Source.COMPUTE
+            return plans
+
+        for correction in (None, task.whole.correction_of(made)):
+            rows.append(judge.row("even steps, first call dense", source.name, made(judge.calls), correction, 0.0))
+    return rows
+
+
 def interval(errors: np.ndarray, episodes: np.ndarray) -> tuple[float, float]:
     """95 % interval of the mean, over episodes."""
     names = np.unique(episodes)
@@ -233,8 +252,8 @@ def show(rows: Sequence[Row], title: str) -> None:
     "--way",
     "ways",
     multiple=True,
-    type=click.Choice(["searched", "switched", "gates", "head", "refined"]),
-    default=["searched", "switched", "gates", "head", "refined"],
+    type=click.Choice(["searched", "switched", "gates", "head", "refined", "refreshed"]),
+    default=["searched", "switched", "gates", "head", "refined", "refreshed"],
 )
 @click.option("--pinned", is_flag=True, help="All calls of a window have the noise of its first.")
 @click.option("--seed", default=0)
@@ -266,20 +285,22 @@ def main(
     task = Task.of(artifact, executor, sets[0], budget, seed)
     judge = Judge(executor, task.actions, sets[1], dense_with_other_noise(artifact, executor, sets[1], seed))
     rows = [judge.row("even steps", "TIMESTEP", uniform_of(artifact.manifest, budget).schedule, None, 0.0)]
+    if "refreshed" in ways:
+        rows += refreshed(task, judge, uniform_of(artifact.manifest, budget).schedule)
     for decided, reads, maker in rows_of(directions, ways):
         rows += measured(task, judge, decided, reads, maker, minutes)
         progress.print(rows[-2], rows[-1], sep="\n")
-        if path is not None:
-            told: Mapping[str, Any] = {
-                "computed_steps": computed_steps,
-                "cells": executor.model.steps * executor.model.blocks,
-                "calls": [one.count for one in sets],
-                "window": window,
-                "pinned": pinned,
-                "pruner_share": artifact.manifest.flops.pruner / artifact.manifest.flops.dense,
-                "rows": [asdict(row) for row in rows],
-            }
-            path.write_text(json.dumps(told, indent=2))
+    if path is not None:
+        told: Mapping[str, Any] = {
+            "computed_steps": computed_steps,
+            "cells": executor.model.steps * executor.model.blocks,
+            "calls": [one.count for one in sets],
+            "window": window,
+            "pinned": pinned,
+            "pruner_share": artifact.manifest.flops.pruner / artifact.manifest.flops.dense,
+            "rows": [asdict(row) for row in rows],
+        }
+        path.write_text(json.dumps(told, indent=2))
     flops = artifact.manifest.flops
     show(rows, f"{budget} of {executor.model.steps * executor.model.blocks} cells, windows of {window} calls")
     print(f"A head costs {flops.pruner / flops.dense:.4%} of the FLOPs of a dense call.")
