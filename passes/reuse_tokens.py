@@ -54,7 +54,7 @@ class ReuseTokens(Pass[Program, Program]):
             if isinstance(stream, str):
                 notes.append(f"{frame_name(i)}: the whole frame is the unit: {stream}")
                 continue
-            graph = _Changed(tower, stream).graph()
+            graph = for_tokens(tower, stream)
             found |= {pixels_name(i): _pixels_graph(tower, stream), tokens_name(i): graph}
             kept = sum(math.prod(type_.at(1)) for name, type_ in graph.inputs.items() if name not in (PIXELS, INDEX))
             notes.append(f"{frame_name(i)}: {stream.tokens} tokens, of which {kept * 4 / 1e6:.1f} MB are kept")
@@ -80,6 +80,11 @@ class ReuseTokens(Pass[Program, Program]):
             for output, one, other in zip(tower.outputs, whole, parts, strict=False):
                 if not torch.allclose(one, other, rtol=0, atol=_CLOSE * float(one.abs().max()), equal_nan=True):
                     raise self.fail(f"%{output} of all tokens is not what the tower gives.")
+
+
+def for_tokens(tower: Graph, stream: TokenStream) -> Graph:
+    """The tower for some of its tokens."""
+    return _Changed(tower, stream).graph()
 
 
 def _rowless(argument: Argument) -> Argument:

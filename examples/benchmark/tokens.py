@@ -1,10 +1,11 @@
 """New frames of a vision transformer when only an arm moves: real sizes, random weights, one thread.
 
-    python examples/benchmark/tokens.py [--only clip,siglip] [--precision fp32,int8] [--rounds 12]
+    python examples/benchmark/tokens.py [--only clip,siglip] [--precision fp32,int8] [--rounds 12] [--alone]
 
 An arm swings in front of a fixed picture. Three policies are shown frames in turn: one computes every frame whole, one
 the tokens whose patches changed, and one that reuses tokens too, but whose pictures are noisy, so that every patch
-changes in every frame. Milliseconds are the processor's, medians: the machine may be busy.
+changes in every frame. With ``--alone`` the encoders are timed for an eighth, a quarter, half and all of their tokens,
+whatever they show, beside the encoder as it is. Milliseconds are the processor's, medians: the machine may be busy.
 """
 
 from __future__ import annotations
@@ -20,17 +21,26 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor, nn
-from towers import SIGLIP
+from towers import SIGLIP, Seeing, session
 
 import ttscompile
 from ttscompile import ChunkSpec, ObservationSpec, PolicySpec
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.tokens import ReuseRecord
+from ttscompile.capture.export import capture
 from ttscompile.frontends.clip import ClipVision, VisionConfig
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.multi_task_dit import DiffusionTransformer, DiTConfig
 from ttscompile.frontends.siglip import Siglip
+from ttscompile.ir.graph import backward_slice
+from ttscompile.ir.pieces import INDEX, PIXELS
+from ttscompile.ir.tokens import find_tokens
+from ttscompile.lower.precision import LEAST_ROWS, quantize_model
+from ttscompile.lower.program import lower_graph
+from ttscompile.passes.clean_up import clean_graph
+from ttscompile.passes.reuse_tokens import for_tokens
 from ttscompile.runtimes.load import open_policy
+from ttscompile.runtimes.tokens import sizes_of
 from ttscompile.samplers.flow import flow_matching_table
 
 Array = npt.NDArray[np.float32]
@@ -52,8 +62,8 @@ class Eye(nn.Module):
                 flat = weight.ndim == 2 and "embedding" in label
                 nn.init.normal_(weight, 0, 0.02 if flat else weight[0].numel() ** -0.5)
 
-    def forward(self, obs: Mapping[str, Tensor]) -> Tensor:
-        seen = self.tower(2 * obs["image"] - 1)
+    def forward(self, obs: Mapping[str, Tensor] | Tensor) -> Tensor:
+        seen = self.tower(obs if isinstance(obs, Tensor) else 2 * obs["image"] - 1)
         return seen if self.pooled else seen.mean(1)
 
 
@@ -112,14 +122,58 @@ def measure(name: str, precision: str, rounds: int) -> str:
     return f"| {title}, {precision} | {' | '.join(figures)} | {shaking / whole:.2f} | {statistics.mean(off):.2g} |"
 
 
+def alone(name: str, rounds: int) -> list[str]:
+    """The rows of one encoder alone, in fp32 and in eight bits."""
+    title, size = TOWERS[name]
+    spec = PolicySpec(
+        (4, 2), {"image": ObservationSpec((3, size, size), window=False)}, flow_matching_table(1), ChunkSpec(2, 0, 4)
+    )
+    graph, captured = capture(Seeing(Eye(name, size)).eval(), spec)
+    weights = dict(captured)
+    graph = clean_graph(graph, weights)
+    last = next(node for node in reversed(graph.nodes) if node.op == "aten.slice.Tensor")
+    tower = backward_slice(graph, (next(iter(last.refs())),), {})
+    stream = find_tokens(tower, weights)
+    assert not isinstance(stream, str)
+    part = for_tokens(tower, stream)
+    rng = np.random.default_rng(0)
+    feed = {name: rng.standard_normal(type_.at(1), dtype=np.float32) for name, type_ in part.inputs.items()}
+    image = {"image": feed[PIXELS]}
+    rows = []
+    for precision in ("fp32", "int8"):
+        models, more = [lower_graph(tower, "whole"), lower_graph(part, "tokens")], dict[str, Array]()
+        if precision == "int8":
+            models[0], _ = quantize_model(models[0], weights, LEAST_ROWS)
+            models[1], more = quantize_model(models[1], weights, LEAST_ROWS, LEAST_ROWS)
+        whole, some = (session(model, {**weights, **more}) for model in models)
+        times: dict[int, list[float]] = {
+            count: [] for count in (0, stream.tokens, *reversed(sizes_of(stream.tokens)[:-1]))
+        }
+        for _ in range(rounds + 1):  # the first does not count
+            for count, own in times.items():
+                start = time.process_time()
+                some.run(None, {**feed, INDEX: np.arange(count)}) if count else whole.run(None, image)
+                own.append(1000 * (time.process_time() - start))
+        figures = (f"{statistics.median(own[1:]):.0f}" for own in times.values())
+        rows.append(f"| {title}, {precision} | {' | '.join(figures)} |")
+    return rows
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
     parser.add_argument("--only", default=",".join(TOWERS), help="names of encoders")
     parser.add_argument("--precision", default="fp32,int8")
     parser.add_argument("--rounds", type=int, default=12)
+    parser.add_argument("--alone", action="store_true", help="time encoders, not frames")
     options = parser.parse_args()
     torch.set_num_threads(1)
+    if options.alone:
+        print("| ms | the encoder as it is | all tokens | half | a quarter | an eighth |")
+        print("| --- | --- | --- | --- | --- | --- |")
+        for name in options.only.split(","):
+            print("\n".join(alone(name, options.rounds)), flush=True)
+        return
     print("| | Whole, ms | Arm moves, ms | Tokens computed | Times faster | All moves / whole | Actions off |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for name in options.only.split(","):

@@ -50,6 +50,7 @@ NEEDED = {
     "push": ("A", "org/name", "--dry-run", "--runs", "1"),
     "realtime": ("A", "--control-hz", "1", "--runs", "1"),
     "report": ("A", "-o", "out.html", "--runs", "1"),
+    "reuse-tokens": ("A", "--trajectories", "calls.npz", "--calls", "2"),
     "serve": ("A", "--control-hz", "1", "--port", "0", "--margin-ticks", "0"),
     "verify": ("A", "--calls", "1"),
 }

@@ -21,6 +21,7 @@ from ttscompile.cli.output import (
     say,
 )
 from ttscompile.cli.recordings import FilesCommand, Sources, require_recordings, trajectories_options
+from ttscompile.cli.types import ERROR
 from ttscompile.report.facts import told_reuse
 
 
@@ -30,7 +31,7 @@ from ttscompile.report.facts import told_reuse
 @count_option("--calls", "To choose on, and as many to judge on, at most.", default=256, least=2)
 @click.option(
     "--max-action-error",
-    type=click.FloatRange(0, min_open=True),
+    type=ERROR,
     help="Mean difference of the executed actions, in their units, that is allowed. Without this option it is a tenth"
     " of what other noise changes.",
 )
