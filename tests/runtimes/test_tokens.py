@@ -17,6 +17,7 @@ from tests.literal_tokens import LiteralTokens
 from tests.once import Once
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.reuse import update_reuse
+from ttscompile.artifact.size import check_size
 from ttscompile.artifact.tokens import ReuseRecord
 from ttscompile.errors import ArtifactError
 from ttscompile.ir.pieces import INDEX
@@ -181,6 +182,23 @@ def test_after_a_failure_nothing_stale_is_read(policy: CompiledPolicy, artifact:
     assert counted(policy) == (37, 37), "what was kept of this camera is gone; the other one is known"
     exact = open_policy(artifact.with_reuse(None))
     np.testing.assert_allclose(found, act(exact, first, other), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("wrong", [{"patch": (1000, 1000)}, {"patch": (2, 4)}, {"fixed": 0}, {"fixed": 3}])
+def test_other_patches_than_there_are_tokens_are_refused(artifact: Artifact, wrong: dict[str, Any]) -> None:
+    """Else tokens of other patches than those that changed would be computed, and nobody would see it."""
+    manifest = artifact.manifest
+    tokens = {name: replace(record, **wrong) for name, record in manifest.tokens.items()}
+    with pytest.raises(ArtifactError, match=r"tokens: expected a patch for each of \d+ tokens; found \d+ by \d+"):
+        open_policy(replace(artifact, manifest=replace(manifest, tokens=tokens)))
+
+
+def test_what_is_kept_counts_as_memory(artifact: Artifact) -> None:
+    (record,) = artifact.manifest.tokens.values()
+    name, kind = next(iter(record.kept.items()))
+    huge = replace(record, kept={**record.kept, name: replace(kind, shape=(TOKENS, 10**12))})
+    with pytest.raises(ArtifactError, match="values take at most"):
+        check_size(replace(artifact.manifest, tokens={"frame_00": huge}), artifact.path)
 
 
 @pytest.mark.parametrize("change", ["camera motion", "noise", "light"])
