@@ -153,6 +153,22 @@ def test_a_frame_that_was_prepared_is_computed_the_same_way(policy: CompiledPoli
         assert counted(other) == (0, 0)
 
 
+def test_actions_depend_on_the_frames_before_and_on_nothing_else(artifact: Artifact) -> None:
+    """Those that were prepared count; after ``reset`` there are none."""
+    policy = open_policy(artifact, seed=0)
+    first, between, newest = (frame((moved(picture(0), i), picture(1))) for i in (0, 30, 2))
+    made = []
+    for prepared in ([], [between], [between], []):
+        policy.reset()
+        act(policy, first, first)
+        for each in prepared:
+            policy.prepare_frame(each)
+        made.append(act(policy, first, newest))
+    np.testing.assert_array_equal(made[0], made[3])
+    np.testing.assert_array_equal(made[1], made[2])
+    assert 0 < np.abs(made[0] - made[1]).max() < 0.1
+
+
 @pytest.mark.parametrize("forget", ["reset", "forget_frames"])
 def test_nothing_is_kept_afterwards(policy: CompiledPolicy, forget: str) -> None:
     first, other = frame((picture(0), picture(1))), frame((moved(picture(0), 7), picture(1)))
