@@ -3,6 +3,9 @@
 A frame is known by its bytes, never by its place or its time. So nothing stale can be read, whatever comes late, twice
 or never: another frame has other bytes. Frames are computed one at a time, so that what is remembered has the very bits
 that would be computed again.
+
+Where tokens are reused, what is computed for a frame depends on the frames of its lane that were computed before it. It
+is remembered for that lane alone; forgotten and computed again, it may have other numbers.
 """
 
 from __future__ import annotations

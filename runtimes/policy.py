@@ -178,6 +178,9 @@ class CompiledPolicy:
         ``predict_action`` and the others then find it by its content. It changes no action, only when the work is done;
         without frame pieces (``info.frames``) there is none.
 
+        Where tokens are reused (``info.reuses_tokens``) actions depend on the frames before, and so on those that are
+        prepared, and on their order: prepare those that calls will read, oldest first.
+
         Args:
             frame: by key ``[B, ...]``, not normalised, as ``select_action`` takes it. Nothing is kept of it but what
                 was computed, until ``reset``.

@@ -13,8 +13,10 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.artifact.manifest import Manifest
+from ttscompile.artifact.manifest import MANIFEST, Manifest
+from ttscompile.artifact.strict_json import REMEDY
 from ttscompile.artifact.tokens import ReuseRecord, TokensRecord
+from ttscompile.errors import ArtifactError
 from ttscompile.ir.pieces import INDEX, PIXELS, frame_pieces, pixels_name, tokens_name
 
 Array: TypeAlias = npt.NDArray[Any]
@@ -88,9 +90,14 @@ class TokenTower:
         Args:
             lane: of the frame. What is kept of it is gone if this fails.
             row: ``[1, ...]``, by the input of the frame piece.
+
+        Raises:
+            ArtifactError: the manifest cuts the picture into other patches than there are tokens.
         """
-        (pixels,) = self._run(self._pixels, row)
         kept = self._lanes.pop(lane, None)
+        (pixels,) = self._run(self._pixels, row)
+        if kept is None:
+            self._require_patches(pixels[0])
         index = self._changed(kept, pixels[0])
         if kept is not None and not index.size:
             kept.age += 1
@@ -125,6 +132,15 @@ class TokenTower:
         size = next((size for size in sizes_of(tokens) if size >= fixed + changed), tokens)
         most = np.argpartition(-off, size - fixed - 1)[: size - fixed] if size < tokens else np.arange(tokens - fixed)
         return np.concatenate([np.arange(fixed), fixed + np.sort(most)])
+
+    def _require_patches(self, pixels: Array) -> None:
+        """Raise unless each token but the fixed ones has a patch: else the wrong ones would be computed."""
+        _, rows, columns, *_ = self._patches(pixels).shape
+        if self._record.fixed + rows * columns != self.tokens:
+            raise ArtifactError(
+                f"{MANIFEST}, tokens: expected a patch for each of {self.tokens - self._record.fixed} tokens; found"
+                f" {rows} by {columns} patches of {self._record.patch} pixels. {REMEDY}"
+            )
 
     def _patches(self, pixels: Array) -> Array:
         """A view ``[C, rows, columns, height, width]`` of the patches of ``[C, H, W]``."""

@@ -16,7 +16,7 @@ from tests.families import cameras
 from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.cli import main
-from ttscompile.errors import CalibrationError, CalibrationFailedError
+from ttscompile.errors import CalibrationError, CalibrationFailedError, TtscompileError
 from ttscompile.verification import verify
 
 SIDE = cameras.SIDE
@@ -75,6 +75,13 @@ def test_an_encoder_without_tokens_is_refused(once: Once, tmp_path: Path) -> Non
     folder = once.folder("seeing", cameras.compile_seeing) / "artifact"
     with pytest.raises(CalibrationError, match="no image encoder of this policy is a vision transformer"):
         ttscompile.reuse_tokens(folder, recorded(tmp_path / "calls.npz"))
+
+
+def test_a_zipped_artifact_is_refused_before_anything_is_tried(folder: Path, tmp_path: Path) -> None:
+    zipped, told = shutil.make_archive(str(tmp_path / "own"), "zip", folder), list[str]()
+    with pytest.raises(TtscompileError, match="Unzip the artifact"):
+        ttscompile.reuse_tokens(zipped, recorded(tmp_path / "calls.npz"), progress=lambda what, *_: told.append(what))
+    assert not told
 
 
 def test_the_command(folder: Path, tmp_path: Path) -> None:

@@ -107,6 +107,48 @@ def test_it_is_exactly_the_quantised_attention_and_near_to_float32(
         assert 0 < np.abs(made - true).mean() < 0.01 * size
 
 
+@pytest.mark.parametrize("flat", [True, False])
+def test_some_queries_of_many(flat: bool) -> None:
+    """A tower for some of its tokens: what is decided for all of them, for any number of them."""
+    inputs = drawn("usual", FEWEST, FEWEST, batch=1)
+
+    def model(queries: int | str) -> ModelProto:
+        tokens = {"q": queries, "k": FEWEST, "v": FEWEST}
+        if flat:
+            return model_of(attention(), tokens, batch=1)
+        made = model_of(make_node("Attention", list("qkv"), ["y"], "n0"), tokens, batch=1)
+        kinds = [make_tensor_value_info(n, TensorProto.FLOAT, [1, COUNT, tokens[n], CHANNELS]) for n in "qkv"]
+        del made.graph.input[:]
+        made.graph.input.extend([*kinds, make_tensor_value_info("x", TensorProto.FLOAT, [1, WIDTH])])
+        made.graph.node[1].input[0] = "x"
+        return made
+
+    given = inputs if flat else {name: heads(value) for name, value in inputs.items()}
+    some, constants = quantize_model(model("B"), WEIGHTS, streams=FEWEST)
+    assert HEADS in {node.op_type for node in some.graph.node}
+    whole, _ = quantize_model(model(FEWEST), WEIGHTS)
+    extra = {} if flat else {"x": np.zeros((1, WIDTH), np.float32)}
+    for count in (FEWEST, 5):
+        few = {**given, "q": given["q"][..., :count, :], **extra}
+        found = run(some, {**WEIGHTS, **constants}, few)
+        if count == FEWEST:
+            np.testing.assert_array_equal(found, run(whole, {**WEIGHTS, **constants}, few))
+        exact = run(model("B"), WEIGHTS, few)
+        assert found.shape == exact.shape
+        assert 0 < np.abs(found - exact).mean() < 0.02 * np.abs(exact).mean()
+
+
+def test_a_tower_and_its_form_for_some_tokens_have_it_both() -> None:
+    """Else a refresh would give other numbers than the tower, and take as long as in fp32."""
+    whole, some = (model_of(attention(), {"q": n, "k": FEWEST, "v": FEWEST}, batch=1) for n in (FEWEST, "B"))
+    kept = [make_tensor_value_info("k.kept", TensorProto.FLOAT, [FEWEST, 1, WIDTH]), *some.graph.input]
+    del some.graph.input[:]
+    some.graph.input.extend(kept)
+    made, _, _ = lower_precision({"frame_00": whole, "tokens_00": some}, WEIGHTS, "int8", ["frame_00"])
+    for name in ("frame_00", "tokens_00"):
+        assert HEADS in {node.op_type for node in made[name].graph.node}
+
+
 def test_an_axis_of_heads_makes_no_difference() -> None:
     inputs = drawn("usual", FEWEST, FEWEST)
     node = make_node("Attention", ["q", "k", "v"], ["y"], "n0")

@@ -17,6 +17,7 @@ from tests.literal_tokens import LiteralTokens
 from tests.once import Once
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.reuse import update_reuse
+from ttscompile.artifact.size import check_size
 from ttscompile.artifact.tokens import ReuseRecord
 from ttscompile.errors import ArtifactError
 from ttscompile.ir.pieces import INDEX
@@ -152,6 +153,22 @@ def test_a_frame_that_was_prepared_is_computed_the_same_way(policy: CompiledPoli
         assert counted(other) == (0, 0)
 
 
+def test_actions_depend_on_the_frames_before_and_on_nothing_else(artifact: Artifact) -> None:
+    """Those that were prepared count; after ``reset`` there are none."""
+    policy = open_policy(artifact, seed=0)
+    first, between, newest = (frame((moved(picture(0), i), picture(1))) for i in (0, 30, 2))
+    made = []
+    for prepared in ([], [between], [between], []):
+        policy.reset()
+        act(policy, first, first)
+        for each in prepared:
+            policy.prepare_frame(each)
+        made.append(act(policy, first, newest))
+    np.testing.assert_array_equal(made[0], made[3])
+    np.testing.assert_array_equal(made[1], made[2])
+    assert 0 < np.abs(made[0] - made[1]).max() < 0.1
+
+
 @pytest.mark.parametrize("forget", ["reset", "forget_frames"])
 def test_nothing_is_kept_afterwards(policy: CompiledPolicy, forget: str) -> None:
     first, other = frame((picture(0), picture(1))), frame((moved(picture(0), 7), picture(1)))
@@ -181,6 +198,23 @@ def test_after_a_failure_nothing_stale_is_read(policy: CompiledPolicy, artifact:
     assert counted(policy) == (37, 37), "what was kept of this camera is gone; the other one is known"
     exact = open_policy(artifact.with_reuse(None))
     np.testing.assert_allclose(found, act(exact, first, other), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("wrong", [{"patch": (1000, 1000)}, {"patch": (2, 4)}, {"fixed": 0}, {"fixed": 3}])
+def test_other_patches_than_there_are_tokens_are_refused(artifact: Artifact, wrong: dict[str, Any]) -> None:
+    """Else tokens of other patches than those that changed would be computed, and nobody would see it."""
+    manifest = artifact.manifest
+    tokens = {name: replace(record, **wrong) for name, record in manifest.tokens.items()}
+    with pytest.raises(ArtifactError, match=r"tokens: expected a patch for each of \d+ tokens; found \d+ by \d+"):
+        open_policy(replace(artifact, manifest=replace(manifest, tokens=tokens)))
+
+
+def test_what_is_kept_counts_as_memory(artifact: Artifact) -> None:
+    (record,) = artifact.manifest.tokens.values()
+    name, kind = next(iter(record.kept.items()))
+    huge = replace(record, kept={**record.kept, name: replace(kind, shape=(TOKENS, 10**12))})
+    with pytest.raises(ArtifactError, match="values take at most"):
+        check_size(replace(artifact.manifest, tokens={"frame_00": huge}), artifact.path)
 
 
 @pytest.mark.parametrize("change", ["camera motion", "noise", "light"])

@@ -49,6 +49,8 @@ def _bytes(manifest: Manifest) -> Iterator[int]:
         yield _nbytes(context.type) * (1 if context.binding is Binding.CONDITION else steps)
     for block in manifest.blocks:
         yield 4 * _nbytes(block.type)
+    for tokens in manifest.tokens.values():
+        yield from map(_nbytes, tokens.kept.values())
 
 
 def _nbytes(kind: TensorType) -> int:

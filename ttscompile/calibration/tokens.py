@@ -22,6 +22,7 @@ from ..runtimes.frames import FrameWork
 from ..runtimes.load import open_policy
 from ..runtimes.random_calls import random_noise
 from ..trajectories.episodes import Episode
+from .arguments import require_directory
 from .calls import load_episodes, split_episodes
 
 THRESHOLDS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2)
@@ -84,6 +85,7 @@ def reuse_tokens(
     calls, seed = integer(calls, "calls", CalibrationError, 2), integer(seed, "seed", CalibrationError)
     if max_action_error is not None and not max_action_error > 0:
         raise CalibrationError(f"max_action_error: expected a positive number; found {max_action_error}.")
+    require_directory(Path(path))
     artifact = load_artifact(Path(path)).with_reuse(None)
     if not artifact.manifest.tokens:
         problem = f"{path}: no image encoder of this policy is a vision transformer, whose tokens could be reused"

@@ -48,7 +48,7 @@ class Attention:
         inputs: names of query ``[B, T, heads * C]``, key and value ``[B, S, heads * C]`` in float32.
         flat: they are as above, as is the result; else ``[B, heads, tokens, C]``.
         heads: how many.
-        queries: T.
+        queries: T; zero if only a run says it, and then B is one.
         keys: S.
         channels: C of query and key, and of value.
         scale: of the scores.
@@ -64,9 +64,16 @@ class Attention:
 
 
 def attention_of(
-    node: NodeProto, attributes: Mapping[str, Any], shapes: Mapping[str, Sequence[int]]
+    node: NodeProto, attributes: Mapping[str, Any], shapes: Mapping[str, Sequence[int]], any_queries: bool = False
 ) -> Attention | None:
-    """What a node attends to, if integers can do that, and are faster."""
+    """What a node attends to, if integers can do that, and are faster.
+
+    Args:
+        node: of the model.
+        attributes: of the node.
+        shapes: of values, zero for a size that is not known.
+        any_queries: the shapes are of one case of many: a run has one row, and any number of queries.
+    """
     if node.op_type != "Attention" or any(node.input[3:]) or len(node.output) != 1:
         return None
     known = {*_PLAIN, "q_num_heads", "kv_num_heads", "scale"}
@@ -78,12 +85,12 @@ def attention_of(
         given = [(b, n, t, c // n) if n else () for n, (b, t, c) in zip(counts, given, strict=True)]
     if not plain or any(len(shape) != 4 or 0 in shape[1:] for shape in given):
         return None
-    (_, heads, queries, channels), (_, others, keys, _), (_, _, _, last) = given
-    if others != heads or min(queries, keys) < FEWEST:
+    (batch, heads, queries, channels), (_, others, keys, _), (_, _, _, last) = given
+    if others != heads or min(queries, keys) < FEWEST or (any_queries and batch != 1):
         return None
     inputs = (node.input[0], node.input[1], node.input[2])
     scale = attributes.get("scale", channels**-0.5)
-    return Attention(inputs, flat, heads, queries, keys, (channels, last), scale)
+    return Attention(inputs, flat, heads, 0 if any_queries else queries, keys, (channels, last), scale)
 
 
 def integer_attention(node: NodeProto, of: Attention, keep: Callable[[str, Array], str]) -> list[NodeProto]:
@@ -91,6 +98,7 @@ def integer_attention(node: NodeProto, of: Attention, keep: Callable[[str, Array
     own = f"{node.name}."
     sizes = (of.queries, of.channels[0]), (of.keys, of.channels[0]), (of.keys, of.channels[1])
     result = (of.queries, of.channels[1])
+    batch, queries = (-1, of.queries) if of.queries else (1, -1)
     nodes: list[NodeProto] = []
 
     def reshape(x: str, y: str, *shape: int) -> None:
@@ -102,15 +110,15 @@ def integer_attention(node: NodeProto, of: Attention, keep: Callable[[str, Array
     parts = [own + name for name in ("query", "key", "value")]
     for x, part, (tokens, channels) in zip(of.inputs, parts, sizes, strict=True):
         if of.flat:
-            reshape(x, f"{part}.tokens", -1, tokens, of.heads, channels)
+            reshape(x, f"{part}.tokens", batch, tokens or -1, of.heads, channels)
             turn(f"{part}.tokens", f"{part}.heads")
-        reshape(f"{part}.heads" if of.flat else x, part, -1, tokens, channels)
+        reshape(f"{part}.heads" if of.flat else x, part, -1 if of.queries else of.heads, tokens or -1, channels)
     each, heads, rows = own + "each", own + "heads", own + "tokens"
     nodes.append(helper.make_node(HEADS, parts, [each], each, body=_head(own, of, sizes, result), num_scan_inputs=3))
-    reshape(each, heads if of.flat else node.output[0], -1, of.heads, *result)
+    reshape(each, heads if of.flat else node.output[0], batch, of.heads, queries, of.channels[1])
     if of.flat:
         turn(heads, rows)
-        reshape(rows, node.output[0], -1, of.queries, of.heads * of.channels[1])
+        reshape(rows, node.output[0], batch, queries, of.heads * of.channels[1])
     return nodes
 
 
@@ -155,9 +163,9 @@ def _head(own: str, of: Attention, sizes: Sequence[tuple[int, int]], result: tup
     add("Mul", "made rows", "scaled")
     add("Add", "scaled v.mean", "y")
     inputs = [
-        helper.make_tensor_value_info(own + name, TensorProto.FLOAT, size)
-        for name, size in zip("qkv", sizes, strict=True)
+        helper.make_tensor_value_info(own + name, TensorProto.FLOAT, [tokens or "T", channels])
+        for name, (tokens, channels) in zip("qkv", sizes, strict=True)
     ]
-    output = helper.make_tensor_value_info(own + "y", TensorProto.FLOAT, result)
+    output = helper.make_tensor_value_info(own + "y", TensorProto.FLOAT, [result[0] or "T", result[1]])
     kept = [numpy_helper.from_array(value, own + name) for name, value in constants.items()]
     return helper.make_graph(nodes, "head", inputs, [output], kept)

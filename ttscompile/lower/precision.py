@@ -21,7 +21,7 @@ from onnx import AttributeProto, ModelProto, NodeProto, TensorProto, helper, num
 from ..core.spec import AUTO, FP32, INT8, PRECISIONS
 from ..errors import LoweringError
 from ..ir.flops import graph_flops
-from ..ir.pieces import BLOCKS, OF_ALL_BLOCKS, STEP, frame_name, is_tokens, part_of
+from ..ir.pieces import BLOCKS, INDEX, OF_ALL_BLOCKS, PIXELS, STEP, frame_name, is_tokens, part_of
 from .integer_attention import HEADS, attention_of, integer_attention
 from .integer_convolution import DOMAIN, INTEGER_PRODUCT, convolution_of, integer_convolution, shapes_of
 from .onnx_model import live_nodes
@@ -131,8 +131,8 @@ def lower_precision(
         lowered: dict[str, ModelProto] = {}
         new: dict[str, Array] = {}
         for name in pieces:
-            # A product has as many rows as there are tokens where the whole frame has enough of them.
-            streams = LEAST_ROWS if is_tokens(name) else 1
+            # What some tokens are computed in is what all of them are: decided for all.
+            streams = _tokens(models[name]) if is_tokens(name) else 1
             model, own = quantize_model(models[name], weights, 0 if part == BLOCKS else LEAST_ROWS, streams)
             if own:
                 lowered[name] = model
@@ -148,6 +148,12 @@ def lower_precision(
             " precision 'fp32'."
         )
     return made, constants, tuple(notes)
+
+
+def _tokens(model: ModelProto) -> int:
+    """How many tokens a frame has, of a model for some of them: that many rows are kept."""
+    kept = next(value for value in model.graph.input if value.name not in (PIXELS, INDEX))
+    return int(kept.type.tensor_type.shape.dim[0].dim_value)
 
 
 def _notes(
@@ -194,7 +200,7 @@ def quantize_model(
         model: from ``lower``: constants are initializers without data.
         weights: values of constants, by name. Only these are quantised.
         least_rows: that a product has to have; a product whose rows are not known has none.
-        streams: for which rows are counted.
+        streams: for which rows are counted. If more than one, the symbolic size is the number of tokens of one row.
 
     Returns:
         A new model, and the constants that it has and ``model`` has not, by name: int8 ``[rows, columns]`` and
@@ -219,7 +225,7 @@ def quantize_model(
         elif (convolution := convolution_of(node, _attributes(node), known, shapes)) is not None:
             integers, scales = _integers(convolution.weight, convolution.matrix, constants)
             nodes += integer_convolution(node, convolution, integers, scales, keep)
-        elif (attention := attention_of(node, _attributes(node), shapes)) is not None:
+        elif (attention := attention_of(node, _attributes(node), shapes, streams > 1)) is not None:
             nodes += integer_attention(node, attention, keep)
         else:
             nodes.append(node)
