@@ -233,8 +233,9 @@ class FramePieces:
             shown[key] = np.broadcast_to(one, value.shape)
         (own,) = (self._rows_of(shown)[n] for n in self._pieces[name].inputs)
         lanes = [hashlib.sha256(row.tobytes()).digest() for row in own]
-        if len(set(lanes)) % streams:  # an integer that cannot hold them: then each row is a lane
-            lanes = [str(i).encode() for i in range(len(own))]
+        integers = [value.dtype for value in obs.values() if value.dtype.kind in "iu"]
+        if any(len(obs) * streams > np.iinfo(kind).max for kind in integers):  # they cannot hold the numbers
+            lanes = [str(i).encode() for i in range(len(own))]  # each row is a lane
         self._lanes[name, streams] = lanes
         return lanes
 

@@ -16,11 +16,13 @@ from tests.families import cameras
 from tests.literal_tokens import LiteralTokens
 from tests.once import Once
 from ttscompile.artifact.load import Artifact, load_artifact
+from ttscompile.artifact.manifest import PieceRecord
 from ttscompile.artifact.reuse import update_reuse
 from ttscompile.artifact.size import check_size
 from ttscompile.artifact.tokens import ReuseRecord
 from ttscompile.errors import ArtifactError
-from ttscompile.ir.pieces import INDEX
+from ttscompile.ir.pieces import FRAMES, INDEX
+from ttscompile.runtimes.frames import FramePieces
 from ttscompile.runtimes.load import open_policy
 from ttscompile.runtimes.onnxruntime.backend import OnnxBackend
 from ttscompile.runtimes.policy import CompiledPolicy
@@ -252,3 +254,21 @@ def test_in_eight_bits(compiled: Path) -> None:
     near, far = act(whole, first, other), act(whole, other, frame((picture(8), picture(9))))
     assert np.abs(act(some, first, other) - near).max() < 0.2 * np.abs(far - near).max()
     assert counted(some) == (5, 37)
+
+
+@pytest.mark.parametrize("streams", [2, 128])
+def test_cameras_share_no_lane_however_many_streams_there_are(streams: int) -> None:
+    """128 streams of three cameras are more than the numbers of a picture in eight bits can tell apart."""
+    cameras_, shown = ("left", "right", "top"), np.zeros((streams, 4, 4), np.uint8)
+    pieces = {
+        FRAMES: PieceRecord("frames.onnx", cameras_, None, (), ("rows",)),
+        "frame_00": PieceRecord("frame_00.onnx", ("rows",), None, (), ("feature",)),
+    }
+
+    def run(name: str, feed: Any) -> tuple[npt.NDArray[Any], ...]:
+        return (np.concatenate([feed[camera] for camera in cameras_]),)
+
+    tower: Any = object()
+    frames = FramePieces(pieces, run, {"frame_00": tower})
+    lanes = frames._lanes_of("frame_00", dict.fromkeys(cameras_, shown))
+    assert len(set(lanes)) == len(lanes) == 3 * streams
