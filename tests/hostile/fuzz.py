@@ -251,6 +251,7 @@ def _warm_up(target: str, make: Callable[..., Callable[[], None]], corpus: Path,
         import torch
 
         torch.set_num_threads(1)
+        importlib.import_module("ttscompile.runtimes.onnxruntime.backend")  # which only an artifact that opens imports
     if target in (*READ_APART, "mixed"):
         from ttscompile.trajectories.apart import IMPORTS
 

@@ -90,6 +90,7 @@ def test_stages_are_explained() -> None:
     assert list(told) == [
         "capture", "CleanUp", "CutCopies", "WidenAttention", "RegroupSums", "find_residual_blocks", "Partition",
         "UnfoldBatch", "SplitTokens", "SplitFeatures", "Hoist", "InsertPruner", "SplitFrames",
+        "ReuseTokens",
     ]  # fmt: skip
     assert "6 blocks: self_attention, cross_attention, feed_forward" in told["find_residual_blocks"][0]
     assert any("left in the loop" in note for note in told["Hoist"])
