@@ -53,6 +53,13 @@ def test_training_lowers_the_error_and_keeps_the_budget(task: Task) -> None:
         assert not np.array_equal(found.pruner[name], task.pruner[name]), name
 
 
+@pytest.mark.parametrize("windows", [2, 3, 8])
+def test_windows_of_one_episode_are_divided(make_task: MakeTask, windows: int) -> None:
+    task = make_task(BUDGET, calls=2 * windows, episodes=range(1))
+    practised, compared = paper._divided(replace(task, calls=replace(task.calls, window=2)))
+    assert sorted([*practised, *compared]) == list(range(2 * windows))
+
+
 def test_nothing_is_kept_that_is_worse_than_whole_steps(task: Task) -> None:
     search = trained(task, 1)
     family = crowded_family(10, 3)

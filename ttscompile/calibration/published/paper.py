@@ -292,7 +292,7 @@ def _divided(task: Task) -> tuple[IntArray, IntArray]:
     known = np.unique(calls.episodes)
     apart = np.isin(calls.episodes[::window][order], known[:: max(2, min(4, len(known)))])
     if len(known) == 1:
-        apart = np.arange(len(order)) < len(order) // 4
+        apart = np.arange(len(order)) < max(len(order) // 4, int(len(order) > 1))
     parts = [order[~apart], order[apart][: max(1, COMPARED // window)]]
     whole = [part if len(part) else order[:1] for part in parts]
     practised, compared = ((part[:, None] * window + np.arange(window)).reshape(-1) for part in whole)
