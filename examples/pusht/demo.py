@@ -4,7 +4,7 @@
 
 The demo compiles the policy with another sampler (DPM-Solver++, 16 steps where the original takes 100), predicts only
 12 of the 16 actions, and calibrates for 6 computed steps of these 16. It then compares the result with the original on
-episodes that it has not seen. That takes about ten minutes on 2 cores; everything it makes is in ``build/pusht``.
+episodes that it has not seen. That takes about twelve minutes on 2 cores; everything it makes is in ``build/pusht``.
 """
 
 from __future__ import annotations
