@@ -124,7 +124,7 @@ def test_some_queries_of_many(flat: bool) -> None:
         return made
 
     given = inputs if flat else {name: heads(value) for name, value in inputs.items()}
-    some, constants = quantize_model(model("B"), WEIGHTS, streams=FEWEST)
+    some, constants = quantize_model(model("B"), WEIGHTS, size=FEWEST)
     assert HEADS in {node.op_type for node in some.graph.node}
     whole, _ = quantize_model(model(FEWEST), WEIGHTS)
     extra = {} if flat else {"x": np.zeros((1, WIDTH), np.float32)}

@@ -24,16 +24,7 @@ from ..ir.program import Binding, Program
 from . import tensors
 from .bind import REPORT, interface
 from .load import check_schedule
-from .manifest import (
-    DENSE,
-    BlockRecord,
-    ContextRecord,
-    FlopsRecord,
-    Manifest,
-    PieceRecord,
-    PlanRecord,
-    Requires,
-)
+from .manifest import DENSE, BlockRecord, ContextRecord, FlopsRecord, Manifest, PieceRecord, PlanRecord, Requires
 from .strict_json import Value, dump_compact, parse
 from .tokens import TokensRecord
 from .typed_json import from_json

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from pathlib import Path
 
 from ..errors import ArtifactError
-from .codec import decode, encode, identities
+from .codec import decode, encode
 from .files import replace_file
-from .load import load_artifact, require_artifact_path
+from .load import load_artifact
 from .manifest import MANIFEST, Manifest
 from .tokens import ReuseRecord
-from .write import locked
+from .write import identified, locked, require_unzipped
 
 
 def update_reuse(path: str | os.PathLike[str], reuse: ReuseRecord | None) -> Manifest:
@@ -28,14 +27,9 @@ def update_reuse(path: str | os.PathLike[str], reuse: ReuseRecord | None) -> Man
     Raises:
         ArtifactError: no artifact, a zipped one, one that is being updated, or one without tokens.
     """
-    directory = Path(path)
-    require_artifact_path(directory)
-    if not directory.is_dir():
-        raise ArtifactError(f"{directory}: expected a directory; found a file. Unzip it and give the directory.")
+    directory = require_unzipped(path)
     with locked(directory):
-        manifest = replace(load_artifact(directory).manifest, reuse=reuse)
-        identity, model_identity = identities(manifest)
-        content = encode(replace(manifest, identity=identity, model_identity=model_identity))
+        content = encode(identified(replace(load_artifact(directory).manifest, reuse=reuse)))
         manifest = decode(content)  # refuses what nobody could load
         try:
             replace_file(directory / MANIFEST, content)

@@ -154,10 +154,7 @@ def update_calibration(
         ArtifactError: no artifact, a zipped one, one that is being updated, or arguments that do not fit it.
         IllegalPlanError: a schedule or a correction that does not fit the policy.
     """
-    directory = Path(path)
-    require_artifact_path(directory)
-    if not directory.is_dir():
-        raise ArtifactError(f"{directory}: expected a directory; found a file. Unzip it and give the directory.")
+    directory = require_unzipped(path)
     with nullcontext() if held else locked(directory):
         artifact = load_artifact(directory)
         if model_identity not in (None, artifact.manifest.model_identity):
@@ -187,7 +184,7 @@ def update_calibration(
                 pruner=artifact.pruner if pruner_weights is None else pruner_weights,
             )
             manifest = _store(directory, manifest, "golden_plans", {} if golden is None else plan_arrays(golden(after)))
-            content = encode(_identified(manifest))
+            content = encode(identified(manifest))
             manifest = decode(content)  # refuses what nobody could load
             replace_file(directory / MANIFEST, content)
         except OSError as error:
@@ -237,7 +234,7 @@ def _fill(
     }
     write_synced(folder / PROGRAM, dump_compact(document))
 
-    manifest = _identified(
+    manifest = identified(
         Manifest(
             schema_version=SCHEMA_VERSION,
             ttscompile_version=VERSION,
@@ -263,7 +260,21 @@ def _fill(
     return manifest
 
 
-def _identified(manifest: Manifest) -> Manifest:
+def require_unzipped(path: str | os.PathLike[str]) -> Path:
+    """The directory of an artifact that is about to be changed.
+
+    Raises:
+        ArtifactError: no artifact, or a zipped one.
+    """
+    directory = Path(path)
+    require_artifact_path(directory)
+    if not directory.is_dir():
+        raise ArtifactError(f"{directory}: expected a directory; found a file. Unzip it and give the directory.")
+    return directory
+
+
+def identified(manifest: Manifest) -> Manifest:
+    """The manifest with the identities of what it describes."""
     identity, model_identity = identities(manifest)
     return replace(manifest, identity=identity, model_identity=model_identity)
 

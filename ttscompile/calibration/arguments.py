@@ -1,4 +1,4 @@
-"""What a calibration and a distillation are given alike: refused where it cannot be, and what follows from it."""
+"""What calibrations of all kinds are given alike: refused where it cannot be, and what follows from it."""
 
 from __future__ import annotations
 
@@ -49,9 +49,7 @@ def require_directory(path: Path) -> None:
     """
     if not path.is_dir():
         load_artifact(path)
-        raise CalibrationError(
-            f"{path}: only a directory can be calibrated or distilled. Unzip the artifact and give the directory."
-        )
+        raise CalibrationError(f"{path}: only a directory can be changed. Unzip the artifact and give the directory.")
 
 
 def calls_to_learn_from(spec: PolicySpec, max_minutes: float, corrects: bool) -> tuple[int, int]:

@@ -36,6 +36,7 @@ from .budget import cells_of, goal_of, with_plans
 from .calls import LARGEST, Calls, Split, digest_of, load_episodes, sample_calls, split_episodes
 from .execute import Executor
 from .pool import Pool, Work, artifact_elsewhere, opened_pool, place_of
+from .progress import Progress
 from .search import plan_of
 from .searches import Outcome, Searches
 from .strategies import strategy_of
@@ -50,9 +51,6 @@ FRACTION = 0.25
 
 WARM_UP = 2
 """Rounds whose times do not count, where there are more than these; their actions count."""
-
-Progress = Callable[[str, int, int], None]
-"""Told what is being done, how many parts are done, and of how many."""
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ call, for somebody who knows everything afterwards, and for a predictor that kno
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import combinations, islice
 from math import comb
@@ -28,14 +28,12 @@ from .compare import FRACTION
 from .crowded import crowded_family
 from .execute import Executor
 from .fit_correction import fit_correction
+from .progress import Progress
 from .targets import REPEATS, dense_rounds
 from .task import Array
 
 FITTED = 384
 """Calls that corrections are fitted on, at most."""
-
-Progress = Callable[[str, int, int], None]
-"""Told what is being done, how many parts are done, and of how many."""
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,16 @@
-"""The progress bar of a calibration, on standard error."""
+"""How far a calibration is: told to whoever asks, or shown as a bar on standard error."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import TracebackType
 
+from rich import progress
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+
+Progress = Callable[[str, int, int], None]
+"""Told what is being done, how many parts are done, and of how many."""
 
 
 class Bar:
@@ -24,7 +29,7 @@ class Bar:
             TimeElapsedColumn(),
             TextColumn("{task.fields[left]}"),
         )
-        self._progress = Progress(*columns, console=Console(stderr=True), disable=not shown)
+        self._progress = progress.Progress(*columns, console=Console(stderr=True), disable=not shown)
         self._task = self._progress.add_task("", total=None, note="", left="")
 
     def __enter__(self) -> Bar:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -24,6 +24,7 @@ from ..runtimes.random_calls import random_noise
 from ..trajectories.episodes import Episode
 from .arguments import require_directory
 from .calls import load_episodes, split_episodes
+from .progress import Progress
 
 THRESHOLDS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2)
 """Differences that are tried, ascending. Encoders read pixels with a deviation of about one."""
@@ -33,8 +34,6 @@ MOST_COMPUTED = 0.75
 """Share of the tokens: where more are computed, looking for changes costs about what it saves."""
 FRACTION = 0.5
 """Of the episodes, that settings are judged on."""
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)

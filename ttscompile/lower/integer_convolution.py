@@ -54,14 +54,14 @@ class Convolution:
     sizes: tuple[int, ...]
 
 
-def shapes_of(model: ModelProto, streams: int = 1) -> dict[str, tuple[int, ...]]:
-    """Shapes of values for so many streams; zero for a size that is not known."""
+def shapes_of(model: ModelProto, size: int = 1) -> dict[str, tuple[int, ...]]:
+    """Shapes of values where B is ``size``; zero for a size that is not known."""
     alone = ModelProto()
     alone.CopyFrom(model)
     for value in alone.graph.input:
-        for size in value.type.tensor_type.shape.dim:
-            if _STREAMS.fullmatch(size.dim_param):
-                size.dim_value = int(size.dim_param.partition("*")[0].replace("B", "1")) * streams
+        for axis in value.type.tensor_type.shape.dim:
+            if _STREAMS.fullmatch(axis.dim_param):
+                axis.dim_value = int(axis.dim_param.partition("*")[0].replace("B", "1")) * size
     for value in alone.graph.output:  # they say the number of streams, too
         value.type.tensor_type.ClearField("shape")
     graph = shape_inference.infer_shapes(alone, data_prop=True).graph

@@ -132,8 +132,8 @@ def lower_precision(
         new: dict[str, Array] = {}
         for name in pieces:
             # What some tokens are computed in is what all of them are: decided for all.
-            streams = _tokens(models[name]) if is_tokens(name) else 1
-            model, own = quantize_model(models[name], weights, 0 if part == BLOCKS else LEAST_ROWS, streams)
+            size = _tokens(models[name]) if is_tokens(name) else 1
+            model, own = quantize_model(models[name], weights, 0 if part == BLOCKS else LEAST_ROWS, size)
             if own:
                 lowered[name] = model
                 new.update(own)
@@ -192,7 +192,7 @@ def require_precision(precision: str, keep_fp32: Collection[str] = ()) -> None:
 
 
 def quantize_model(
-    model: ModelProto, weights: Mapping[str, Array], least_rows: int = 0, streams: int = 1
+    model: ModelProto, weights: Mapping[str, Array], least_rows: int = 0, size: int = 1
 ) -> tuple[ModelProto, dict[str, Array]]:
     """One model with its products by constants in integers; inputs and outputs stay as they are.
 
@@ -200,14 +200,14 @@ def quantize_model(
         model: from ``lower``: constants are initializers without data.
         weights: values of constants, by name. Only these are quantised.
         least_rows: that a product has to have; a product whose rows are not known has none.
-        streams: for which rows are counted. If more than one, the symbolic size is the number of tokens of one row.
+        size: what B is taken to be where rows are counted: one stream, or in a form for some tokens all of them.
 
     Returns:
         A new model, and the constants that it has and ``model`` has not, by name: int8 ``[rows, columns]`` and
         float32 ``[columns]``. No constants if there was nothing to replace.
     """
     known = {t.name: weights[t.name] for t in model.graph.initializer if t.name in weights}
-    matrices, shapes = _matrices(model, known), shapes_of(model, streams)
+    matrices, shapes = _matrices(model, known), shapes_of(model, size)
     constants: dict[str, Array] = {}
     small: list[TensorProto] = []
 
@@ -225,7 +225,7 @@ def quantize_model(
         elif (convolution := convolution_of(node, _attributes(node), known, shapes)) is not None:
             integers, scales = _integers(convolution.weight, convolution.matrix, constants)
             nodes += integer_convolution(node, convolution, integers, scales, keep)
-        elif (attention := attention_of(node, _attributes(node), shapes, streams > 1)) is not None:
+        elif (attention := attention_of(node, _attributes(node), shapes, size > 1)) is not None:
             nodes += integer_attention(node, attention, keep)
         else:
             nodes.append(node)
