@@ -144,7 +144,7 @@ def alone(name: str, rounds: int) -> list[str]:
         models, more = [lower_graph(tower, "whole"), lower_graph(part, "tokens")], dict[str, Array]()
         if precision == "int8":
             models[0], _ = quantize_model(models[0], weights, LEAST_ROWS)
-            models[1], more = quantize_model(models[1], weights, LEAST_ROWS, LEAST_ROWS)
+            models[1], more = quantize_model(models[1], weights, LEAST_ROWS, stream.tokens)  # as the product does
         whole, some = (session(model, {**weights, **more}) for model in models)
         times: dict[int, list[float]] = {
             count: [] for count in (0, stream.tokens, *reversed(sizes_of(stream.tokens)[:-1]))
