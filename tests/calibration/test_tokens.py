@@ -15,6 +15,8 @@ import ttscompile
 from tests.families import cameras
 from tests.once import Once
 from ttscompile.artifact.load import load_artifact
+from ttscompile.calibration import tokens
+from ttscompile.calibration.tokens import with_spread
 from ttscompile.cli import main
 from ttscompile.errors import CalibrationError, CalibrationFailedError, TtscompileError
 from ttscompile.verification import verify
@@ -56,8 +58,8 @@ def test_what_is_settled_saves_and_is_written(folder: Path, tmp_path: Path) -> N
     assert (reuse.calls, reuse.refresh) == (12, 64)
     (rung,) = (rung for rung in verify(folder).rungs if rung.name == "tokens")
     assert rung.status == "passed"
-    tokens, of = rung.details["spot"]
-    assert 0 < tokens < of == 2 * 2 * 37, "of two streams, and two cameras"
+    computed, of = rung.details["spot"]
+    assert 0 < computed < of == 2 * 2 * 37, "of two streams, and two cameras"
     again = ttscompile.reuse_tokens(folder, recorded(tmp_path / "calls.npz"))
     assert again.reuse == found.reuse, "what is settled already changes nothing"
 
@@ -69,6 +71,24 @@ def test_what_does_not_pay_is_refused_and_changes_nothing(folder: Path, tmp_path
     with pytest.raises(CalibrationFailedError, match="does not pay: the actions differ by"):
         ttscompile.reuse_tokens(folder, recorded(tmp_path / "calls.npz"), max_action_error=1e-9)
     assert (folder / "manifest.json").read_bytes() == before
+
+
+def test_a_setting_that_is_good_in_one_episode_alone_is_not_taken_for_good() -> None:
+    episodes = np.array([0, 0, 0, 1, 1, 1])
+    steady, lucky = np.array([2.0, 2.2, 1.8, 2.0, 2.1, 1.9]), np.array([0.4, 0.5, 0.6, 3.0, 3.1, 2.9])
+    (mean, bound), (luckier, wider) = with_spread(steady, episodes), with_spread(lucky, episodes)
+    assert mean == pytest.approx(2.0)
+    assert luckier < mean
+    assert wider > bound, "two episodes that differ by 2.5 tell little of a third"
+    assert with_spread(steady[:3], episodes[:3]) == (pytest.approx(2.0), pytest.approx(2.0)), "one has no spread"
+
+
+def test_settings_are_chosen_with_their_spread(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = recorded(tmp_path / "calls.npz")
+    error = ttscompile.reuse_tokens(folder, files).reuse.error
+    monkeypatch.setattr(tokens, "with_spread", lambda errors, _: (float(errors.mean()), 1e3 * error))
+    with pytest.raises(CalibrationFailedError, match="two standard errors counted"):
+        ttscompile.reuse_tokens(folder, files, max_action_error=2 * error)
 
 
 def test_an_encoder_without_tokens_is_refused(once: Once, tmp_path: Path) -> None:
