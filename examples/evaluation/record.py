@@ -7,29 +7,30 @@ The seeds start at 0; evaluation starts at 100000, so that no policy is judged o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import click
 import numpy as np
-from environments import environment_class, environment_option
+from environments import Array, environment_class, environment_option
 from rich.console import Console
 from rich.progress import Progress
-from rollout import Episode, run_episodes
+from rollout import run_episodes
 from variants import open_variant, run, runtime_option, threads_option
 
 
-def save_trajectories(path: Path, episodes: Sequence[Episode]) -> None:
-    """Write episodes as a trajectory file.
+def save_trajectories(path: Path, episodes: Sequence[Mapping[str, Array]]) -> None:
+    """Write what was observed in episodes as a trajectory file.
 
     Args:
         path: an ``.npz``: by key of the observation ``[N, To, ...]``, one row a call, in order; ``episode_ends [E]``
             int64, the row after the last of each episode.
-        episodes: at least one.
+        episodes: at least one; of each the windows of its calls, by key ``[calls, To, ...]``.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    arrays = {key: np.concatenate([episode.windows[key] for episode in episodes]) for key in episodes[0].windows}
-    np.savez(path, **arrays, episode_ends=np.cumsum([episode.calls for episode in episodes]).astype(np.int64))
+    arrays = {key: np.concatenate([episode[key] for episode in episodes]) for key in episodes[0]}
+    ends = np.cumsum([len(next(iter(episode.values()))) for episode in episodes])
+    np.savez(path, **arrays, episode_ends=ends.astype(np.int64))
 
 
 @click.command()
@@ -58,7 +59,7 @@ def main(
     with Progress(console=Console(stderr=True)) as progress:
         task = progress.add_task("recording episodes", total=episodes)
         rollout = run_episodes(make, variant, seeds, batch, lambda n: progress.update(task, completed=n))
-    save_trajectories(output, rollout.episodes)
+    save_trajectories(output, [episode.windows for episode in rollout.episodes])
     calls = sum(episode.calls for episode in rollout.episodes)
     score = np.mean([episode.score for episode in rollout.episodes])
     click.echo(f"{output}: {calls} calls in {episodes} episodes, mean score {score:.3f}")

@@ -258,3 +258,30 @@ def run_episodes(
         episodes=tuple(known[seed] for seed in seeds),
         call_ms=tuple(ms for part in parts for ms in part.call_ms),
     )
+
+
+def action_errors(variant: Variant, reference: Variant, episodes: Sequence[Episode]) -> Array:
+    """How far two policies' actions are apart on the observations of episodes, call by call, with the episodes' noise.
+
+    Args:
+        variant: a policy and its plan.
+        reference: a policy with the same steps, observations and actions, such as the dense one.
+        episodes: what is observed; each is a stream, and caches are carried from call to call.
+
+    Returns:
+        ``[episodes, calls of the longest]``, mean absolute differences in the units of the actions; NaN after an end.
+    """
+    seeds, calls = [episode.seed for episode in episodes], [episode.calls for episode in episodes]
+    errors = np.full((len(episodes), max(calls)), np.nan)
+    for each in (variant, reference):
+        each.policy.reset()
+    for number in range(max(calls)):
+        rows = [min(number, count - 1) for count in calls]  # one that has ended repeats its last window
+        windows = stacked([{k: a[row] for k, a in e.windows.items()} for e, row in zip(episodes, rows, strict=True)])
+        noise = seeded_noise(variant.noise, seeds, number)
+        made, exact = (
+            v.policy.predict_action(windows, noise=noise, plan=v.plan)["action"] for v in (variant, reference)
+        )
+        running = number < np.array(calls)
+        errors[running, number] = np.abs(made - exact).mean(axis=(1, 2))[running]
+    return errors

@@ -58,7 +58,7 @@ def record_calls(artifact: Path, output: Path, episodes: int, batch: int, thread
     with progress_bar() as progress:
         task = progress.add_task("recording episodes", total=episodes)
         rollout = run_episodes(PushT, dense, range(episodes), batch, lambda n: progress.update(task, completed=n))
-    save_trajectories(output, rollout.episodes)
+    save_trajectories(output, [episode.windows for episode in rollout.episodes])
     return f"{sum(episode.calls for episode in rollout.episodes)} calls in {episodes} episodes"
 
 

@@ -2,13 +2,11 @@
 
 import numpy as np
 from record import save_trajectories
-from rollout import Episode
 
 
 def episode(calls, start):
     obs = np.arange(start, start + calls * 40, dtype=np.float32).reshape(calls, 2, 20)
-    windows = {"obs": obs, "observation.image": np.full((calls, 1, 3, 4, 4), start % 251, np.uint8)}
-    return Episode(0, "", windows, np.zeros((1, 2)), np.zeros(1), False, {})
+    return {"obs": obs, "observation.image": np.full((calls, 1, 3, 4, 4), start % 251, np.uint8)}
 
 
 def test_rows_are_calls_in_order_and_ends_are_counted(tmp_path):
@@ -19,7 +17,7 @@ def test_rows_are_calls_in_order_and_ends_are_counted(tmp_path):
         assert sorted(file.files) == ["episode_ends", "obs", "observation.image"]
         assert file["episode_ends"].tolist() == [3, 4, 6]
         assert file["obs"].dtype == np.float32
-        np.testing.assert_array_equal(file["obs"], np.concatenate([e.windows["obs"] for e in episodes]))
+        np.testing.assert_array_equal(file["obs"], np.concatenate([e["obs"] for e in episodes]))
         assert file["observation.image"].shape == (6, 1, 3, 4, 4)
         assert file["observation.image"].dtype == np.uint8
 
