@@ -90,7 +90,7 @@ def draw(found: Sequence[Drift], path: Path, title: str) -> None:
         axes.set_xlabel("call of the episode")
         axes.grid(color="#eeeeee", linewidth=0.5)
         axes.legend(fontsize=8, frameon=False)
-    figure.suptitle(title, fontsize=8, x=0.01, ha="left")
+    figure.suptitle(title, fontsize=8)
     write_picture(figure, path)
 
 

@@ -33,7 +33,7 @@ from variants import first_seed_option, open_variant, results_console, run
 
 import ttscompile
 from ttscompile.artifact.load import load_artifact
-from ttscompile.plots.figure import new_figure, plain_powers, require_picture_name, write_picture
+from ttscompile.plots.figure import new_figure, require_picture_name, write_picture
 from ttscompile.trajectories import load_trajectories
 
 AXES = {
@@ -110,7 +110,7 @@ def draw(over: str, found: Sequence[Varied], dense: Estimate, path: Path, title:
     left, right = figure.subplots(1, 2)
     places = [one.value for one in found]
     for axes, estimates, told in (
-        (left, [one.error for one in found], "action error on the dense policy's episodes"),
+        (left, [one.error for one in found], "action error"),
         (right, [one.score for one in found], "score"),
     ):
         spread = [[e.mean - e.low for e in estimates], [e.high - e.mean for e in estimates]]
@@ -119,15 +119,14 @@ def draw(over: str, found: Sequence[Varied], dense: Estimate, path: Path, title:
         axes.set_xlabel(AXES[over])
         if over != "seed":
             axes.set_xscale("log")
-            plain_powers(axes.xaxis)
-        axes.set_xticks(places, minor=False)
+        axes.set_xticks(places, labels=[f"{place:g}" for place in places])
         axes.set_xticks([], minor=True)
         axes.grid(color="#eeeeee", linewidth=0.5)
     left.set_ylim(bottom=0)
     right.axhspan(dense.low, dense.high, color="#dddddd", zorder=0, label="dense, 95 % interval")
     right.axhline(dense.mean, color="#888888", linewidth=1, zorder=0)
     right.legend(fontsize=8, frameon=False, loc="lower right")
-    figure.suptitle(title, fontsize=8, x=0.01, ha="left")
+    figure.suptitle(title, fontsize=8)
     write_picture(figure, path)
 
 
