@@ -12,6 +12,8 @@ from environments.pusht_pixels import PushTPixels
 import ttscompile
 from tests.once import Once
 from tests.rounding import PROMISED
+from ttscompile.artifact.load import load_artifact
+from ttscompile.cli.timing import original_policy
 from ttscompile.ir.program import Program
 
 POLICIES = Path(__file__).parents[2] / "examples" / "policies"
@@ -24,7 +26,8 @@ def test_dense_compiled_is_what_lerobot_answered(name: str, once: Once) -> None:
     def convert(directory: Path) -> Program:
         return ttscompile.convert(POLICIES / name / "policy", directory, task=TASK)
 
-    policy = ttscompile.load(once.compiled(f"policies-{name}", convert)[0])
+    folder = once.compiled(f"policies-{name}", convert)[0]
+    policy = ttscompile.load(folder)
     with np.load(POLICIES / name / "answers.npz", allow_pickle=False) as file:
         answers = {key: file[key] for key in file.files}
     windows = {key: answers[key] for key in policy.info.observation}
@@ -33,6 +36,8 @@ def test_dense_compiled_is_what_lerobot_answered(name: str, once: Once) -> None:
     assert found.shape == answers["action"].shape
     assert answers["action"].std(axis=0).min() > 1, "other windows, other actions"
     np.testing.assert_allclose(found, answers["action"], rtol=0, atol=PROMISED * WORLD)
+    _, original = original_policy(POLICIES / name / "policy", load_artifact(folder).manifest.spec)
+    assert [*original.observations] == [*policy.info.observation], "bench gives the original the same instruction"
 
 
 def test_keypoints_under_lerobots_name() -> None:

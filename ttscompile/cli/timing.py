@@ -226,8 +226,10 @@ def original_policy(checkpoint: Path, spec: PolicySpec) -> tuple[nn.Module, Poli
         SpecError: the checkpoint is of another policy.
     """
     from ttscompile.frontends import load_checkpoint_policy
+    from ttscompile.frontends.families import LoadOptions
 
-    module, original = load_checkpoint_policy(checkpoint)
+    options = LoadOptions(task=spec.source.get("task"))  # an instruction that was compiled in is no observation
+    module, original = load_checkpoint_policy(checkpoint, options=options)
     wrong = f"{checkpoint}: expected the policy that the artifact was made from"
     found, expected = _interface(original), _interface(spec)
     if found != expected:
