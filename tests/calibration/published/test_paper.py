@@ -99,6 +99,14 @@ def test_nothing_is_read_of_earlier_calls_where_calls_stand_alone(make_task: Mak
     assert found.notes["sources"]["ROLLOUT"] == 0
 
 
+def test_an_earlier_calibration_leaves_no_trace(task: Task) -> None:
+    """The head of the artifact is the one that it left, and switches leave one that is zero but for them."""
+    left = {name: value if name == "pruner.mask" else np.zeros_like(value) for name, value in task.pruner.items()}
+    first, again = trained(task, 2).state(), trained(replace(task, pruner=left), 2).state()
+    for name, value in first.items():
+        np.testing.assert_array_equal(again[name], value, err_msg=name)
+
+
 def test_going_on_equals_not_stopping(task: Task) -> None:
     whole, stopped = trained(task, 12), trained(task, 5)
     resumed = Paper(task)

@@ -11,8 +11,9 @@ What differs from the authors' training, and why:
 - *The budget.* They add ``|reuse - target|`` to the loss. In the few hundred updates that there is time for, that
   holds no budget. Here COMPUTE has a price, which is set in every update so that the calls of the batch keep the budget
   on average: what such a term comes to where it is strong enough.
-- *The start.* A schedule of whole steps that computes more than the budget has, and shrinks to it. From one that keeps
-  the budget every first move of a single cell does harm, and training does not get past that.
+- *The start.* The head of an artifact that was never calibrated, and a schedule of whole steps that computes more than
+  the budget has, and shrinks to it. From one that keeps the budget every first move of a single cell does harm, and
+  training does not get past that.
 - *What is kept.* The head at its best, on calls that it was not trained on; or the best of some schedules of whole
   steps that keep the budget, if no head was better.
 - *The optimiser.* Adam with one size for each array of the head, as ``gates`` has it: a cell that hardly matters must
@@ -32,6 +33,7 @@ import torch
 from torch import Tensor
 
 from ...core.lattice import PlanArray, Source, whole_steps_plan
+from ...ir.plan_head import first_numbers
 from ...runtimes.settle import pruner_plan
 from ..calls import Calls, IntArray
 from ..crowded import crowded_family
@@ -116,7 +118,7 @@ class Paper(NothingAfter):
             self._most = min(round(START * task.budget), self._start[..., 0].size)
             self._start = self._base(sources, self._best_steps(self._most))
         if self._observes:
-            self._values |= {name: np.array(task.pruner[name], np.float32) for name in TRAINED}
+            self._values |= _first_numbers(task.pruner)
         self._rates = {name: RELATIVE_RATE * (_rms(value) or 1.0) for name, value in self._values.items()}
         self._rates[BASE] = RATE
         self._mean = {name: np.zeros_like(value) for name, value in self._values.items()}
@@ -276,6 +278,13 @@ def _price(logits: Array, cells: int) -> float:
     if count >= len(ordered):
         return float(ordered[-1]) - 1 if len(ordered) else 0.0
     return float(ordered[0]) + 1 if count <= 0 else float(ordered[count - 1] + ordered[count]) / 2
+
+
+def _first_numbers(head: Mapping[str, Array]) -> dict[str, Array]:
+    """What the observation goes through, as it was before any calibration: an artifact has what the last one left."""
+    (width, inputs), rank = head["pruner.hidden.weight"].shape, head["pruner.step"].shape[1]
+    first = first_numbers(inputs, width, rank, *head[BASE].shape[:2])
+    return {name: first[name] for name in TRAINED}
 
 
 def _rms(value: Array) -> float:
