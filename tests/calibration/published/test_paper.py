@@ -17,7 +17,7 @@ from ttscompile.calibration import judge
 from ttscompile.calibration.crowded import crowded_family
 from ttscompile.calibration.published import paper
 from ttscompile.calibration.published.paper import Paper
-from ttscompile.calibration.task import Task
+from ttscompile.calibration.task import Clock, Task
 from ttscompile.core.lattice import Source, whole_steps_plan
 from ttscompile.runtimes.settle import pruner_plan
 
@@ -105,6 +105,14 @@ def test_an_earlier_calibration_leaves_no_trace(task: Task) -> None:
     first, again = trained(task, 2).state(), trained(replace(task, pruner=left), 2).state()
     for name, value in first.items():
         np.testing.assert_array_equal(again[name], value, err_msg=name)
+
+
+def test_nothing_is_tried_before_the_first_update(task: Task) -> None:
+    """So one that was interrupted after its last update is not cut short by a limit that is over when it goes on."""
+    clock = Clock(0.0)
+    search = Paper(replace(task, clock=clock))
+    search.restore(trained(task, 1).state())
+    assert not clock.cut
 
 
 def test_going_on_equals_not_stopping(task: Task) -> None:

@@ -109,30 +109,32 @@ class Paper(NothingAfter):
         begin: Sequence[int] | None = None,
     ) -> None:
         self._task, self._observes = task, observes and has_head(task.pruner)
+        self._sources, self._begin = sources, begin
         practised, compared = _divided(task)
         self._practised, self._compared = (task.executor.select(task.calls, one) for one in (practised, compared))
         self._practice: Practice | None = None
-        self._values = {BASE: self._base(sources, self._best_steps(task.budget) if begin is None else begin)}
-        self._most, self._start = task.budget, self._values[BASE]
-        if begin is None:
-            self._most = min(round(START * task.budget), self._start[..., 0].size)
-            self._start = self._base(sources, self._best_steps(self._most))
+        model = task.executor.model
+        self._most = task.budget if begin is not None else min(round(START * task.budget), model.steps * model.blocks)
+        self._values = {BASE: self._base([0])}
         if self._observes:
             self._values |= _first_numbers(task.pruner)
         self._rates = {name: RELATIVE_RATE * (_rms(value) or 1.0) for name, value in self._values.items()}
         self._rates[BASE] = RATE
         self._mean = {name: np.zeros_like(value) for name, value in self._values.items()}
         self._size = dict.fromkeys(self._values, 0.0)
-        self._best = self._priced()
-        self.plan, self.loss = self._frozen(), float("nan")
+        self._best = dict(self._values)
+        self.plan, self.loss = whole_steps_plan(model.steps, model.blocks, [0]), float("nan")
 
     def advance(self, interval: int) -> None:
         """One update; after every few of them, and after the last, the head is held against the best."""
         if self._practice is None:
             self._practice = Practice(self._task.executor, self._practised)
         if interval == 0:
+            begin = self._begin
+            self._values[BASE] = self._base(self._best_steps(self._task.budget) if begin is None else begin)
             self._compare()  # nothing is kept that is worse than whole steps
-            self._values[BASE] = self._start.copy()
+            if begin is None:
+                self._values[BASE] = self._base(self._best_steps(self._most))
         window = self._practice.calls.window
         order = self._task.draw(interval, 4).permutation(self._practice.calls.count // window)
         chosen = order[: max(1, BATCH // window), None] * window + np.arange(window)
@@ -180,7 +182,7 @@ class Paper(NothingAfter):
         ]
         return min(tried)[1]
 
-    def _base(self, sources: Collection[Source], begin: Sequence[int]) -> Array:
+    def _base(self, begin: Sequence[int]) -> Array:
         """What does not depend on the observation, at first, ``[K, blocks, 4]``."""
         model, draw = self._task.executor.model, self._task.draw(0, 5)
         base = np.zeros((model.steps, model.blocks, len(Source)))
@@ -188,7 +190,7 @@ class Paper(NothingAfter):
         base[..., Source.COMPUTE] += APART * draw.standard_normal(base.shape[:2])
         base[..., Source.TIMESTEP] = FIRST[1]
         alone = {Source.ROLLOUT} if self._task.calls.window == 1 else set[Source]()
-        for source in {Source.FORWARD, Source.ROLLOUT} - (set(sources) - alone):
+        for source in {Source.FORWARD, Source.ROLLOUT} - (set(self._sources) - alone):
             base[..., source] = FORBIDDEN
         return base.astype(np.float32)
 
