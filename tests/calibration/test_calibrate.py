@@ -97,7 +97,7 @@ def test_the_record_is_in_the_artifact(calibrated: tuple[Path, CalibrationResult
     assert manifest.calibration is not None
     record = json.loads(json.dumps(dict(manifest.calibration)))
     assert record["plans"]["schedule"]["error"] == pytest.approx(result.plans["schedule"].error)
-    assert record["sparsity"] == pytest.approx(result.sparsity)
+    assert record["plans"][result.default_plan]["sparsity"] == pytest.approx(result.sparsity)
     for plan in record["plans"].values():
         assert plan["of_other_noise"] == pytest.approx(plan["error"] / result.other_noise)
     assert record["stopped"] == result.stopped == "converged"

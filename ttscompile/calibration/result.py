@@ -111,4 +111,4 @@ class CalibrationResult:
             for score in record["plans"].values():
                 score["of_other_noise"] = score["error"] / self.other_noise
         record["episodes"] = {name: list(numbers) for name, numbers in self.episodes.items()}
-        return {**record, "sparsity": self.sparsity, "flops_sparsity": self.flops_sparsity}
+        return record
