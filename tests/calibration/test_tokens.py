@@ -15,8 +15,9 @@ import ttscompile
 from tests.families import cameras
 from tests.once import Once
 from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.write import locked
 from ttscompile.cli import main
-from ttscompile.errors import CalibrationError, CalibrationFailedError, TtscompileError
+from ttscompile.errors import ArtifactError, CalibrationError, CalibrationFailedError, TtscompileError
 from ttscompile.verification import verify
 
 SIDE = cameras.SIDE
@@ -69,6 +70,19 @@ def test_what_does_not_pay_is_refused_and_changes_nothing(folder: Path, tmp_path
     with pytest.raises(CalibrationFailedError, match="does not pay: the actions differ by"):
         ttscompile.reuse_tokens(folder, recorded(tmp_path / "calls.npz"), max_action_error=1e-9)
     assert (folder / "manifest.json").read_bytes() == before
+
+
+def test_nobody_changes_the_artifact_meanwhile(folder: Path, tmp_path: Path) -> None:
+    class Told(Exception):
+        pass
+
+    def told(*_: object) -> None:
+        with pytest.raises(ArtifactError, match="another process is changing the artifact"), locked(folder):
+            pass
+        raise Told
+
+    with pytest.raises(Told):
+        ttscompile.reuse_tokens(folder, recorded(tmp_path / "calls.npz"), calls=2, progress=told)
 
 
 def test_an_encoder_without_tokens_is_refused(once: Once, tmp_path: Path) -> None:
