@@ -238,6 +238,14 @@ def test_it_says_when_a_search_had_too_little_time_or_too_few_calls(planned: Pat
     assert "tts fits corrections of 48 features from at most 8 calls" in found.warnings[2]
 
 
+def test_it_says_who_does_not_take_part_as_he_is(planned: Path, recording: Path) -> None:
+    found = compare(planned, [recording], ["tts-paper"], [0.5], calls=1, learned=8, intervals=1)
+    assert [point.series for point in found.points] == ["this artifact"] * 2 + ["tts-paper"]
+    assert found.warnings[1].startswith("tts-paper: one plan for all calls takes part")
+    found = compare(planned, [recording], ["interval"], [], calls=1)
+    assert found.warnings[1] == "no strategy takes part: no share of the cells was given for K = 10."
+
+
 def test_a_strategy_that_cannot_reach_a_sparsity_is_left_out_with_the_reason(planned: Path, recording: Path) -> None:
     found = compare(planned, [recording], ["deepcache"], [0.8], calls=1)
     assert {point.series for point in found.points} == {"this artifact"}
@@ -338,6 +346,7 @@ def test_the_command_prints_the_same_as_a_table_and_as_json(
 def test_without_sparsities_those_are_taken_that_the_steps_allow(planned: Path, recording: Path) -> None:
     assert default_sparsities(100) == (0.9, 0.95, 0.98)
     assert default_sparsities(16) == (11 / 16, 13 / 16, 14 / 16)
+    assert (default_sparsities(3), default_sparsities(2), default_sparsities(1)) == ((1 - 2 / 3,), (0.5,), ())
     arguments = ["compare", str(planned), "--trajectories", str(recording), "--calls", "2", "--json"]
     told = CliRunner().invoke(main, [*arguments, "--strategies", "interval"])  # of ten steps: 95 % is none
     assert told.exit_code == 0, told.stderr
