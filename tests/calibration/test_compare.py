@@ -14,8 +14,12 @@ from click.testing import CliRunner
 from PIL import Image
 
 import ttscompile
+from tests.families import cameras
+from tests.once import Once
 from ttscompile import SamplerTable
 from ttscompile.artifact.load import Artifact, load_artifact
+from ttscompile.artifact.reuse import update_reuse
+from ttscompile.artifact.tokens import ReuseRecord
 from ttscompile.artifact.write import update_calibration
 from ttscompile.calibration.compare import _require_same_policy, compare
 from ttscompile.calibration.search import plan_of
@@ -244,6 +248,22 @@ def test_it_says_who_does_not_take_part_as_he_is(planned: Path, recording: Path)
     assert found.warnings[1].startswith("tts-paper: one plan for all calls takes part")
     found = compare(planned, [recording], ["interval"], [], calls=1)
     assert found.warnings[1] == "no strategy takes part: no share of the cells was given for K = 10."
+
+
+def test_the_truth_has_all_tokens(once: Once, tmp_path: Path) -> None:
+    """With a threshold that nothing passes the newest of two frames is taken for the one before."""
+
+    def make(folder: Path) -> None:
+        ttscompile.compile_denoiser(*cameras.policy("clip"), folder / "artifact")
+
+    folder, draw = shutil.copytree(once.folder("tokens in fp32", make) / "artifact", tmp_path / "own"), np.random
+    views = {key: draw.default_rng(0).random((8, 2, 3, cameras.SIDE, cameras.SIDE)) for key in cameras.CAMERAS}
+    recorded = tmp_path / "calls.npz"
+    np.savez(recorded, state=np.zeros((8, 2, 4), np.float32), episode_ends=np.array([4, 8]), **views)
+    for reuse, differs in ((None, False), (ReuseRecord(100.0, 64, 0.5, 0.0, 0.0, 1), True)):
+        update_reuse(folder, reuse)
+        (dense,) = compare(folder, [recorded], [], [], calls=1).points
+        assert (dense.error > 0) == differs
 
 
 def test_a_strategy_that_cannot_reach_a_sparsity_is_left_out_with_the_reason(planned: Path, recording: Path) -> None:

@@ -2,7 +2,7 @@
 
 Every point is a plan that onnxruntime executes, in the artifact's precision and with its correction. On each held-out
 call all points take their turn with the same observation and the same noise, and are held against the actions of the
-dense policy in fp32. So error and latency are of the same calls, and whatever else the machine does
+dense policy in fp32 with all tokens. So error and latency are of the same calls, and whatever else the machine does
 hits all points. Every call is the first of an episode: nothing is reused from one to the next.
 
 Another artifact of the policy with another sampler has no use for all of that noise: it starts from the same initial
@@ -319,7 +319,7 @@ def _measure(
     """
     # Noise of the original's shape fits every artifact of the policy, however many steps it predicts.
     spec, draw = artifact.manifest.spec.original, np.random.default_rng((seed, 4))
-    exact = artifact.at_precision(FP32)
+    exact = artifact.at_precision(FP32).with_reuse(None)
     truth = CompiledPolicy(exact, open_runtime(exact, "onnxruntime", threads))
     errors: list[list[float]] = [[] for _ in entrants]
     reports: list[list[tuple[float, float]]] = [[] for _ in entrants]
