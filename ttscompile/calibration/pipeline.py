@@ -238,6 +238,9 @@ def _write(
 
 def _known_budget(artifact: Artifact, goal: Goal, strategy: Strategy) -> Budget | None:
     """The budget where nothing has to be run for it; refuses what cannot be satisfied before any work."""
+    if artifact.manifest.steps == 1:
+        told = "the policy has one denoising step, which every plan computes: nothing can be reused"
+        raise CalibrationError(f"{told}. Convert with more denoising steps, or use plan='dense'.")
     if goal.kind == ERROR and not strategy.fits_correction:
         raise CalibrationError(
             f"max_action_error needs strategy {' or '.join(map(repr, FITTED))}; found {strategy.name!r}. Give this"
