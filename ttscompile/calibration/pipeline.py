@@ -139,7 +139,8 @@ def calibrate(
         budget = _known_budget(artifact, goal, chosen)
         episodes = load_episodes(spec, trajectories, observation)
         split = split_episodes(len(episodes), validation_fraction, seed)
-        fewest, limit = calls_to_learn_from(spec, max_minutes, chosen.fits_correction or correct)
+        corrects = chosen.fits_correction or correct
+        fewest, limit = calls_to_learn_from(spec, max_minutes, corrects)
         state = StateFile(
             Path(path),
             {
@@ -166,11 +167,21 @@ def calibrate(
         with Bar(progress) as bar:
             if (warning := few_steps(artifact.manifest)) is not None:
                 bar.warn(warning)
+            if short := sum(each.calls < window for each in episodes):
+                bar.warn(
+                    f"{short} of {len(episodes)} episodes have fewer than {window} calls, and are left out: strategy"
+                    f" {strategy!r} takes {window} consecutive ones."
+                )
             least = {"calibration": fewest, "validation": limit}
             sets = {
                 name: with_targets(executor, name, calls, least[name], state, clock, bar, pool)
                 for name, calls in sets.items()
             }
+            if corrects and (count := sets["calibration"].count) < fewest:
+                bar.warn(
+                    f"the recordings give {count} calls to learn from, and a correction needs {fewest}: it may do harm"
+                    " where nothing was recorded. Record more episodes."
+                )
             if clock.left() < 0:
                 bar.warn(
                     f"{max_minutes:g} minutes were over when the dense policy had answered the calls to learn from:"
