@@ -190,6 +190,10 @@ def test_a_negative_seed_is_refused(artifact: Path, recording: Path) -> None:
     for name in ("seed", "threads", "max_intervals"):
         with pytest.raises(CalibrationError, match=f"{name} must be an integer of at least .; found 0.5"):
             calibrate(artifact, [recording], 0.7, **{name: 0.5}, progress=False)
+    with pytest.raises(CalibrationError, match="max_intervals must be an integer of at least 1; found 0"):
+        calibrate(artifact, [recording], 0.7, max_intervals=0, progress=False)
+    with pytest.raises(CalibrationError, match="intervals must be an integer of at least 1; found 0"):
+        compare(artifact, [recording], [], [], intervals=0)
     for name in ("calls", "learned", "seed", "threads", "intervals"):
         with pytest.raises(CalibrationError, match=f"{name} must be an integer of at least .; found True"):
             compare(artifact, [recording], [], [], **{name: True})

@@ -126,7 +126,7 @@ def compare(
     calls, learned = integer(calls, "calls", CalibrationError, 1), integer(learned, "learned", CalibrationError, 2)
     threads, seed = integer(threads, "threads", CalibrationError, 1), integer(seed, "seed", CalibrationError)
     if intervals is not None:
-        intervals = integer(intervals, "intervals", CalibrationError)
+        intervals = integer(intervals, "intervals", CalibrationError, 1)
     artifact = load_artifact(path)
     spec = artifact.manifest.spec
     budgets = {one: cells_of(goal_of(target_sparsity=one), artifact.manifest, False) for one in sparsities}

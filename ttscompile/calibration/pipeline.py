@@ -118,7 +118,7 @@ def calibrate(
     begun = time.monotonic()
     seed = integer(seed, "seed", CalibrationError)
     if max_intervals is not None:
-        max_intervals = integer(max_intervals, "max_intervals", CalibrationError)
+        max_intervals = integer(max_intervals, "max_intervals", CalibrationError, 1)
     if ray is not None and device is not None:
         raise CalibrationError(
             f"expected a device or a cluster; found device {device!r} and ray {ray!r}: workers of a cluster compute on"
