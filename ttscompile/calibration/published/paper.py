@@ -244,7 +244,7 @@ class Paper(NothingAfter):
 
     def _priced(self) -> dict[str, Array]:
         """The head with the price of a computed cell with which calls that it is not trained on keep the budget."""
-        task, logits = self._task, self._logits(self._values, self._compared).numpy().copy()
+        task, logits = self._task, self._logits(self._values, self._compared).numpy()
         blocks, fixed = task.executor.model.blocks, {name: value.copy() for name, value in self._values.items()}
         for cells in range(task.budget, blocks - 1, -1):
             price = _price(logits, cells)
