@@ -247,7 +247,7 @@ def _write(
     artifact: Artifact,
     result: Distilled,
     schedule: PlanArray,
-    correction: Correction,
+    correction: Correction | None,
     distilled: DistilledWeights,
 ) -> None:
     """Add the plan to those of the artifact."""
@@ -267,7 +267,7 @@ def _write(
             "default_plan": DISTILLED,
             DISTILLED: result.record(),
         },
-        corrections={**artifact.corrections, DISTILLED: correction},
+        corrections={**artifact.corrections, **({} if correction is None else {DISTILLED: correction})},
         distilled=distilled,
         model_identity=artifact.manifest.model_identity,
         golden=record_plans,
