@@ -6,21 +6,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-import numpy.typing as npt
-
 from ttscompile.ir.dataflow import dominators, reaching
 from ttscompile.ir.flops import graph_flops, node_flops
 from ttscompile.ir.graph import Argument, Batch, Enum, Graph, Node, Ref, TensorType
+from ttscompile.ir.plan_head import SOURCES, Parameters, first_numbers
 from ttscompile.ir.program import Binding, Program
 
 from .base import Pass, PassResult
-
-Parameters = dict[str, npt.NDArray[np.float32]]
-
-SOURCES = 4
-MASKED = -1e9
-"""Logit of a source that is illegal in a cell whatever the caches hold."""
 
 MAX_SHARE = 0.01
 """The head may cost at most this share of the dense FLOPs."""
@@ -61,7 +53,7 @@ class InsertPruner(Pass[Program, Program]):
         steps, blocks = program.spec.sampler.steps, len(program.blocks)
         inputs = sum(math.prod(_read(types[f])) for f in features)
         head = self._fitted(inputs, steps, blocks, program.dense_flops)
-        parameters = head._parameters(inputs, steps, blocks)
+        parameters = first_numbers(inputs, head.width, head.rank, steps, blocks)
         if taken := sorted(parameters.keys() & program.weights.keys()):
             raise self.fail(
                 f"the module has weights of its own called {', '.join(taken)}, as those of the plan head are."
@@ -87,27 +79,6 @@ class InsertPruner(Pass[Program, Program]):
                 break
             head = InsertPruner(rank=head.rank // 2, width=max(head.width // 2, 4))
         return head
-
-    def _parameters(self, inputs: int, steps: int, blocks: int) -> Parameters:
-        draw = np.random.default_rng(0)
-
-        def normal(*shape: int, scale: float) -> npt.NDArray[np.float32]:
-            return (draw.standard_normal(shape) * scale).astype(np.float32)
-
-        base = np.zeros((steps, blocks, SOURCES), np.float32)
-        base[..., 0] = 4.0  # dense until calibrated: |tanh| <= 1 keeps the observation's part below this
-        mask = np.zeros_like(base)
-        mask[0, :, 1:] = MASKED
-        return {
-            "pruner.hidden.weight": normal(self.width, inputs, scale=inputs**-0.5),
-            "pruner.hidden.bias": np.zeros(self.width, np.float32),
-            "pruner.code.weight": normal(self.rank, self.width, scale=self.width**-0.5),
-            "pruner.code.bias": np.zeros(self.rank, np.float32),
-            "pruner.step": normal(steps, self.rank, scale=0.1),
-            "pruner.block": normal(self.rank, blocks * SOURCES, scale=0.1),
-            "pruner.base": base,
-            "pruner.mask": mask,
-        }
 
     def _head(self, features: dict[str, TensorType], parameters: Parameters, steps: int, blocks: int) -> Graph:
         nodes: list[Node] = []

@@ -55,7 +55,7 @@ def named(directory: Path, role: str) -> Path:
 @pytest.fixture
 def calibrated(written: Path) -> Path:
     plan = np.array([[0, 0], [2, 1], [3, 0]], np.int8)
-    update_calibration(written, load_artifact(written).pruner, {"mine": plan}, "tts", {"sparsity": 0.5})
+    update_calibration(written, load_artifact(written).pruner, {"mine": plan}, "tts", {})
     return written
 
 

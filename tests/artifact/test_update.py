@@ -23,6 +23,7 @@ from ttscompile.errors import ArtifactError, IllegalPlanError
 
 ROOT = Path(__file__).resolve().parents[2]
 PLAN = np.array([[0, 0], [1, 2], [0, 3]], np.int8)
+RECORD = {"strategy": "tts", "plans": {"tts": {"sparsity": 0.75}, "mine": {"sparsity": 0.5}}, "losses": [1.5, None]}
 
 
 def new_pruner(path: Path, by: float = 1) -> dict[str, np.ndarray]:
@@ -37,7 +38,7 @@ def update(path: Path, by: float = 1, **changes: Any) -> Manifest:
         "pruner_weights": new_pruner(path, by),
         "schedules": {"mine": PLAN},
         "default_plan": "tts",
-        "record": {"strategy": "tts", "seed": 0, "sparsity": 0.75, "losses": [1.5, None]},
+        "record": RECORD,
     }
     return update_calibration(path, **{**arguments, **changes})
 
@@ -63,7 +64,7 @@ def test_plans_weights_and_record_are_replaced(written: Path) -> None:
         "mine": PlanRecord("schedule", 0.5, 0.5),
         "tts": PlanRecord("pruner", 0.75, None),
     }
-    assert manifest.calibration == {"strategy": "tts", "seed": 0, "sparsity": 0.75, "losses": [1.5, None]}
+    assert manifest.calibration == RECORD
     np.testing.assert_array_equal(artifact.schedule("mine"), PLAN)
     for name, value in pruner.items():
         assert artifact.pruner[name].tobytes() == value.tobytes()
@@ -101,7 +102,10 @@ def test_schedules_alone(written: Path) -> None:
 
 
 def test_the_pruner_beside_a_default_schedule(written: Path) -> None:
-    assert set(update(written, default_plan="mine").plans) == {"mine", "pruner"}
+    """What was measured of each stands in its own record, whichever of the two is the default."""
+    record = {"plans": {"pruner": {"sparsity": 0.75, "flops_sparsity": 0.5}, "mine": {"sparsity": 0.5}}}
+    beside = update(written, default_plan="mine", record=record).plans
+    assert beside == {"mine": PlanRecord("schedule", 0.5, 0.5), "pruner": PlanRecord("pruner", 0.75, 0.5)}
     assert set(update(written, default_plan="dense", schedules={}).plans) == {"pruner"}
 
 
@@ -118,7 +122,7 @@ BAD: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"default_plan": "no such name!"}, ArtifactError, "cannot be called"),
     ({"record": {"x": float("nan")}}, ArtifactError, "expected JSON"),
     ({"record": {"x": np.zeros(2)}}, ArtifactError, "expected JSON"),
-    ({"record": {"sparsity": 1.5}}, ArtifactError, r"sparsity: expected a number in 0\.\.1"),
+    ({"record": {"plans": {"tts": {"sparsity": 1.5}}}}, ArtifactError, r"sparsity: expected a number in 0\.\.1"),
     ({"model_identity": "0" * 64}, ArtifactError, "converted again"),
     (
         {"schedules": {}, "corrections": {"tts": no_correction(STEPS, (HORIZON, CHANNELS))}},

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from ttscompile.calibration import budget as budgets
 from ttscompile.calibration import pipeline
 from ttscompile.calibration.budget import Goal, cells_of, goal_of, measure_budget
 from ttscompile.calibration.crowded import CrowdedSchedules, budget_of_error
+from ttscompile.calibration.oracle import oracle
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.progress import Bar
 from ttscompile.calibration.result import CalibrationResult
@@ -209,6 +212,21 @@ def test_an_error_is_kept_on_held_out_episodes(artifact: Path, recording: Path) 
     assert strict.validation_error <= 0.6 * loose.validation_error
     assert strict.sparsity < loose.sparsity
     assert strict.budget["max_action_error"] == 0.6 * loose.validation_error
+
+
+def test_of_one_step_nothing_can_be_reused(artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    loaded = load_artifact(artifact)
+    sampler = loaded.manifest.spec.sampler
+    rows = {name: np.ascontiguousarray(getattr(sampler, name)[:1]) for name in sampler.COLUMNS}
+    one = replace(sampler, timesteps=sampler.timesteps[:1].copy(), **rows)
+    single = replace(loaded, manifest=replace(loaded.manifest, spec=replace(loaded.manifest.spec, sampler=one)))
+    monkeypatch.setattr(pipeline, "load_artifact", lambda _: single)
+    for asked in ({"max_action_error": 1.0}, {"latency_ms": 1.0}, {"target_sparsity": 0.5}, {}):
+        with pytest.raises(CalibrationError, match="one denoising step, which every plan computes"):
+            quick(artifact, recording, **asked)
+    monkeypatch.setattr(sys.modules["ttscompile.calibration.oracle"], "load_artifact", lambda _: single)
+    with pytest.raises(CalibrationError, match="1 denoising step; expected three at least"):
+        oracle(artifact, [recording], 2)
 
 
 def test_an_error_needs_the_strategy_that_fits_corrections(artifact: Path, recording: Path) -> None:

@@ -97,10 +97,10 @@ def test_the_record_is_in_the_artifact(calibrated: tuple[Path, CalibrationResult
     assert manifest.calibration is not None
     record = json.loads(json.dumps(dict(manifest.calibration)))
     assert record["plans"]["schedule"]["error"] == pytest.approx(result.plans["schedule"].error)
-    assert record["sparsity"] == pytest.approx(result.sparsity)
+    assert record["plans"][result.default_plan]["sparsity"] == pytest.approx(result.sparsity)
     for plan in record["plans"].values():
         assert plan["of_other_noise"] == pytest.approx(plan["error"] / result.other_noise)
-    assert record["stopped"] == result.stopped == "converged"
+    assert record["stopped"] == result.stopped == "finished"
     assert set(manifest.plans) == set(result.plans)
     assert record["budget"] == {"target_sparsity": TARGET, "cells": 18}
     assert not (directory / FILE).exists()
@@ -236,6 +236,18 @@ def test_two_short_episodes_are_enough(artifact: Path, tmp_path: Path) -> None:
     np.savez(path, obs=draw.standard_normal((2, 2, 3)).astype(np.float32), episode_ends=[1, 2])
     result = quick(artifact, path, strategy="interval")
     assert result.calls == {"calibration": 8, "validation": 1}  # each observation with eight noises
+
+
+def test_recordings_that_are_too_short_are_told_of(
+    artifact: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    draw = np.random.default_rng(0)
+    path = tmp_path / "short.npz"
+    np.savez(path, obs=draw.standard_normal((9, 2, 3)).astype(np.float32), episode_ends=[2, 5, 8, 9])
+    quick(artifact, path, strategy="interval", correct=True, progress=True)
+    assert "calls to learn from, and a correction needs 147" in capsys.readouterr().err
+    quick(artifact, path, strategy="tts-paper", max_intervals=1, progress=True)
+    assert "2 of 4 episodes have fewer than 3 calls, and are left out" in capsys.readouterr().err
 
 
 def test_constant_observations_are_fine(artifact: Path, tmp_path: Path) -> None:

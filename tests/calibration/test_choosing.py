@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from ttscompile.calibration import choosing
 from ttscompile.calibration.choosing import AFTER, OBSERVATION, SINGLE, Choice, Errors, choices
 
 OBSERVATIONS, DRAWS, SCHEDULES, EPISODES = 120, 4, 6, 12
@@ -51,6 +54,15 @@ def test_what_is_known_is_found(follows: str) -> None:
         assert rows[name].interval[0] > 0
     assert rows[other].gain < 0.25 * rows[AFTER].gain
     assert (rows[OBSERVATION].gain > 0.3) == (follows == "the observation")
+
+
+def test_one_episode_to_learn_from_teaches_next_to_nothing() -> None:
+    """No other one says how much of what is seen there holds elsewhere, so next to nothing of it is believed."""
+    steps = np.full(SCHEDULES, 3)
+    learned = replace(made(0, "nothing", steps), episodes=np.zeros(OBSERVATIONS, np.int64))
+    guessed = choosing._predicted(learned, made(1, "nothing", steps), "all of these", relative=True)[1]
+    spread = (np.log(learned.of) - np.log(learned.of).mean(2, keepdims=True)).std()
+    assert guessed.std((0, 1)).max() < 0.01 * spread
 
 
 def test_hard_calls_get_more_steps() -> None:

@@ -14,8 +14,12 @@ from click.testing import CliRunner
 from PIL import Image
 
 import ttscompile
+from tests.families import cameras
+from tests.once import Once
 from ttscompile import SamplerTable
 from ttscompile.artifact.load import Artifact, load_artifact
+from ttscompile.artifact.reuse import update_reuse
+from ttscompile.artifact.tokens import ReuseRecord
 from ttscompile.artifact.write import update_calibration
 from ttscompile.calibration.compare import _require_same_policy, compare
 from ttscompile.calibration.search import plan_of
@@ -238,6 +242,30 @@ def test_it_says_when_a_search_had_too_little_time_or_too_few_calls(planned: Pat
     assert "tts fits corrections of 48 features from at most 8 calls" in found.warnings[2]
 
 
+def test_it_says_who_does_not_take_part_as_he_is(planned: Path, recording: Path) -> None:
+    found = compare(planned, [recording], ["tts-paper"], [0.5], calls=1, learned=8, intervals=1)
+    assert [point.series for point in found.points] == ["this artifact"] * 2 + ["tts-paper"]
+    assert found.warnings[1].startswith("tts-paper: one plan for all calls takes part")
+    found = compare(planned, [recording], ["interval"], [], calls=1)
+    assert found.warnings[1] == "no strategy takes part: no share of the cells was given for K = 10."
+
+
+def test_the_truth_has_all_tokens(once: Once, tmp_path: Path) -> None:
+    """With a threshold that nothing passes the newest of two frames is taken for the one before."""
+
+    def make(folder: Path) -> None:
+        ttscompile.compile_denoiser(*cameras.policy("clip"), folder / "artifact")
+
+    folder, draw = shutil.copytree(once.folder("tokens in fp32", make) / "artifact", tmp_path / "own"), np.random
+    views = {key: draw.default_rng(0).random((8, 2, 3, cameras.SIDE, cameras.SIDE)) for key in cameras.CAMERAS}
+    recorded = tmp_path / "calls.npz"
+    np.savez(recorded, state=np.zeros((8, 2, 4), np.float32), episode_ends=np.array([4, 8]), **views)
+    for reuse, differs in ((None, False), (ReuseRecord(100.0, 64, 0.5, 0.0, 0.0, 1), True)):
+        update_reuse(folder, reuse)
+        (dense,) = compare(folder, [recorded], [], [], calls=1).points
+        assert (dense.error > 0) == differs
+
+
 def test_a_strategy_that_cannot_reach_a_sparsity_is_left_out_with_the_reason(planned: Path, recording: Path) -> None:
     found = compare(planned, [recording], ["deepcache"], [0.8], calls=1)
     assert {point.series for point in found.points} == {"this artifact"}
@@ -338,6 +366,7 @@ def test_the_command_prints_the_same_as_a_table_and_as_json(
 def test_without_sparsities_those_are_taken_that_the_steps_allow(planned: Path, recording: Path) -> None:
     assert default_sparsities(100) == (0.9, 0.95, 0.98)
     assert default_sparsities(16) == (11 / 16, 13 / 16, 14 / 16)
+    assert (default_sparsities(3), default_sparsities(2), default_sparsities(1)) == ((1 - 2 / 3,), (0.5,), ())
     arguments = ["compare", str(planned), "--trajectories", str(recording), "--calls", "2", "--json"]
     told = CliRunner().invoke(main, [*arguments, "--strategies", "interval"])  # of ten steps: 95 % is none
     assert told.exit_code == 0, told.stderr

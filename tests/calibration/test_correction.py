@@ -15,7 +15,7 @@ from ttscompile.calibration import regression
 from ttscompile.calibration.fit_correction import fit_correction
 from ttscompile.calibration.sparse_loop import anchors_of
 from ttscompile.calibration.task import Found, Task
-from ttscompile.calibration.whole_steps import _set_apart
+from ttscompile.calibration.whole_steps import WholeSteps, _set_apart
 from ttscompile.core.lattice import PlanArray, Source, dense_plan, uniform_plan
 from ttscompile.errors import CalibrationError
 
@@ -109,6 +109,13 @@ def test_any_schedule_can_be_corrected(make_task: MakeTask, plan: PlanArray) -> 
         assert found.notes["corrected"] is True and found.notes["made"] == "by hand"
         better = replace(task, executor=task.executor.corrected(found.correction))
         assert better.error(schedule, held_out) < 0.5 * task.error(schedule, held_out)
+
+
+def test_a_loop_that_ends_in_no_numbers_gets_no_correction(make_task: MakeTask, plan: PlanArray) -> None:
+    task = make_task(calls=40)
+    assert task.calls.path is not None
+    calls = replace(task.calls, path=task.calls.path * float("nan"))
+    assert WholeSteps(task.executor, task.actions, calls, 0).correction_of(plan) is None
 
 
 def test_a_plan_that_reads_earlier_calls_is_not_corrected(make_task: MakeTask, plan: PlanArray) -> None:

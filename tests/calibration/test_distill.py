@@ -25,6 +25,7 @@ from ttscompile.calibration.distill import Distilled, distill
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.state import FILE
 from ttscompile.cli import main
+from ttscompile.core.correction import no_correction
 from ttscompile.errors import ArtifactError, CalibrationError, CalibrationFailedError
 from ttscompile.report import facts
 from ttscompile.report.card import card
@@ -239,6 +240,16 @@ def test_what_is_no_better_is_not_kept(copied: Path, recording: Path, monkeypatc
     with pytest.raises(CalibrationFailedError, match="after 1 updates. The artifact is as it was"):
         train(copied, recording, updates=1)
     assert {name: one for name, one in contents(copied).items() if name in before} == before
+
+
+def test_a_correction_that_does_harm_is_no_excuse(
+    copied: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Training mends some of it; the plan as it is, without one, is better all the same."""
+    harm = no_correction(policies.STEPS, (policies.HORIZON, policies.CHANNELS))
+    monkeypatch.setattr("ttscompile.calibration.distill.fit_correction", lambda *_: replace(harm, bias=harm.bias + 1))
+    with pytest.raises(CalibrationFailedError, match="The artifact is as it was"):
+        train(copied, recording, updates=4)
 
 
 def test_calibrating_again_drops_it(distilled: tuple[Path, Distilled], recording: Path, tmp_path: Path) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import errno
+import os
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,6 +22,7 @@ from ttscompile.calibration.budget import _pruner_ms
 from ttscompile.calibration.calls import LARGEST, Actions, split_episodes
 from ttscompile.calibration.compare import _error, compare
 from ttscompile.calibration.crowded import CrowdedSchedules
+from ttscompile.calibration.distill import distill
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.progress import Bar
@@ -28,6 +31,7 @@ from ttscompile.calibration.state import FILE, StateFile
 from ttscompile.calibration.strategies import FITTED, NAMES, strategy_of
 from ttscompile.calibration.targets import draw_calls, with_targets
 from ttscompile.calibration.task import Clock
+from ttscompile.calibration.tokens import reuse_tokens
 from ttscompile.calibration.tts import Tts, switched
 from ttscompile.core.lattice import PlanArray, Source, uniform_plan
 from ttscompile.errors import CalibrationError, CalibrationFailedError
@@ -186,6 +190,10 @@ def test_a_negative_seed_is_refused(artifact: Path, recording: Path) -> None:
     for name in ("seed", "threads", "max_intervals"):
         with pytest.raises(CalibrationError, match=f"{name} must be an integer of at least .; found 0.5"):
             calibrate(artifact, [recording], 0.7, **{name: 0.5}, progress=False)
+    with pytest.raises(CalibrationError, match="max_intervals must be an integer of at least 1; found 0"):
+        calibrate(artifact, [recording], 0.7, max_intervals=0, progress=False)
+    with pytest.raises(CalibrationError, match="intervals must be an integer of at least 1; found 0"):
+        compare(artifact, [recording], [], [], intervals=0)
     for name in ("calls", "learned", "seed", "threads", "intervals"):
         with pytest.raises(CalibrationError, match=f"{name} must be an integer of at least .; found True"):
             compare(artifact, [recording], [], [], **{name: True})
@@ -200,6 +208,15 @@ def test_a_state_that_cannot_be_removed_is_an_error(
     monkeypatch.setattr(Path, "unlink", read_only)
     with pytest.raises(CalibrationError, match=f"{FILE}: cannot be removed.*Read-only"):
         calibrate(artifact, [recording], 0.7, progress=False)
+
+
+@pytest.mark.parametrize("change", [calibrate, distill, reuse_tokens])
+def test_an_artifact_that_cannot_be_written_is_refused_before_any_work(
+    change: Callable[..., Any], artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "access", lambda path, mode: path != artifact)  # whoever is root may write everywhere
+    with pytest.raises(CalibrationError, match="nothing can be written there"):
+        change(artifact, [recording])
 
 
 def test_the_pruner_is_timed_with_observations_as_the_network_takes_them(compiled: Path) -> None:

@@ -15,10 +15,11 @@ import ttscompile
 from tests.families import cameras
 from tests.once import Once
 from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.write import locked
 from ttscompile.calibration import tokens
 from ttscompile.calibration.tokens import with_spread
 from ttscompile.cli import main
-from ttscompile.errors import CalibrationError, CalibrationFailedError, TtscompileError
+from ttscompile.errors import ArtifactError, CalibrationError, CalibrationFailedError, TtscompileError
 from ttscompile.verification import verify
 
 SIDE = cameras.SIDE
@@ -89,6 +90,19 @@ def test_settings_are_chosen_with_their_spread(folder: Path, tmp_path: Path, mon
     monkeypatch.setattr(tokens, "with_spread", lambda errors, _: (float(errors.mean()), 1e3 * error))
     with pytest.raises(CalibrationFailedError, match="two standard errors counted"):
         ttscompile.reuse_tokens(folder, files, max_action_error=2 * error)
+
+
+def test_nobody_changes_the_artifact_meanwhile(folder: Path, tmp_path: Path) -> None:
+    class Told(Exception):
+        pass
+
+    def told(*_: object) -> None:
+        with pytest.raises(ArtifactError, match="another process is changing the artifact"), locked(folder):
+            pass
+        raise Told
+
+    with pytest.raises(Told):
+        ttscompile.reuse_tokens(folder, recorded(tmp_path / "calls.npz"), calls=2, progress=told)
 
 
 def test_an_encoder_without_tokens_is_refused(once: Once, tmp_path: Path) -> None:

@@ -88,6 +88,23 @@ def test_an_interruption_of_the_imports_is_one_too(monkeypatch: pytest.MonkeyPat
         start()
 
 
+@pytest.mark.parametrize("command", ["calibrate", "distill", "compare"])
+@pytest.mark.parametrize("before", [[], ["--traceback"]])
+def test_what_can_go_on_says_so(command: str, before: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(_: Path) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys.modules[f"ttscompile.cli.{command}"], "manifest_of", interrupted)
+    result = CliRunner().invoke(main, [*before, command, "out", "--trajectories", "a.npz"])
+    told = "interrupted; the same command with --resume goes on\n"
+    assert (result.exit_code, result.stderr) == (Status.INTERRUPTED, told)
+
+
+def test_an_artifact_that_is_called_like_a_command(failing: Callable[[BaseException], None]) -> None:
+    failing(KeyboardInterrupt())
+    assert CliRunner().invoke(main, ["inspect", "calibrate"]).stderr == "interrupted\n"
+
+
 def test_a_signal_while_a_library_is_loaded_is_no_broken_package(failing: Callable[[BaseException], None]) -> None:
     """On a slow processor onnxruntime takes seconds, and pybind11 tells of any error in it as of an import's."""
     error = ImportError("initialization failed")

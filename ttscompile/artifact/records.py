@@ -209,7 +209,8 @@ def plan_records(
         name = names.PRUNER if default_plan in {DENSE, *plans} else default_plan
         if name in plans or _PLAN_NAME.fullmatch(name) is None:
             raise ArtifactError(f"the pruner's plan cannot be called {name!r}. Give the schedule another name.")
-        shares = {key: record.get(key) for key in ("sparsity", "flops_sparsity")}
+        score = record.get("plans", {}).get(name, {})
+        shares = {key: score.get(key) for key in ("sparsity", "flops_sparsity")}
         plans[name] = from_json(PlanRecord, Value({"kind": names.PRUNER, **shares}, "calibration record"))
     if default_plan not in {DENSE, *plans}:
         raise ArtifactError(f"default plan {default_plan!r}: expected one of {[DENSE, *plans]}.")

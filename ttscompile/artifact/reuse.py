@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import nullcontext
 from dataclasses import replace
 
 from ..errors import ArtifactError
@@ -14,12 +15,13 @@ from .tokens import ReuseRecord
 from .write import identified, locked, require_unzipped
 
 
-def update_reuse(path: str | os.PathLike[str], reuse: ReuseRecord | None) -> Manifest:
+def update_reuse(path: str | os.PathLike[str], reuse: ReuseRecord | None, held: bool = False) -> Manifest:
     """Have an artifact reuse tokens in another way: at once, or not at all. Plans and weights stay.
 
     Args:
         path: the artifact's directory.
         reuse: how; None for not at all.
+        held: whether the caller has the artifact ``locked``.
 
     Returns:
         The new manifest.
@@ -28,7 +30,7 @@ def update_reuse(path: str | os.PathLike[str], reuse: ReuseRecord | None) -> Man
         ArtifactError: no artifact, a zipped one, one that is being updated, or one without tokens.
     """
     directory = require_unzipped(path)
-    with locked(directory):
+    with nullcontext() if held else locked(directory):
         content = encode(identified(replace(load_artifact(directory).manifest, reuse=reuse)))
         manifest = decode(content)  # refuses what nobody could load
         try:

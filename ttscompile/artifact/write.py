@@ -131,8 +131,8 @@ def update_calibration(
 
     Afterwards the artifact has exactly these schedules and, if ``pruner_weights`` are given, one plan of the pruner.
     That plan has the name ``default_plan``, or ``pruner`` where ``default_plan`` is a schedule or ``dense``; its
-    sparsities are ``record["sparsity"]`` and ``record["flops_sparsity"]`` if the record has them. To keep what is
-    there, pass ``artifact.pruner`` and ``artifact.schedules``.
+    ``sparsity`` and ``flops_sparsity`` are those of ``record["plans"]`` under this name, if the record has them. To
+    keep what is there, pass ``artifact.pruner`` and ``artifact.schedules``.
 
     Args:
         path: the artifact's directory.

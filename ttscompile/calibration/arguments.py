@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -45,11 +46,15 @@ def require_directory(path: Path) -> None:
 
     Raises:
         ArtifactError: it is none at all.
-        CalibrationError: it is zipped.
+        CalibrationError: it is zipped, or nothing can be written there.
     """
     if not path.is_dir():
         load_artifact(path)
         raise CalibrationError(f"{path}: only a directory can be changed. Unzip the artifact and give the directory.")
+    if not os.access(path, os.W_OK | os.X_OK):  # told now, not after minutes of work
+        raise CalibrationError(
+            f"{path}: nothing can be written there. Give a copy of the artifact that can be changed."
+        )
 
 
 def calls_to_learn_from(spec: PolicySpec, max_minutes: float, corrects: bool) -> tuple[int, int]:

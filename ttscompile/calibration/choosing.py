@@ -185,11 +185,11 @@ def _ridge(read: Array, targets: Array, ridge: float) -> Array:
 
 
 def _left_out(read: Array, targets: Array, episodes: npt.NDArray[np.int64], ridge: float) -> float:
-    """Mean squared error on episodes that the regression did not see."""
+    """Mean squared error on episodes that the regression did not see; of one episode the largest is best."""
     found = []
     for fold in range(4):
         out = np.isin(episodes, np.unique(episodes)[fold::4])
         if out.any() and not out.all():
             weights = _ridge(read[~out], targets[~out], ridge)
             found.append(np.mean((np.hstack([read[out], np.ones((int(out.sum()), 1))]) @ weights - targets[out]) ** 2))
-    return float(np.mean(found)) if found else ridge
+    return float(np.mean(found)) if found else -ridge

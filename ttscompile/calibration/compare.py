@@ -2,7 +2,8 @@
 
 Every point is a plan that onnxruntime executes, in the artifact's precision and with its correction. On each held-out
 call all points take their turn with the same observation and the same noise, and are held against the actions of the
-dense policy in fp32. So error and latency are of the same calls, and whatever else the machine does hits all points.
+dense policy in fp32 with all tokens. So error and latency are of the same calls, and whatever else the machine does
+hits all points. Every call is the first of an episode: nothing is reused from one to the next.
 
 Another artifact of the policy with another sampler has no use for all of that noise: it starts from the same initial
 sample, and where the number of steps is the same and its sampler is stochastic, takes the same draws. How far two dense
@@ -125,7 +126,7 @@ def compare(
     calls, learned = integer(calls, "calls", CalibrationError, 1), integer(learned, "learned", CalibrationError, 2)
     threads, seed = integer(threads, "threads", CalibrationError, 1), integer(seed, "seed", CalibrationError)
     if intervals is not None:
-        intervals = integer(intervals, "intervals", CalibrationError)
+        intervals = integer(intervals, "intervals", CalibrationError, 1)
     artifact = load_artifact(path)
     spec = artifact.manifest.spec
     budgets = {one: cells_of(goal_of(target_sparsity=one), artifact.manifest, False) for one in sparsities}
@@ -179,6 +180,13 @@ def compare(
     if cut:
         told = f"the limit of {max_minutes:g} minutes cut the search short of {', '.join(cut)}: see --max-minutes."
         warnings.append(told)
+    if strategies and not budgets:
+        warnings.append(f"no strategy takes part: no share of the cells was given for K = {artifact.manifest.steps}.")
+    if pruning := [name for name in strategies if strategy_of(name).uses_pruner]:
+        warnings.append(
+            f"{', '.join(pruning)}: one plan for all calls takes part, of independent calls. What depends on the"
+            " observation is found by 'calibrate', after which it is among the plans of the artifact."
+        )
     fitted, features = [name for name in strategies if strategy_of(name).fits_correction], FEATURES * spec.sample[0]
     if fitted and learned < features:
         warnings.append(
@@ -311,7 +319,7 @@ def _measure(
     """
     # Noise of the original's shape fits every artifact of the policy, however many steps it predicts.
     spec, draw = artifact.manifest.spec.original, np.random.default_rng((seed, 4))
-    exact = artifact.at_precision(FP32)
+    exact = artifact.at_precision(FP32).with_reuse(None)
     truth = CompiledPolicy(exact, open_runtime(exact, "onnxruntime", threads))
     errors: list[list[float]] = [[] for _ in entrants]
     reports: list[list[tuple[float, float]]] = [[] for _ in entrants]

@@ -55,7 +55,7 @@ class Distilled:
 
     Attributes:
         plan: the schedule that was distilled.
-        before: its score, with a correction fitted on the same calls.
+        before: its score as it is, or with a correction fitted on the same calls, whichever is better.
         after: the score of the plan ``distilled``.
         rank: of the changes of the weights.
         matrices: how many were changed.
@@ -166,7 +166,8 @@ def distill(
             student = Student(artifact, schedule, correction, rank, seed, updates, there)
             _train(student, sets["calibration"], state, clock.until(TRAINING), bar, updates)
         weights = student.weights()
-        before = _score(artifact, executor.corrected(correction), schedule, sets["validation"])
+        tried = [executor.corrected(one) for one in (correction, known)]
+        before = min((_score(artifact, one, schedule, sets["validation"]) for one in tried), key=lambda one: one.error)
         after = _score(artifact, student.executor, schedule, sets["validation"])
         if not after.error < before.error:
             raise CalibrationFailedError(
@@ -246,7 +247,7 @@ def _write(
     artifact: Artifact,
     result: Distilled,
     schedule: PlanArray,
-    correction: Correction,
+    correction: Correction | None,
     distilled: DistilledWeights,
 ) -> None:
     """Add the plan to those of the artifact."""
@@ -266,7 +267,7 @@ def _write(
             "default_plan": DISTILLED,
             DISTILLED: result.record(),
         },
-        corrections={**artifact.corrections, DISTILLED: correction},
+        corrections={**artifact.corrections, **({} if correction is None else {DISTILLED: correction})},
         distilled=distilled,
         model_identity=artifact.manifest.model_identity,
         golden=record_plans,

@@ -244,11 +244,17 @@ def rollout_reads(column: PlanArray, window: int) -> tuple[IntArray, IntArray]:
     """
     if len(column) % window or not (column == Source.ROLLOUT).any():
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    numbers = np.arange(len(column))
-    computed = np.where(column == Source.COMPUTE, numbers, -1).reshape(-1, window)
-    latest = np.maximum.accumulate(computed, axis=1).reshape(-1)
+    latest = latest_before(column, window)
     reading = np.flatnonzero((column == Source.ROLLOUT) & (latest >= 0))
     return reading, latest[reading]
+
+
+def latest_before(column: PlanArray, window: int) -> IntArray:
+    """For each call the last one before it, in its window, that computed a cell; -1 where none did. ``[N]`` twice."""
+    computed = np.where(column == Source.COMPUTE, np.arange(len(column)), -1).reshape(-1, window)
+    before = np.full_like(computed, -1)
+    before[:, 1:] = np.maximum.accumulate(computed, axis=1)[:, :-1]
+    return before.reshape(-1)
 
 
 def whole_windows(numbers: IntArray, window: int) -> bool:

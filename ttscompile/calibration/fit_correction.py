@@ -15,8 +15,8 @@ from .execute import Executor
 from .sparse_loop import SparseLoop, is_whole
 
 
-def fit_correction(executor: Executor, plan: PlanArray, calls: Calls, reads: bool) -> Correction:
-    """The correction of a schedule, or one for all plans of a pruner.
+def fit_correction(executor: Executor, plan: PlanArray, calls: Calls, reads: bool) -> Correction | None:
+    """The correction of a schedule, or one for all plans of a pruner; None where the sparse loop ends in no numbers.
 
     Args:
         executor: runs the policy; its own correction is not used.

@@ -95,6 +95,9 @@ def oracle(
     schedules, calls, draws = (integer(size, name, CalibrationError, 2) for name, size in sizes.items())
     artifact = load_artifact(path)
     spec, steps, blocks = artifact.manifest.spec, artifact.manifest.steps, len(artifact.manifest.blocks)
+    if steps < 3:
+        told = f"the policy has {steps} denoising step{'s' * (steps > 1)}; expected three at least"
+        raise CalibrationError(f"{told}: with fewer there is nothing to choose. Convert with more denoising steps.")
     if not 1 < integer(budget, "computed steps", CalibrationError) < steps:
         raise CalibrationError(f"computed steps: expected between 2 and {steps - 1} of {steps}; found {budget}.")
     episodes = load_episodes(spec, trajectories, observation)

@@ -118,7 +118,7 @@ def calibrate(
     begun = time.monotonic()
     seed = integer(seed, "seed", CalibrationError)
     if max_intervals is not None:
-        max_intervals = integer(max_intervals, "max_intervals", CalibrationError)
+        max_intervals = integer(max_intervals, "max_intervals", CalibrationError, 1)
     if ray is not None and device is not None:
         raise CalibrationError(
             f"expected a device or a cluster; found device {device!r} and ray {ray!r}: workers of a cluster compute on"
@@ -139,7 +139,8 @@ def calibrate(
         budget = _known_budget(artifact, goal, chosen)
         episodes = load_episodes(spec, trajectories, observation)
         split = split_episodes(len(episodes), validation_fraction, seed)
-        fewest, limit = calls_to_learn_from(spec, max_minutes, chosen.fits_correction or correct)
+        corrects = chosen.fits_correction or correct
+        fewest, limit = calls_to_learn_from(spec, max_minutes, corrects)
         state = StateFile(
             Path(path),
             {
@@ -166,11 +167,21 @@ def calibrate(
         with Bar(progress) as bar:
             if (warning := few_steps(artifact.manifest)) is not None:
                 bar.warn(warning)
+            if short := sum(each.calls < window for each in episodes):
+                bar.warn(
+                    f"{short} of {len(episodes)} episodes have fewer than {window} calls, and are left out: strategy"
+                    f" {strategy!r} takes {window} consecutive ones."
+                )
             least = {"calibration": fewest, "validation": limit}
             sets = {
                 name: with_targets(executor, name, calls, least[name], state, clock, bar, pool)
                 for name, calls in sets.items()
             }
+            if corrects and (count := sets["calibration"].count) < fewest:
+                bar.warn(
+                    f"the recordings give {count} calls to learn from, and a correction needs {fewest}: it may do harm"
+                    " where nothing was recorded. Record more episodes."
+                )
             if clock.left() < 0:
                 bar.warn(
                     f"{max_minutes:g} minutes were over when the dense policy had answered the calls to learn from:"
@@ -238,6 +249,9 @@ def _write(
 
 def _known_budget(artifact: Artifact, goal: Goal, strategy: Strategy) -> Budget | None:
     """The budget where nothing has to be run for it; refuses what cannot be satisfied before any work."""
+    if artifact.manifest.steps == 1:
+        told = "the policy has one denoising step, which every plan computes: nothing can be reused"
+        raise CalibrationError(f"{told}. Convert with more denoising steps, or use plan='dense'.")
     if goal.kind == ERROR and not strategy.fits_correction:
         raise CalibrationError(
             f"max_action_error needs strategy {' or '.join(map(repr, FITTED))}; found {strategy.name!r}. Give this"

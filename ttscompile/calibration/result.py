@@ -66,7 +66,7 @@ class CalibrationResult:
         episodes: numbers of the episodes in the order of the files, learned from and judged on.
         calls: how many calls of these were used.
         intervals: how many intervals the search took.
-        stopped: why it ended: ``converged``, ``finished`` or ``time limit``.
+        stopped: why it ended: ``finished`` or ``time limit``.
         seconds: of work, the parts before an interruption included.
         other_noise: mean absolute difference of the executed actions of two dense calls on one observation with
             different noise, in the units of the actions; None if it was not measured.
@@ -111,4 +111,4 @@ class CalibrationResult:
             for score in record["plans"].values():
                 score["of_other_noise"] = score["error"] / self.other_noise
         record["episodes"] = {name: list(numbers) for name, numbers in self.episodes.items()}
-        return {**record, "sparsity": self.sparsity, "flops_sparsity": self.flops_sparsity}
+        return record

@@ -63,7 +63,7 @@ def search_plan(
         after: told after each interval how many are done, and how many seconds the longest took.
 
     Returns:
-        What was found, after how many intervals, and why it stopped: ``converged``, ``finished`` or ``time limit``.
+        What was found, after how many intervals, and why it stopped: ``finished`` or ``time limit``.
 
     Raises:
         CalibrationFailedError: the time was up before there was a plan within the budget.
@@ -81,4 +81,4 @@ def search_plan(
         number += 1
         longest = max(longest, clock.elapsed() - start)
         after(number, longest)
-    return search.found(), number, "time limit" if clock.cut else "converged" if search.done else "finished"
+    return search.found(), number, "time limit" if clock.cut else "finished"

@@ -134,9 +134,11 @@ class SparseLoop:
                 place = self.after(place, plans[:, k], pool)
         return place
 
-    def correction(self, place: Place) -> Correction:
-        """What was fitted, at the place after the last step of a loop with corrections."""
+    def correction(self, place: Place) -> Correction | None:
+        """What was fitted, at the place after the last step of a loop with corrections; None if that is no numbers."""
         assert self._components is not None
+        if not all(bool(torch.isfinite(one).all()) for solved in place.solved for one in solved):
+            return None
         columns = zip(*place.solved, strict=True)
         weights, biases, observed = (np.stack([each.numpy() for each in column]) for column in columns)
         observed = np.ascontiguousarray(observed.transpose(1, 0, 2, 3))

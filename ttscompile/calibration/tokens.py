@@ -14,6 +14,7 @@ import numpy.typing as npt
 from ..artifact.load import Artifact, load_artifact
 from ..artifact.reuse import update_reuse
 from ..artifact.tokens import ReuseRecord
+from ..artifact.write import locked
 from ..core.given import integer
 from ..core.spec import Noise
 from ..errors import CalibrationError, CalibrationFailedError
@@ -80,47 +81,49 @@ def reuse_tokens(
             as it was.
         CalibrationError: the artifact has no encoder with tokens, or an argument is out of range.
         TrajectoryError: the recordings do not fit the policy.
-        ArtifactError: the artifact cannot be opened or written.
+        ArtifactError: the artifact cannot be opened or written, or another process is changing it.
     """
     calls, seed = integer(calls, "calls", CalibrationError, 2), integer(seed, "seed", CalibrationError)
     if max_action_error is not None and not max_action_error > 0:
         raise CalibrationError(f"max_action_error: expected a positive number; found {max_action_error}.")
     require_directory(Path(path))
-    artifact = load_artifact(Path(path)).with_reuse(None)
-    if not artifact.manifest.tokens:
-        problem = f"{path}: no image encoder of this policy is a vision transformer, whose tokens could be reused"
-        raise CalibrationError(f"{problem}. 'ttscompile convert --explain' says of each encoder why.")
-    episodes = load_episodes(artifact.manifest.spec, trajectories, observation)
-    split = split_episodes(len(episodes), FRACTION, seed)
-    learned, judged = (
-        _Recorded(artifact, [episodes[i] for i in numbers], calls, (seed, part))
-        for part, numbers in enumerate((split.calibration, split.validation))
-    )
-    allowed = SHARE * learned.other_noise if max_action_error is None else float(max_action_error)
-    found: list[_Tried] = []
-    for number, refresh in enumerate(REFRESHES):
-        for more, threshold in enumerate(THRESHOLDS):
-            progress("settings", number * len(THRESHOLDS) + more, len(REFRESHES) * len(THRESHOLDS))
-            found.append(learned.tried(ReuseRecord(threshold, refresh, 1.0, 0.0, 0.0, 1)))
-            if found[-1].error > allowed:
-                break  # a larger threshold changes more
-    good = [one for one in found if one.bound <= allowed]
-    if not good:
-        least = min(one.bound for one in found)
-        why = f"the actions differ by {least:.4g} at least, two standard errors counted, and {allowed:.4g} is allowed"
-        raise _refused(path, why)
-    best = min(good, key=lambda one: (one.computed, one.error))
-    progress("held-out episodes", 0, 1)
-    held = judged.tried(best.reuse)
-    if held.error > allowed:
-        raise _refused(path, f"on held-out episodes actions differ by {held.error:.4g}, and {allowed:.4g} is allowed")
-    if held.computed > MOST_COMPUTED:
-        raise _refused(path, f"{held.computed:.0%} of the tokens would be computed all the same")
-    reuse = replace(
-        best.reuse, computed=held.computed, error=held.error, other_noise=judged.other_noise, calls=judged.count
-    )
-    update_reuse(path, reuse)
-    return TokenCalibration(reuse, (judged.frame_ms, held.frame_ms))
+    with locked(Path(path)):  # what is settled is of the artifact that was measured
+        artifact = load_artifact(Path(path)).with_reuse(None)
+        if not artifact.manifest.tokens:
+            problem = f"{path}: no image encoder of this policy is a vision transformer, whose tokens could be reused"
+            raise CalibrationError(f"{problem}. 'ttscompile convert --explain' says of each encoder why.")
+        episodes = load_episodes(artifact.manifest.spec, trajectories, observation)
+        split = split_episodes(len(episodes), FRACTION, seed)
+        learned, judged = (
+            _Recorded(artifact, [episodes[i] for i in numbers], calls, (seed, part))
+            for part, numbers in enumerate((split.calibration, split.validation))
+        )
+        allowed = SHARE * learned.other_noise if max_action_error is None else float(max_action_error)
+        found: list[_Tried] = []
+        for number, refresh in enumerate(REFRESHES):
+            for more, threshold in enumerate(THRESHOLDS):
+                progress("settings", number * len(THRESHOLDS) + more, len(REFRESHES) * len(THRESHOLDS))
+                found.append(learned.tried(ReuseRecord(threshold, refresh, 1.0, 0.0, 0.0, 1)))
+                if found[-1].error > allowed:
+                    break  # a larger threshold changes more
+        good = [one for one in found if one.bound <= allowed]
+        if not good:
+            told = f"{min(one.bound for one in found):.4g} at least, two standard errors counted"
+            raise _refused(path, f"the actions differ by {told}, and {allowed:.4g} is allowed")
+        best = min(good, key=lambda one: (one.computed, one.error))
+        progress("held-out episodes", 0, 1)
+        held = judged.tried(best.reuse)
+        if held.error > allowed:
+            raise _refused(
+                path, f"on held-out episodes actions differ by {held.error:.4g}, and {allowed:.4g} is allowed"
+            )
+        if held.computed > MOST_COMPUTED:
+            raise _refused(path, f"{held.computed:.0%} of the tokens would be computed all the same")
+        reuse = replace(
+            best.reuse, computed=held.computed, error=held.error, other_noise=judged.other_noise, calls=judged.count
+        )
+        update_reuse(path, reuse, held=True)
+        return TokenCalibration(reuse, (judged.frame_ms, held.frame_ms))
 
 
 def _refused(path: str | os.PathLike[str], why: str) -> CalibrationFailedError:

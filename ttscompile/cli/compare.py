@@ -43,8 +43,11 @@ if TYPE_CHECKING:
 def default_sparsities(steps: int) -> tuple[float, ...]:
     """Shares of the cells that a policy of ``steps`` steps can reuse, from safe to daring.
 
-    Of less than 50 steps, what leaves five, three and two to compute: a single one is more than 0.98 leaves.
+    Of less than 50 steps, what leaves five, three and two to compute: a single one is more than 0.98 leaves. Of two
+    steps one can be left, and of a single one nothing.
     """
+    if steps <= 2:
+        return (0.5,) * (steps - 1)
     return (0.9, 0.95, 0.98) if steps >= 50 else tuple(1 - left / steps for left in (5, 3, 2) if left < steps)
 
 
@@ -185,7 +188,7 @@ def _print(found: Comparison, output: Console, threads: str) -> None:
         output,
         f"Error: mean absolute difference of the executed actions, in their units, from those of the dense policy in"
         f" fp32 with the same observation and noise; {found.calls} calls of episodes that no strategy here learned"
-        f" from. Latency: medians of the same calls, one stream, {threads}."
+        f" from, each as the first of its episode. Latency: medians of the same calls, one stream, {threads}."
         " Comparison: no other plan is faster and more accurate.",
     )
     told = {"steps": "the same initial sample and other draws", "all": "other noise altogether"}

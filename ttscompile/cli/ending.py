@@ -34,6 +34,7 @@ import ttscompile
 from ttscompile.errors import CalibrationFailedError, TtscompileError
 
 TRACEBACK = "--traceback"
+_RESUMED = ("calibrate", "distill", "compare")
 _WORDS = "ttscompile.words"
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _HOME = Path(ttscompile.__file__).parent
@@ -162,7 +163,8 @@ def _require_folder() -> None:
 
 
 def _resumes(words: Sequence[str]) -> str:
-    return "; the same command with --resume goes on" if "calibrate" in words[1:3] else ""
+    command = next((word for word in words[1:] if word != TRACEBACK), "")
+    return "; the same command with --resume goes on" if command in _RESUMED else ""
 
 
 def _open_standard_streams() -> None:

@@ -113,6 +113,7 @@ def test_the_schedule_is_the_best_decision(make_task: MakeTask, name: str) -> No
     errors = [task.error(plan, task.calls) for plan in plans]
     assert len(plans) > 1
     np.testing.assert_array_equal(found.schedule, plans[int(np.argmin(errors))])
+    assert found.error == pytest.approx(min(errors), rel=1e-5)  # of the schedule, not of what was decided call by call
 
 
 def test_decisions_within_the_budget_once_each() -> None:

@@ -17,7 +17,7 @@ from ttscompile.calibration import judge
 from ttscompile.calibration.crowded import crowded_family
 from ttscompile.calibration.published import paper
 from ttscompile.calibration.published.paper import Paper
-from ttscompile.calibration.task import Task
+from ttscompile.calibration.task import Clock, Task
 from ttscompile.core.lattice import Source, whole_steps_plan
 from ttscompile.runtimes.settle import pruner_plan
 
@@ -97,6 +97,22 @@ def test_nothing_is_read_of_earlier_calls_where_calls_stand_alone(make_task: Mak
     assert found.pruner is not None
     assert (found.pruner[paper.BASE][..., Source.ROLLOUT] == paper.FORBIDDEN).all()
     assert found.notes["sources"]["ROLLOUT"] == 0
+
+
+def test_an_earlier_calibration_leaves_no_trace(task: Task) -> None:
+    """The head of the artifact is the one that it left, and switches leave one that is zero but for them."""
+    left = {name: value if name == "pruner.mask" else np.zeros_like(value) for name, value in task.pruner.items()}
+    first, again = trained(task, 2).state(), trained(replace(task, pruner=left), 2).state()
+    for name, value in first.items():
+        np.testing.assert_array_equal(again[name], value, err_msg=name)
+
+
+def test_nothing_is_tried_before_the_first_update(task: Task) -> None:
+    """So one that was interrupted after its last update is not cut short by a limit that is over when it goes on."""
+    clock = Clock(0.0)
+    search = Paper(replace(task, clock=clock))
+    search.restore(trained(task, 1).state())
+    assert not clock.cut
 
 
 def test_going_on_equals_not_stopping(task: Task) -> None:

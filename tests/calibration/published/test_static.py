@@ -10,6 +10,7 @@ from ttscompile.calibration.published.gates import Gates
 from ttscompile.calibration.search import plan_of
 from ttscompile.calibration.strategies import strategy_of
 from ttscompile.core.lattice import PlanArray, Source
+from ttscompile.errors import CalibrationError
 
 from ..tasks import MakeTask
 
@@ -33,10 +34,9 @@ def test_deepcache_spends_the_budget_on_full_steps() -> None:
 
 
 @pytest.mark.parametrize("blocks", [1, 2])
-def test_deepcache_with_nothing_between_the_outermost_blocks_is_dense(blocks: int) -> None:
-    ((plan, _),) = static.edge_plans(4, blocks, 4 * blocks)
-    assert (plan == Source.COMPUTE).all()
-    assert strategy_of("deepcache").least(4, blocks) == 4 * blocks
+def test_deepcache_with_nothing_between_the_outermost_blocks_is_refused(blocks: int) -> None:
+    with pytest.raises(CalibrationError, match="a sparsity of 0;"):
+        strategy_of("deepcache").require_reach(4, blocks, 3 * blocks)
 
 
 def test_delta_dit_keeps_the_front_fresh_and_then_the_rear() -> None:
@@ -52,9 +52,9 @@ def test_delta_dit_spends_the_budget_on_full_steps() -> None:
     assert all(int((plan == Source.COMPUTE).sum()) == 17 for plan, _ in found)
 
 
-def test_delta_dit_of_one_block_is_dense() -> None:
-    found = static.delta_plans(4, 1, 4)
-    assert all((plan == Source.COMPUTE).all() for plan, _ in found)
+def test_delta_dit_of_one_block_is_refused() -> None:
+    with pytest.raises(CalibrationError, match="a sparsity of 0;"):
+        strategy_of("delta-dit").require_reach(4, 1, 3)
 
 
 def test_a_rule_takes_the_parameters_with_the_lowest_error(make_task: MakeTask) -> None:

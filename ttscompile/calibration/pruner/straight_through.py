@@ -18,7 +18,7 @@ from ...core.lattice import BoolArray, PlanArray, Source
 from ...runtimes.reference.model import Contexts
 from ...runtimes.reference.reuse import Caches, Cell, reuse
 from ..calls import Calls, IntArray
-from ..execute import Executor, State, rollout_reads
+from ..execute import Executor, State, latest_before
 
 BYTES = 2**28
 """Memory for what the blocks compute in the dense calls, as bfloat16. It decides how many calls are learned from."""
@@ -114,13 +114,7 @@ def _earlier(column: PlanArray, computed: Tensor, axis: int, window: int) -> Ten
 
     Every call is asked, not only those that read it: the gate of ROLLOUT has a gradient in all of them.
     """
-    asked = np.full_like(column, Source.ROLLOUT)
-    latest = np.full(len(column), -1)
-    for place in range(1, window):  # the call at this place of each window reads; those before it say what they did
-        of = np.arange(len(column)) % window
-        reading, read = rollout_reads(np.where(of == place, asked, column), window)
-        mine = of[reading] == place
-        latest[reading[mine]] = read[mine]
+    latest = latest_before(column, window)
     if (latest < 0).all():
         return None
     return computed.index_select(axis, torch.from_numpy(np.maximum(latest, 0)).to(computed.device))

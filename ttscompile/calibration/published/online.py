@@ -244,14 +244,12 @@ def online(task: Task, proposed: Sequence[tuple[Criterion, float]]) -> Found:
         )
     errors = [_error(task, decided, some) for _, decided in kept]
     best, decided = kept[int(np.argmin(errors))]
-    calls, near = some, max(best.threshold, 1e-6)
-    again = fit_threshold(task, best, more, near / 2, near, probes)
-    if again is not None:
-        (best, decided), calls = again, more
+    near = max(best.threshold, 1e-6)
+    best, decided = fit_threshold(task, best, more, near / 2, near, probes) or (best, decided)
     chosen = best_of(task, [(plan, {}) for plan in within(decided.plans, task.budget)[:FROZEN]])
     cells = {"mean": float(decided.cells.mean()), "most": int(decided.cells.max())}
     notes = {"criterion": best.record(), "computed_cells": cells}
-    return Found(chosen.schedule, notes, error=_error(task, decided, calls))
+    return replace(chosen, notes=notes)
 
 
 def _error(task: Task, decided: Decided, calls: Calls) -> float:

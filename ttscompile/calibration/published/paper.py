@@ -11,8 +11,9 @@ What differs from the authors' training, and why:
 - *The budget.* They add ``|reuse - target|`` to the loss. In the few hundred updates that there is time for, that
   holds no budget. Here COMPUTE has a price, which is set in every update so that the calls of the batch keep the budget
   on average: what such a term comes to where it is strong enough.
-- *The start.* A schedule of whole steps that computes more than the budget has, and shrinks to it. From one that keeps
-  the budget every first move of a single cell does harm, and training does not get past that.
+- *The start.* The head of an artifact that was never calibrated, and a schedule of whole steps that computes more than
+  the budget has, and shrinks to it. From one that keeps the budget every first move of a single cell does harm, and
+  training does not get past that.
 - *What is kept.* The head at its best, on calls that it was not trained on; or the best of some schedules of whole
   steps that keep the budget, if no head was better.
 - *The optimiser.* Adam with one size for each array of the head, as ``gates`` has it: a cell that hardly matters must
@@ -32,6 +33,7 @@ import torch
 from torch import Tensor
 
 from ...core.lattice import PlanArray, Source, whole_steps_plan
+from ...ir.plan_head import first_numbers
 from ...runtimes.settle import pruner_plan
 from ..calls import Calls, IntArray
 from ..crowded import crowded_family
@@ -107,30 +109,32 @@ class Paper(NothingAfter):
         begin: Sequence[int] | None = None,
     ) -> None:
         self._task, self._observes = task, observes and has_head(task.pruner)
+        self._sources, self._begin = sources, begin
         practised, compared = _divided(task)
         self._practised, self._compared = (task.executor.select(task.calls, one) for one in (practised, compared))
         self._practice: Practice | None = None
-        self._values = {BASE: self._base(sources, self._best_steps(task.budget) if begin is None else begin)}
-        self._most, self._start = task.budget, self._values[BASE]
-        if begin is None:
-            self._most = min(round(START * task.budget), self._start[..., 0].size)
-            self._start = self._base(sources, self._best_steps(self._most))
+        model = task.executor.model
+        self._most = task.budget if begin is not None else min(round(START * task.budget), model.steps * model.blocks)
+        self._values = {BASE: self._base([0])}
         if self._observes:
-            self._values |= {name: np.array(task.pruner[name], np.float32) for name in TRAINED}
+            self._values |= _first_numbers(task.pruner)
         self._rates = {name: RELATIVE_RATE * (_rms(value) or 1.0) for name, value in self._values.items()}
         self._rates[BASE] = RATE
         self._mean = {name: np.zeros_like(value) for name, value in self._values.items()}
         self._size = dict.fromkeys(self._values, 0.0)
-        self._best = self._priced()
-        self.plan, self.loss = self._frozen(), float("nan")
+        self._best = dict(self._values)
+        self.plan, self.loss = whole_steps_plan(model.steps, model.blocks, [0]), float("nan")
 
     def advance(self, interval: int) -> None:
         """One update; after every few of them, and after the last, the head is held against the best."""
         if self._practice is None:
             self._practice = Practice(self._task.executor, self._practised)
         if interval == 0:
+            begin = self._begin
+            self._values[BASE] = self._base(self._best_steps(self._task.budget) if begin is None else begin)
             self._compare()  # nothing is kept that is worse than whole steps
-            self._values[BASE] = self._start.copy()
+            if begin is None:
+                self._values[BASE] = self._base(self._best_steps(self._most))
         window = self._practice.calls.window
         order = self._task.draw(interval, 4).permutation(self._practice.calls.count // window)
         chosen = order[: max(1, BATCH // window), None] * window + np.arange(window)
@@ -178,7 +182,7 @@ class Paper(NothingAfter):
         ]
         return min(tried)[1]
 
-    def _base(self, sources: Collection[Source], begin: Sequence[int]) -> Array:
+    def _base(self, begin: Sequence[int]) -> Array:
         """What does not depend on the observation, at first, ``[K, blocks, 4]``."""
         model, draw = self._task.executor.model, self._task.draw(0, 5)
         base = np.zeros((model.steps, model.blocks, len(Source)))
@@ -186,7 +190,7 @@ class Paper(NothingAfter):
         base[..., Source.COMPUTE] += APART * draw.standard_normal(base.shape[:2])
         base[..., Source.TIMESTEP] = FIRST[1]
         alone = {Source.ROLLOUT} if self._task.calls.window == 1 else set[Source]()
-        for source in {Source.FORWARD, Source.ROLLOUT} - (set(sources) - alone):
+        for source in {Source.FORWARD, Source.ROLLOUT} - (set(self._sources) - alone):
             base[..., source] = FORBIDDEN
         return base.astype(np.float32)
 
@@ -240,7 +244,7 @@ class Paper(NothingAfter):
 
     def _priced(self) -> dict[str, Array]:
         """The head with the price of a computed cell with which calls that it is not trained on keep the budget."""
-        task, logits = self._task, self._logits(self._values, self._compared).numpy().copy()
+        task, logits = self._task, self._logits(self._values, self._compared).numpy()
         blocks, fixed = task.executor.model.blocks, {name: value.copy() for name, value in self._values.items()}
         for cells in range(task.budget, blocks - 1, -1):
             price = _price(logits, cells)
@@ -276,6 +280,13 @@ def _price(logits: Array, cells: int) -> float:
     if count >= len(ordered):
         return float(ordered[-1]) - 1 if len(ordered) else 0.0
     return float(ordered[0]) + 1 if count <= 0 else float(ordered[count - 1] + ordered[count]) / 2
+
+
+def _first_numbers(head: Mapping[str, Array]) -> dict[str, Array]:
+    """What the observation goes through, as it was before any calibration: an artifact has what the last one left."""
+    (width, inputs), rank = head["pruner.hidden.weight"].shape, head["pruner.step"].shape[1]
+    first = first_numbers(inputs, width, rank, *head[BASE].shape[:2])
+    return {name: first[name] for name in TRAINED}
 
 
 def _rms(value: Array) -> float:

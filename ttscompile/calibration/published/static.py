@@ -16,7 +16,7 @@ decide.
 
 from __future__ import annotations
 
-from ...core.lattice import PlanArray, Source, dense_plan, uniform_plan
+from ...core.lattice import PlanArray, Source, uniform_plan
 from ..task import Found, Task
 from .fixed import best_of, fixed
 
@@ -55,8 +55,8 @@ def delta_plan(steps: int, blocks: int, full_steps: int, fresh: int, boundary: i
 def delta_plans(steps: int, blocks: int, budget: int) -> Candidates:
     """For each number of fresh blocks and each boundary, as many full steps as the budget has room for."""
     found = []
-    for fresh in range(1, max(2, blocks)):
-        full_steps = min(steps, (budget - fresh * steps) // max(1, blocks - fresh))
+    for fresh in range(1, blocks):
+        full_steps = min(steps, (budget - fresh * steps) // (blocks - fresh))
         if full_steps < 1:
             break
         for boundary in (round(share * steps) for share in BOUNDARIES):
@@ -80,8 +80,6 @@ def edge_plan(steps: int, blocks: int, full_steps: int, edge: int) -> PlanArray:
 
 def edge_plans(steps: int, blocks: int, budget: int) -> Candidates:
     """For each width of the edge, the plan with as many full steps as the budget has room for."""
-    if blocks <= 2:  # nothing is between them
-        return [(dense_plan(steps, blocks), {"edge": 1, "full_steps": steps})]
     found = []
     for edge in range(1, -(-blocks // 2)):
         full_steps = min(steps, (budget - 2 * edge * steps) // (blocks - 2 * edge))

@@ -1,0 +1,43 @@
+"""The numbers that the plan head begins with: ``insert_pruner`` writes them, and training starts from them."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+Parameters = dict[str, npt.NDArray[np.float32]]
+
+SOURCES = 4
+MASKED = -1e9
+"""Logit of a source that is illegal in a cell whatever the caches hold."""
+
+
+def first_numbers(inputs: int, width: int, rank: int, steps: int, blocks: int) -> Parameters:
+    """Constants of the head by name: always the same, and with them the plan is dense.
+
+    Args:
+        inputs: numbers of the features that it reads.
+        width: of the hidden layer.
+        rank: number of observation-dependent directions in the space of plans.
+        steps: K.
+        blocks: of the network.
+    """
+    draw = np.random.default_rng(0)
+
+    def normal(*shape: int, scale: float) -> npt.NDArray[np.float32]:
+        return (draw.standard_normal(shape) * scale).astype(np.float32)
+
+    base = np.zeros((steps, blocks, SOURCES), np.float32)
+    base[..., 0] = 4.0  # dense until calibrated: |tanh| <= 1 keeps the observation's part below this
+    mask = np.zeros_like(base)
+    mask[0, :, 1:] = MASKED
+    return {
+        "pruner.hidden.weight": normal(width, inputs, scale=inputs**-0.5),
+        "pruner.hidden.bias": np.zeros(width, np.float32),
+        "pruner.code.weight": normal(rank, width, scale=width**-0.5),
+        "pruner.code.bias": np.zeros(rank, np.float32),
+        "pruner.step": normal(steps, rank, scale=0.1),
+        "pruner.block": normal(rank, blocks * SOURCES, scale=0.1),
+        "pruner.base": base,
+        "pruner.mask": mask,
+    }
