@@ -23,8 +23,8 @@ Array: TypeAlias = npt.NDArray[Any]
 Run: TypeAlias = Callable[[str, Mapping[str, Array]], tuple[Array, ...]]
 """A piece, by its name, on inputs by theirs; its outputs in order."""
 Renew: TypeAlias = Callable[[str, Mapping[str, Array], Mapping[str, Array]], tuple[Array, ...]]
-"""A piece for some tokens, by its name, on inputs and on what is kept, by theirs; its other outputs in order. What is kept
-gets its new rows where it is."""
+"""A piece for some tokens, by its name, on inputs and on what is kept, by theirs; its other outputs in order. What is
+kept gets its new rows where it is."""
 Lane: TypeAlias = bytes
 """One camera of one stream."""
 

@@ -20,13 +20,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import torch
+from moving import REUSE, arm, picture
 from torch import Tensor, nn
 from towers import SIGLIP, Seeing, session
 
 import ttscompile
 from ttscompile import ChunkSpec, ObservationSpec, PolicySpec
 from ttscompile.artifact.load import load_artifact
-from ttscompile.artifact.tokens import ReuseRecord
 from ttscompile.capture.export import capture
 from ttscompile.frontends.clip import ClipVision, VisionConfig
 from ttscompile.frontends.encoded import EncodedDenoiser
@@ -46,7 +46,6 @@ from ttscompile.samplers.flow import flow_matching_table
 Array = npt.NDArray[np.float32]
 
 ACTIONS, HORIZON, STEPS, WIDTH = 4, 8, 4, 768
-THRESHOLD = 0.02
 TOWERS = {"clip": ("CLIP B/16, 224 x 224", 224), "siglip": ("SigLIP of SmolVLA, 512 x 512", 512)}
 
 
@@ -77,30 +76,16 @@ def compiled(name: str, precision: str, folder: Path) -> None:
     ttscompile.compile_denoiser(EncodedDenoiser(Eye(name, size), network).eval(), spec, folder, precision=precision)
 
 
-def arm(still: Array, angle: float) -> Array:
-    """The picture with an arm of two links in front of it, a tenth of it wide."""
-    size = still.shape[-1]
-    y, x = np.mgrid[:size, :size] / size
-    image, foot, turn = still.copy(), np.array([0.95, 0.5]), -np.pi / 2 + angle
-    for length in (0.4, 0.35):
-        way = length * np.array([np.sin(turn), np.cos(turn)])
-        along = np.clip(((y - foot[0]) * way[0] + (x - foot[1]) * way[1]) / length**2, 0, 1)
-        near = (y - foot[0] - along * way[0]) ** 2 + (x - foot[1] - along * way[1]) ** 2 < 0.05**2
-        image[:, near] = 0.9
-        foot, turn = foot + way, turn + 1.5 * angle
-    return image
-
-
 def measure(name: str, precision: str, rounds: int) -> str:
     """One row of the table."""
     title, size = TOWERS[name]
     with tempfile.TemporaryDirectory() as folder:
         compiled(name, precision, Path(folder))
         artifact = load_artifact(folder)
-        reusing = artifact.with_reuse(ReuseRecord(THRESHOLD, 10**6, 1.0, 0.0, 0.0, 1))
+        reusing = artifact.with_reuse(REUSE)
         policies = [open_policy(each, seed=0) for each in (artifact, reusing, reusing)]
     rng = np.random.default_rng(0)
-    still = rng.random((3, 8, 8)).repeat(size // 8, 1).repeat(size // 8, 2).astype(np.float32)
+    still = picture(size, rng)
     times: list[list[float]] = [[], [], []]
     shares, off = list[float](), list[float]()
     noise = ttscompile.Noise(rng.standard_normal((1, HORIZON, ACTIONS), dtype=np.float32))
