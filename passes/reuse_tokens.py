@@ -10,7 +10,7 @@ import torch
 
 from ttscompile.ir.graph import Argument, Batch, Graph, Node, Ref, Size, TensorType, backward_slice
 from ttscompile.ir.operations import Movement, operation
-from ttscompile.ir.pieces import INDEX, PIXELS, frame_name, pixels_name, tokens_name
+from ttscompile.ir.pieces import INDEX, PIXELS, frame_name, pixels_name, renewed_name, tokens_name
 from ttscompile.ir.program import Program
 from ttscompile.ir.tokens import ATTENTION, TokenStream, evaluator, find_tokens
 
@@ -34,14 +34,16 @@ class ReuseTokens(Pass[Program, Program]):
     After, beside it; in ``tokens_00`` there is one row, and B is the number of tokens::
 
         pixels_00 : %row -> %pixels                       # what patches are cut from
-        tokens_00 : %pixels, %index : [B], %k.kept : [17, 128] -> %feature, %k.rows : [B, 128]
+        tokens_00 : %pixels, %index : [B], %k.kept : [17, 1, 128] -> %feature, %k.kept.new : [17, 1, 128]
             %tokens.changed : [1, B, 128] = aten.index_select.default(%tokens, 1, %index)
             %k.changed      : [1, B, 128] = aten.linear.default(%normed.changed, ...)
-            %k              = %k.kept with %k.rows in the rows %index
+            %k.kept.new     = %k.kept with %k.changed in the rows %index
+            %k              = %k.kept.new
 
     A value has a row for each token as long as nothing but attention brings tokens together. What attention reads of
     all tokens, and what follows after the last layer, is kept from frame to frame, and written anew for the tokens in
-    ``index``. With all of them it is the tower. Which token is of which patch is found on numbers.
+    ``index``. Nothing else reads what was kept, so a runtime may have it written where it is. With all tokens it is the
+    tower. Which token is of which patch is found on numbers.
     """
 
     def call(self, program: Program) -> PassResult[Program]:
@@ -121,7 +123,7 @@ class _Changed:
         stream: its tokens.
         nodes: written so far.
         inputs: what is kept, by name.
-        outputs: the rows that have to be kept.
+        outputs: what has to be kept, with its new rows.
         there: values that are written whole.
     """
 
@@ -213,19 +215,22 @@ class _Changed:
             self.nodes.append(_rowless_node(node))
             return
         front = (axis, *(a for a in range(len(type_.shape)) if a != axis))
-        rest = tuple(type_.shape[a] for a in front[1:])
-        kept, rows = replace(type_, shape=(self.stream.tokens, *rest)), replace(type_, shape=(Batch(), *rest))
         back = tuple(front.index(a) for a in range(len(front)))
-        self.inputs[f"{name}.kept"] = kept
-        self.outputs.append(f"{name}.rows")
+        rest = tuple(type_.shape[a] for a in front[1:])
+        all_rows, new_rows = replace(type_, shape=(self.stream.tokens, *rest)), replace(type_, shape=(Batch(), *rest))
+        kept, renewed = f"{name}.kept", renewed_name(f"{name}.kept")
+        self.inputs[kept] = all_rows
+        self.outputs.append(renewed)
+        args = (Ref(kept), 0, Ref(INDEX), Ref(f"{name}.rows"))
+        # Past axes of size 1 nothing moves, and nothing is to be copied.
+        moves = any(size != 1 for size in type_.shape[:axis])
+
+        def moved(result: str, read: str, order: tuple[int, ...], kind: TensorType) -> Node:
+            how = ("aten.permute.default", order) if moves else ("aten.reshape.default", kind.shape)
+            return Node(result, how[0], (Ref(read), how[1]), (), (kind,))
+
         self.nodes += [
-            Node(f"{name}.rows", "aten.permute.default", (Ref(f"{name}.changed"), front), (), (rows,)),
-            Node(
-                f"{name}.all",
-                "aten.index_copy.default",
-                (Ref(f"{name}.kept"), 0, Ref(INDEX), Ref(f"{name}.rows")),
-                (),
-                (kept,),
-            ),
-            Node(name, "aten.permute.default", (Ref(f"{name}.all"), back), (), (type_,)),
+            moved(f"{name}.rows", f"{name}.changed", front, new_rows),
+            Node(renewed, "aten.index_copy.default", args, (), (all_rows,)),
+            moved(name, renewed, back, type_),
         ]

@@ -25,10 +25,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    import numpy as np
     from torch import nn
-
-    from ttscompile import PolicySpec
 
 STEPS = 4
 
@@ -119,81 +116,25 @@ def convert_clip(folder: Path) -> None:
 
 
 def run_smolvla(folder: Path) -> None:
-    """See ``compare``; two of ten steps are computed."""
+    """See ``large_calls``; two of ten steps are computed."""
+    import large_calls
     import large_smolvla
 
     from ttscompile.frontends import load_checkpoint_policy
 
     module, spec = load_checkpoint_policy(folder / "smolvla")
-    compare(folder, "vision, prefix, loop", large_smolvla.eager(module, spec), spec, 2)
+    large_calls.compare(folder, "vision, prefix, loop", large_smolvla.eager(module, spec), spec, 2)
+    large_calls.reusing(folder, spec, 2)
 
 
 def run_clip(folder: Path) -> None:
-    """See ``compare``; five of a hundred steps are computed."""
+    """See ``large_calls``; five of a hundred steps are computed."""
+    import large_calls
     import large_clip
 
     module, spec = large_clip.policy()
-    compare(folder, "encoder, loop", large_clip.eager(module, spec), spec, 5)
-
-
-def compare(
-    folder: Path,
-    parts: str,
-    eager: Callable[[], tuple[np.ndarray, list[float]]],
-    spec: PolicySpec,
-    computed: int,
-    rounds: int = 5,
-) -> None:
-    """One call after the other, in turn: eager, dense and with few computed steps, in fp32 and in int8.
-
-    Seconds are the processor's: all calls are on one thread, and the machine may be busy.
-
-    Args:
-        folder: with the artifact.
-        parts: what ``eager`` takes the time of.
-        eager: a call of the original.
-        spec: of the policy.
-        computed: how many steps the sparse plan computes.
-        rounds: that are counted.
-    """
-    import large_smolvla
-    import numpy as np
-    import torch
-
-    import ttscompile
-    from ttscompile.artifact.load import load_artifact
-
-    torch.set_num_threads(1)
-    record = load_artifact(folder / "compiled").manifest.precision
-    assert record is not None and record.error is not None
-    policies = {name: ttscompile.load(folder / "compiled", precision=name) for name in ("fp32", "int8")}
-    info = policies["fp32"].info
-    obs, noise = large_smolvla.call(spec)
-    few = np.full((info.K, len(info.blocks)), ttscompile.Source.TIMESTEP, np.int8)
-    few[np.arange(computed) * info.K // computed] = ttscompile.Source.COMPUTE
-    plans = {"dense": "dense", f"{computed} of {info.K} steps": few}
-    times: dict[str, list[list[float]]] = {}
-    for _ in range(rounds + 1):  # the first does not count
-        expected, split = eager()
-        times.setdefault(f"eager: {parts}", []).append(split)
-        for precision, policy in policies.items():
-            for name, plan in plans.items():
-                policy.forget_frames()  # every call sees the same observation
-                start = time.process_time()
-                found = policy.predict_action(obs, noise=noise, plan=plan)["action"]
-                took, timings = time.process_time() - start, policy.last_report.timings
-                before = took * timings.prologue / timings.total
-                times.setdefault(f"{name}, {precision}: prologue, loop", []).append([before, took - before])
-                if (name, precision) == ("dense", "fp32"):
-                    error = float(np.abs(found - expected).max())
-    for name, rows in times.items():
-        medians = [statistics.median(each) for each in zip(*rows[1:], strict=True)]
-        total = statistics.median(sum(row) for row in rows[1:])
-        print(f"{total:8.2f} s  {name}: {', '.join(f'{each:.2f}' for each in medians)}")
-    print(f"{error:8.1e}  the dense call from eager; {peak():.2f} GiB at most, all of them loaded")
-    alone = ", ".join(f"{part} alone {value:.2g}" for part, value in record.parts.items() if value is not None)
-    print(f"{record.told}: dense actions {record.error.mean:.2g} from fp32; {alone};", end=" ")
-    print(f"other noise {record.error.other_noise:.2g}")
+    large_calls.compare(folder, "encoder, loop", large_clip.eager(module, spec), spec, 5)
+    large_calls.reusing(folder, spec, 5)
 
 
 def run(folder: Path) -> None:

@@ -14,39 +14,39 @@ import argparse
 import statistics
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from moving import REUSE, arm, picture
 from torch import Tensor, nn
 from towers import SIGLIP, Seeing, session
 
 import ttscompile
 from ttscompile import ChunkSpec, ObservationSpec, PolicySpec
 from ttscompile.artifact.load import load_artifact
-from ttscompile.artifact.tokens import ReuseRecord
 from ttscompile.capture.export import capture
 from ttscompile.frontends.clip import ClipVision, VisionConfig
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.multi_task_dit import DiffusionTransformer, DiTConfig
 from ttscompile.frontends.siglip import Siglip
 from ttscompile.ir.graph import backward_slice
-from ttscompile.ir.pieces import INDEX, PIXELS
+from ttscompile.ir.pieces import INDEX, PIXELS, renewed_name
 from ttscompile.ir.tokens import find_tokens
 from ttscompile.lower.precision import LEAST_ROWS, quantize_model
 from ttscompile.lower.program import lower_graph
 from ttscompile.passes.clean_up import clean_graph
 from ttscompile.passes.reuse_tokens import for_tokens
 from ttscompile.runtimes.load import open_policy
+from ttscompile.runtimes.onnxruntime.sessions import Bound
 from ttscompile.runtimes.tokens import sizes_of
 from ttscompile.samplers.flow import flow_matching_table
 
 Array = npt.NDArray[np.float32]
 
 ACTIONS, HORIZON, STEPS, WIDTH = 4, 8, 4, 768
-THRESHOLD = 0.02
 TOWERS = {"clip": ("CLIP B/16, 224 x 224", 224), "siglip": ("SigLIP of SmolVLA, 512 x 512", 512)}
 
 
@@ -77,30 +77,16 @@ def compiled(name: str, precision: str, folder: Path) -> None:
     ttscompile.compile_denoiser(EncodedDenoiser(Eye(name, size), network).eval(), spec, folder, precision=precision)
 
 
-def arm(still: Array, angle: float) -> Array:
-    """The picture with an arm of two links in front of it, a tenth of it wide."""
-    size = still.shape[-1]
-    y, x = np.mgrid[:size, :size] / size
-    image, foot, turn = still.copy(), np.array([0.95, 0.5]), -np.pi / 2 + angle
-    for length in (0.4, 0.35):
-        way = length * np.array([np.sin(turn), np.cos(turn)])
-        along = np.clip(((y - foot[0]) * way[0] + (x - foot[1]) * way[1]) / length**2, 0, 1)
-        near = (y - foot[0] - along * way[0]) ** 2 + (x - foot[1] - along * way[1]) ** 2 < 0.05**2
-        image[:, near] = 0.9
-        foot, turn = foot + way, turn + 1.5 * angle
-    return image
-
-
 def measure(name: str, precision: str, rounds: int) -> str:
     """One row of the table."""
     title, size = TOWERS[name]
     with tempfile.TemporaryDirectory() as folder:
         compiled(name, precision, Path(folder))
         artifact = load_artifact(folder)
-        reusing = artifact.with_reuse(ReuseRecord(THRESHOLD, 10**6, 1.0, 0.0, 0.0, 1))
+        reusing = artifact.with_reuse(REUSE)
         policies = [open_policy(each, seed=0) for each in (artifact, reusing, reusing)]
     rng = np.random.default_rng(0)
-    still = rng.random((3, 8, 8)).repeat(size // 8, 1).repeat(size // 8, 2).astype(np.float32)
+    still = picture(size, rng)
     times: list[list[float]] = [[], [], []]
     shares, off = list[float](), list[float]()
     noise = ttscompile.Noise(rng.standard_normal((1, HORIZON, ACTIONS), dtype=np.float32))
@@ -122,8 +108,8 @@ def measure(name: str, precision: str, rounds: int) -> str:
     return f"| {title}, {precision} | {' | '.join(figures)} | {shaking / whole:.2f} | {statistics.mean(off):.2g} |"
 
 
-def alone(name: str, rounds: int) -> list[str]:
-    """The rows of one encoder alone, in fp32 and in eight bits."""
+def alone(name: str, precisions: Sequence[str], rounds: int) -> list[str]:
+    """The rows of one encoder alone."""
     title, size = TOWERS[name]
     spec = PolicySpec(
         (4, 2), {"image": ObservationSpec((3, size, size), window=False)}, flow_matching_table(1), ChunkSpec(2, 0, 4)
@@ -139,8 +125,10 @@ def alone(name: str, rounds: int) -> list[str]:
     rng = np.random.default_rng(0)
     feed = {name: rng.standard_normal(type_.at(1), dtype=np.float32) for name, type_ in part.inputs.items()}
     image = {"image": feed[PIXELS]}
+    kept = {renewed_name(name): array for name, array in feed.items() if name not in (PIXELS, INDEX)}
+    given = {name: np.zeros(part.types()[name].at(1), np.float32) for name in tower.outputs} | kept
     rows = []
-    for precision in ("fp32", "int8"):
+    for precision in precisions:
         models, more = [lower_graph(tower, "whole"), lower_graph(part, "tokens")], dict[str, Array]()
         if precision == "int8":
             models[0], _ = quantize_model(models[0], weights, LEAST_ROWS)
@@ -149,10 +137,11 @@ def alone(name: str, rounds: int) -> list[str]:
         times: dict[int, list[float]] = {
             count: [] for count in (0, stream.tokens, *reversed(sizes_of(stream.tokens)[:-1]))
         }
+        bound = {count: Bound(some, {**feed, INDEX: np.arange(count)}, given) for count in times if count}
         for _ in range(rounds + 1):  # the first does not count
             for count, own in times.items():
                 start = time.process_time()
-                some.run(None, {**feed, INDEX: np.arange(count)}) if count else whole.run(None, image)
+                bound[count].run() if count else whole.run(None, image)
                 own.append(1000 * (time.process_time() - start))
         figures = (f"{statistics.median(own[1:]):.0f}" for own in times.values())
         rows.append(f"| {title}, {precision} | {' | '.join(figures)} |")
@@ -172,7 +161,7 @@ def main() -> None:
         print("| ms | the encoder as it is | all tokens | half | a quarter | an eighth |")
         print("| --- | --- | --- | --- | --- | --- |")
         for name in options.only.split(","):
-            print("\n".join(alone(name, options.rounds)), flush=True)
+            print("\n".join(alone(name, options.precision.split(","), options.rounds)), flush=True)
         return
     print("| | Whole, ms | Arm moves, ms | Tokens computed | Times faster | All moves / whole | Actions off |")
     print("| --- | --- | --- | --- | --- | --- | --- |")

@@ -20,7 +20,7 @@ from ttscompile.runtimes.liveness import readable_rollout
 from ttscompile.runtimes.tokens import token_towers
 
 from .decode import decode_first, decode_rest
-from .sessions import open_blocks, open_sessions, run_piece
+from .sessions import open_blocks, open_sessions, renew_piece, run_piece
 from .workspace import Workspace
 
 
@@ -52,6 +52,7 @@ class OnnxBackend:
         self._blocks = self._pruned or any(one.partial for one in self._schedules)  # whether these have sessions
         self.sessions = open_sessions(artifact, threads, self._blocks)
         self._run = partial(run_piece, self.sessions, self._manifest.pieces)  # which does not keep the backend alive
+        self._renew = partial(renew_piece, self.sessions, self._manifest.pieces)
         self.frames = self._open_frames()
         self.keeps = readable_rollout(artifact)
         self.workspace: Workspace | None = self._open_workspace(1)
@@ -101,7 +102,7 @@ class OnnxBackend:
 
     def _open_frames(self) -> FramePieces:
         """Frame pieces that remember nothing yet."""
-        return FramePieces(self._manifest.pieces, self._run, token_towers(self._manifest, self._run))
+        return FramePieces(self._manifest.pieces, self._run, token_towers(self._manifest, self._run, self._renew))
 
     @property
     def _work(self) -> Workspace:

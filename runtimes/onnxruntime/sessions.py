@@ -45,6 +45,7 @@ from ttscompile.ir.pieces import (
     STREAM,
     block_name,
     of_tokens,
+    renewed_name,
 )
 from ttscompile.measure.machine import has_integer_dot_product
 
@@ -307,6 +308,37 @@ def run_piece(
         ArtifactError: the graph does not do what the manifest says.
     """
     return tuple(run_named(sessions[name], pieces[name].outputs, inputs).values())
+
+
+def renew_piece(
+    sessions: Mapping[str, Any],
+    pieces: Mapping[str, PieceRecord],
+    name: str,
+    inputs: Mapping[str, Array],
+    kept: Mapping[str, Array],
+) -> tuple[Array, ...]:
+    """Run a piece for some tokens: what is kept gets its new rows where it is. Its other outputs, in order.
+
+    A ScatterND whose output is bound to the memory that it reads writes the new rows and nothing else.
+
+    Raises:
+        ArtifactError: the graph does not do what the manifest says. What is kept may have some of the new rows.
+    """
+    into = {renewed_name(key): array for key, array in kept.items()}
+    given, made = {**inputs, **kept}, [output for output in pieces[name].outputs if output not in into]
+    assert all(array.flags.c_contiguous for array in given.values())
+    binding = sessions[name].io_binding()
+    try:
+        for key, array in given.items():
+            binding.bind_input(key, "cpu", 0, array.dtype.type, array.shape, array.ctypes.data)
+        for output in made:
+            binding.bind_output(output, "cpu")
+        for output, array in into.items():
+            binding.bind_output(output, "cpu", 0, array.dtype.type, array.shape, array.ctypes.data)
+        sessions[name].run_with_iobinding(binding)
+    except Exception as error:  # onnxruntime's own classes, and what it raises itself
+        raise _failed(error) from error
+    return tuple(value.numpy() for value in binding.get_outputs()[: len(made)])
 
 
 def _failed(error: Exception) -> ArtifactError:

@@ -14,6 +14,7 @@ import torch
 
 import ttscompile
 from tests.once import Once
+from ttscompile.artifact.load import load_artifact
 from ttscompile.core.spec import Noise
 from ttscompile.errors import CheckpointError, ObservationError
 from ttscompile.frontends import load_checkpoint_policy
@@ -76,6 +77,13 @@ def test_two_instructions(compiled: Path, golden: Mapping[str, Array], runtime: 
         given = arrays(golden, call)
         found = policy.predict_action_chunk(observed(given), noise=Noise(given["noise"]), plan="dense")
         assert np.abs(found - golden[f"call{call}.action"]).max() < 1e-4
+
+
+def test_tokens_of_both_cameras_may_be_reused(compiled: Path) -> None:
+    """SigLIP and the connector behind it are one piece, whose tokens are found."""
+    manifest = load_artifact(compiled).manifest
+    assert {name: (one.tokens, one.fixed) for name, one in manifest.tokens.items()} == {"frame_00": (64, 0)}
+    assert set(CAMERAS) <= set(manifest.pieces["frames"].inputs)
 
 
 def test_images_of_another_size_in_the_same_artifact(

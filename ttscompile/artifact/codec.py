@@ -24,6 +24,7 @@ from ..ir.pieces import (
     of_tokens,
     part_of,
     pixels_name,
+    renewed_name,
     tokens_name,
 )
 from . import typed_json
@@ -186,7 +187,8 @@ def _check_tokens(manifest: Manifest, fields: Mapping[str, Value]) -> None:
         rows = [kind.at(1)[:1] for kind in record.kept.values()]
         fits = pixels.inputs == frame.inputs and pixels.outputs == (PIXELS,) and 0 <= record.fixed < record.tokens
         fits = fits and sorted(part.inputs) == sorted((PIXELS, INDEX, *record.kept))
-        if not fits or len(part.outputs) != len(frame.outputs) + len(rows) or set(rows) != {(record.tokens,)}:
+        renewed = tuple(map(renewed_name, record.kept))
+        if not fits or part.outputs[len(frame.outputs) :] != renewed or set(rows) != {(record.tokens,)}:
             fields["tokens"].members()[name].fail("what the pieces of its tokens read and give")
     if manifest.reuse is not None and not manifest.tokens:
         fields["reuse"].fail("none, because no frame piece has tokens")

@@ -17,7 +17,8 @@ class TokensRecord:
         tokens: T.
         fixed: how many tokens, the first ones, are of no patch.
         patch: height and width of a patch in pixels; the other tokens are of the patches, row by row.
-        kept: type ``[T, ...]`` of each array that is kept, by the input of ``tokens_00`` that reads it.
+        kept: type ``[T, ...]`` of each array that is kept, by the input of ``tokens_00`` that reads it. The last
+            outputs of ``tokens_00`` are the same arrays with new rows, in this order.
     """
 
     tokens: Positive

@@ -72,6 +72,11 @@ PIXELS, INDEX = "tokens.pixels", "tokens.index"
 captured value has a dot in its name."""
 
 
+def renewed_name(kept: str) -> str:
+    """What a piece for some tokens gives for something that is kept: all of it, with new rows for these tokens."""
+    return f"{kept}.new"
+
+
 def pixels_name(index: int) -> str:
     """``pixels_00``: the row of a frame piece to what its patches are cut from."""
     return f"{_PIXELS}{index:02d}"

@@ -69,10 +69,13 @@ def find_tokens(tower: Graph, weights: Weights) -> TokenStream | str:
     if len(placed) < LEAST_TOKENS:
         return f"%{entry} has {len(placed)} tokens, fewer than {LEAST_TOKENS}"
     stream = TokenStream(pixels, entry, len(placed), fixed, _axes(tower, entry, len(placed)))
-    total = graph_flops(tower)
-    whole = total - sum(node_flops(node, types) for node in tower.nodes if node.name in stream.axes)
-    if whole > MOST_WHOLE * total:
-        where = next(n for n in tower.nodes if n.name not in stream.axes and stream.axes.keys() & set(n.refs()))
+    total, behind = graph_flops(tower), _reached(tower, {entry})
+    whole = [node for node in tower.nodes if node.name not in stream.axes]
+    cutting = sum(node_flops(node, types) for node in whole if node.name not in behind)
+    if cutting > MOST_WHOLE * total:
+        return f"cutting patches, up to %{entry}, is {cutting / total:.0%} of its FLOPs"
+    if sum(node_flops(node, types) for node in whole) > MOST_WHOLE * total:
+        where = next(node for node in whole if stream.axes.keys() & set(node.refs()))
         return f"at %{where.name} ({where.op}) tokens come together otherwise than by attention"
     return stream
 

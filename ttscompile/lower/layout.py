@@ -225,17 +225,21 @@ class _Sinker:
         wanted = sorted((c for c in chunks if c[0] in target), key=lambda c: target.index(c[0]))
         name = view.base
         if chunks != wanted:
-            name = self.write_reshape(name, tuple(product(a.size for a in c) or 1 for c in chunks))
+            left = [c for c in chunks if c[0] in target]
+            axes = tuple(left.index(c) for c in wanted)
+            moves = axes != tuple(range(len(axes)))
+            ones = max(map(_leading_ones, (self.types[name].shape, shape))) if moves else 0
+            name = self.write_reshape(name, (*[1] * ones, *(product(a.size for a in c) or 1 for c in chunks)))
             for atom, index in view.picks:
-                axis = next(i for i, c in enumerate(chunks) if c[0] == atom)
-                chunks.pop(axis)
-                sizes = self.types[name].shape
+                place = next(i for i, c in enumerate(chunks) if c[0] == atom)
+                chunks.pop(place)
+                sizes, axis = self.types[name].shape, ones + place
                 type_ = replace(self.types[name], shape=sizes[:axis] + sizes[axis + 1 :])
                 name = self.write("aten.select.int", (Ref(name), axis, index), type_)
-            axes = tuple(chunks.index(c) for c in wanted)
-            if axes != tuple(range(len(axes))):
-                type_ = replace(self.types[name], shape=tuple(self.types[name].shape[a] for a in axes))
-                name = self.write("aten.permute.default", (Ref(name), axes), type_)
+            if moves:
+                order = (*range(ones), *(ones + axis for axis in axes))
+                type_ = replace(self.types[name], shape=tuple(self.types[name].shape[a] for a in order))
+                name = self.write("aten.permute.default", (Ref(name), order), type_)
         return self.write_reshape(name, shape)
 
     def write_reshape(self, name: str, shape: tuple[Size, ...]) -> str:
@@ -257,6 +261,11 @@ class _Sinker:
             self.nodes.append(Node(name, op, args, kwargs, (type_,), self.source))
             self.written[key] = name
         return self.written[key]
+
+
+def _leading_ones(shape: Sequence[Size]) -> int:
+    """Axes of size 1 before all others. They stay in a permutation: so a batch of one moves its heads as others do."""
+    return next((axis for axis, size in enumerate(shape) if size != 1), len(shape))
 
 
 def product(sizes: Iterable[Size]) -> Size | None:

@@ -1,0 +1,141 @@
+"""Calls of a large policy, timed for ``large.py``: PyTorch and compiled, and with tokens reused where an arm moves.
+
+Seconds are the processor's: all calls are on one thread, and the machine may be busy. Contestants take turns.
+"""
+
+from __future__ import annotations
+
+import resource
+import statistics
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import torch
+from large_smolvla import call
+from moving import REUSE, arm, picture
+
+import ttscompile
+from ttscompile import Noise, PolicySpec
+from ttscompile.artifact.load import load_artifact
+from ttscompile.runtimes.info import PolicyInfo
+from ttscompile.runtimes.load import open_policy
+from ttscompile.runtimes.policy import CompiledPolicy
+
+Times: TypeAlias = dict[str, list[list[float]]]
+"""By contestant, of each call the seconds of its parts."""
+
+
+def compare(
+    folder: Path,
+    parts: str,
+    eager: Callable[[], tuple[np.ndarray, list[float]]],
+    spec: PolicySpec,
+    computed: int,
+    rounds: int = 5,
+) -> None:
+    """One call after the other, in turn: eager, dense and with few computed steps, in fp32 and in int8.
+
+    Seconds are the processor's: all calls are on one thread, and the machine may be busy.
+
+    Args:
+        folder: with the artifact.
+        parts: what ``eager`` takes the time of.
+        eager: a call of the original.
+        spec: of the policy.
+        computed: how many steps the sparse plan computes.
+        rounds: that are counted.
+    """
+    torch.set_num_threads(1)
+    record = load_artifact(folder / "compiled").manifest.precision
+    assert record is not None and record.error is not None
+    policies = {name: ttscompile.load(folder / "compiled", precision=name) for name in ("fp32", "int8")}
+    info = policies["fp32"].info
+    obs, noise = call(spec)
+    plans = plans_of(info, computed)
+    times: Times = {}
+    for _ in range(rounds + 1):  # the first does not count
+        expected, split = eager()
+        times.setdefault(f"eager: {parts}", []).append(split)
+        for precision, policy in policies.items():
+            for name, plan in plans.items():
+                policy.forget_frames()  # every call sees the same observation
+                found = timed(policy, obs, noise, plan, times, f"{name}, {precision}")
+                if (name, precision) == ("dense", "fp32"):
+                    error = float(np.abs(found - expected).max())
+    tell(times, 1)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    print(f"{error:8.1e}  the dense call from eager; {peak:.2f} GiB at most, all of them loaded")
+    alone = ", ".join(f"{part} alone {value:.2g}" for part, value in record.parts.items() if value is not None)
+    print(f"{record.told}: dense actions {record.error.mean:.2g} from fp32; {alone};", end=" ")
+    print(f"other noise {record.error.other_noise:.2g}")
+
+
+def plans_of(info: PolicyInfo, computed: int) -> dict[str, Any]:
+    """The dense plan, and one of whole steps, evenly spaced."""
+    few = np.full((info.K, len(info.blocks)), ttscompile.Source.TIMESTEP, np.int8)
+    few[np.arange(computed) * info.K // computed] = ttscompile.Source.COMPUTE
+    return {"dense": "dense", f"{computed} of {info.K} steps": few}
+
+
+def timed(
+    policy: CompiledPolicy, obs: Mapping[str, np.ndarray], noise: Noise, plan: Any, times: Times, name: str
+) -> np.ndarray:
+    """The actions of a call; its seconds before the loop and in it go to ``times``."""
+    start = time.process_time()
+    found = policy.predict_action(obs, noise=noise, plan=plan)["action"]
+    took = time.process_time() - start
+    assert policy.last_report is not None
+    timings = policy.last_report.timings
+    before = took * timings.prologue / timings.total
+    times.setdefault(f"{name}: prologue, loop", []).append([before, took - before])
+    return np.asarray(found)
+
+
+def tell(times: Times, left_out: int) -> None:
+    """Print medians of all but the first calls."""
+    for name, rows in times.items():
+        counted = rows[left_out:]
+        medians = [statistics.median(each) for each in zip(*counted, strict=True)]
+        total = statistics.median(map(sum, counted))
+        print(f"{total:8.2f} s  {name}: {', '.join(f'{each:.2f}' for each in medians)}", flush=True)
+
+
+def reusing(folder: Path, spec: PolicySpec, computed: int, rounds: int = 7) -> None:
+    """Calls in int8 with a new frame of every camera, in which only an arm moves: all tokens, and those that changed.
+
+    Args:
+        folder: with the artifact.
+        spec: of the policy.
+        computed: how many steps the sparse plan computes.
+        rounds: that are counted, of a frame for each plan.
+    """
+    artifact = load_artifact(folder / "compiled").at_precision("int8")
+    whole, some = (open_policy(each, seed=0) for each in (artifact, artifact.with_reuse(REUSE)))
+    plans, times, rng = plans_of(whole.info, computed), Times(), np.random.default_rng(1)
+    obs, noise = call(spec)
+    other = Noise(rng.standard_normal(noise.initial.shape, dtype=np.float32))
+    cameras = [key for key, value in obs.items() if value.ndim == 5]  # [1, frames, 3, H, W]
+    still = {key: picture(obs[key].shape[-1], rng) for key in cameras}
+    shares, off, changes = list[float](), dict[str, list[float]](), dict[str, list[float]]()
+    for number in range(len(plans) * (rounds + 2)):
+        name, plan = list(plans.items())[number % len(plans)]
+        for place, (key, background) in enumerate(still.items()):
+            ages = reversed(range(obs[key].shape[1]))
+            angles = [place + 0.05 * max(number - age, 0) for age in ages]
+            obs[key] = np.stack([arm(background, angle) for angle in angles])[None]
+        expected = timed(whole, obs, noise, plan, times, f"{name}, int8, new frames, all tokens")
+        found = timed(some, obs, noise, plan, times, f"{name}, int8, new frames, some tokens")
+        if number >= 2 * len(plans):  # the first is whole, and those that follow may be the first of their size
+            frames = some.last_report.frames
+            shares.append(frames.tokens / frames.of)
+            off.setdefault(name, []).append(float(np.abs(found - expected).mean()))
+            again = whole.predict_action(obs, noise=other, plan=plan)["action"]
+            changes.setdefault(name, []).append(float(np.abs(again - expected).mean()))
+    tell(times, 2)
+    print(f"{statistics.mean(shares):8.0%}  of the tokens of a new frame are computed")
+    for name, values in off.items():
+        mean, noisy = statistics.mean(values), statistics.mean(changes[name])
+        print(f"{mean:8.2g}  {name}: actions off those with all tokens, on average; other noise {noisy:.2g}")
