@@ -6,7 +6,7 @@
 What may differ is the number of recorded ``episodes``, the ``minutes`` of calibration, or the ``seed``. A calibration
 is judged by the score of numbered seeds, as ``evaluate.py`` does it, and by how far its actions are from the dense
 policy's on what that observed in these episodes, which are the same for all. Calibrations that were finished are kept
-in ``--output``, so that an interrupted command goes on where it was.
+in ``--output``, so that an interrupted command goes on where it was, and more values can be added.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from variants import first_seed_option, open_variant, results_console, run
 
 import ttscompile
 from ttscompile.artifact.load import load_artifact
+from ttscompile.cli.output import identity_of
 from ttscompile.plots.figure import new_figure, require_picture_name, write_picture
 from ttscompile.trajectories import load_trajectories
 
@@ -77,20 +78,30 @@ def calibrated(
 
     Returns:
         The minutes that it took.
+
+    Raises:
+        UsageError: what is there is of another artifact, of other recordings, or was calibrated otherwise.
     """
+    given = {"source": identity_of(source), "recordings": [str(path.resolve()) for path in recordings], **options}
     kept = folder.with_suffix(".json")
-    if not kept.exists():
-        shutil.rmtree(folder, ignore_errors=True)
-        shutil.copytree(source, folder)
-        if over == "episodes":
-            recordings = [first_episodes(folder, recordings, int(value))]
-        elif over == "minutes":
-            options = {**options, "max_minutes": value}
-        else:
-            options = {**options, "seed": int(value)}
-        found = ttscompile.calibrate(folder, recordings, **options)
-        kept.write_text(json.dumps({"minutes": found.seconds / 60}))
-    return float(json.loads(kept.read_text())["minutes"])
+    if kept.exists():
+        record = json.loads(kept.read_text())
+        if record["given"] != given:
+            raise click.UsageError(
+                f"{folder} was calibrated from {record['given']}, not {given}: give another --output."
+            )
+        return float(record["minutes"])
+    shutil.rmtree(folder, ignore_errors=True)
+    shutil.copytree(source, folder)
+    if over == "episodes":
+        recordings = [first_episodes(folder, recordings, int(value))]
+    elif over == "minutes":
+        options = {**options, "max_minutes": value}
+    else:
+        options = {**options, "seed": int(value)}
+    minutes = ttscompile.calibrate(folder, recordings, **options).seconds / 60
+    kept.write_text(json.dumps({"minutes": minutes, "given": given}))
+    return minutes
 
 
 def first_episodes(folder: Path, recordings: Sequence[Path], count: int) -> Path:
@@ -220,8 +231,8 @@ def main(
     rows = []
     for value, folder, took, variant, one in zip(values, folders, minutes, variants[1:], found[1:], strict=True):
         error = estimate(np.nanmean(action_errors(variant, dense, seen), axis=1).tolist())
-        artifact_now = load_artifact(folder)
-        plan = artifact_now.schedule(artifact_now.manifest.default_plan)
+        compiled = load_artifact(folder)
+        plan = compiled.schedule(compiled.manifest.default_plan)
         computed = tuple(np.flatnonzero((plan == ttscompile.Source.COMPUTE).any(axis=1)).tolist())
         assert one.score_difference is not None, "the dense policy is the first"
         rows.append(Varied(value, computed, took, error, one.score, one.score_difference, one.success))

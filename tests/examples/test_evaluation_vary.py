@@ -113,6 +113,10 @@ def test_both_commands(once: Once, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert {path: path.stat().st_mtime_ns for path in stamps} == stamps, "nothing was calibrated anew"
     result = CliRunner().invoke(vary.main, [*words, "--over", "episodes=4"])
     assert (result.exit_code, "the recordings hold 3" in result.output) == (2, True)
+    result = CliRunner().invoke(vary.main, [*words, "--over", "episodes=2", "--target-sparsity", "0.25"])
+    assert (result.exit_code, "give another --output" in result.output) == (2, True), (
+        "what is kept is of another budget"
+    )
 
     told = run(drift.main, "varied/episodes-2", "--episodes", "2", "--picture", "drift.png", "--json")
     (one,) = json.loads(told)["variants"]
