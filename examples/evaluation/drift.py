@@ -2,9 +2,9 @@
 
     python examples/evaluation/drift.py DIR DIR:uniform --episodes 100 --picture drift.png
 
-Each variant drives numbered seeds. Then its calls are repeated, on what it observed and with the same noise, beside the
-dense policy of its artifact: the action error of the first call, of the second, and so on. Beside it stands the score
-after as many calls, of the variant and of the dense policy on the same seeds.
+Each variant drives numbered seeds. Then the dense policy of its artifact answers its calls, on what it observed and with
+the same noise: the difference is the action error of the first call, of the second, and so on. Beside it stands the
+score after as many calls, of the variant and of the dense policy on the same seeds.
 """
 
 from __future__ import annotations
@@ -26,7 +26,17 @@ from rich.console import Console
 from rich.progress import Progress, TaskID
 from rich.table import Table
 from rollout import Episode, action_errors, run_episodes
-from variants import Variant, first_seed_option, open_variant, results_console, run
+from variants import (
+    Variant,
+    batch_option,
+    cache_folder,
+    first_seed_option,
+    json_option,
+    open_variant,
+    picture_option,
+    results_console,
+    run,
+)
 
 from ttscompile.plots.figure import new_figure, require_picture_name, write_picture
 
@@ -56,18 +66,18 @@ class Drift:
     dense: npt.NDArray[np.float64]
 
 
-def measured(variant: Variant, dense: Variant, episodes: Sequence[Episode], exact: Sequence[Episode]) -> Drift:
+def measured(label: str, dense: Variant, episodes: Sequence[Episode], exact: Sequence[Episode]) -> Drift:
     """Errors and scores by the number of the call, of a variant's episodes and of the dense policy's."""
-    errors = action_errors(variant, dense, episodes)
+    errors = action_errors(dense, episodes)
     running = np.isfinite(errors).mean(axis=0)
     reached = int((running >= REACHED).sum())
     found = [estimate(column[np.isfinite(column)].tolist()) for column in errors.T[:reached]]
-    executed = -(-len(episodes[0].actions) // episodes[0].calls)
+    executed = max(-(-len(e.actions) // e.calls) for e in episodes)  # of all but the last call of an episode
     own, others = (
         np.mean([[e.scores[min(len(e.scores), executed * (i + 1)) - 1] for i in range(reached)] for e in some], axis=0)
         for some in (episodes, exact)
     )
-    return Drift(variant.label, found, running[:reached], own, others)
+    return Drift(label, found, running[:reached], own, others)
 
 
 def draw(found: Sequence[Drift], path: Path, title: str) -> None:
@@ -119,9 +129,9 @@ def _update(progress: Progress, task: TaskID, done: int) -> None:
 @environment_option
 @click.option("--episodes", default=100, show_default=True, type=click.IntRange(1))
 @first_seed_option
-@click.option("--batch", default=20, show_default=True, type=click.IntRange(1), help="Episodes in lockstep.")
-@click.option("--picture", type=click.Path(dir_okay=False, path_type=Path))
-@click.option("--json", "as_json", is_flag=True, help="One JSON document instead of a table.")
+@batch_option
+@picture_option
+@json_option
 def main(
     variants: tuple[str, ...],
     environment: str,
@@ -134,7 +144,7 @@ def main(
     """Compare each call of the variants with the dense one, by its number in the episode."""
     if picture is not None:
         require_picture_name(picture)
-    make, cache = environment_class(environment), Path("build", environment, "episodes")
+    make, cache = environment_class(environment), cache_folder(environment)
     seeds = range(first_seed, first_seed + episodes)
     found = list[Drift]()
     with Progress(console=Console(stderr=True)) as progress:
@@ -148,7 +158,7 @@ def main(
                 update = partial(_update, progress, task)
                 kept = Episodes(cache, environment, each, "onnxruntime")
                 rollouts.append(run_episodes(make, each, seeds, batch, update, kept).episodes)
-            found.append(measured(variant, dense, *rollouts))
+            found.append(measured(text, dense, *rollouts))
     if picture is not None:
         draw(found, picture, f"{make.title}, {episodes} paired episodes")
     if as_json:

@@ -29,8 +29,11 @@ from rollout import EpisodeCache, Rollout, run_episodes
 from score_plot import Timed, plot_scores, time_calls
 from variants import (
     Variant,
+    batch_option,
+    cache_folder,
     cache_option,
     first_seed_option,
+    json_option,
     open_variant,
     results_console,
     run,
@@ -206,7 +209,7 @@ def task_table(evaluations: Sequence[Evaluation]) -> Table:
 @environment_option
 @click.option("--episodes", default=48, show_default=True, type=click.IntRange(1))
 @first_seed_option
-@click.option("--batch", default=16, show_default=True, type=click.IntRange(1), help="Episodes in lockstep.")
+@batch_option
 @runtime_option
 @threads_option
 @cache_option
@@ -219,7 +222,7 @@ def task_table(evaluations: Sequence[Evaluation]) -> Table:
     type=click.Path(dir_okay=False, path_type=Path),
     help="Draw score against the latency of a call, which is measured after the episodes.",
 )
-@click.option("--json", "as_json", is_flag=True, help="One JSON document instead of a table.")
+@json_option
 def main(
     variants: tuple[str, ...],
     environment: str,
@@ -241,7 +244,7 @@ def main(
     if jobs > 1 and ray:
         raise click.UsageError("--jobs is for this machine, and --ray for a cluster: give one of them.")
     make = environment_class(environment)
-    cache = cache or Path("build", environment, "episodes")
+    cache = cache or cache_folder(environment)
     opened = [open_variant(text, runtime, threads) for text in variants]
     seeds = range(first_seed, first_seed + episodes)
     caches = [None if no_cache else Episodes(cache, environment, v, runtime) for v in opened]

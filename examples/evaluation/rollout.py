@@ -260,28 +260,25 @@ def run_episodes(
     )
 
 
-def action_errors(variant: Variant, reference: Variant, episodes: Sequence[Episode]) -> Array:
-    """How far two policies' actions are apart on the observations of episodes, call by call, with the episodes' noise.
+def action_errors(variant: Variant, episodes: Sequence[Episode]) -> Array:
+    """How far a policy's actions are from those of episodes, call by call, on their observations and with their noise.
 
     Args:
-        variant: a policy and its plan.
-        reference: a policy with the same steps, observations and actions, such as the dense one.
-        episodes: what is observed; each is a stream, and caches are carried from call to call.
+        variant: a policy and its plan; observations and actions are those of the policy that the episodes are of.
+        episodes: each is a stream, and caches are carried from call to call.
 
     Returns:
         ``[episodes, calls of the longest]``, mean absolute differences in the units of the actions; NaN after an end.
     """
     seeds, calls = [episode.seed for episode in episodes], [episode.calls for episode in episodes]
     errors = np.full((len(episodes), max(calls)), np.nan)
-    for each in (variant, reference):
-        each.policy.reset()
+    variant.policy.reset()
     for number in range(max(calls)):
         rows = [min(number, count - 1) for count in calls]  # one that has ended repeats its last window
         windows = stacked([{k: a[row] for k, a in e.windows.items()} for e, row in zip(episodes, rows, strict=True)])
         noise = seeded_noise(variant.noise, seeds, number)
-        made, exact = (
-            v.policy.predict_action(windows, noise=noise, plan=v.plan)["action"] for v in (variant, reference)
-        )
-        running = number < np.array(calls)
-        errors[running, number] = np.abs(made - exact).mean(axis=(1, 2))[running]
+        made = variant.policy.predict_action(windows, noise=noise, plan=variant.plan)["action"]
+        for i in np.flatnonzero(number < np.array(calls)):
+            taken = episodes[i].actions[number * made.shape[1] : (number + 1) * made.shape[1]]  # the last chunk is cut
+            errors[i, number] = np.abs(made[i, : len(taken)] - taken).mean()
     return errors

@@ -116,8 +116,18 @@ threads_option = click.option("--threads", default=2, show_default=True, type=cl
 first_seed_option = click.option(
     "--first-seed", default=100_000, show_default=True, type=click.IntRange(0), help="Seeds count up from here."
 )
+batch_option = click.option(
+    "--batch", default=16, show_default=True, type=click.IntRange(1), help="Episodes in lockstep."
+)
+picture_option = click.option("--picture", type=click.Path(dir_okay=False, path_type=Path), help="PNG, SVG or PDF.")
+json_option = click.option("--json", "as_json", is_flag=True, help="One JSON document instead of a table.")
 cache_option = click.option(
     "--cache",
     type=click.Path(file_okay=False, path_type=Path),
     help="Where episodes are kept, by what was computed, and taken from; otherwise build/ENVIRONMENT/episodes.",
 )
+
+
+def cache_folder(environment: str) -> Path:
+    """Where episodes are kept, if nothing else is said."""
+    return Path("build", environment, "episodes")

@@ -29,7 +29,16 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 from rollout import Episode, action_errors
-from variants import first_seed_option, open_variant, results_console, run
+from variants import (
+    batch_option,
+    cache_folder,
+    first_seed_option,
+    json_option,
+    open_variant,
+    picture_option,
+    results_console,
+    run,
+)
 
 import ttscompile
 from ttscompile.artifact.load import load_artifact
@@ -186,9 +195,9 @@ def parsed(text: str) -> tuple[str, list[float]]:
 @click.option("--max-minutes", default=5.0, show_default=True, help="Of each calibration.")
 @click.option("--episodes", default=200, show_default=True, type=click.IntRange(1), help="To evaluate on.")
 @first_seed_option
-@click.option("--batch", default=20, show_default=True, type=click.IntRange(1), help="Episodes in lockstep.")
-@click.option("--picture", type=click.Path(dir_okay=False, path_type=Path))
-@click.option("--json", "as_json", is_flag=True, help="One JSON document instead of a table.")
+@batch_option
+@picture_option
+@json_option
 def main(
     artifact: Path,
     trajectories: tuple[Path, ...],
@@ -216,7 +225,7 @@ def main(
     ]
     dense = open_variant(f"{artifact}:dense", "onnxruntime", 1)
     variants = [dense, *(open_variant(str(folder), "onnxruntime", 1) for folder in folders)]
-    seeds, cache = range(first_seed, first_seed + episodes), Path("build", environment, "episodes")
+    seeds, cache = range(first_seed, first_seed + episodes), cache_folder(environment)
     with Progress(console=Console(stderr=True)) as progress:
         tasks = {v.label: progress.add_task(v.label, total=episodes) for v in variants}
         found = evaluate(
@@ -230,7 +239,7 @@ def main(
     seen: Sequence[Episode] = found[0].rollout.episodes[:COMPARED]
     rows = []
     for value, folder, took, variant, one in zip(values, folders, minutes, variants[1:], found[1:], strict=True):
-        error = estimate(np.nanmean(action_errors(variant, dense, seen), axis=1).tolist())
+        error = estimate(np.nanmean(action_errors(variant, seen), axis=1).tolist())
         compiled = load_artifact(folder)
         plan = compiled.schedule(compiled.manifest.default_plan)
         computed = tuple(np.flatnonzero((plan == ttscompile.Source.COMPUTE).any(axis=1)).tolist())

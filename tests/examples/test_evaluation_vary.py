@@ -16,17 +16,26 @@ from environments.pusht import PushT
 from record import save_trajectories
 from rollout import Episode, action_errors
 from torch import Tensor, nn
-from variants import NoiseShape, Variant
+from variants import NoiseShape, Variant, seeded_noise
 
 import ttscompile
 from tests.once import Once
 from ttscompile import ChunkSpec, ObservationSpec, PolicySpec
 from ttscompile.samplers.flow import flow_matching_table
 
+SHAPE = NoiseShape(3, (4, 2), False)
 
-def episode(seed: int, calls: int) -> Episode:
+
+def episode(seed: int, calls: int, share: float = 1.0, executed: int = 8) -> Episode:
+    """Of a policy that counts by ``share``; of the last chunk so many actions were executed."""
     observed = np.full((calls, 2, 20), seed, np.float32) + np.arange(calls, dtype=np.float32)[:, None, None]
-    return Episode(seed, "", {"obs": observed}, np.zeros((8 * calls, 2)), np.linspace(0, 1, 8 * calls), True, {})
+    policy = Counting(share)
+    made = [
+        policy.predict_action({"obs": one[None]}, seeded_noise(SHAPE, [seed], i), None)["action"][0]
+        for i, one in enumerate(observed)
+    ]
+    actions = np.concatenate(made)[: 8 * (calls - 1) + executed]
+    return Episode(seed, "", {"obs": observed}, actions, np.linspace(0, 1, len(actions)), True, {})
 
 
 class Counting:
@@ -45,18 +54,17 @@ class Counting:
 
 
 def test_errors_are_of_calls_in_order_and_end_with_the_episode():
-    shape = NoiseShape(3, (4, 2), False)
-    ours, theirs = (Variant(str(share), Counting(share), None, shape) for share in (3.0, 1.0))
-    found = action_errors(ours, theirs, [episode(1, 3), episode(2, 1)])
+    ours = Variant("ours", Counting(3.0), None, SHAPE)
+    found = action_errors(ours, [episode(1, 3), episode(2, 1, executed=3)])
     np.testing.assert_allclose(found, [[2, 4, 6], [2, np.nan, np.nan]], rtol=1e-5)
-    np.testing.assert_allclose(action_errors(ours, theirs, [episode(1, 3)]), [[2, 4, 6]], rtol=1e-5)
+    np.testing.assert_allclose(action_errors(ours, [episode(1, 3)]), [[2, 4, 6]], rtol=1e-5)
+    np.testing.assert_allclose(action_errors(ours, [episode(1, 3, share=3.0)]), [[0, 0, 0]], atol=1e-5)
 
 
 def test_a_drift_keeps_what_a_tenth_of_the_episodes_reached():
-    shape = NoiseShape(3, (4, 2), False)
-    ours, theirs = (Variant(str(share), Counting(share), None, shape) for share in (3.0, 1.0))
+    dense = Variant("dense", Counting(3.0), None, SHAPE)
     episodes = [episode(1, 4), *(episode(seed, 2) for seed in range(2, 13))]
-    found = drift.measured(ours, theirs, episodes, episodes)
+    found = drift.measured("ours", dense, episodes, episodes)
     assert [one.mean for one in found.errors] == pytest.approx([2, 4]), "one of twelve goes on"
     np.testing.assert_array_equal(found.running, [1, 1])
     np.testing.assert_array_equal(found.scores, found.dense)
