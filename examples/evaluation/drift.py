@@ -2,9 +2,9 @@
 
     python examples/evaluation/drift.py DIR DIR:uniform --episodes 100 --picture drift.png
 
-Each variant drives numbered seeds. Then the dense policy of its artifact answers its calls, on what it observed and with
-the same noise: the difference is the action error of the first call, of the second, and so on. Beside it stands the
-score after as many calls, of the variant and of the dense policy on the same seeds.
+Each variant drives numbered seeds. Then the dense policy of its artifact answers its calls, on what it observed and
+with the same noise: the difference is the action error of the first call, of the second, and so on. Beside it stands
+the score after as many calls, of the variant and of the dense policy on the same seeds.
 """
 
 from __future__ import annotations
