@@ -42,6 +42,7 @@ class PolicyInfo:
         frames: how many pieces depend on one frame alone, and are remembered by its content; 0 where there are none, or
             where the runtime computes all of them in every call.
         reuses_tokens: whether of new frames only some tokens are computed, so that a call depends on the frames before.
+        warm_steps: of a policy that was loaded with ``warm``, steps of all calls but the first; None for any other.
     """
 
     K: int
@@ -61,3 +62,4 @@ class PolicyInfo:
     prefix_refusal: str | None
     frames: int = 0
     reuses_tokens: bool = False
+    warm_steps: int | None = None

@@ -16,6 +16,7 @@ from ttscompile.core.spec import FloatArray, Noise
 from ttscompile.errors import (
     IllegalPlanError,
     NonFiniteActionsError,
+    ObservationError,
     TtscompileError,
 )
 from ttscompile.measure.process import LONGEST_WAIT, Process
@@ -69,6 +70,7 @@ class CompiledPolicy:
         self._prefix_refusal = prefix_refusal(artifact.manifest.spec)
         self._rng = np.random.default_rng(check_seed(seed))
         self._report: CallReport | None = None
+        self._sample: FloatArray | None = None  # of the last call, ``[B, T, D]``, normalised
         self._queues = Queues(artifact.manifest.spec.observations)
         self._lock, self._process = threading.Lock(), Process()
         self._exit = weakref.finalize(self, _end_calls, self._lock, self._process)
@@ -130,10 +132,14 @@ class CompiledPolicy:
         """
         seed = check_seed(seed)
         with self._turn():
-            self._runtime.reset()
+            self._reset()
             self._queues.reset()
             if seed is not None:
                 self._rng = np.random.default_rng(seed)
+
+    def _reset(self) -> None:
+        self._sample = None
+        self._runtime.reset()
 
     def predict_action(
         self,
@@ -190,7 +196,7 @@ class CompiledPolicy:
             What was computed, and what was known.
 
         Raises:
-            ObservationError: a frame that does not fit.
+            ObservationError: a frame that does not fit, or of another number of streams than the episode has.
             TtscompileError: the policy is in the middle of a call.
         """
         with self._turn():
@@ -199,6 +205,7 @@ class CompiledPolicy:
             specs = self._manifest.spec.observations
             one, whole = Queues(specs), self._read(frame, others=True)[0]
             obs = one.observation(one.after(whole))  # a window that holds nothing else
+            self._runtime.require_streams(len(next(iter(obs.values()))))
             with np.errstate(all="ignore"):
                 return self._runtime.learn({key: specs[key].normalized(array) for key, array in obs.items()}, stop)
 
@@ -283,8 +290,14 @@ class CompiledPolicy:
         self, obs: Mapping[str, Array], noise: Noise | None, plan: str | npt.ArrayLike | None, prefix: Any = None
     ) -> FloatArray:
         """One call; the actions ``[B, T, Da]``, which are finite."""
-        self._report = None
+        self._report = self._sample = None
         spec = self._manifest.spec
+        if spec.start is not None and noise is None:
+            held = spec.start.told(spec.sampler.steps)
+            raise ObservationError(
+                f"this artifact holds {held}, which begin with the chunk of the call before."
+                " Load the whole loop with it: ttscompile.load(WHOLE, warm=THIS)."
+            )
         obs = check_observation(obs, spec.observations)
         streams = len(next(iter(obs.values())))
         self._runtime.require_streams(streams)
@@ -302,13 +315,14 @@ class CompiledPolicy:
             actions = spec.chunk.unnormalized(sample)
         if not np.isfinite(actions).all():
             self._runtime.reset()  # what it kept may not be finite either
+            self._queues.reset()
             bad = f"{np.count_nonzero(~np.isfinite(actions))} of {actions.size}"
             raise NonFiniteActionsError(
                 f"{bad} numbers of the actions are not finite: the arithmetic of plan {report.plan_name!r} overflowed."
                 " Look at the observation. If it is as in training, weights or plan are damaged: run 'ttscompile"
                 " verify', and try plan='dense'. The episode has ended, as by reset()."
             )
-        self._report = report
+        self._report, self._sample = report, sample
         return actions
 
     def _draw(self, streams: int) -> Noise:

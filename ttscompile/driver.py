@@ -79,6 +79,7 @@ def convert(
     encoders: str | os.PathLike[str] | None = None,
     without_cameras: Sequence[str] | None = None,
     prediction_horizon: int | None = None,
+    last_steps: int | None = None,
     precision: str = FP32,
     keep_fp32: Collection[str] = (),
     single_file: str | os.PathLike[str] | None = None,
@@ -105,6 +106,7 @@ def convert(
         without_cameras: of a vision-language-action model: names of cameras that it was trained with and that the robot
             lacks. None leaves out only those that lerobot calls empty.
         prediction_horizon: predict only the first so many steps of the policy's horizon; see ``compile_denoiser``.
+        last_steps: compile so many steps at the end of the loop alone, for ``load(warm=)``; None: the whole loop.
         precision: of the weights: ``fp32``, ``int8`` or ``auto``; see ``compile_denoiser``.
         keep_fp32: what stays in fp32 beside another precision; see ``compile_denoiser``.
         single_file: where one ONNX file of the whole call goes too, for programs without ttscompile; None for none.
@@ -122,9 +124,7 @@ def convert(
         checkpoint, base = fetched.path, {"base": fetched.origin}
         if fetched.licence is not None:
             base["base_licence"] = fetched.licence
-    options = LoadOptions(
-        sampler=sampler, steps=steps, spacing=spacing, task=task, encoders=encoders, without_cameras=without_cameras
-    )
+    options = LoadOptions(sampler, steps, spacing, task, encoders, without_cameras, last_steps)
     module, spec = load_checkpoint_policy(checkpoint, format, options)
     spec = replace(spec, source={**spec.source, **base})
     beside = files_beside(checkpoint, spec)
@@ -187,7 +187,7 @@ def _compile(
     if prediction_horizon is not None:
         prediction_horizon = integer(prediction_horizon, "prediction_horizon", SpecError, 1)
     if single_file is not None:
-        require_free_or_path(single_file, ArtifactError, "Give another path for the single file.")
+        _require_apart(single_file, directory)
     if prediction_horizon is not None or spec.left_out:
         kept = spec.sample[0] if prediction_horizon is None else prediction_horizon
         spec, changed = narrow(module, spec.original, kept)
@@ -215,6 +215,18 @@ def _compile(
         _write(Path(single_file), whole)
         explain("write_single_file", (f"{len(whole) / 1e6:.1f} MB",))
     return program
+
+
+def _require_apart(single_file: str | os.PathLike[str], directory: str | os.PathLike[str] | None) -> None:
+    """Raise unless a single file can be written there, and is no part of the artifact, which is replaced as a whole."""
+    other = "Give another path for the single file."
+    require_free_or_path(single_file, ArtifactError, other)
+    file = Path(os.path.realpath(single_file))
+    if file.is_dir():
+        raise ArtifactError(f"{single_file}: expected a file, or nothing; found a directory. {other}")
+    if directory is not None and Path(os.path.realpath(directory)) in (file, *file.parents):
+        problem = f"expected a path outside of the artifact {os.fspath(directory)}, which is replaced as a whole"
+        raise ArtifactError(f"{single_file}: {problem}. {other}")
 
 
 def _write(path: Path, content: bytes) -> None:

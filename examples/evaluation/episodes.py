@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from rollout import Episode
-from variants import Variant
+from variants import PINNED, Variant
 
 FORMAT = "2"
 """Part of every key: a changed environment or another way to draw noise needs another."""
@@ -36,8 +36,11 @@ class Episodes:
     def __init__(self, root: Path, environment: str, variant: Variant, runtime: str) -> None:
         info = variant.policy.info
         plan = variant.plan or info.default_plan
-        identity = info.model_identity if plan == "dense" and not info.reuses_tokens else info.identity
-        key = "\n".join((FORMAT, environment, identity, info.precision, plan, runtime))
+        as_converted = plan == "dense" and not info.reuses_tokens and info.warm_steps is None
+        identity = info.model_identity if as_converted else info.identity
+        key = "\n".join(
+            (FORMAT, environment, identity, info.precision, plan, runtime) + (PINNED,) * variant.noise.pinned
+        )
         self._folder = root / hashlib.sha256(key.encode()).hexdigest()[:16]
 
     def read(self, seed: int) -> Episode | None:

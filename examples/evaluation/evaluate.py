@@ -44,7 +44,6 @@ from variants import (
 from ttscompile.artifact.manifest import abbreviated
 from ttscompile.calibration.pool import RayPool
 from ttscompile.cli.options import ray_option
-from ttscompile.cli.output import identity_of
 from ttscompile.measure.machine import fingerprint, one_line
 
 TIMED_CALLS = 15
@@ -238,7 +237,10 @@ def main(
     picture: Path | None,
     as_json: bool,
 ) -> None:
-    """Compare artifacts and plans: DIR takes the artifact's own plan, DIR:dense computes everything."""
+    """Compare artifacts and plans: DIR takes the artifact's own plan, DIR:dense computes everything.
+
+    DIR+REST is ttscompile.load(DIR, warm=REST). DIR:dense:pinned gives all calls of an episode the noise of its first.
+    """
     if (jobs > 1 or ray) and no_cache:
         raise click.UsageError("--jobs and --ray hand episodes over through the cache: leave out --no-cache.")
     if jobs > 1 and ray:
@@ -262,7 +264,7 @@ def main(
         evaluations = evaluate(make, opened, seeds, batch, finished, caches)
     timed = [] if picture is None else time_calls(opened, evaluations[0].rollout.episodes[0].windows, TIMED_CALLS)
     machine = fingerprint()
-    identities = [identity_of(Path(text.partition(":")[0])) for text in variants]
+    identities = [one.policy.info.identity for one in opened]
     if picture is not None:
         plural = "s" * (threads > 1)
         title = f"{make.title}, {len(seeds)} paired episodes; {threads} thread{plural} a call\n{one_line(machine)}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
@@ -15,6 +15,9 @@ import ttscompile
 from ttscompile.cli.output import results_console as results_console
 from ttscompile.cli.output import run as run
 from ttscompile.runtimes.info import PolicyInfo
+
+PINNED = ":pinned"
+"""After a plan: the noise of an episode's first call in all of its calls."""
 
 Plan: TypeAlias = str | npt.NDArray[np.int8]
 """``dense``, the name of a plan in the artifact, or a matrix ``[K, blocks]``."""
@@ -44,11 +47,13 @@ class NoiseShape:
         steps: K.
         sample: ``(T, D)``.
         stochastic: whether the sampler draws noise at its steps.
+        pinned: whether all calls of an episode have the noise of its first.
     """
 
     steps: int
     sample: tuple[int, int]
     stochastic: bool
+    pinned: bool = False
 
 
 @dataclass(frozen=True)
@@ -78,15 +83,22 @@ def open_variant(text: str, runtime: str, threads: int) -> Variant:
 
     Args:
         text: ``DIR`` for the artifact's default plan, ``DIR:dense``, or ``DIR:NAME`` for a plan that it holds.
+            ``DIR+REST`` is ``ttscompile.load(DIR, warm=REST)``. With ``:pinned`` after the plan all calls of an episode
+            have the same noise.
         runtime: of ``ttscompile.load``.
         threads: of ``ttscompile.load``.
 
     Returns:
         The variant, its label being the text.
     """
-    directory, colon, plan = text.partition(":")
-    policy = ttscompile.load(Path(directory), runtime=runtime, threads=threads)
-    return Variant(text, policy, plan if colon else None, noise_shape(policy.info))
+    named = text.removesuffix(PINNED)
+    folders, colon, plan = named.partition(":")
+    directory, rest = folders, ""
+    if not Path(folders).exists():  # a name may have a plus in it
+        directory, _, rest = folders.partition("+")
+    policy = ttscompile.load(Path(directory), runtime=runtime, threads=threads, warm=rest or None)
+    noise = replace(noise_shape(policy.info), pinned=named != text)
+    return Variant(text, policy, plan if colon else None, noise)
 
 
 def seeded_noise(shape: NoiseShape, seeds: Sequence[int], call: int) -> ttscompile.Noise:
@@ -103,7 +115,7 @@ def seeded_noise(shape: NoiseShape, seeds: Sequence[int], call: int) -> ttscompi
     Returns:
         ``initial [N, T, D]`` and ``steps [K, N, T, D]`` (None for a deterministic sampler), float32.
     """
-    generators = [np.random.default_rng([seed, call]) for seed in seeds]
+    generators = [np.random.default_rng([seed, 0 if shape.pinned else call]) for seed in seeds]
     initial = np.stack([g.standard_normal(shape.sample, dtype=np.float32) for g in generators])
     if not shape.stochastic:
         return ttscompile.Noise(initial, None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from ttscompile.calibration.sparse_loop import SparseLoop
 from ttscompile.calibration.task import Task
 from ttscompile.calibration.trails import Trails
 from ttscompile.runtimes.reference.model import ReferenceModel
+from ttscompile.runtimes.reference.sampler import TorchSampler
 
 from .tasks import MakeTask
 
@@ -64,6 +66,19 @@ def test_calls_beside_end_where_the_fitted_correction_leads_them(task: Task, rea
             fitted = executor.select(task.calls, range(30))
             executor = executor.corrected(fit_correction(executor, plan, fitted, reads))
         torch.testing.assert_close(made.end(steps).samples, executor.run(plan, judged), rtol=1e-4, atol=1e-4)
+
+
+def test_what_is_judged_is_bounded_as_a_call_is(task: Task, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A correction can leave what the sampler has clipped; a call clips that once more."""
+    model, table = task.executor.model, task.executor.artifact.manifest.spec.sampler
+    last = np.arange(table.steps) == table.steps - 1
+    columns = {name: np.where(last, float(name == "x0_to_next"), getattr(table, name)) for name in table.COLUMNS[2:]}
+    monkeypatch.setattr(model, "sampler", TorchSampler(replace(table, clip=0.05, **columns)))
+    judged, plan = task.executor.select(task.calls, range(30, 40)), task.whole.plan((0, 2, 5))
+    correction = fit_correction(task.executor, plan, task.executor.select(task.calls, range(30)), reads=True)
+    found = trails_of(task, reads=True).end((0, 2, 5)).samples
+    assert found.abs().max() == torch.tensor(0.05)
+    torch.testing.assert_close(found, task.executor.corrected(correction).run(plan, judged), rtol=1e-4, atol=1e-4)
 
 
 def test_what_schedules_share_is_computed_once(task: Task, counted: Counted) -> None:

@@ -1,5 +1,7 @@
 """Episodes that are kept on disk."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from environments.pusht import PushT
@@ -12,7 +14,7 @@ from ttscompile import ChunkSpec, ObservationSpec
 
 class Info:
     model_identity, identity, precision, default_plan = "m" * 64, "i" * 64, "fp32", "schedule"
-    reuses_tokens = False
+    reuses_tokens, warm_steps = False, None
     observation, action = {"obs": ObservationSpec((2, 20))}, ChunkSpec(2, 1, 9)
 
 
@@ -100,6 +102,12 @@ def test_calibration_does_not_change_the_dense_policy(tmp_path):
     assert cached(tmp_path, variant("dense", identity="j" * 64)).read(7) is not None
     assert cached(tmp_path, variant("dense", model_identity="n" * 64)).read(7) is None
     assert cached(tmp_path, variant("dense", reuses_tokens=True)).read(7) is None, "it may act otherwise"
+    assert cached(tmp_path, variant("dense", warm_steps=3)).read(7) is None, "its calls begin otherwise"
+
+
+def test_pinned_noise_has_episodes_of_its_own(tmp_path):
+    cached(tmp_path, variant()).write(episode())
+    assert cached(tmp_path, replace(variant(), noise=replace(SHAPE, pinned=True))).read(7) is None
 
 
 def test_a_damaged_file_is_as_good_as_none(tmp_path):

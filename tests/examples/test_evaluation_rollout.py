@@ -1,5 +1,6 @@
 """Lockstep episodes: what the policy is given, and what is made of what it answers."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -61,6 +62,13 @@ def test_noise_differs_between_seeds_calls_and_steps():
     later = seeded_noise(SHAPE, [4, 5], call=1)
     draws = [one.initial[0], one.initial[1], later.initial[0], later.initial[1], *one.steps[:, 0], *later.steps[:, 0]]
     assert len({draw.tobytes() for draw in draws}) == len(draws)
+
+
+def test_pinned_noise_is_that_of_the_first_call():
+    pinned = replace(SHAPE, pinned=True)
+    first, later = seeded_noise(SHAPE, [4, 5], call=0), seeded_noise(pinned, [4, 5], call=3)
+    np.testing.assert_array_equal(later.initial, first.initial)
+    np.testing.assert_array_equal(later.steps, first.steps)
 
 
 def test_another_sampler_starts_from_the_same_noise():

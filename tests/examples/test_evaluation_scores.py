@@ -88,3 +88,6 @@ def test_processes_fill_the_cache_with_the_episodes_of_one(compiled_pusht, tmp_p
     told.clear()
     fill()
     assert told == [(text, 2)]
+    pinned = open_variant(f"{text}:pinned", "onnxruntime", 1)
+    assert (pinned.plan, pinned.noise.pinned) == ("one", True)
+    assert not open_variant(text, "onnxruntime", 1).noise.pinned

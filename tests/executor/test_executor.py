@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import ttscompile
+from ttscompile.core.spec import Affine, ObservationSpec
 from ttscompile.errors import (
     DeadlineMissedError,
     ExecutorClosedError,
@@ -23,7 +24,9 @@ from ttscompile.errors import (
     TtscompileError,
     WorkerDeadError,
 )
+from ttscompile.runtimes.arrays import check_observation
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings, GuardLimits, settings
+from ttscompile.runtimes.executor.measure import some_observation
 
 from .simulation import REAL_LIMIT, TA, FakeClock, ScriptedPolicy, World
 
@@ -246,6 +249,19 @@ def test_latencies_are_measured_if_they_are_not_given_and_warm_up_does_not_count
     assert policy.resets[0] is None  # before measuring; the reset after it comes with the first episode
 
 
+def test_latencies_are_measured_with_what_the_policy_takes() -> None:
+    """Zeros would be no token, and a mask that leaves nothing: what attends to nothing gives no numbers."""
+    specs = {
+        "task": ObservationSpec((3,), dtype="int64", window=False, bounds=(1.0, 5.0)),
+        "mask": ObservationSpec((8,), dtype="bool", window=False, bounds=(0.0, 1.0)),
+        "image": ObservationSpec((2, 3, 4, 4), bounds=(0.5, 1.0)),
+        "obs": ObservationSpec((2, 3), Affine(np.full(3, 2.0), np.full(3, -1.0))),
+    }
+    made = check_observation(some_observation(specs), specs)
+    assert made["mask"].any()
+    assert all((made[key] == again).all() for key, again in some_observation(specs).items())
+
+
 def test_a_closed_executor_says_so() -> None:
     with World() as world:
         world.begin()
@@ -279,7 +295,8 @@ def test_the_guard_refuses_and_the_loop_goes_on_with_what_it_has() -> None:
         ({"rate_tolerance": 0.5}, "rate_tolerance must be between"),
         ({"seam": "glue"}, "seam must be one of"),
         ({"interpolation": "cubic"}, "interpolation must be one of"),
-        ({"tiers": ()}, "tiers must be names"),
+        ({"tiers": ()}, "tiers must be a tuple of names"),
+        ({"tiers": "fast"}, "each once; found 'fast'"),
         ({"tiers": ("a", "a")}, "each once"),
     ],
 )

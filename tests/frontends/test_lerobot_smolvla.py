@@ -15,6 +15,7 @@ import torch
 import ttscompile
 from tests.once import Once
 from ttscompile.artifact.load import load_artifact
+from ttscompile.cli.timing import original_policy
 from ttscompile.core.spec import Noise
 from ttscompile.errors import CheckpointError, ObservationError
 from ttscompile.frontends import load_checkpoint_policy
@@ -145,6 +146,17 @@ def test_a_camera_that_the_robot_lacks(
     found = eager(directory, given, observed(given), without)
     assert np.abs(found - others["missing"]).max() < 1e-4
     assert np.abs(found - golden["call0.action"]).max() > 0.01
+
+
+def test_a_rival_is_the_original_without_the_same_camera(directory: Path) -> None:
+    _, spec = load_checkpoint_policy(directory, options=LoadOptions(task="push", without_cameras=[CAMERAS[1]]))
+    module, original = original_policy(directory, spec)
+    assert set(original.observations) == {CAMERAS[0], STATE}
+    assert original.source == spec.source
+    drawn = {key: each.draw(np.random.default_rng(0)) for key, each in original.observations.items()}
+    noise = Noise(np.zeros((1, *original.sample), np.float32))
+    obs = {key: torch.from_numpy(original.observations[key].normalized(value)) for key, value in drawn.items()}
+    assert np.isfinite(np.asarray(eager_policy(module, original)(obs, noise))).all()
 
 
 def test_what_a_configuration_leaves_out_is_lerobots_default(directory: Path, tmp_path: Path) -> None:

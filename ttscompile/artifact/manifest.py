@@ -20,7 +20,7 @@ from ..ir.program import Binding
 from .tokens import ReuseRecord, TokensRecord
 
 FORMAT = "ttscompile artifact"
-SCHEMA_VERSION = 9
+SCHEMA_VERSION = 10
 MANIFEST = "manifest.json"
 DENSE = "dense"
 """The plan that computes every cell; every artifact has it without listing it."""

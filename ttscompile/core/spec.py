@@ -16,6 +16,7 @@ import numpy.typing as npt
 from ..errors import SpecError
 from .given import integer, listed, numbers
 from .rules import DType, Positive
+from .start import Start
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -24,6 +25,9 @@ PRECISIONS = (FP32, INT8)
 """Names of what an artifact can hold its weights in."""
 AUTO = "auto"
 """In place of a precision: int8 in the parts that it changes little, as measured in actions."""
+
+WITHOUT = "without"
+"""In ``PolicySpec.source``: the cameras of the checkpoint that were left out, with commas between."""
 
 LARGEST = 1e6
 """No number that goes into the network, normalised, is larger, either way; what is cannot be from training. A range
@@ -159,6 +163,15 @@ class SamplerTable:
     def steps(self) -> int:
         """K, the number of denoising steps."""
         return len(self.timesteps)
+
+    @property
+    def bound(self) -> float | None:
+        """What no number of the denoised sample exceeds, either way; None if there is nothing that would see to that.
+
+        It is ``clip`` where the last step gives the clipped x0 and nothing beside.
+        """
+        beside = (self.sample_to_next[-1], self.out_to_next[-1], self.noise_to_next[-1], *self.memory_to_next[-1])
+        return self.clip if self.x0_to_next[-1] == 1 and not any(beside) else None
 
     @property
     def stochastic(self) -> bool:
@@ -314,6 +327,7 @@ class PolicySpec:
         source: what this was compiled from, for people: format and variant, no path.
         left_out: steps that the original predicts after the last one of the sample (``ttscompile.capture.narrow``).
         instruction: of a policy that is told its task in words, which a text alone gives; None for all others.
+        start: of a loop that is the rest of a longer one (``samplers.rest``); None of a whole one.
     """
 
     sample: tuple[Positive, Positive]
@@ -325,6 +339,7 @@ class PolicySpec:
     source: Mapping[str, str] = field(default_factory=dict)
     left_out: int = 0
     instruction: Instruction | None = None
+    start: Start | None = None
 
     def __post_init__(self) -> None:
         sizes = tuple(integer(n, "a size in the sample's shape", SpecError, 1) for n in self.sample)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ..errors import NonFiniteActionsError, TtscompileError
 from .finding import Finding, Level
@@ -62,7 +62,10 @@ def _needs(artifact: Artifact) -> list[Finding]:
     remedy = f"{(available or 0) / 2**20:.0f} MiB are available: free some, or raise the limit of the control group."
     short = available is not None and needed > available
     found.append(Finding.judged(PART, "memory", told, short, remedy, Level.PROBLEM))
-    if manifest.calibration is None or manifest.default_plan == "dense":
+    if manifest.spec.start is not None:
+        told = f"dense: {manifest.spec.start.told(manifest.steps)}, for ttscompile.load(WHOLE, warm=THIS)"
+        found.append(Finding(PART, "plan", told))
+    elif manifest.calibration is None or manifest.default_plan == "dense":
         remedy = "It computes everything, in many times the time. Run: ttscompile calibrate DIR --trajectories FILE."
         found.append(Finding(PART, "plan", "dense: not calibrated", Level.WARNING, remedy))
     else:
@@ -72,18 +75,18 @@ def _needs(artifact: Artifact) -> list[Finding]:
 
 
 def _call(artifact: Artifact) -> list[Finding]:
-    """Calls on an observation that the normaliser maps to 0."""
-    from ..runtimes.executor.measure import neutral_observation
+    """Calls on a random observation."""
     from ..runtimes.open import open_runtime
     from ..runtimes.policy import CompiledPolicy
+    from ..runtimes.random_calls import random_call
 
     try:
         policy = CompiledPolicy(artifact, open_runtime(artifact), seed=0)
-        obs: dict[str, Any] = neutral_observation(dict(policy.info.observation))
+        obs, noise = random_call(artifact.manifest.spec, 0, 0)
         times = []
         for _ in range(CALLS):
             policy.forget_frames()
-            policy.predict_action(obs)
+            policy.predict_action(obs, noise=noise)
             report = policy.last_report
             assert report is not None  # a call was made
             times.append(report.timings.total)

@@ -7,14 +7,14 @@ list formats and samplers, and say what is wrong with a path or an option, befor
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from ..core.given import integer
-from ..core.spec import PolicySpec
+from ..core.spec import WITHOUT, PolicySpec
 from ..errors import CheckpointError, SpecError
 from ..samplers.flow import METHODS
 from .refusals import refuse_directory
@@ -43,6 +43,7 @@ class LoadOptions:
     task: str | None = None
     encoders: str | os.PathLike[str] | None = None
     without_cameras: Sequence[str] | None = None
+    last_steps: int | None = None
 
     def __post_init__(self) -> None:
         if self.steps is not None:
@@ -50,6 +51,18 @@ class LoadOptions:
 
 
 AS_SAVED = LoadOptions()
+
+
+def as_converted(source: Mapping[str, str], encoders: str | os.PathLike[str] | None = None) -> LoadOptions:
+    """The options that decide what a policy observes, as a source tells them: its task, and cameras left out.
+
+    Args:
+        source: of the artifact.
+        encoders: the folder that ``convert`` was given, which no artifact tells.
+    """
+    without = source.get(WITHOUT)
+    cameras = without.split(", ") if without else None
+    return LoadOptions(task=source.get("task"), encoders=encoders, without_cameras=cameras)
 
 
 @dataclass(frozen=True)
@@ -111,7 +124,7 @@ FAMILIES = (
         kind="directory",
         detect=_is_lerobot,
         module="lerobot",
-        options=frozenset({"sampler", "steps", "spacing", "task", "encoders", "without_cameras"}),
+        options=frozenset({"sampler", "steps", "spacing", "task", "encoders", "without_cameras", "last_steps"}),
     ),
     Family(
         name="diffusion_policy",
@@ -121,7 +134,7 @@ FAMILIES = (
         # Every file that no other family takes: its module names what a file is that is none of its own.
         detect=lambda path: not path.is_dir(),
         module="diffusion_policy",
-        options=frozenset({"sampler", "steps", "spacing"}),
+        options=frozenset({"sampler", "steps", "spacing", "last_steps"}),
     ),
 )
 

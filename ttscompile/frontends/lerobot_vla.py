@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ..core.spec import Instruction, ObservationSpec, PolicySpec, SamplerTable
+from ..core.spec import WITHOUT, Instruction, ObservationSpec, PolicySpec, SamplerTable
 from ..errors import CheckpointError, SpecError
 from ..samplers.flow import METHODS, flow_matching_table
 from .families import LoadOptions
@@ -96,7 +96,9 @@ def vla_spec(
             TOKENS: ObservationSpec(shape, dtype="int64", window=False, bounds=(0.0, last)),
             MASK: ObservationSpec(shape, dtype="bool", window=False, bounds=(0.0, 1.0)),
         }
-    source = {"policy": str(config.settings.values["type"])} | ({} if options.task is None else {"task": options.task})
+    source = {"policy": str(config.settings.values["type"])}
+    source |= {} if options.task is None else {"task": options.task}
+    source |= {WITHOUT: ", ".join(options.without_cameras)} if options.without_cameras else {}
     spec = policy_spec(config, processors, _sampler(config.settings, options), source, language)
     observations = dict(spec.observations)
     if image is not None:

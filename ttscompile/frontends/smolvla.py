@@ -63,12 +63,6 @@ class SmolVLAConfig:
     actions: int
     periods: tuple[float, float]
 
-    @property
-    def image_tokens(self) -> int:
-        """Of one camera."""
-        height, width = (n // self.vision.patch_size for n in self.image)
-        return height * width // self.scale**2
-
 
 def expert_of(text: LanguageConfig, multiplier: float) -> LanguageConfig:
     """The expert beside a language model: narrower, with the same heads."""

@@ -1,0 +1,63 @@
+"""The rest of a denoising loop, for calls that begin with the chunk of the call before: a warm start.
+
+Falcon (arXiv 2503.00339) begins a call with earlier actions and as much noise as a step in the middle of the loop has.
+Numpy only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from ..core.given import integer
+from ..core.spec import SamplerTable
+from ..core.start import Start
+from ..errors import SpecError
+
+TOLERANCE = 1e-3
+"""Of what the shares of action and noise are known by: the table is in float32."""
+
+
+def rest_of(table: SamplerTable, last_steps: int) -> tuple[SamplerTable, Start]:
+    """The last steps of a loop, and what they begin with.
+
+    A multistep solver has no earlier predictions there: its first step takes its own in their place.
+
+    Args:
+        table: of the whole loop.
+        last_steps: how many of its steps are left, fewer than all.
+
+    Returns:
+        Their table, and how the sample before them is made of action and noise.
+
+    Raises:
+        SpecError: there are no fewer steps; or the table does not tell these shares: Runge-Kutta, an EDM, or a network
+            that predicts the action itself.
+    """
+    last_steps = integer(last_steps, "last_steps", SpecError, 1)
+    if last_steps >= table.steps:
+        raise SpecError(f"last_steps is {last_steps}; expected fewer than the {table.steps} steps of the loop.")
+    skipped = table.steps - last_steps
+    action, noise = _shares(table, skipped)
+    columns = {name: getattr(table, name)[skipped:].copy() for name in ("timesteps", *SamplerTable.COLUMNS)}
+    from_memory, to_memory = table.memory_to_next[skipped:].copy(), table.to_memory[skipped:].copy()
+    columns["x0_to_next"][0] += from_memory[0].sum()
+    to_memory[0, :, 0] += to_memory[0, :, 3:].sum(-1)
+    from_memory[0], to_memory[0, :, 3:] = 0, 0
+    rest = replace(table, **columns, memory_to_next=from_memory, to_memory=to_memory)
+    return rest, Start(skipped, action, noise)
+
+
+def _shares(table: SamplerTable, step: int) -> tuple[float, float]:
+    """Of action and of noise in the sample before a step."""
+    sample, out = float(table.sample_to_x0[step]), float(table.out_to_x0[step])
+    if table.name == "euler" and sample == 1 and 0 < abs(out) <= 1:  # x0 = x + left v; x = (1 - left) x0 + left noise
+        return 1 - abs(out), abs(out)
+    if table.name in ("ddpm", "ddim", "dpmsolver++") and sample > 0:
+        if abs(1 + out**2 - sample**2) < TOLERANCE * sample**2:  # the network predicts the noise: x0 = (x - s out) / a
+            return 1 / sample, -out / sample
+        if abs(sample**2 + out**2 - 1) < TOLERANCE:  # it predicts the velocity: x0 = a x - s out
+            return sample, -out
+    raise SpecError(
+        f"a loop of {table.name!r} does not tell what part of its sample is noise in the middle; expected ddpm, ddim,"
+        " dpmsolver++ or euler, and a network that predicts noise or velocity. Leave last_steps out."
+    )
