@@ -12,9 +12,11 @@ choosing among schedules could gain.
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +27,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.write import update_calibration
 from ttscompile.calibration.calls import (
     Actions,
     Calls,
@@ -36,10 +39,10 @@ from ttscompile.calibration.calls import (
 )
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.judge import dense_with_other_noise, uniform_of
-from ttscompile.calibration.published.paper import Paper
+from ttscompile.calibration.published.paper import UPDATES, Paper
 from ttscompile.calibration.search import search_plan
 from ttscompile.calibration.targets import REPEATS, dense_rounds
-from ttscompile.calibration.task import Clock, Search, Task
+from ttscompile.calibration.task import Clock, Found, Search, Task
 from ttscompile.calibration.tts import Tts, switched
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import PlanArray, Source
@@ -57,7 +60,7 @@ DIRECTIONS = {
     "ROLLOUT": (Source.ROLLOUT,),
     "all": (Source.FORWARD, Source.TIMESTEP, Source.ROLLOUT),
 }
-"""What a trained plan may read, beside TIMESTEP in the first call of an episode: a cell has to add something there."""
+"""What a trained plan may read; TIMESTEP is allowed to all: a cell has to add something in an episode's first call."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +81,8 @@ class Row:
         plans: how many different plans the judged calls had.
         seconds: of the search.
         updates: of the training; 0 where nothing is trained.
+        trained: error of the best head that training came to, over that of what was kept in its place, on calls that it
+            was not trained on: 1 if it was kept. None where nothing is trained.
     """
 
     decided: str
@@ -93,20 +98,21 @@ class Row:
     plans: int
     seconds: float
     updates: int = 0
+    trained: float | None = None
 
 
 Maker = Callable[[Task], Search]
 
 
-def from_corrected(task: Task) -> Search:
+def from_corrected(task: Task, updates: int) -> Search:
     """A head that departs from searched steps, trained with their correction."""
     clock = task.clock.until(0.5)
     found, _, _ = search_plan(Tts(replace(task, clock=clock)), clock)
     executor = task.executor.corrected(found.correction)
-    return Paper(replace(task, executor=executor), begin=found.notes["steps"])
+    return Paper(replace(task, executor=executor), begin=found.notes["steps"], updates=updates)
 
 
-def rows_of(directions: Sequence[str], ways: Sequence[str]) -> list[tuple[str, str, Maker]]:
+def rows_of(directions: Sequence[str], ways: Sequence[str], updates: int) -> list[tuple[str, str, Maker]]:
     """What is measured: how a plan comes about, what it reads, and the search."""
     rows: list[tuple[str, str, Maker]] = []
     if "searched" in ways:
@@ -116,11 +122,11 @@ def rows_of(directions: Sequence[str], ways: Sequence[str]) -> list[tuple[str, s
     for name in directions:
         sources = DIRECTIONS[name]
         if "gates" in ways and name != "ROLLOUT":  # a plan for all calls never computes what it would read
-            rows.append(("gates for all calls", name, lambda task, s=sources: Paper(task, s, observes=False)))
+            rows.append(("gates for all calls", name, partial(Paper, sources=sources, observes=False, updates=updates)))
         if "refined" in ways and name == "all":
-            rows.append(("head from searched steps", name, from_corrected))
+            rows.append(("head from searched steps", name, partial(from_corrected, updates=updates)))
         if "head" in ways:
-            rows.append(("head for each call", name, lambda task, s=sources: Paper(task, s)))
+            rows.append(("head for each call", name, partial(Paper, sources=sources, updates=updates)))
     return rows
 
 
@@ -185,13 +191,17 @@ def interval(errors: np.ndarray, episodes: np.ndarray) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def measured(task: Task, judge: Judge, decided: str, reads: str, maker: Maker, minutes: float) -> list[Row]:
-    """What a search finds, with and without corrections."""
+def measured(
+    task: Task, judge: Judge, decided: str, reads: str, maker: Maker, minutes: float, kept: Path | None = None
+) -> list[Row]:
+    """What a search finds, with and without corrections; ``kept`` gets it, if it is an artifact."""
     begun, clock = time.monotonic(), Clock(60 * minutes)
     found, _, _ = search_plan(maker(replace(task, clock=clock)), clock)
     plain = replace(found, correction=None, pruner_correction=None)
     corrected = found if found.correction is not None else task.corrected(found)
     seconds = time.monotonic() - begun
+    if kept is not None:
+        keep(corrected, kept)
     rows = []
     for one in (plain, corrected):
         plans, correction = one.schedule, one.correction
@@ -199,8 +209,24 @@ def measured(task: Task, judge: Judge, decided: str, reads: str, maker: Maker, m
             plans = pruner_plan(task.executor.logits(judge.calls, one.pruner))
             correction = one.pruner_correction
         row = judge.row(decided, reads, plans, correction, seconds)
-        rows.append(replace(row, updates=int(found.notes.get("updates", 0))))
+        trained = found.notes.get("trained_error")
+        share = None if trained is None else trained / found.notes["kept_error"]
+        rows.append(replace(row, updates=int(found.notes.get("updates", 0)), trained=share))
     return rows
+
+
+def keep(found: Found, directory: Path) -> None:
+    """Have the artifact in ``directory`` execute what was found, with its correction, as the plan ``found``."""
+    schedule = found.pruner is None
+    corrections = {"found": found.correction if schedule else found.pruner_correction}
+    update_calibration(
+        directory,
+        found.pruner,
+        {"found": found.schedule} if schedule else {},
+        "found",
+        {"strategy": "ablation", **found.notes},
+        corrections={name: one for name, one in corrections.items() if one is not None},
+    )
 
 
 def drawn(
@@ -223,8 +249,10 @@ def drawn(
 def show(rows: Sequence[Row], title: str) -> None:
     """Print the table."""
     table = Table(title=title)
-    for name in ("decided by", "reads", "correction", "error [95 %]", "/ other noise", "cells", "most", "plans"):
-        table.add_column(name, justify="left" if name in ("decided by", "reads") else "right")
+    for name in ("decided by", "reads"):
+        table.add_column(name)
+    for name in ("correction", "error [95 %]", "/ other noise", "cells", "most", "plans", "trained"):
+        table.add_column(name, justify="right")
     for row in rows:
         low, high = row.interval
         table.add_row(
@@ -236,6 +264,7 @@ def show(rows: Sequence[Row], title: str) -> None:
             f"{row.cells:.1f}",
             str(row.most),
             str(row.plans),
+            "" if row.trained is None else f"{row.trained:.2f}",
         )
     Console(width=140).print(table)
 
@@ -245,6 +274,7 @@ def show(rows: Sequence[Row], title: str) -> None:
 @click.option("--trajectories", multiple=True, required=True, type=click.Path(exists=True, path_type=Path))
 @click.option("--computed-steps", default=3.0, help="The budget: computed cells of a call, in whole steps.")
 @click.option("--minutes", default=2.0, help="Of each search, at most.")
+@click.option("--updates", default=UPDATES, help="Of each training, at most.")
 @click.option("--learned", default=512, help="Calls to learn from, at most.")
 @click.option("--judged", default=256, help="Held-out calls, at most.")
 @click.option("--direction", "directions", multiple=True, type=click.Choice(list(DIRECTIONS)), default=list(DIRECTIONS))
@@ -257,18 +287,21 @@ def show(rows: Sequence[Row], title: str) -> None:
 )
 @click.option("--pinned", is_flag=True, help="All calls of a window have the noise of its first.")
 @click.option("--seed", default=0)
+@click.option("--keep", "kept", type=click.Path(path_type=Path), help="Copy the artifact there, with the last plan.")
 @click.option("--json", "path", type=click.Path(path_type=Path), help="Write the rows there, too.")
 def main(
     directory: Path,
     trajectories: Sequence[Path],
     computed_steps: float,
     minutes: float,
+    updates: int,
     learned: int,
     judged: int,
     directions: Sequence[str],
     ways: Sequence[str],
     pinned: bool,
     seed: int,
+    kept: Path | None,
     path: Path | None,
 ) -> None:
     """Measure all rows on the artifact in DIRECTORY."""
@@ -287,8 +320,10 @@ def main(
     rows = [judge.row("even steps", "TIMESTEP", uniform_of(artifact.manifest, budget).schedule, None, 0.0)]
     if "refreshed" in ways:
         rows += refreshed(task, judge, uniform_of(artifact.manifest, budget).schedule)
-    for decided, reads, maker in rows_of(directions, ways):
-        rows += measured(task, judge, decided, reads, maker, minutes)
+    if kept is not None:
+        shutil.copytree(directory, kept)
+    for decided, reads, maker in rows_of(directions, ways, updates):
+        rows += measured(task, judge, decided, reads, maker, minutes, kept)
         progress.print(rows[-2], rows[-1], sep="\n")
     if path is not None:
         told: Mapping[str, Any] = {

@@ -96,7 +96,7 @@ def test_the_command_says_what_it_did(copied: Path, recording: Path) -> None:
     assert "weights of its own: 9 matrices of blocks were trained" in " ".join(done.stdout.split())
     again = CliRunner().invoke(main, ["distill", str(copied), "--trajectories", str(recording), "--plan", "other"])
     assert again.exit_code == 2
-    assert "expected a schedule that can be distilled; found 'other'" in again.stderr
+    assert "has no schedule 'other' that could be distilled. Give one of ['" in again.stderr
 
 
 def test_people_are_told_that_it_is_another_network(distilled: tuple[Path, Distilled]) -> None:
@@ -275,8 +275,8 @@ def test_in_eight_bits(once: Once, recording: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("plan", "message"),
     [
-        ("pruner", r"found 'pruner'. Give one of \['schedule', 'uniform'\]"),
-        (DISTILLED, r"found 'distilled'. Give one of \['schedule', 'uniform'\]"),
+        ("pruner", r"no schedule 'pruner' that could be distilled. Give one of \['schedule', 'uniform'\]"),
+        (DISTILLED, r"no schedule 'distilled' that could be distilled. Give one of \['schedule', 'uniform'\]"),
     ],
 )
 def test_a_plan_that_cannot_be_distilled(scheduled: Path, recording: Path, plan: str, message: str) -> None:

@@ -28,11 +28,7 @@ SIDE = cameras.SIDE
 @pytest.fixture
 def folder(once: Once, tmp_path: Path) -> Path:
     """An artifact of its own for each test."""
-
-    def make(folder: Path) -> None:
-        ttscompile.compile_denoiser(*cameras.policy("clip"), folder / "artifact", precision="int8")
-
-    return shutil.copytree(once.folder("tokens", make) / "artifact", tmp_path / "own")
+    return shutil.copytree(cameras.compiled_tokens(once) / "artifact", tmp_path / "own")
 
 
 def recorded(path: Path, shaking: float = 0.0) -> list[Path]:

@@ -8,16 +8,17 @@ import pytest
 from ablate import DIRECTIONS, interval, main, rows_of
 from click.testing import CliRunner
 
+import ttscompile
 from tests.calibration import policies
 from tests.once import Once
 from ttscompile.calibration import tts
-from ttscompile.calibration.published.paper import Paper
+from ttscompile.calibration.published.paper import UPDATES
 
 WAYS = ["searched", "switched", "gates", "head", "refined"]
 
 
 def test_every_way_and_direction_is_a_row_once() -> None:
-    rows = [(decided, reads) for decided, reads, _ in rows_of(list(DIRECTIONS), WAYS)]
+    rows = [(decided, reads) for decided, reads, _ in rows_of(list(DIRECTIONS), WAYS, UPDATES)]
     assert len(rows) == len(set(rows)) == 2 + 3 + 4 + 1  # a plan for all calls has no use for ROLLOUT
 
 
@@ -29,12 +30,12 @@ def test_an_interval_is_over_episodes() -> None:
 
 
 def test_it_runs_and_every_row_keeps_the_budget(once: Once, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Paper, "intervals", 2)
     monkeypatch.setattr(tts, "DISTANCES", (1,))
     calls, found = policies.record(tmp_path / "calls.npz", episodes=8), tmp_path / "rows.json"
-    sizes = ["--learned", "70", "--judged", "14", "--minutes", "0.02", "--pinned"]
+    sizes = ["--learned", "70", "--judged", "14", "--minutes", "0.02", "--updates", "2", "--pinned"]
     chosen = ["--way", "searched", "--way", "head", "--direction", "all"]
     arguments = [str(policies.compiled(once)), "--trajectories", str(calls), "--json", str(found)]
+    arguments += ["--keep", str(tmp_path / "kept")]
     result = CliRunner().invoke(main, [*arguments, *sizes, *chosen], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     told = json.loads(found.read_text())
@@ -44,7 +45,12 @@ def test_it_runs_and_every_row_keeps_the_budget(once: Once, tmp_path: Path, monk
         *[("searched steps", "TIMESTEP")] * 2,
         *[("head for each call", "all")] * 2,
     ]
+    assert all(0 < row["updates"] <= 2 for row in told["rows"][3:])
     for row in told["rows"]:
         assert row["cells"] <= 18
         assert row["interval"][0] - 1e-6 <= row["error"] <= row["interval"][1] + 1e-6
     assert "head for each call" in result.output
+    kept = ttscompile.load(tmp_path / "kept")
+    kept.predict_action({"obs": np.zeros((1, 2, 3), np.float32)})
+    assert kept.last_report is not None
+    assert (kept.info.default_plan, kept.last_report.computed[0] <= 18) == ("found", True)

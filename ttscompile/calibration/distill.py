@@ -197,7 +197,7 @@ def _schedule(artifact: Artifact, plan: str) -> PlanArray:
     if plan not in artifact.schedules or plan == DISTILLED:
         known = [name for name in artifact.schedules if name != DISTILLED]
         remedy = f"Give one of {known}" if known else "Calibrate the artifact first"
-        raise CalibrationError(f"{artifact.path}: expected a schedule that can be distilled; found {plan!r}. {remedy}.")
+        raise CalibrationError(f"{artifact.path}: has no schedule {plan!r} that could be distilled. {remedy}.")
     schedule = artifact.schedule(plan)
     steps = np.flatnonzero((schedule == Source.COMPUTE).all(axis=1)).tolist()
     if len(steps) < 2 or not np.array_equal(schedule, whole_steps_plan(len(schedule), schedule.shape[1], steps)):

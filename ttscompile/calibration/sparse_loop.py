@@ -202,4 +202,5 @@ class _Lane:
 
     def correct(self, weight: Tensor, added: Tensor, anchor: bool) -> None:
         """Correct the step: weights ``[G, 6 T, T]``, and what is added beside, ``[D, n, T]``."""
-        self._carried = correct(self._before, self._prediction, self._carried, weight, added, anchor)
+        carried = correct(self._before, self._prediction, self._carried, weight, added, anchor)
+        self._carried = self._executor.model.sampler.bounded(carried, self._k)

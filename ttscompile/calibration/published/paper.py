@@ -42,7 +42,7 @@ from ..pruner.switches import has_head
 from ..task import Array, Found, NothingAfter, Task
 
 UPDATES = 240
-"""At most; an update is an interval."""
+"""At most, if nothing else is said; an update is an interval."""
 
 BATCH = 16
 """Calls of an update, about: whole windows."""
@@ -59,11 +59,11 @@ FIRST = 2.0, 1.0
 APART = 1e-3
 """Deviation of the logits of COMPUTE at first: no two cells are equal."""
 
-RATE = 0.05
-"""Of what does not depend on the observation."""
+RATE = 0.005
+"""Of what does not depend on the observation, at first; it falls to 0, evenly from update to update."""
 
-RELATIVE_RATE = 0.15
-"""Of the head's other arrays, times their size at first; where that is 0, times 1."""
+RELATIVE_RATE = 0.015
+"""Of the head's other arrays, times their size at first; where that is 0, times 1. It falls likewise."""
 
 MEMORY = 0.9
 """Of the running gradient, and of its running size."""
@@ -93,9 +93,12 @@ class Paper(NothingAfter):
             episode reads TIMESTEP instead.
         observes: whether the head reads the observation. Else one plan is trained for all calls.
         begin: the steps from which it departs, within the budget; None for the best of a family, and for more at first.
+        updates: at most; None for ``UPDATES``.
 
     Attributes:
         loss: error of the best head so far on calls that it was not trained on, at the budget.
+        trained: the same without what it begins with: how far training got, whether or not that is better. Infinite
+            before the first comparison.
         plan: its plans, frozen.
     """
 
@@ -107,7 +110,10 @@ class Paper(NothingAfter):
         sources: Collection[Source] = tuple(Source),
         observes: bool = True,
         begin: Sequence[int] | None = None,
+        updates: int | None = None,
     ) -> None:
+        if updates is not None:
+            self.intervals = updates
         self._task, self._observes = task, observes and has_head(task.pruner)
         self._sources, self._begin = sources, begin
         practised, compared = _divided(task)
@@ -122,8 +128,9 @@ class Paper(NothingAfter):
         self._rates[BASE] = RATE
         self._mean = {name: np.zeros_like(value) for name, value in self._values.items()}
         self._size = dict.fromkeys(self._values, 0.0)
-        self._best = dict(self._values)
+        self._best, self._interval = dict(self._values), 0
         self.plan, self.loss = whole_steps_plan(model.steps, model.blocks, [0]), float("nan")
+        self.trained = float("inf")
 
     def advance(self, interval: int) -> None:
         """One update; after every few of them, and after the last, the head is held against the best."""
@@ -146,6 +153,7 @@ class Paper(NothingAfter):
     def state(self) -> dict[str, Array]:
         """The head as it is and at its best, and what the optimiser remembers."""
         state = {"plan": self.plan, "loss": np.array(self.loss), "interval": np.array(self._interval)}
+        state["trained"] = np.array(self.trained)
         for name, value in self._values.items():
             state |= {f"now/{name}": value, f"mean/{name}": self._mean[name], f"best/{name}": self._best[name]}
             state[f"size/{name}"] = np.array(self._size[name])
@@ -155,6 +163,7 @@ class Paper(NothingAfter):
         """Go back to where ``state`` was taken."""
         self.plan = np.array(state["plan"], np.int8)
         self.loss, self._interval = float(state["loss"]), int(state["interval"])
+        self.trained = float(state["trained"])
         for name in self._values:
             self._values[name], self._mean[name] = np.array(state[f"now/{name}"]), np.array(state[f"mean/{name}"])
             self._best[name], self._size[name] = np.array(state[f"best/{name}"]), float(state[f"size/{name}"])
@@ -166,6 +175,8 @@ class Paper(NothingAfter):
         executed = legal(plans, self._compared.window)
         notes = {
             "updates": self._interval,
+            "trained_error": self.trained if np.isfinite(self.trained) else None,
+            "kept_error": self.loss,
             "computed_cells": {"mean": float(computed.mean()), "most": int(computed.max())},
             "sources": {source.name: int((executed == source).sum()) for source in Source},
         }
@@ -231,13 +242,16 @@ class Paper(NothingAfter):
             self._mean[name] = MEMORY * self._mean[name] + (1 - MEMORY) * gradient
             self._size[name] = MEMORY * self._size[name] + (1 - MEMORY) * float((gradient.astype(float) ** 2).mean())
             step = self._mean[name] / unbiased / np.sqrt(self._size[name] / unbiased + 1e-30)
-            self._values[name] = (self._values[name] - self._rates[name] * step).astype(np.float32)
+            rate = self._rates[name] * (1 - interval / self.intervals)
+            self._values[name] = (self._values[name] - rate * step).astype(np.float32)
 
     def _compare(self) -> None:
         """Keep the head if it is better than the best one so far."""
         task, calls, values = self._task, self._compared, self._priced()
         plans = legal(pruner_plan(self._logits(values, calls).numpy()), calls.window)
         error = float(task.actions.errors(task.executor.run(plans, calls), calls.targets, units=False).mean())
+        if self._interval:
+            self.trained = min(self.trained, error)
         if not error >= self.loss:  # also if nothing was measured before
             self._best, self.loss = values, error
             self.plan = self._frozen()
