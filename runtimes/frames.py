@@ -232,10 +232,11 @@ class FramePieces:
             one = shares.astype(value.dtype).reshape(-1, *[1] * (value.ndim - 1))
             shown[key] = np.broadcast_to(one, value.shape)
         (own,) = (self._rows_of(shown)[n] for n in self._pieces[name].inputs)
-        lanes = [hashlib.sha256(row.tobytes()).digest() for row in own]
+        rows = [hashlib.sha256(row.tobytes()).digest() for row in own]
         integers = [value.dtype for value in obs.values() if value.dtype.kind in "iu"]
         if any(len(obs) * streams > np.iinfo(kind).max for kind in integers):  # they cannot hold the numbers
-            lanes = [str(i).encode() for i in range(len(own))]  # each row is a lane
+            rows = [str(i).encode() for i in range(len(own))]  # each row is a lane
+        lanes = [b"%d " % streams + row for row in rows]  # of other numbers of streams, other lanes
         self._lanes[name, streams] = lanes
         return lanes
 

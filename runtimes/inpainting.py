@@ -166,6 +166,13 @@ def known_samples(spec: PolicySpec, prefix: FloatArray, initial: FloatArray) -> 
     return Known(positions, channels, np.concatenate([noisy, prefix[None]]))
 
 
+def with_prefix(sample: FloatArray, known: Known | None) -> FloatArray:
+    """A denoised sample ``[B, T, D]`` with the committed actions as they are, written into it."""
+    if known is not None:
+        sample[:, known.positions, known.channels] = known.values[-1]
+    return sample
+
+
 def _keeps_variance(signal: npt.NDArray[np.float64], deviation: npt.NDArray[np.float64]) -> bool:
     """Whether these are the levels of a process that adds noise and keeps the variance, seen backwards."""
     one = np.abs(signal**2 + deviation**2 - 1) <= TOLERANCE

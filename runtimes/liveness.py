@@ -50,6 +50,13 @@ def readable_rollout(artifact: Artifact) -> BoolArray:
     return readable
 
 
+def reading_earlier_calls(artifact: Artifact) -> set[str]:
+    """Names of the plans that can read what an earlier call of the episode computed."""
+    reading = {name for name, schedule in artifact.schedules.items() if (schedule == Source.ROLLOUT).any()}
+    pruned = {name for name, plan in artifact.manifest.plans.items() if plan.pruned}
+    return reading | pruned if pruned and _pruner_can_read(artifact).any() else reading
+
+
 def _pruner_can_read(artifact: Artifact) -> BoolArray:
     """Cells in which the ROLLOUT logit can be the largest; every cell of a pruner that is not the head we know."""
     shape = (artifact.manifest.steps, len(artifact.manifest.blocks), len(Source))

@@ -24,6 +24,7 @@ from ttscompile.artifact.manifest import DENSE, DISTILLED
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import BoolArray, PlanArray, Source, check_plan, require_legal
 from ttscompile.core.spec import FloatArray, Noise
+from ttscompile.core.update import bounded
 from ttscompile.errors import IllegalPlanError, ObservationError
 from ttscompile.ir.pieces import PRUNER
 
@@ -31,7 +32,7 @@ from .arrays import check_noise
 from .backend import Backend, Call
 from .frames import NO_FRAMES, FramePieces, FrameWork
 from .helper import Helper
-from .inpainting import known_samples
+from .inpainting import known_samples, with_prefix
 from .report import GIVEN, CallReport, Timings
 from .settle import LoweringCache, pruner_plan, repair_plan
 
@@ -190,10 +191,10 @@ class Runtime:
             self._matrices = True
         self._used, backend = opened, opened.backend
         keep = np.ones_like(backend.keeps) if self._matrices or plan_name == DENSE else backend.keeps
+        self._end_episode()  # a call that fails ends the episode: its residuals stand beside those of earlier ones
         backend.prepare(streams, None if settled is None else settled.lowered)
 
         start = time.perf_counter()
-        self._end_episode()  # a call that fails ends the episode: its residuals stand beside those of earlier ones
         backend.start(Call(obs, noise, correction, known, keep, written))
         prologue = time.perf_counter()
         waited = 0.0
@@ -202,6 +203,8 @@ class Runtime:
         else:
             backend.first_step()
         sample = backend.other_steps(settled.lowered)
+        if correction is not None:
+            sample = with_prefix(bounded(spec.sampler, sample), known)
         stop = time.perf_counter()
         computed = settled.plans == Source.COMPUTE.value
         self._written, self._dropped = np.where(computed, keep, written), np.where(computed, ~keep, dropped)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any, Protocol
@@ -62,23 +62,20 @@ def require_prefix(policy: Policy) -> None:
         raise ExecutorError(f"{needed}; {why} Use seam='blend' or seam='replace'.")
 
 
-def neutral_observation(specs: dict[str, ObservationSpec]) -> dict[str, npt.NDArray[Any]]:
-    """An observation of one stream that the normaliser maps to 0."""
-    made: dict[str, npt.NDArray[Any]] = {}
-    for key, spec in specs.items():
-        zeros = np.zeros((1, *spec.shape), np.float32)
-        made[key] = (zeros if spec.normalizer is None else spec.normalizer.unnormalize(zeros)).astype(spec.dtype)
-    return made
+def some_observation(specs: Mapping[str, ObservationSpec]) -> dict[str, npt.NDArray[Any]]:
+    """An observation of one stream to measure with: random, and always the same. Zeros may be none: a mask, a token."""
+    rng = np.random.default_rng(0)
+    return {key: spec.draw(rng) for key, spec in specs.items()}
 
 
 def measure_latencies(
     policy: Policy, clock: Clock, settings: ExecutorSettings, plans: Sequence[str]
 ) -> dict[str, Times]:
-    """What the measured calls of each plan take on a neutral observation; with a prefix, if calls will have one.
+    """What the measured calls of each plan take on ``some_observation``; with a prefix, if calls will have one.
 
     The plans take turns. The caller resets the policy before and after.
     """
-    obs, known = neutral_observation(dict(policy.info.observation)), {}
+    obs, known = some_observation(policy.info.observation), {}
     if settings.seam == "prefix":  # one action that the normaliser maps to 0
         chunk = policy.info.action
         known["prefix"] = chunk.unnormalized(np.zeros((1, 1, chunk.action_dim), np.float32))

@@ -31,6 +31,8 @@ DTYPES = {
     for name in (dtype.name, dtype.str, dtype.str[1:])
 }
 """What a packed array may be of, by each of its names: ``uint8``, ``|u1``, ``u1``."""
+KINDS = {"b": "biu", "i": "iu", "u": "iu", "f": "iuf"}
+"""By the kind of an expected dtype: the kinds that the numbers of lists may have."""
 MOST_SECONDS = 1e15
 """Times are less than this, either way."""
 
@@ -111,11 +113,12 @@ def _array(key: str, value: Any, dtype: str) -> Array:
         return _packed(key, value)
     try:
         array = np.asarray(value)
-        if array.dtype.kind not in "iuf" or (array.dtype.kind == "f" and np.dtype(dtype).kind != "f"):
-            raise ProtocolError(f"observation {key[:40]!r} must be lists of numbers that are {dtype}.")
-        if array.dtype.kind != "f" and np.dtype(dtype).kind in "iu" and array.size:
-            limits = np.iinfo(dtype)
-            if array.min() < limits.min or array.max() > limits.max:
+        if array.dtype.kind not in KINDS[np.dtype(dtype).kind]:
+            of = "true and false" if dtype == "bool" else f"numbers that are {dtype}"
+            raise ProtocolError(f"observation {key[:40]!r} must be lists of {of}.")
+        if np.dtype(dtype).kind != "f" and array.size:
+            low, high = (0, 1) if dtype == "bool" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
+            if array.min() < low or array.max() > high:
                 raise ProtocolError(f"observation {key[:40]!r} has a number that is no {dtype}.")
         with np.errstate(over="ignore"):  # what becomes infinite is refused as that
             return array.astype(dtype)

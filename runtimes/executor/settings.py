@@ -128,8 +128,9 @@ class ExecutorSettings:
             raise ExecutorError(f"interpolation must be one of {INTERPOLATIONS}; found {self.interpolation!r}.")
         if self.seam not in SEAMS:
             raise ExecutorError(f"seam must be one of {SEAMS}; found {self.seam!r}.")
-        if self.tiers is not None and (not self.tiers or len(set(self.tiers)) < len(self.tiers)):
-            raise ExecutorError(f"tiers must be names of plans, each once; found {self.tiers}.")
+        text = isinstance(self.tiers, str)  # whose letters would be taken for names
+        if self.tiers is not None and (text or not self.tiers or len(set(self.tiers)) < len(self.tiers)):
+            raise ExecutorError(f"tiers must be a tuple of names of plans, each once; found {self.tiers!r}.")
 
 
 @dataclass(frozen=True)

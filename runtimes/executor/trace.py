@@ -11,6 +11,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from ttscompile.artifact.files import replace_file
+
 if TYPE_CHECKING:
     from ttscompile.runtimes.frames import FrameWork
     from ttscompile.runtimes.report import Timings
@@ -89,8 +91,12 @@ class Trace:
         }
 
     def write(self, path: str | Path, process: str = "ttscompile") -> None:
-        """Write the document to a file."""
-        Path(path).write_text(json.dumps(self.to_json(process), allow_nan=False))
+        """Write the document to a file, whole or not at all.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        replace_file(Path(path), json.dumps(self.to_json(process), allow_nan=False).encode())
 
 
 def _as_json(event: Event, zero: float) -> dict[str, Any]:

@@ -16,7 +16,6 @@ import numpy as np
 
 from ttscompile.artifact.load import Artifact
 from ttscompile.artifact.manifest import DENSE
-from ttscompile.core.lattice import Source
 from ttscompile.errors import (
     DeadlineMissedError,
     IllegalPlanError,
@@ -29,6 +28,7 @@ from ttscompile.runtimes.executor.lock import Lock
 from ttscompile.runtimes.executor.metrics import Metric
 from ttscompile.runtimes.executor.protocol import Request, read_arrays
 from ttscompile.runtimes.executor.window import Array
+from ttscompile.runtimes.liveness import reading_earlier_calls
 
 METHODS = {"info": frozenset[str](), "predict": frozenset({"obs", "plan"})}
 
@@ -56,7 +56,7 @@ class Plans(NamedTuple):
         Raises:
             IllegalPlanError: there is no such plan, or it reads the call before, which here is another robot's.
         """
-        reading = {name for name, plan in artifact.schedules.items() if (plan == Source.ROLLOUT).any()}
+        reading = reading_earlier_calls(artifact)
         names = tuple(name for name in dict.fromkeys((DENSE, *artifact.manifest.plans)) if name not in reading)
         found = cls(names, artifact.manifest.default_plan if default is None else default)
         return found._replace(default=found.known(found.default))

@@ -77,7 +77,12 @@ class TorchSampler:
         if condition is not None and correction.reads:
             observed = torch.tensor(correction.observed[:, k])
             bias = bias + torch.einsum("bn,nf,fdt->dbt", condition, torch.tensor(correction.reading), observed)
-        return correct(carried, prediction, uncorrected, weights, bias, bool(correction.anchors[k]))
+        return self.bounded(correct(carried, prediction, uncorrected, weights, bias, bool(correction.anchors[k])), k)
+
+    def bounded(self, corrected: Carried, k: int) -> Carried:
+        """What is carried to step k + 1, corrected: after the last step it is clipped where the sampler bounds it."""
+        bound = self._table.bound if k + 1 == self._table.steps else None
+        return corrected if bound is None else corrected._replace(sample=corrected.sample.clamp(-bound, bound))
 
 
 def features(carried: Carried, prediction: Tensor) -> Tensor:

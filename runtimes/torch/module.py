@@ -91,6 +91,7 @@ class SparseCall(nn.Module):
         self._keep("table", pieces.tables)
         correction = artifact.corrections.get(plan)
         self._advance = Advance(manifest.spec, correction, CPU)
+        self._bound = None if correction is None else manifest.spec.sampler.bound
         self._keep("advance", self._advance.tensors())
         form, _ = idle_form(pieces, artifact.weights)
         self._idle = None if form is None else IdleSteps(form, CPU)
@@ -149,8 +150,10 @@ class SparseCall(nn.Module):
         offset = offset if added is None else offset + added
         offset = nn.functional.pad(offset, (0, advance.memories * horizon))
         nothing = np.zeros(self._plan.computed.shape, np.bool_)
-        made = denoise(network, self._plan, nothing, advance, initial, offset.unbind(), {})
-        actions = made.sample[..., : spec.chunk.action_dim]
+        sample = denoise(network, self._plan, nothing, advance, initial, offset.unbind(), {}).sample
+        if self._bound is not None:
+            sample = sample.clamp(-self._bound, self._bound)
+        actions = sample[..., : spec.chunk.action_dim]
         normalizer = self._kept("actions")
         return (actions - normalizer["offset"]) / normalizer["scale"] if normalizer else actions.clone()
 

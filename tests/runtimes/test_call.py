@@ -8,7 +8,10 @@ import sys
 import textwrap
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -150,6 +153,28 @@ def test_a_prologue_that_fails_ends_the_episode(
     assert runtime.streams is None
     with pytest.raises(IllegalPlanError, match="never computed"):
         call(runtime, toy_artifact, 0, reuse)
+
+
+def test_weights_that_find_no_memory_read_nothing_of_others(
+    toy_artifact: Artifact, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A plan with weights of its own has a backend of its own, which never computed what the other's calls have."""
+    manifest: Any = replace(toy_artifact.manifest, distilled=cast("Any", object()))
+    given: Any = SimpleNamespace(manifest=manifest, schedules={}, with_weights_of=lambda plan: toy_artifact)
+    runtime, (obs, noise) = Runtime(given, OnnxBackend), random_inputs(toy_artifact, np.random.default_rng(0), 1)
+    reuse = dense_plan(5, 5)
+    reuse[1:] = Source.ROLLOUT
+    runtime.predict(obs, noise, dense_plan(5, 5), plan_name="dense")
+
+    def full(*_: object) -> None:
+        raise MemoryError
+
+    with monkeypatch.context() as patched:
+        patched.setattr(OnnxBackend, "prepare", full)
+        with pytest.raises(MemoryError):
+            runtime.predict(obs, noise, reuse * 0, plan_name="distilled")
+    with pytest.raises(IllegalPlanError, match="never computed"):
+        runtime.predict(obs, noise, reuse, plan_name="distilled")
 
 
 def test_the_interpreter_ends_with_a_runtime_open(pruned: Artifact) -> None:

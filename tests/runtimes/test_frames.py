@@ -171,6 +171,16 @@ def test_a_wrong_frame_is_refused_and_nothing_is_kept(policy: CompiledPolicy) ->
     assert done(policy) == (5, 0)
 
 
+def test_a_frame_of_another_number_of_streams_is_refused_within_an_episode(policy: CompiledPolicy) -> None:
+    two = {key: np.concatenate([value, value]) for key, value in frame(3).items()}
+    policy.prepare_frame(two)
+    act(policy, window(frame(0), frame(1)))
+    with pytest.raises(ObservationError, match=r"2 streams, and the episode under way 1. Call reset\(\)"):
+        policy.prepare_frame(two)
+    policy.reset()
+    assert policy.prepare_frame(two).computed
+
+
 def test_a_piece_that_fails_ends_the_call_and_leaves_nothing(policy: CompiledPolicy, monkeypatch: Any) -> None:
     backend: Any = policy._runtime.backend
     obs = window(frame(0), frame(1))

@@ -14,7 +14,7 @@ from ttscompile.artifact.write import update_calibration
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import IllegalPlanError
 from ttscompile.runtimes import open_runtime
-from ttscompile.runtimes.liveness import readable_rollout, rollout_needs
+from ttscompile.runtimes.liveness import readable_rollout, reading_earlier_calls, rollout_needs
 from ttscompile.runtimes.load import load
 
 from .agreement import call_terms, random_inputs
@@ -35,6 +35,7 @@ def scheduled(own_artifact: Artifact) -> Artifact:
 
 def test_schedules_say_exactly_what_they_read(scheduled: Artifact, toy_artifact: Artifact) -> None:
     assert np.argwhere(readable_rollout(scheduled)).tolist() == [[2, 1], [3, 4]]
+    assert reading_earlier_calls(scheduled) == {"reads"}
     needs = load(scheduled.path).info.rollout
     assert (needs.read, needs.bytes_read, needs.cells, needs.bytes_most) == (2, 2 * ENTRY, 25, 25 * ENTRY)
     assert rollout_needs(toy_artifact).read == 0  # its pruner is no plan of it
@@ -67,7 +68,9 @@ def test_a_pruner_is_known_by_the_bounds_of_its_logits(
     update_calibration(own_artifact.path, dict(own_artifact.pruner), {}, "tts", {})
     artifact = load_artifact(own_artifact.path)
     assert readable_rollout(artifact).all()  # the toy's own pruner is of another form
-    assert np.argwhere(readable_rollout(replace(artifact, pruner=head(**changes)))).tolist() == cells
+    changed = replace(artifact, pruner=head(**changes))
+    assert np.argwhere(readable_rollout(changed)).tolist() == cells
+    assert reading_earlier_calls(changed) == ({"tts"} if cells else set())
 
 
 def test_calls_with_the_artifacts_plans_keep_what_these_read(scheduled: Artifact) -> None:

@@ -12,7 +12,7 @@ import torch
 from ttscompile import Noise
 from ttscompile.artifact import Artifact
 from ttscompile.core.spec import ObservationSpec
-from ttscompile.errors import IllegalPlanError, ObservationError
+from ttscompile.errors import IllegalPlanError, NonFiniteActionsError, ObservationError
 from ttscompile.runtimes.arrays import check_observation, read_observation
 from ttscompile.runtimes.load import load
 from ttscompile.runtimes.policy import CompiledPolicy
@@ -220,6 +220,26 @@ def test_reset_drops_actions_and_streams(policy: CompiledPolicy) -> None:
     policy.reset()
     action = policy.select_action({"obs": np.zeros((2, 2), np.float32)}, noise=some_noise(2), plan="dense")
     assert action.shape == (2, 2) and policy.last_report is not first
+
+
+def test_an_overflow_ends_the_episode_of_the_queues_too(
+    policy: CompiledPolicy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The error says that the episode has ended, as by ``reset``: then another number of streams may come."""
+    one, two = ({"obs": np.zeros((n, 2), np.float32)} for n in (1, 2))
+    for _ in range(2):  # a chunk
+        policy.select_action(one, noise=some_noise(), plan="dense")
+    predict = policy._runtime.predict
+
+    def overflown(*given: Any, **named: Any) -> Any:
+        sample, report = predict(*given, **named)
+        return sample + np.float32(np.inf), report
+
+    with monkeypatch.context() as patched:
+        patched.setattr(policy._runtime, "predict", overflown)
+        with pytest.raises(NonFiniteActionsError, match=r"ended, as by reset\(\)"):
+            policy.select_action(one, noise=some_noise(), plan="dense")
+    assert policy.select_action(two, noise=some_noise(2), plan="dense").shape == (2, 2)
 
 
 def test_a_chunk_of_lerobots_takes_a_prefix(toy_artifact: Artifact) -> None:

@@ -36,10 +36,7 @@ REUSE = ReuseRecord(threshold=0.0, refresh=1000, computed=0.3, error=0.0, other_
 
 @pytest.fixture(scope="module")
 def compiled(once: Once) -> Path:
-    return once.folder(
-        "tokens",
-        lambda folder: ttscompile.compile_denoiser(*cameras.policy("clip"), folder / "artifact", precision="int8"),
-    )
+    return cameras.compiled_tokens(once)
 
 
 @pytest.fixture
@@ -274,10 +271,11 @@ def test_in_eight_bits(compiled: Path) -> None:
     assert counted(some) == (5, 37)
 
 
-@pytest.mark.parametrize("streams", [2, 128])
+@pytest.mark.parametrize("streams", [2, 3, 128])
 def test_cameras_share_no_lane_however_many_streams_there_are(streams: int) -> None:
     """128 streams of three cameras are more than the numbers of a picture in eight bits can tell apart."""
-    cameras_, shown = ("left", "right", "top"), np.zeros((streams, 4, 4), np.uint8)
+    kind = np.uint8 if streams == 128 else np.float32
+    cameras_, shown = ("left", "right", "top"), np.zeros((streams, 4, 4), kind)
     pieces = {
         FRAMES: PieceRecord("frames.onnx", cameras_, None, (), ("rows",)),
         "frame_00": PieceRecord("frame_00.onnx", ("rows",), None, (), ("feature",)),
@@ -290,3 +288,5 @@ def test_cameras_share_no_lane_however_many_streams_there_are(streams: int) -> N
     frames = FramePieces(pieces, run, {"frame_00": tower})
     lanes = frames._lanes_of("frame_00", dict.fromkeys(cameras_, shown))
     assert len(set(lanes)) == len(lanes) == 3 * streams
+    fewer = frames._lanes_of("frame_00", dict.fromkeys(cameras_, shown[:1]))
+    assert set(lanes).isdisjoint(fewer), "of another batch, which is prepared before its first call"

@@ -11,6 +11,8 @@ matrix is the correction's with the sampler's coefficients added on diagonals; t
 adds and the correction's bias, known before the loop. So the update is three small operations in the place of a dozen.
 Everything has the action dimensions first: no operation has to turn its arguments. The correction reads and corrects
 samples, never memories.
+
+After the last step a corrected sample is clipped where the sampler has clipped it (``bounded``).
 """
 
 from __future__ import annotations
@@ -24,6 +26,17 @@ from .spec import FloatArray, SamplerTable
 def clips(sampler: SamplerTable) -> bool:
     """Whether the update has a term that is not linear."""
     return sampler.clip is not None and bool((sampler.sample_to_x0 != 0).any() or (sampler.out_to_x0 != 0).any())
+
+
+def bounded(sampler: SamplerTable, sample: FloatArray) -> FloatArray:
+    """A denoised sample, of any shape, with every number within what the sampler leaves it.
+
+    A correction adds to what the sampler clipped, and so could leave that. One with infinite numbers stays as it is, so
+    that whoever looks for them finds them.
+    """
+    if sampler.bound is None or not np.isfinite(sample).all():
+        return sample
+    return np.clip(sample, -sampler.bound, sampler.bound)
 
 
 def rows(sampler: SamplerTable, horizon: int) -> int:

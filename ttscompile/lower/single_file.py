@@ -103,6 +103,8 @@ def lower_single_file(program: Program, models: Mapping[str, ModelProto], weight
     loop = DenoisingLoop(main, program, models, weights, contexts)
     values = LoopInputs("initial_noise", offset, update, ANCHORS, history, memory, stored, "rollout_index")
     sample, residuals = loop.write(plan, values)
+    if (bound := spec.sampler.bound) is not None:  # without a correction no number is beyond it
+        sample = main.op("Clip", sample, *(main.constant(end, np.float32) for end in (-bound, bound)))
     _write_actions(main, sample, spec)
     main.rename(plan.executed, "executed_plan")
     _write_cache(main, plan, stored, residuals, (spec.sampler.steps, len(groups)))
