@@ -9,10 +9,14 @@ import numpy as np
 import onnxruntime
 import pytest
 from click.testing import CliRunner
+from torch import nn
 
 import ttscompile
+from tests.calibration.policies import spec
 from ttscompile import Noise
 from ttscompile.cli import main
+from ttscompile.driver import compile_denoiser
+from ttscompile.errors import ArtifactError
 
 
 @pytest.mark.parametrize("precision", ["fp32", "int8"])
@@ -42,3 +46,15 @@ def test_convert_writes_one_file_of_the_same_policy(one_layer_checkpoint: Path, 
     (found,) = session.run(["action"], feeds)
     # Actions are pixels, 0 to 512; int8 rounds values that differ in the last bit to different integers.
     assert np.abs(found - expected).max() < (0.05 if precision == "fp32" else 5.0)
+
+
+@pytest.mark.parametrize("inside", ["compiled", "compiled/call.onnx", "compiled/more/call.onnx", "link/call.onnx"])
+def test_a_file_inside_of_the_artifact_is_refused_before_any_work(tmp_path: Path, inside: str) -> None:
+    """The next convert or calibrate would replace it with the artifact."""
+    (tmp_path / "link").symlink_to(tmp_path / "compiled")
+    with pytest.raises(ArtifactError, match="outside of the artifact") as raised:
+        compile_denoiser(nn.Identity(), spec(), tmp_path / "compiled", single_file=tmp_path / inside)
+    assert "another path" in str(raised.value)
+    with pytest.raises(ArtifactError, match="found a directory"):
+        compile_denoiser(nn.Identity(), spec(), tmp_path / "compiled", single_file=tmp_path)
+    assert not (tmp_path / "compiled").exists()

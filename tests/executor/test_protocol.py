@@ -29,6 +29,19 @@ def test_requests_are_read_and_frames_converted() -> None:
     assert beyond.tolist() == [np.inf]  # without a warning; ``observe`` refuses it
 
 
+def test_a_mask_is_of_true_and_false() -> None:
+    """LeRobot's language policies have one; 0 and 1 mean the same, and other numbers nothing."""
+    frames = FrameSpec.of({"mask": ObservationSpec((3,), dtype="bool", window=False)}, 1)
+    for given_as in ([True, False, True], [1, 0, 1], [1, False, True]):
+        mask = read_frame({"mask": given_as}, frames)["mask"]
+        assert (mask.dtype, mask.tolist()) == (np.bool_, [True, False, True])
+    for wrong in ([2, 0, 1], [-1, 0, 1], [0.5, 0.0, 1.0], ["true", "false", "true"]):
+        with pytest.raises(ProtocolError, match="mask"):
+            read_frame({"mask": wrong}, frames)
+    with pytest.raises(ProtocolError, match="numbers that are float32"):
+        read_frame({"obs": [True, False]}, FrameSpec.of({"obs": ObservationSpec((2,), window=False)}, 1))
+
+
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=4),

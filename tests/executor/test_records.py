@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import inspect
 import json
 from dataclasses import FrozenInstanceError, fields
@@ -82,6 +83,23 @@ def test_a_trace_is_what_perfetto_reads(tmp_path: Path) -> None:
         {"ph": "i", "name": "reset", "pid": 1, "tid": CONTROL, "ts": 5e5, "s": "t"},
         {"ph": "X", "name": "inference", "pid": 1, "tid": WORKER, "ts": 1e6, "dur": 2.5e5, "args": {"plan": "dense"}},
     ]
+
+
+def test_a_trace_is_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A full disk leaves the trace of before."""
+    trace, path = Trace(10), tmp_path / "trace.json"
+    trace.write(path)
+    before = path.read_bytes()
+    trace.instant(CONTROL, "reset", 1.0)
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("ttscompile.artifact.files.os.fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        trace.write(path)
+    assert [each.name for each in tmp_path.iterdir()] == ["trace.json"]
+    assert path.read_bytes() == before
 
 
 @pytest.mark.parametrize(

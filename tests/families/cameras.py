@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 import ttscompile
+from tests.once import Once
 from ttscompile import ChunkSpec, ObservationSpec, PolicySpec
 from ttscompile.frontends.clip import ClipVision, VisionConfig
 from ttscompile.frontends.encoded import EncodedDenoiser
@@ -144,3 +145,10 @@ def policy(kind: str, told: bool = False) -> tuple[nn.Module, PolicySpec]:
         observations["mask"] = ObservationSpec((WORDS,), dtype="bool", window=False, bounds=(0, 1))
     spec = PolicySpec((HORIZON, ACTIONS), observations, flow_matching_table(STEPS), ChunkSpec(ACTIONS, TO - 1, TO + 1))
     return EncodedDenoiser(Encoder(kind, told), Denoiser(features)).eval(), spec
+
+
+def compiled_tokens(once: Once) -> Path:
+    """A folder with the policy of kind ``clip``, whose encoder has tokens, in int8 too: ``artifact``."""
+    return once.folder(
+        "tokens", lambda folder: ttscompile.compile_denoiser(*policy("clip"), folder / "artifact", precision="int8")
+    )

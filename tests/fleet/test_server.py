@@ -16,7 +16,10 @@ import pytest
 
 from tests.executor.serving import LIMITS, Client, ServerError, connected, listening, vanish
 from tests.executor.watching import figures, get
+from tests.runtimes.toys import toy_program, written_artifact
 from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.write import update_calibration
+from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import ClusterError, IllegalPlanError, NonFiniteActionsError
 from ttscompile.runtimes.executor.lock import Lock, hashed
 from ttscompile.runtimes.executor.window import Array
@@ -175,6 +178,16 @@ def test_the_lock_is_that_of_serve(planned: Path, copies: Scripted) -> None:
 def test_a_plan_that_cannot_run_is_refused_before_it_starts(planned: Path, plan: str, message: str) -> None:
     with pytest.raises(IllegalPlanError, match=message):
         Plans.of(load_artifact(planned), plan)
+
+
+def test_a_pruner_that_may_read_the_call_before_is_left_out(tmp_path: Path) -> None:
+    """Each request begins an episode: such a plan would quietly be another one than was calibrated."""
+    made = written_artifact(toy_program(), tmp_path / "artifact")
+    update_calibration(made.path, dict(made.pruner), {"evenly": uniform_plan(5, 5, 2)}, "tts", {})
+    artifact = load_artifact(made.path)
+    assert Plans.of(artifact, "evenly").names == ("dense", "evenly")
+    with pytest.raises(IllegalPlanError, match="another robot's"):
+        Plans.of(artifact)
 
 
 def wait_until(there: Any) -> None:

@@ -21,11 +21,13 @@ from tests.passes.modules import MODULES, spec
 from ttscompile.artifact.load import load_artifact
 from ttscompile.cli import main
 from ttscompile.core.spec import PolicySpec
+from ttscompile.driver import compile_denoiser
 from ttscompile.errors import ArtifactError, HubError, RuntimeUnavailableError, TtscompileError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.hub import fetch_artifact, fetch_checkpoint
 from ttscompile.hub.name import HubName, read_name
+from ttscompile.report.card import card
 
 from .served import Hub, serving
 
@@ -211,6 +213,17 @@ def test_a_checkpoint_is_converted_and_passes_its_licence_on(
     refused = CliRunner().invoke(main, ["push", str(tmp_path / "compiled"), "org/made", "--license", "mit"])
     assert refused.exit_code == 2 and "the base is under the licence apache-2.0" in refused.stderr
     assert pushed.stdout == f"pushed hf://org/made@{hub.find('org/made', 'main')[0]}\n"
+
+
+def test_the_card_tells_what_was_left_out(tmp_path: Path) -> None:
+    """Else the command on it makes another artifact."""
+    shorter = {"task": "push", "without": "observation.images.side, observation.images.`top`"}
+    compile_denoiser(MODULES["adaLN"]().eval(), replace(spec(), source=shorter), tmp_path / "compiled")
+    artifact = load_artifact(tmp_path / "compiled")
+    manifest = replace(artifact.manifest, spec=replace(artifact.manifest.spec, left_out=3))
+    told = card(replace(artifact, manifest=manifest), "org/made", [], [], None)
+    names = "--without-camera observation.images.side --without-camera observation.images.top"
+    assert f" --task TASK {names} --prediction-horizon {spec().sample[0]}`" in told, told
 
 
 def test_of_a_directory_of_lerobot_its_own_files_are_taken(hub: Hub) -> None:

@@ -19,7 +19,7 @@ from ttscompile.cli.options import (
 )
 from ttscompile.cli.output import print_identity, print_json, progress, results, say, table
 from ttscompile.cli.timing import Compiled, Measurement, contestants, measure
-from ttscompile.cli.types import PATH, TEXT
+from ttscompile.cli.types import FOLDER, PATH, TEXT
 from ttscompile.core.spec import FP32
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.units import ms, share
@@ -55,6 +55,11 @@ plan of it on the CPU, for --runtime torch."""
     type=PATH,
     help="The checkpoint that DIRECTORY was made from. The rivals 'original' and 'eager' need it.",
 )
+@click.option(
+    "--encoders",
+    type=FOLDER,
+    help="For --checkpoint: the folder that 'ttscompile convert' was given by the same name, if it was.",
+)
 @seed_option("Seed of the observations and the noise.")
 @json_option
 def bench(
@@ -67,6 +72,7 @@ def bench(
     precision: str | None,
     against: tuple[str, ...],
     checkpoint: Path | None,
+    encoders: Path | None,
     seed: int,
     as_json: bool,
 ) -> None:
@@ -80,7 +86,7 @@ def bench(
     identity = artifact.manifest.identity
     with console.status("loading"):
         own = Compiled(runtime, device, precision, threads)
-        entered = contestants(artifact, own, plan, against, checkpoint)
+        entered = contestants(artifact, own, plan, against, checkpoint, encoders)
     if entered[0].plan == "dense":
         say(console, f"warning: {directory} runs dense: it is not calibrated, or --plan dense was given.")
     with console.status("timing") as status:

@@ -19,7 +19,7 @@ from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.timer import Times
 from ttscompile.measure.units import ms
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings, Feasibility, GuardLimits, MonotonicClock
-from ttscompile.runtimes.executor.measure import Jitter, measure_jitter, measure_latencies, neutral_observation
+from ttscompile.runtimes.executor.measure import Jitter, measure_jitter, measure_latencies, some_observation
 from ttscompile.runtimes.executor.settings import resolve
 from ttscompile.runtimes.policy import CompiledPolicy
 
@@ -133,7 +133,7 @@ def _jitter(policy: CompiledPolicy, name: str, policy_hz: float, latency: float,
     alone = measure_jitter(hz, seconds)
     with AsyncExecutor(policy, hz, settings, latencies={name: latency}) as executor:
         frames = resolve(settings, policy.info, hz).frames
-        obs = neutral_observation(dict(policy.info.observation))
+        obs = some_observation(policy.info.observation)
         frame: dict[str, Any] = {key: obs[key][0, -1] if key in frames.history else obs[key][0] for key in obs}
 
         def work() -> None:

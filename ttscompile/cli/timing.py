@@ -109,7 +109,12 @@ class Compiled:
 
 
 def contestants(
-    artifact: Artifact, own: Compiled, plan: str | None, against: Sequence[str], checkpoint: Path | None
+    artifact: Artifact,
+    own: Compiled,
+    plan: str | None,
+    against: Sequence[str],
+    checkpoint: Path | None,
+    encoders: Path | None = None,
 ) -> list[Contestant]:
     """The compiled policy first, then its rivals, in fp32; each with a policy, and caches, of its own.
 
@@ -119,6 +124,7 @@ def contestants(
         plan: of the compiled policy; None for the artifact's default.
         against: ``original``, ``eager``, ``onnxruntime-dense``, ``onnxruntime``.
         checkpoint: for ``original`` and ``eager``.
+        encoders: the folder that ``convert`` was given with the checkpoint, if it was.
 
     Raises:
         ArtifactError: it cannot be run.
@@ -141,7 +147,7 @@ def contestants(
         elif rival == "onnxruntime":
             made.append(compiled("onnxruntime", chosen, Compiled()))
         elif checkpoint is not None:
-            made.append(_eager(checkpoint, threads, manifest, rival == "original"))
+            made.append(_eager(checkpoint, encoders, threads, manifest, rival == "original"))
     return made
 
 
@@ -191,7 +197,7 @@ def plan_contestant(label: str, policy: CompiledPolicy, plan: str, spec: PolicyS
     return Contestant(label, plan, call, lambda: policy.last_report, spec, 0.0)
 
 
-def _eager(checkpoint: Path, threads: int, manifest: Manifest, as_saved: bool) -> Contestant:
+def _eager(checkpoint: Path, encoders: Path | None, threads: int, manifest: Manifest, as_saved: bool) -> Contestant:
     """The original network in eager PyTorch, in the artifact's denoising loop, or in the one it was saved with."""
     try:
         import torch
@@ -203,7 +209,7 @@ def _eager(checkpoint: Path, threads: int, manifest: Manifest, as_saved: bool) -
             f"the original network needs {error.name}, which is not installed. Run: pip install 'ttscompile[compile]',"
             " or take 'original' and 'eager' out of --against."
         ) from error
-    module, original = original_policy(checkpoint, manifest.spec)
+    module, original = original_policy(checkpoint, manifest.spec, encoders)
     torch.set_num_threads(threads)
     dense, sampler = manifest.flops.dense, original.sampler
     if not as_saved:
@@ -215,21 +221,21 @@ def _eager(checkpoint: Path, threads: int, manifest: Manifest, as_saved: bool) -
     return network_contestant(label, eager_policy(module, original), original, flops)
 
 
-def original_policy(checkpoint: Path, spec: PolicySpec) -> tuple[nn.Module, PolicySpec]:
+def original_policy(checkpoint: Path, spec: PolicySpec, encoders: Path | None = None) -> tuple[nn.Module, PolicySpec]:
     """The network of the checkpoint that an artifact was made from, and what the checkpoint says about it; needs torch.
 
     Args:
         checkpoint: as ``convert`` took it.
         spec: specification of the policy in the artifact.
+        encoders: see ``contestants``.
 
     Raises:
         SpecError: the checkpoint is of another policy.
     """
     from ttscompile.frontends import load_checkpoint_policy
-    from ttscompile.frontends.families import LoadOptions
+    from ttscompile.frontends.families import as_converted
 
-    options = LoadOptions(task=spec.source.get("task"))  # an instruction that was compiled in is no observation
-    module, original = load_checkpoint_policy(checkpoint, options=options)
+    module, original = load_checkpoint_policy(checkpoint, options=as_converted(spec.source, encoders))
     wrong = f"{checkpoint}: expected the policy that the artifact was made from"
     found, expected = _interface(original), _interface(spec)
     if found != expected:

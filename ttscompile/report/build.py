@@ -61,7 +61,7 @@ def build(
     manifest = artifact.manifest
     require_packages()
     progress("timing calls")
-    latencies = measure_parts(policy, (DENSE, *manifest.plans), given.runs)
+    latencies = measure_parts(policy, manifest.spec, (DENSE, *manifest.plans), given.runs)
     course = None
     if given.episode is not None:
         progress("running an episode")

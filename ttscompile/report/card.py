@@ -11,6 +11,7 @@ from typing import Any
 
 from ..artifact.load import Artifact
 from ..artifact.manifest import Manifest
+from ..core.spec import WITHOUT
 from ..core.untrusted_json import parse_json
 from ..errors import ReportError
 from ..hub.name import HubName, read_name
@@ -216,7 +217,13 @@ def _made(manifest: Manifest, base: HubName | None) -> Section:
     precision = "" if manifest.precision is None else f" --precision {manifest.precision_name}"
     if manifest.precision is not None:
         precision += "".join(f" --keep-fp32 {p}" for p in manifest.precision.parts if p not in manifest.precision.kept)
-    lines = [f"ttscompile convert {checkpoint} -o DIR --sampler {sampler.name} --steps {steps}{precision}"]
+    spec = manifest.spec
+    more = "" if spec.start is None else f" --last-steps {steps}"
+    steps += 0 if spec.start is None else spec.start.skipped
+    more += " --task TASK" * ("task" in spec.source)
+    more += "".join(f" --without-camera {_word(name)}" for name in spec.source.get(WITHOUT, "").split())
+    more += f" --prediction-horizon {spec.sample[0]}" * (spec.left_out > 0)
+    lines = [f"ttscompile convert {checkpoint} -o DIR --sampler {sampler.name} --steps {steps}{more}{precision}"]
     if record is not None:
         options = [("strategy", "strategy"), ("seed", "seed")]
         told = {name: record[key] for name, key in options if isinstance(record.get(key), str | int)}

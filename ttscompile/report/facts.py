@@ -11,6 +11,7 @@ from ..artifact.ceiling import few_steps
 from ..artifact.load import Artifact
 from ..artifact.manifest import DENSE, DISTILLED, BlockRecord, Manifest, PlanRecord, marked
 from ..artifact.tokens import ReuseRecord
+from ..core.start import Start
 from ..ir.flops import frames_flops, graph_flops
 from ..ir.program import Binding
 from ..measure.units import flops, plain, share
@@ -281,12 +282,20 @@ def _mapping(value: object) -> Mapping[str, Any]:
     return value if isinstance(value, Mapping) else {}
 
 
+def last_steps(start: Start, steps: int) -> str:
+    """What the rest of a loop is for."""
+    told = f"These are {start.told(steps)}, which begin with the chunk of the call before"
+    return f"{told}. Load them with the whole loop: ttscompile.load(WHOLE, warm=THIS)."
+
+
 def limits(artifact: Artifact) -> Section:
     """What a reader should not expect, from the artifact's own facts."""
     manifest = artifact.manifest
     sampler = manifest.spec.sampler
     points = []
-    if manifest.calibration is None or manifest.default_plan == DENSE:
+    if manifest.spec.start is not None:
+        points.append(last_steps(manifest.spec.start, manifest.steps))
+    elif manifest.calibration is None or manifest.default_plan == DENSE:
         points.append("Not calibrated: its default plan computes everything. It is as slow as a dense call.")
     else:
         points.append(
@@ -314,7 +323,5 @@ def limits(artifact: Artifact) -> Section:
         )
     if coarse := [str(i) for i, block in enumerate(manifest.blocks) if block.reason]:
         points.append(f"Blocks {', '.join(coarse)} are coarse: several operations are reused or computed together.")
-    points.append(
-        "Times are of warm calls of one stream on one machine, taken while this page was made. There is no GPU runtime."
-    )
+    points.append("Times are of warm calls of one stream on one machine, taken while this page was made.")
     return Section("Limits", points=tuple(points))

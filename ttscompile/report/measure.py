@@ -10,9 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.lattice import PlanArray, Source
+from ..core.spec import Noise, PolicySpec
 from ..measure.timer import Timer, Times
-from ..runtimes.executor.measure import neutral_observation
 from ..runtimes.policy import CompiledPolicy
+from ..runtimes.random_calls import random_call
 from ..runtimes.report import CallReport
 from ..trajectories.episodes import Episode
 
@@ -67,22 +68,23 @@ class Course:
         return np.stack([np.mean(self.plans == source, axis=0) for source in Source])
 
 
-def measure_parts(policy: CompiledPolicy, plans: Sequence[str], runs: int) -> list[Latency]:
+def measure_parts(policy: CompiledPolicy, spec: PolicySpec, plans: Sequence[str], runs: int) -> list[Latency]:
     """What calls spend their time on, by their own reports; plans take turns.
 
     Args:
         policy: loaded; it is reset before and after.
+        spec: its specification.
         plans: their names.
         runs: counted calls of each.
     """
-    obs = neutral_observation(dict(policy.info.observation))
+    obs, noise = random_call(spec, 0, 0)
     reports: list[list[CallReport]] = [[] for _ in plans]
     policy.reset()
     timer = Timer(len(plans), WARM_UP)
     for _ in range(WARM_UP + runs):
         for i in timer.round():
             policy.forget_frames()  # a call may have to compute them all
-            report = _call(policy, obs, plans[i])
+            report = _call(policy, obs, plans[i], noise)
             if timer.counted:
                 reports[i].append(report)
     policy.reset()
@@ -114,8 +116,8 @@ def run_episode(policy: CompiledPolicy, episode: Episode) -> Course:
     return Course(episode.name, plans, tuple(report.legalised[0] for report in made))
 
 
-def _call(policy: CompiledPolicy, obs: Mapping[str, Any], plan: str | None) -> CallReport:
-    policy.predict_action(obs, plan=plan)
+def _call(policy: CompiledPolicy, obs: Mapping[str, Any], plan: str | None, noise: Noise | None = None) -> CallReport:
+    policy.predict_action(obs, noise=noise, plan=plan)
     report = policy.last_report
     assert report is not None  # a call was made
     return report

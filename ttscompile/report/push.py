@@ -62,7 +62,7 @@ def push(
     progress("timing calls")
     policy = CompiledPolicy(artifact, open_runtime(artifact), seed=0)
     plans = tuple(dict.fromkeys((manifest.default_plan, DENSE)))
-    text = card(artifact, repository, measure_parts(policy, plans, runs), success, licence)
+    text = card(artifact, repository, measure_parts(policy, artifact.manifest.spec, plans, runs), success, licence)
     if dry_run:
         return text
     progress("uploading")

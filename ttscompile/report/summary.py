@@ -25,6 +25,7 @@ def document(artifact: Artifact) -> dict[str, Any]:
         "ttscompile_version": manifest.ttscompile_version,
         "source": dict(spec.source),
         "sampler": {name: getattr(spec.sampler, name) for name in ("name", "steps", "stochastic", "clip")},
+        "start": None if spec.start is None else dict(vars(spec.start)),
         "sample": list(spec.sample),
         "left_out": spec.left_out,
         "observations": {k: {"shape": list(o.shape), "dtype": o.dtype} for k, o in spec.observations.items()},

@@ -14,6 +14,7 @@ from ..artifact.manifest import DENSE
 from ..core.correction import Correction
 from ..core.lattice import PlanArray, Source
 from ..core.spec import Noise
+from ..core.update import bounded
 from ..errors import RuntimeUnavailableError
 from ..runtimes.open import open_runtime
 from ..runtimes.policy import CompiledPolicy
@@ -221,7 +222,8 @@ def _replay(
     if differ.any():  # a near tie, maybe: hold what the stored plan gives against the record
         _, samples = episode(record.plan)
     few = bool(np.count_nonzero(differ) <= (CELLS * differ.size if pruned else 0))
-    return made, differ, few, largest(samples, record.sample)
+    expected = bounded(artifact.manifest.spec.sampler, record.sample)  # records are older than what bounds a sample
+    return made, differ, few, largest(samples, expected)
 
 
 def _where(

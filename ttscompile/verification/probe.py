@@ -17,7 +17,7 @@ from ..artifact.load import Artifact
 from ..core.correction import HISTORY, Correction, no_correction
 from ..core.lattice import PlanArray, Source
 from ..core.spec import FloatArray, Noise
-from ..core.update import clips, matrices
+from ..core.update import bounded, clips, matrices
 from ..ir.pieces import ADVANCE, CONDITION, LAYERS, PREDICTION, STEM, STEP, STREAM, TAIL, advance_context, block_name
 from ..ir.program import Binding
 from ..runtimes.frames import FramePieces
@@ -146,6 +146,8 @@ class Probe:
             if correction.anchors[k]:
                 history = np.concatenate([sample, prediction, history[..., : history.shape[2] // 2]], 2)
             sample = np.asarray(following, np.float32)
+            if k + 1 == sampler.steps:
+                sample = bounded(sampler, sample)
             samples.append(sample.transpose(1, 2, 0))
             predictions.append(prediction.transpose(1, 2, 0))
         return np.stack(samples), np.stack(predictions)
