@@ -3,7 +3,7 @@
     python examples/benchmark/frames.py [--policies resnet,clip,smolvla] [--rounds 9] [--seconds 60]
 
 Each policy has two cameras. ``resnet`` and ``clip`` have a window of two frames, and compute 2 of their 40 steps;
-SmolVLA sees one frame, and computes 2 of 10. Calls take turns:
+SmolVLA sees one frame, computes 2 of 10 steps, and is in int8. Calls take turns:
 
 - ``all``: every frame and the instruction are computed in the call, as if none had been seen;
 - ``newest``: the frame before was prepared when it came, where the window has one, and the instruction is known;
@@ -11,8 +11,10 @@ SmolVLA sees one frame, and computes 2 of 10. Calls take turns:
 - ``still``: nothing moves.
 
 Seconds are the processor's, since the machine may be busy; ratios are those of the medians. Then an executor runs in
-real time, in turn with and without preparing frames, and the calls that it makes are timed. It controls at 10 Hz, and
-the frames of a window are 0.1 s apart, those of ``clip`` 0.5 s: calls have to leave time between them.
+real time, in turn with and without preparing and remembering frames, and the calls that it makes are timed. It controls
+at 10 Hz, and the frames of a window are 0.1 s apart, those of ``clip`` 0.5 s: calls have to leave time between them.
+SmolVLA has no frame before its newest, so there one camera shows what it did before; and then tokens are reused, and in
+front of both cameras an arm moves.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ import argparse
 import statistics
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +31,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
+from moving import REUSE, arm, picture
 from torch import Tensor, nn
 
 import ttscompile
@@ -41,6 +44,7 @@ from ttscompile.frontends.multi_image_encoder import MultiImageEncoder, View
 from ttscompile.frontends.multi_task_dit import DiffusionTransformer, DiTConfig, ObservationEncoder
 from ttscompile.frontends.resnet import group_norm
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
+from ttscompile.runtimes.load import open_policy
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.samplers.flow import flow_matching_table
 
@@ -49,7 +53,7 @@ Obs = dict[str, npt.NDArray[Any]]
 TO, STEPS, HORIZON, EXECUTED, ACTIONS, STATE, WORDS = 2, 40, 32, 24, 14, 14, 77
 CAMERAS = ("front", "wrist")
 CONTROL_HZ = 10.0
-POLICY_HZ = {"resnet": 10.0, "clip": 2.0}
+POLICY_HZ = {"resnet": 10.0, "clip": 2.0, "smolvla": 10.0}
 PLAN = "two_steps"
 
 
@@ -88,7 +92,7 @@ def compiled(name: str, folder: Path) -> None:
         import large_smolvla
 
         large_smolvla.save(folder.parent / "smolvla-checkpoint")
-        program = ttscompile.convert(folder.parent / "smolvla-checkpoint", folder)
+        program = ttscompile.convert(folder.parent / "smolvla-checkpoint", folder, precision="int8")
     else:
         program = ttscompile.compile_denoiser(*network(name), folder)
     steps = program.spec.sampler.steps
@@ -113,19 +117,28 @@ def network(name: str) -> tuple[nn.Module, PolicySpec]:
     return EncodedDenoiser(encoder, DiffusionTransformer(config, encoder.width)).eval(), spec
 
 
-def frames(spec: PolicySpec, seed: int) -> Iterator[Obs]:
-    """Frames of one stream for ever, without the axes of batch and time; the instruction stays."""
+def frames(spec: PolicySpec, seed: int, still: Sequence[str] = ()) -> Iterator[Obs]:
+    """Frames of one stream for ever, without the axes of batch and time; instruction and ``still`` cameras stay."""
     rng = np.random.default_rng(seed)
     words = {key: one.draw(rng)[0] for key, one in spec.observations.items() if one.dtype != "float32"}
     measured = {key: one.one_frame if one.frames else one for key, one in spec.observations.items() if key not in words}
+    words |= {key: measured[key].draw(rng)[0] for key in still}
     while True:
         yield {key: one.draw(rng)[0] for key, one in measured.items()} | words
+
+
+def arms(spec: PolicySpec, seed: int) -> Iterator[Obs]:
+    """The same where cameras see an arm move in front of what stays."""
+    rng = np.random.default_rng(seed)
+    still = {key: picture(one.shape[-1], rng) for key, one in spec.observations.items() if one.image}
+    for number, obs in enumerate(frames(spec, seed)):
+        yield obs | {key: arm(each, 0.05 * number) for key, each in still.items()}
 
 
 def window(spec: PolicySpec, before: Obs, newest: Obs) -> Obs:
     """What a call reads."""
     return {
-        key: np.stack([before[key], newest[key]])[None] if one.frames else newest[key][None]
+        key: np.stack([before[key], newest[key]][-one.frames :])[None] if one.frames else newest[key][None]
         for key, one in spec.observations.items()
     }
 
@@ -184,12 +197,13 @@ class _Timed:
         return made
 
 
-def drive(policy: CompiledPolicy, spec: PolicySpec, policy_hz: float, seconds: float) -> None:
+def drive(
+    policy: CompiledPolicy, spec: PolicySpec, policy_hz: float, seconds: float, stream: Callable[[], Iterator[Obs]]
+) -> None:
     """Run an executor in real time, twice in each way in turn, and print how long its calls took."""
     settings = ExecutorSettings(
         policy_hz=policy_hz,
-        n_obs_steps=TO,
-        horizon=EXECUTED // 2,
+        horizon=(spec.chunk.stop - spec.chunk.start) // 2,
         refuse_infeasible=False,
         warm_up=1,
         measured_calls=2,
@@ -198,14 +212,14 @@ def drive(policy: CompiledPolicy, spec: PolicySpec, policy_hz: float, seconds: f
     found: dict[str, list[float]] = {"all": [], "newest": []}
     for _ in range(2):
         for way in found:
-            stream, timed = frames(spec, 1), _Timed(policy, way == "all")
+            seen, timed = stream(), _Timed(policy, way == "all")
             with AsyncExecutor(timed, CONTROL_HZ, settings) as executor:
                 timed.took.clear()
                 until, tick = time.monotonic() + seconds / 4, 0
                 while time.monotonic() < until:
                     start = time.monotonic()
                     if tick % round(CONTROL_HZ / policy_hz) == 0:  # the camera has the policy's rate
-                        executor.observe(next(stream))
+                        executor.observe(next(seen))
                     if executor.ready:
                         executor.action()
                     tick += 1
@@ -213,7 +227,23 @@ def drive(policy: CompiledPolicy, spec: PolicySpec, policy_hz: float, seconds: f
             found[way] += timed.took[1:]  # the first call of an episode has nothing before it
     before, now = (statistics.median(found[way]) for way in ("all", "newest"))
     what = f"In the executor at {CONTROL_HZ:g} Hz, policy {policy_hz:g} Hz, medians of {len(found['newest'])} calls:"
-    print(f"{what} {before:.3f} s without preparing frames, {now:.3f} s with it ({now / before:.2f}).")
+    print(f"{what} {before:.3f} s when frames are forgotten, {now:.3f} s when not ({now / before:.2f}).")
+
+
+def measure(name: str, folder: Path, rounds: int, seconds: float) -> None:
+    """Print what the calls of a policy take: alone, and in an executor."""
+    artifact = load_artifact(folder)
+    policy, spec, hz = ttscompile.load(folder), artifact.manifest.spec, POLICY_HZ[name]
+    print(f"\n## {name}\n")
+    calls(policy, spec, rounds)
+    alone = [key for key, one in spec.observations.items() if one.image and one.frames == 1]
+    print(f"\n{alone[0]} shows what it did before." if alone else "")
+    drive(policy, spec, hz, seconds, lambda: frames(spec, 1, alone[:1]))
+    if alone:
+        print("\nTokens are reused, and an arm moves in front of both cameras.")
+        del policy  # half of the memory
+        reusing = open_policy(artifact.at_precision("int8").with_reuse(REUSE), seed=0)
+        drive(reusing, spec, hz, seconds, lambda: arms(spec, 1))
 
 
 def main() -> None:
@@ -229,12 +259,7 @@ def main() -> None:
         for name in options.policies.split(","):
             if not (folder / name).is_dir():
                 compiled(name, folder / name)
-            policy, spec = ttscompile.load(folder / name), load_artifact(folder / name).manifest.spec
-            print(f"\n## {name}\n")
-            calls(policy, spec, options.rounds)
-            if name in POLICY_HZ:  # a window of one frame has none before its newest
-                print()
-                drive(policy, spec, POLICY_HZ[name], options.seconds)
+            measure(name, folder / name, options.rounds, options.seconds)
 
 
 if __name__ == "__main__":

@@ -140,6 +140,7 @@ def run_clip(folder: Path) -> None:
 def run(folder: Path) -> None:
     """Load what was written and run one dense call."""
     import numpy as np
+    from rate import ProductRate, run_all
 
     import ttscompile
 
@@ -150,15 +151,20 @@ def run(folder: Path) -> None:
     noise = ttscompile.Noise(call["noise"])
     out = policy.predict_action({"obs": call["obs"]}, noise=noise, plan="dense")
     error = np.abs(out["action_pred"] - np.load(folder / "expected.npy")).max()
+    product = ProductRate("fp32")
+    run_all([product])
     taken = seconds(lambda: policy.predict_action({"obs": call["obs"]}, noise=noise, plan="dense"))
+    run_all([product])
     print(f"{taken:8.3f} s  a dense call of {STEPS} steps, on one thread, {error:.1e} from eager")
+    assert policy.last_report is not None
+    print(f"{product.seconds(policy.last_report.flops[0]):8.3f} s  its arithmetic alone")
     size = sum(file.stat().st_size for file in (folder / "compiled").iterdir()) / 2**30
     print(f"{peak():8.2f} GiB at most while it ran; the artifact has {size:.2f} GiB")
 
 
 def seconds(call: Callable[[], object]) -> float:
-    """Median of five calls after one that does not count."""
-    return statistics.median(timeit.repeat(call, number=1, repeat=6)[1:])
+    """Median of five calls after one that does not count; the processor's, since the machine may be busy."""
+    return statistics.median(timeit.repeat(call, timer=time.process_time, number=1, repeat=6)[1:])
 
 
 def peak() -> float:

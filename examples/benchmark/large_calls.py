@@ -1,6 +1,7 @@
 """Calls of a large policy, timed for ``large.py``: PyTorch and compiled, and with tokens reused where an arm moves.
 
-Seconds are the processor's: all calls are on one thread, and the machine may be busy. Contestants take turns.
+Seconds are the processor's: all calls are on one thread, and the machine may be busy. Contestants take turns, and with
+them a product that says what the arithmetic of their calls takes alone (``rate.py``): the floor.
 """
 
 from __future__ import annotations
@@ -9,23 +10,80 @@ import resource
 import statistics
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import torch
 from large_smolvla import call
 from moving import REUSE, arm, picture
+from rate import rates, run_all
 
 import ttscompile
 from ttscompile import Noise, PolicySpec
-from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.load import Artifact, load_artifact
+from ttscompile.ir.flops import graph_flops
 from ttscompile.runtimes.info import PolicyInfo
 from ttscompile.runtimes.load import open_policy
 from ttscompile.runtimes.policy import CompiledPolicy
+from ttscompile.runtimes.report import CallReport
 
-Times: TypeAlias = dict[str, list[list[float]]]
-"""By contestant, of each call the seconds of its parts."""
+
+class Arithmetic:
+    """FLOPs of calls of an artifact, before the loop and in it."""
+
+    def __init__(self, artifact: Artifact) -> None:
+        pieces = artifact.pieces
+        rows = [graph_flops(tower) for n, tower in zip(pieces.rows, pieces.towers, strict=True) for _ in range(n)]
+        self._prologue = artifact.manifest.flops.prologue
+        self._rows = sorted(rows, reverse=True)  # the instruction, which hardly ever is new, costs least
+
+    def of(self, report: CallReport) -> list[float]:
+        """Of one call: frames that it knew cost nothing, and tokens that it computed their share of a frame."""
+        work = report.frames
+        share = work.tokens / work.of if work.of else 1.0
+        before = self._prologue - sum(self._rows) + share * sum(self._rows[: work.computed])
+        return [before, report.flops[0] - self._prologue]
+
+
+@dataclass(frozen=True)
+class _Calls:
+    """Of one contestant: its precision; by call the seconds of its parts; and the FLOPs before the loop and in it."""
+
+    precision: str
+    seconds: list[list[float]] = field(default_factory=list)
+    flops: list[list[float]] = field(default_factory=list)
+
+
+class Times:
+    """What the calls of all contestants took, in turn with the products of the floor."""
+
+    def __init__(self, arithmetic: Arithmetic) -> None:
+        self._arithmetic, self._products = arithmetic, rates()
+        self._calls: dict[str, _Calls] = {}
+
+    def add(self, name: str, precision: str, seconds: list[float], report: CallReport) -> None:
+        """A call of a contestant, which computed what the report says."""
+        calls = self._calls.setdefault(name, _Calls(precision))
+        calls.seconds.append(seconds)
+        calls.flops.append(self._arithmetic.of(report))
+
+    def next_round(self) -> None:
+        """Time the products of the floor."""
+        run_all(self._products.values())
+
+    def tell(self, left_out: int) -> None:
+        """Print medians of all but the first calls."""
+        for name, calls in self._calls.items():
+            seconds, flops = calls.seconds[left_out:], calls.flops[left_out:]
+            total = statistics.median(map(sum, seconds))
+            parts = ", ".join(f"{statistics.median(part):.2f}" for part in zip(*seconds, strict=True))
+            least = [
+                self._products[calls.precision].seconds(statistics.mean(part)) for part in zip(*flops, strict=True)
+            ]
+            floor = f"floor {sum(least):.3f}: {', '.join(f'{part:.3f}' for part in least)}"
+            print(f"{total:8.2f} s  {name}: {parts}; {floor}; {total / sum(least):.2f} times it", flush=True)
 
 
 def compare(
@@ -55,17 +113,19 @@ def compare(
     info = policies["fp32"].info
     obs, noise = call(spec)
     plans = plans_of(info, computed)
-    times: Times = {}
+    times = Times(Arithmetic(load_artifact(folder / "compiled")))
     for _ in range(rounds + 1):  # the first does not count
+        times.next_round()
         expected, split = eager()
-        times.setdefault(f"eager: {parts}", []).append(split)
         for precision, policy in policies.items():
             for name, plan in plans.items():
                 policy.forget_frames()  # every call sees the same observation
-                found = timed(policy, obs, noise, plan, times, f"{name}, {precision}")
+                found = timed(policy, obs, noise, plan, times, precision, f"{name}, {precision}")
                 if (name, precision) == ("dense", "fp32"):
                     error = float(np.abs(found - expected).max())
-    tell(times, 1)
+                    assert policy.last_report is not None
+                    times.add(f"eager: {parts}", precision, split, policy.last_report)
+    times.tell(1)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(f"{error:8.1e}  the dense call from eager; {peak:.2f} GiB at most, all of them loaded")
     alone = ", ".join(f"{part} alone {value:.2g}" for part, value in record.parts.items() if value is not None)
@@ -81,7 +141,13 @@ def plans_of(info: PolicyInfo, computed: int) -> dict[str, Any]:
 
 
 def timed(
-    policy: CompiledPolicy, obs: Mapping[str, np.ndarray], noise: Noise, plan: Any, times: Times, name: str
+    policy: CompiledPolicy,
+    obs: Mapping[str, np.ndarray],
+    noise: Noise,
+    plan: Any,
+    times: Times,
+    precision: str,
+    name: str,
 ) -> np.ndarray:
     """The actions of a call; its seconds before the loop and in it go to ``times``."""
     start = time.process_time()
@@ -90,17 +156,8 @@ def timed(
     assert policy.last_report is not None
     timings = policy.last_report.timings
     before = took * timings.prologue / timings.total
-    times.setdefault(f"{name}: prologue, loop", []).append([before, took - before])
+    times.add(f"{name}: prologue, loop", precision, [before, took - before], policy.last_report)
     return np.asarray(found)
-
-
-def tell(times: Times, left_out: int) -> None:
-    """Print medians of all but the first calls."""
-    for name, rows in times.items():
-        counted = rows[left_out:]
-        medians = [statistics.median(each) for each in zip(*counted, strict=True)]
-        total = statistics.median(map(sum, counted))
-        print(f"{total:8.2f} s  {name}: {', '.join(f'{each:.2f}' for each in medians)}", flush=True)
 
 
 def reusing(folder: Path, spec: PolicySpec, computed: int, rounds: int = 7) -> None:
@@ -114,27 +171,28 @@ def reusing(folder: Path, spec: PolicySpec, computed: int, rounds: int = 7) -> N
     """
     artifact = load_artifact(folder / "compiled").at_precision("int8")
     whole, some = (open_policy(each, seed=0) for each in (artifact, artifact.with_reuse(REUSE)))
-    plans, times, rng = plans_of(whole.info, computed), Times(), np.random.default_rng(1)
+    plans, times, rng = plans_of(whole.info, computed), Times(Arithmetic(artifact)), np.random.default_rng(1)
     obs, noise = call(spec)
     other = Noise(rng.standard_normal(noise.initial.shape, dtype=np.float32))
     cameras = [key for key, value in obs.items() if value.ndim == 5]  # [1, frames, 3, H, W]
     still = {key: picture(obs[key].shape[-1], rng) for key in cameras}
     shares, off, changes = list[float](), dict[str, list[float]](), dict[str, list[float]]()
     for number in range(len(plans) * (rounds + 2)):
+        times.next_round()
         name, plan = list(plans.items())[number % len(plans)]
         for place, (key, background) in enumerate(still.items()):
             ages = reversed(range(obs[key].shape[1]))
             angles = [place + 0.05 * max(number - age, 0) for age in ages]
             obs[key] = np.stack([arm(background, angle) for angle in angles])[None]
-        expected = timed(whole, obs, noise, plan, times, f"{name}, int8, new frames, all tokens")
-        found = timed(some, obs, noise, plan, times, f"{name}, int8, new frames, some tokens")
+        expected = timed(whole, obs, noise, plan, times, "int8", f"{name}, int8, new frames, all tokens")
+        found = timed(some, obs, noise, plan, times, "int8", f"{name}, int8, new frames, some tokens")
         if number >= 2 * len(plans):  # the first is whole, and those that follow may be the first of their size
             frames = some.last_report.frames
             shares.append(frames.tokens / frames.of)
             off.setdefault(name, []).append(float(np.abs(found - expected).mean()))
             again = whole.predict_action(obs, noise=other, plan=plan)["action"]
             changes.setdefault(name, []).append(float(np.abs(again - expected).mean()))
-    tell(times, 2)
+    times.tell(2)
     print(f"{statistics.mean(shares):8.0%}  of the tokens of a new frame are computed")
     for name, values in off.items():
         mean, noisy = statistics.mean(values), statistics.mean(changes[name])

@@ -21,8 +21,9 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from moving import REUSE, arm, picture
+from rate import session
 from torch import Tensor, nn
-from towers import SIGLIP, Seeing, session
+from towers import SIGLIP, Seeing
 
 import ttscompile
 from ttscompile import ChunkSpec, ObservationSpec, PolicySpec

@@ -1,23 +1,28 @@
 """Image encoders alone, of real size with random weights: eager PyTorch, onnxruntime in fp32, and in eight bits.
 
-    python examples/benchmark/towers.py [--only clip,siglip,resnet]
+    python examples/benchmark/towers.py [--only clip,siglip,resnet] [--profile]
 
-One image, one thread. Milliseconds are the processor's, medians of calls in turn: the machine may be busy.
+One image, one thread. Milliseconds are the processor's, medians of calls in turn: the machine may be busy. The floor is
+what the arithmetic takes alone (``rate.py``). With ``--profile`` the share of each operation of int8 follows.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import statistics
+import tempfile
+from collections import Counter
 from collections.abc import Callable
+from pathlib import Path
 from time import process_time
-from typing import Any
 
 import numpy as np
 import onnx
 import onnxruntime
 import torch
-from onnx import ModelProto, numpy_helper
+from onnx import ModelProto
+from rate import rates, run_all, session
 from torch import nn
 
 from ttscompile import ChunkSpec, ObservationSpec, PolicySpec
@@ -25,7 +30,9 @@ from ttscompile.capture.export import capture
 from ttscompile.frontends.clip import ClipVision, VisionConfig
 from ttscompile.frontends.resnet import group_norm, resnet
 from ttscompile.frontends.siglip import Siglip, SiglipConfig
+from ttscompile.ir.flops import graph_flops
 from ttscompile.ir.pieces import CONDITION
+from ttscompile.lower.integer_attention import HEADS
 from ttscompile.lower.precision import LEAST_ROWS, quantize_model
 from ttscompile.lower.program import lower_graph
 from ttscompile.samplers.flow import flow_matching_table
@@ -55,18 +62,8 @@ class Seeing(nn.Module):
         return sample + self.tower(image).flatten(1)[:, :8].unflatten(1, (4, 2))
 
 
-def session(model: ModelProto, weights: dict[str, Any]) -> onnxruntime.InferenceSession:
-    """On one thread."""
-    for tensor in model.graph.initializer:
-        if tensor.name in weights:
-            tensor.CopyFrom(numpy_helper.from_array(np.ascontiguousarray(weights[tensor.name]), tensor.name))
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    return onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
-
-
-def measure(title: str, tower: nn.Module, size: int, rounds: int) -> str:
-    """One row of the table."""
+def measure(title: str, tower: nn.Module, size: int, rounds: int, profiled: bool) -> str:
+    """One row of the table, and where it is asked for the profile."""
     module = Seeing(tower).eval()
     spec = PolicySpec(
         sample=(4, 2),
@@ -80,6 +77,7 @@ def measure(title: str, tower: nn.Module, size: int, rounds: int) -> str:
     draw = np.random.default_rng(0)
     given = {"sample": np.zeros((1, 4, 2), np.float32), "timestep": np.zeros(1, np.float32)}
     given["image"] = draw.standard_normal((1, 3, size, size), dtype=np.float32)
+    products = rates()
     sessions = [
         session(onnx.ModelProto.FromString(m.SerializeToString()), {**weights, **more}) for m in (model, integer)
     ]
@@ -95,6 +93,7 @@ def measure(title: str, tower: nn.Module, size: int, rounds: int) -> str:
     calls = [eager, *map(running, sessions)]
     times: list[list[float]] = [[], [], []]
     for _ in range(rounds + 1):  # the first does not count
+        run_all(products.values())
         found = []
         for call, own in zip(calls, times, strict=True):
             start = process_time()
@@ -102,8 +101,29 @@ def measure(title: str, tower: nn.Module, size: int, rounds: int) -> str:
             own.append(process_time() - start)
     ms = [1000 * statistics.median(own[1:]) for own in times]
     off = np.abs(found[2] - found[1]).mean() / np.abs(found[1]).mean()
-    row = (*(f"{each:.1f}" for each in ms), f"{ms[1] / ms[2]:.1f}", f"{ms[0] / ms[2]:.1f}", f"{off:.1%}")
-    return f"| {title} | {' | '.join(row)} |"
+    floors = [1000 * product.seconds(graph_flops(graph)) for product in products.values()]
+    cells = [f"{each:.1f}" for each in (ms[0], ms[1], floors[0], ms[2], floors[1])]
+    row = (*cells, f"{ms[1] / ms[2]:.1f}", f"{ms[0] / ms[2]:.1f}", f"{off:.1%}")
+    split = profile(integer, {**weights, **more}, given, rounds) if profiled else ""
+    return f"| {title} | {' | '.join(row)} |{split}"
+
+
+def profile(model: ModelProto, weights: dict[str, np.ndarray], given: dict[str, np.ndarray], rounds: int) -> str:
+    """A line for each operation that takes 1 % of a model's time, the largest first; ``Scan`` is attention."""
+    with tempfile.TemporaryDirectory() as folder:
+        one = session(model, weights, Path(folder) / "profile")
+        for _ in range(rounds):
+            one.run(None, {value.name: given[value.name] for value in one.get_inputs()})
+        events = json.loads(Path(one.end_profiling()).read_bytes())
+    nodes = [each for each in events if each["name"].endswith("_kernel_time")]
+    attending = [(each["ts"], each["ts"] + each["dur"]) for each in nodes if each["args"]["op_name"] == HEADS]
+    took: Counter[str] = Counter()
+    for each in nodes:
+        operation = each["args"]["op_name"]
+        if operation == HEADS or not any(start <= each["ts"] < end for start, end in attending):
+            took[operation] += each["dur"]
+    shares = [(operation, each / took.total()) for operation, each in took.most_common()]
+    return "".join(f"\n  {share:6.1%}  {operation}" for operation, share in shares if share >= 0.01)
 
 
 def main() -> None:
@@ -111,14 +131,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
     parser.add_argument("--only", default=",".join(TOWERS), help="names of towers")
     parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--profile", action="store_true", help="say which operations take the time of int8")
     options = parser.parse_args()
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    print("| ms | eager | fp32 | int8 | fp32 / int8 | eager / int8 | features off |")
-    print("| --- | --- | --- | --- | --- | --- | --- |")
+    print("| ms | eager | fp32 | its floor | int8 | its floor | fp32 / int8 | eager / int8 | features off |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
     for name in options.only.split(","):
         title, make, size = TOWERS[name]
-        print(measure(title, make(), size, options.rounds), flush=True)
+        print(measure(title, make(), size, options.rounds, options.profile), flush=True)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """The policies that lerobot trained: compiled, they give what lerobot itself gave; and what was drawn for them."""
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +15,8 @@ from tests.once import Once
 from tests.rounding import PROMISED
 from ttscompile.artifact.load import load_artifact
 from ttscompile.cli.timing import original_policy
+from ttscompile.errors import CheckpointError
+from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.ir.program import Program
 
 POLICIES = Path(__file__).parents[2] / "examples" / "policies"
@@ -38,6 +41,16 @@ def test_dense_compiled_is_what_lerobot_answered(name: str, once: Once) -> None:
     np.testing.assert_allclose(found, answers["action"], rtol=0, atol=PROMISED * WORLD)
     _, original = original_policy(POLICIES / name / "policy", load_artifact(folder).manifest.spec)
     assert [*original.observations] == [*policy.info.observation], "bench gives the original the same instruction"
+
+
+def test_encoders_that_are_kept_elsewhere_are_named_to_the_rival_too(tmp_path: Path) -> None:
+    policy = POLICIES / "pixels" / "policy"
+    spec = load_checkpoint_policy(policy)[1]
+    shutil.copytree(policy, tmp_path / "policy", ignore=lambda folder, names: ["clip-tiny"])
+    with pytest.raises(CheckpointError, match="--encoders"):
+        original_policy(tmp_path / "policy", spec)
+    _, original = original_policy(tmp_path / "policy", spec, policy / "clip-tiny")
+    assert original.observations.keys() == spec.observations.keys()
 
 
 def test_keypoints_under_lerobots_name() -> None:
