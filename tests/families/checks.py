@@ -7,9 +7,12 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
+import torch
+from torch import nn
 
-from tests.rounding import amplified, bound
+from tests.rounding import Counted, amplified, bound
 from tests.runtimes.agreement import call_terms, largest_difference
+from ttscompile import PolicySpec
 from ttscompile.artifact import load_artifact
 from ttscompile.ir.flops import graph_flops
 from ttscompile.ir.program import Program
@@ -46,3 +49,12 @@ def assert_runtimes_agree(folder: Path, streams: tuple[int, ...] = (1, 3)) -> No
     allowed = bound(amplified(call_terms(artifact), artifact.manifest.spec.sampler))
     for count in streams:
         assert largest_difference(artifact, left, right, rng, count, calls=3) < allowed
+
+
+def rounded(module: nn.Module, conditions: Arrays, spec: PolicySpec) -> tuple[float, float]:
+    """Terms and largest angle of a whole call, as ``tests.rounding`` counts them."""
+    inputs = {key: torch.from_numpy(value) for key, value in conditions.items()}
+    largest = torch.tensor(spec.sampler.timesteps).max().expand(len(next(iter(inputs.values()))))
+    with torch.no_grad(), Counted() as counted:
+        module(torch.zeros(len(largest), *spec.sample), largest, **inputs)
+    return amplified(spec.sampler.steps * counted.terms, spec.sampler), counted.angle

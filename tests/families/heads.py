@@ -10,9 +10,11 @@ from torch import nn
 from tests.families.checks import Arrays, golden
 from tests.families.cogact import CogACTHead
 from tests.families.dit_policy import DiTPolicyHead
+from tests.families.dita import DitaHead
 from tests.families.groot import GR00THead
 from tests.families.pi import PiHead
 from tests.families.rdt import RDTHead
+from tests.families.scaledp import ScaleDPHead
 from tests.families.smolvla import SmolVLAHead
 from tests.families.weights import draw_weights
 from ttscompile import ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
@@ -149,6 +151,34 @@ def dit_policy() -> Family:
     )
 
 
+def scaledp() -> Family:
+    solver = diffusers.DDIMScheduler(100, beta_schedule="squaredcos_cap_v2")
+    return Family(
+        title="ScaleDP (DexVLA)",
+        verified="DexVLA fc21a82 `model_forward`, `forward`, up to the rounding of float32",
+        module=ScaleDPHead(24, heads=3, layers=2, hidden=20, horizon=6, actions=5, features=18, state=4),
+        conditions=("features", "state"),
+        sampler=sampler_table(solver, 10, name="ddim"),
+        prediction="prediction",
+        blocks={"self_attention": 2, "feed_forward": 2},
+        loop=0.9,
+    )
+
+
+def dita() -> Family:
+    solver = diffusers.DDIMScheduler(100, beta_schedule="squaredcos_cap_v2")
+    return Family(
+        title="Dita",
+        verified="Dita 66350e7 `forward`, `inference`, up to the rounding of float32",
+        module=DitaHead(128, heads=2, hidden=80, layers=2, actions=7),
+        conditions=("prefix",),
+        sampler=sampler_table(solver, 10, name="ddim"),
+        prediction="prediction",
+        blocks={"self_attention": 2, "feed_forward": 2},
+        loop=0.9,
+    )
+
+
 FAMILIES = {
     "smolvla": smolvla,
     "rdt": rdt,
@@ -157,6 +187,8 @@ FAMILIES = {
     "groot": groot,
     "cogact": cogact,
     "dit_policy": dit_policy,
+    "scaledp": scaledp,
+    "dita": dita,
 }
 
 
@@ -170,5 +202,6 @@ def loaded(family: Family, name: str) -> tuple[nn.Module, Arrays, PolicySpec]:
         key: ObservationSpec(arrays[key].shape[1:], dtype=str(arrays[key].dtype)) for key in family.conditions
     }
     horizon, channels = arrays["noise"].shape[1:]
-    spec = PolicySpec((horizon, channels), observations, family.sampler, ChunkSpec(channels, 0, horizon))
+    chunk = ChunkSpec(channels, horizon - arrays["actions"].shape[1], horizon)
+    spec = PolicySpec((horizon, channels), observations, family.sampler, chunk)
     return family.module.eval(), arrays, spec

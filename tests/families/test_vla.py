@@ -6,26 +6,14 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import nn
 
 import ttscompile
-from tests.families.checks import Arrays, assert_runtimes_agree, in_loop, kinds
+from tests.families.checks import assert_runtimes_agree, in_loop, kinds, rounded
 from tests.families.heads import FAMILIES, Family, loaded
 from tests.families.support import record
-from tests.rounding import Counted, amplified, assert_equal_but_for_rounding
-from ttscompile import PolicySpec
+from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile.driver import transform
 from ttscompile.ir.program import Program
-
-
-def rounded(module: nn.Module, conditions: Arrays, spec: PolicySpec) -> tuple[float, float]:
-    """Terms and largest angle of a whole call, as ``tests.rounding`` counts them."""
-    inputs = {key: torch.from_numpy(value) for key, value in conditions.items()}
-    largest = torch.tensor(spec.sampler.timesteps).max().expand(len(next(iter(inputs.values()))))
-    with torch.no_grad(), Counted() as counted:
-        module(torch.zeros(len(largest), *spec.sample), largest, **inputs)
-    return amplified(spec.sampler.steps * counted.terms, spec.sampler), counted.angle
-
 
 LOWERED = ("smolvla", "rdt")
 """Run through both runtimes every time; the others with ``-m soak``, for the sake of time."""
@@ -67,7 +55,7 @@ def test_a_compiled_head_acts_as_the_original(name: str, tmp_path: Path) -> None
     for runtime in ("reference", "onnxruntime"):
         policy = ttscompile.load(tmp_path / "compiled", runtime=runtime)
         noise = ttscompile.Noise(arrays["noise"])
-        action = policy.predict_action(conditions, noise=noise, plan="dense")["action_pred"]
+        action = policy.predict_action(conditions, noise=noise, plan="dense")["action"]
         action = action * conditions["action_mask"] if family.masks else action
         assert_equal_but_for_rounding(action, arrays["actions"], terms, angle)
     assert_runtimes_agree(tmp_path / "compiled")

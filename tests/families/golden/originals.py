@@ -140,3 +140,8 @@ def normal(seed: int) -> Callable[..., np.ndarray]:
 def noise_from(initial: np.ndarray) -> AbstractContextManager[Any]:
     """What ``torch.randn`` gives inside: the noise that a call starts from."""
     return patch("torch.randn", lambda *args, **kwargs: torch.from_numpy(initial.copy()))
+
+
+def on_cpu() -> AbstractContextManager[Any]:
+    """``Tensor.cuda`` does nothing inside: for originals that send tensors to a GPU by name."""
+    return patch.object(torch.Tensor, "cuda", lambda self, *args, **kwargs: self)
