@@ -33,7 +33,7 @@ OWN_MODULE = r"compile_denoiser\(module, spec\)"
 PAYLOADS: list[tuple[dict[str, Any], str, str]] = [
     ({"model": {"action_model": {"net.blocks.0.attn.qkv.weight": W}, "projector": {"a": W}}}, "CogACT", OWN_MODULE),
     ({"model": {"llm_backbone": {"a": W}, "x_embedder": {"mlp.fc1.weight": W}}}, "HybridVLA", "inside its language"),
-    ({"parameter": {"blocks.0.weight": W}}, "Dita", "KV cache"),
+    ({"parameter": {"blocks.0.weight": W}}, "Dita", r"tokens of words and frames.*dita\.py"),
     ({"model.blocks.0.ffn.fc1.weight": W, "lang_adaptor.0.weight": W}, "weights of RDT", "dpmsolver"),
     ({"model": {"noise_net.dec_pos": W, "noise_net.time_net.w": W}, "optim": {}}, "DiT-Policy", OWN_MODULE),
     (
@@ -97,6 +97,7 @@ DIRECTORY_FILES: list[tuple[list[str], str]] = [
     (["config.json", "model.safetensors"], r"a directory of weights .told by model\.safetensors"),
     (["config.json=lang_adaptor", "pytorch_model.bin"], r"this is RDT .told by config\.json: lang_adaptor.*dpmsolver"),
     (["config.json=model_type=gr00t_n1_5", "model.safetensors"], r"a GR00T model .told by config\.json: model_type"),
+    (["config.json=policy_head_type=scale_dp_policy", "model.safetensors"], r"DexVLA.*scaledp\.py"),
     (["pytorch_model.bin"], "a directory of weights"),
     (["README.md"], r"found README\.md; expected the config\.json and model\.safetensors"),
     ([], "found nothing"),

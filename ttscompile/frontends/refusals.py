@@ -19,7 +19,8 @@ from .settings import read_json
 
 _BUILD = "Build the network with the code that trained it and use ttscompile.compile_denoiser(module, spec)"
 _HEAD = f"{_BUILD}: the action head is the module, and what the vision-language model gives it are its observations."
-_DITA = f"{_HEAD} For Dita the prefix of its Llama, as a KV cache."
+_DITA = f"{_HEAD} For Dita they are the tokens of words and frames; examples/vla/dita.py does it."
+_SCALEDP = f"{_HEAD} examples/vla/scaledp.py does it for its policy_head, ScaleDP."
 _U_NET = (
     "Its denoiser is not a transformer and has no residual stream whose blocks could be reused. Train a transformer"
     " policy: Diffusion Policy's configurations named train_diffusion_transformer_*, or LeRobot's multi_task_dit."
@@ -77,6 +78,7 @@ DIRECTORIES = (
     Refusal(r"(^|/)pretrained_model/config\.json$", "a directory around what lerobot saved", _INNER),
     Refusal(r"^config\.json: (lang|img|state)_adaptor\b", "RDT", f"{_HEAD} Its sampler is dpmsolver++."),
     Refusal(r"^config\.json: model_type=gr00t", "a GR00T model", _HEAD),
+    Refusal(r"^config\.json: (policy_head|model)_type=scale_dp", "DexVLA or its ScaleDP", _SCALEDP),
     Refusal(r"\.ckpt$", "a directory of checkpoints", "Give one of the files in it, checkpoints/latest.ckpt say."),
     Refusal(r"\.(safetensors|bin|pth?)$", "a directory of weights", _WEIGHTS),
 )
