@@ -27,18 +27,24 @@ from ttscompile.samplers.table import sampler_table
 
 
 class Head(nn.Module):
-    """``forward`` of a ``RobotTransformerNet`` without ``use_action_head_diff``, as a function of tensors.
+    """``forward`` of a ``RobotTransformerNet``, as a function of tensors.
 
     Dita evaluates its Llama on all tokens at every step. Attention is causal: no token sees those behind it. Here the
     prefix, the timestep and the actions go through it one after the other, each with the keys and values of those
     before. Then only the actions stay in the loop.
 
     Args:
-        network: a ``RobotTransformerNet`` whose ``dim_align_type`` is 0.
+        network: a ``RobotTransformerNet`` that denoises with its Llama and pads the actions to the width of a token.
+
+    Raises:
+        ValueError: it has another head (``use_action_head_diff``) or another way to a token (``dim_align_type``).
     """
 
     def __init__(self, network: Any) -> None:
         super().__init__()
+        for setting in ("use_action_head_diff", "dim_align_type"):
+            if found := getattr(network, setting):
+                raise ValueError(f"{setting} of the network must be 0; found {found}. Write its forward into a Head.")
         self.llama, self.time = network.transformer, network.time_emb
         self.width = network.token_embedding_size
 

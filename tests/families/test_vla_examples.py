@@ -47,6 +47,7 @@ class Dita(nn.Module):
 
     token_embedding_size, tokens_per_context_image = 128, TOKENS
     time_sequence_length, trajectory_dim, num_inference_steps = 6, 7, 10
+    use_action_head_diff, dim_align_type = 0, 0
 
     def __init__(self) -> None:
         super().__init__()
@@ -112,6 +113,14 @@ def test_a_wrapper_computes_what_the_original_computes(
     with torch.no_grad(), Counted() as counted:
         made = head(torch.from_numpy(arrays["noise"]), torch.from_numpy(arrays["timesteps"]), **inputs)
     assert_equal_but_for_rounding(made, arrays["prediction"], counted.terms, max(counted.angle, 90.0))
+
+
+@pytest.mark.parametrize("setting", ["use_action_head_diff", "dim_align_type"])
+def test_another_dita_is_refused(setting: str) -> None:
+    network = Dita()
+    setattr(network, setting, 2)
+    with pytest.raises(ValueError, match=f"{setting} of the network must be 0; found 2"):
+        dita.Head(network)
 
 
 @pytest.mark.soak
