@@ -27,11 +27,11 @@ from ttscompile.report.facts import told_warm
 @click.command("warm-start", cls=FilesCommand)
 @artifact_argument
 @trajectories_options(required=False)
-@count_option("--calls", "To measure, at most.", default=128, least=2)
+@count_option("--calls", "To measure, at most.", default=512, least=2)
 @click.option(
     "--max-distance",
     type=ERROR,
-    default=1.1,
+    default=1.4,
     show_default=True,
     help="How far actions may be from those of a dense call with other noise; 1 is how far two dense calls are apart.",
 )
@@ -50,7 +50,7 @@ def warm_start(
 
     A program that loads it with warm=True then computes the whole loop in the first call of an episode, and these last
     steps in all others. The fewest steps are taken with which actions are like dense ones, also where the world changed
-    between two calls. Exit status 1: there are none, and nothing was changed.
+    into that of another episode between two calls. Exit status 1: there are none, and nothing was changed.
     """
     manifest_of(directory)
     if off == bool(trajectories):
