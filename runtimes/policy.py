@@ -16,7 +16,6 @@ from ttscompile.core.spec import FloatArray, Noise
 from ttscompile.errors import (
     IllegalPlanError,
     NonFiniteActionsError,
-    ObservationError,
     TtscompileError,
 )
 from ttscompile.measure.process import LONGEST_WAIT, Process

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -52,10 +53,12 @@ class OnnxBackend:
         self._schedules = tuple(self._lowered.values())
         self._pruned = any(plan.pruned for plan in self._manifest.plans.values())
         self._blocks = self._pruned or any(one.partial for one in self._schedules)  # whether these have sessions
-        self.sessions = open_sessions(artifact, threads, self._blocks) if whole is None else whole.sessions
+        self.sessions: dict[str, Any] = (
+            open_sessions(artifact, threads, self._blocks) if whole is None else whole.sessions
+        )
         self._run = partial(run_piece, self.sessions, self._manifest.pieces)  # which does not keep the backend alive
         self._renew = partial(renew_piece, self.sessions, self._manifest.pieces)
-        self.frames = self._open_frames() if whole is None else whole.frames
+        self.frames: FramePieces = self._open_frames() if whole is None else whole.frames
         self.keeps = readable_rollout(artifact)
         self.workspace: Workspace | None = self._open_workspace(1)
 

@@ -13,7 +13,7 @@ from .manifest import DENSE
 
 
 def with_last_steps(artifact: Artifact, steps: int) -> tuple[Artifact, Start]:
-    """The artifact of the last steps of the loop alone, dense, and what they begin with. Files and weights are the same.
+    """The artifact of the last steps of the loop alone, dense, and what they begin with. Its files are the same.
 
     Args:
         artifact: of the whole loop.

@@ -16,9 +16,7 @@ from .warm import WarmRecord
 from .write import identified, locked, require_unzipped
 
 
-def settle(
-    path: str | os.PathLike[str], *, held: bool = False, **record: ReuseRecord | WarmRecord | None
-) -> Manifest:
+def settle(path: str | os.PathLike[str], *, held: bool = False, **record: ReuseRecord | WarmRecord | None) -> Manifest:
     """Have an artifact reuse tokens, or begin calls with the chunk before, in another way. Plans and weights stay.
 
     Args:

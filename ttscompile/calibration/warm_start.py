@@ -141,9 +141,7 @@ class _Measured:
         before, other, self._noise, beside = ([random_noise(self._spec, rng) for _ in places] for _ in range(4))
         self._now = [_normalized(self._spec, episodes[i], row) for i, row in places]
         own = [_normalized(self._spec, episodes[i], row - 1) for i, row in places]
-        changed = [
-            _normalized(self._spec, episodes[another(episodes, i, row, rng)], row - 1) for i, row in places
-        ]
+        changed = [_normalized(self._spec, episodes[another(episodes, i, row, rng)], row - 1) for i, row in places]
         dense = artifact.manifest
         self._before = [
             _samples(self._runtime, dense, seen, noise) for seen, noise in ((own, before), (changed, other))

@@ -68,7 +68,8 @@ def warm_start(
     if as_json:
         print_json({"warm": vars(found.warm), "tried": [vars(one) for one in found.tried]})
         return
-    head = ("last steps", "distance", "where the world has changed")
+    head = ("last steps", "distance from a dense call", "where the world has changed")
     rows = [(str(one.last_steps), f"{one.same:.3g}", f"{one.changed:.3g}") for one in found.tried]
-    results().print(table("Distance from a dense call; two dense calls: 1", *head, rows=rows))
+    results().print(table(*head, rows=rows))
+    say(results(), "A distance of 1 is that of two dense calls with different noise.")
     say(results(), told_warm(found.warm, manifest_of(directory).steps))

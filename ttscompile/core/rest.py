@@ -17,7 +17,6 @@ TOLERANCE = 1e-3
 """Of what the shares of action and noise are known by: the table is in float32."""
 
 
-
 @dataclass(frozen=True)
 class Start:
     """What the rest of a longer loop begins with.
