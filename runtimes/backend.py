@@ -55,6 +55,9 @@ class Backend(Protocol[Lowered]):
     A backend that has ``frames`` too, a ``FramePieces``, computes with it what depends on one frame alone, and so only
     for frames that are new; one that has none computes all of them in ``start``.
 
+    A backend that has ``of_last_steps`` too, which takes an artifact of the last steps of the same loop, makes with it
+    the backend of these, and shares its weights with it.
+
     Attributes:
         keeps: bool ``[K, blocks]``; entries of the rollout cache that are worth keeping when a plan of the artifact is
             executed. Those that none of these plans reads may be left out.

@@ -15,7 +15,7 @@ from .arrays import check_seed
 from .instruct import Instruct
 from .open import kind_of, open_runtime
 from .policy import CompiledPolicy, require_plan
-from .warm_start import WarmPolicy
+from .warm_start import WarmPolicy, settled_steps
 
 TRIES = 3
 """Times that ``load`` begins before it gives up on an artifact that is replaced while it is loaded."""
@@ -32,7 +32,7 @@ def load(
     device: str | None = None,
     tokenizer: str | Path | None = None,
     reuse_tokens: bool = True,
-    warm: str | Path | None = None,
+    warm: int | bool | None = None,
 ) -> CompiledPolicy:
     """Load a compiled policy.
 
@@ -55,17 +55,18 @@ def load(
             ``task`` in place of tokens. Needs the package tokenizers. None: the caller gives tokens.
         reuse_tokens: of new frames compute the tokens whose patches changed, as ``ttscompile.reuse_tokens`` has settled
             it for the artifact; where it has not, and in other runtimes, all are computed. False computes all.
-        warm: artifact of the last steps of the same loop (``convert --last-steps``). All calls of an episode but the
-            first then begin with the chunk of the call before, and compute these steps alone; each call has to be one
-            chunk later than the one before (``docs/howto/warm-start.md``). A plan is of calls that compute the whole
-            loop; the others have the default plan of ``warm``. None: every call begins with noise.
+        warm: how many steps at the end of the loop a call computes that begins with the chunk of the call before; True
+            for as many as ``ttscompile.warm_start`` has settled. All calls of an episode but the first do so then, and
+            each has to be one chunk later than the one before (``docs/howto/warm-start.md``). These steps are dense: a
+            plan is of calls that compute the whole loop. None or False: every call begins with noise.
 
     Raises:
         IllegalPlanError: the artifact has no plan of this name.
         ObservationError: the tokenizer cannot be had, or the policy has no use for it.
         ArtifactChangedError: the artifact was replaced while it was loaded, and again whenever it was tried again.
         ArtifactError: the artifact is missing, damaged, of another version, or without blocks of this precision; or
-            ``warm`` does not hold the last steps of its loop.
+            ``warm`` is True and nothing was settled.
+        SpecError: ``warm`` is no number of steps below those of the loop, or this sampler has no such start.
         RuntimeUnavailableError: the runtime, or ``huggingface_hub``, cannot be had on this machine.
         HubError: the repository cannot be had, or holds no artifact.
         TtscompileError: the seed is no whole number of at least 0.
@@ -76,14 +77,10 @@ def load(
         fetched = fetch_artifact(str(path))
         path, origin = fetched.path, fetched.origin
 
-    rest = None
-    if warm is not None:
-        rest = load(warm, runtime, threads, precision=precision, device=device, reuse_tokens=reuse_tokens)
-
     def once() -> CompiledPolicy:
         artifact = load_artifact(path)
         artifact = artifact if reuse_tokens else artifact.with_reuse(None)
-        return open_policy(artifact, runtime, threads, seed, precision, plan, device, tokenizer, origin, rest)
+        return open_policy(artifact, runtime, threads, seed, precision, plan, device, tokenizer, origin, warm)
 
     for _ in range(TRIES - 1):
         with suppress(ArtifactChangedError):
@@ -101,9 +98,9 @@ def open_policy(
     device: str | None = None,
     tokenizer: str | Path | None = None,
     origin: str | None = None,
-    rest: CompiledPolicy | None = None,
+    warm: int | bool | None = None,
 ) -> CompiledPolicy:
-    """The policy of an artifact that is loaded; see ``load``, ``CompiledPolicy`` and, with ``rest``, ``WarmPolicy``."""
+    """The policy of an artifact that is loaded; see ``load``, ``CompiledPolicy`` and ``WarmPolicy``."""
     made, own = kind_of(runtime).precisions, FP32
     if made:
         if precision is not None and precision not in made:
@@ -118,4 +115,6 @@ def open_policy(
     opened = open_runtime(artifact, runtime, threads, device, own, plan)
     instruct = None if tokenizer is None else Instruct(artifact.manifest.spec, tokenizer)
     arguments = (artifact, opened, seed, plan, own if made else None, origin, instruct)
-    return CompiledPolicy(*arguments) if rest is None else WarmPolicy(*arguments, rest=rest)
+    if warm is None or warm is False:
+        return CompiledPolicy(*arguments)
+    return WarmPolicy(*arguments, last_steps=settled_steps(artifact) if warm is True else warm)

@@ -16,7 +16,6 @@ from ttscompile.core.spec import FloatArray, Noise
 from ttscompile.errors import (
     IllegalPlanError,
     NonFiniteActionsError,
-    ObservationError,
     TtscompileError,
 )
 from ttscompile.measure.process import LONGEST_WAIT, Process
@@ -292,12 +291,6 @@ class CompiledPolicy:
         """One call; the actions ``[B, T, Da]``, which are finite."""
         self._report = self._sample = None
         spec = self._manifest.spec
-        if spec.start is not None and noise is None:
-            held = spec.start.told(spec.sampler.steps)
-            raise ObservationError(
-                f"this artifact holds {held}, which begin with the chunk of the call before."
-                " Load the whole loop with it: ttscompile.load(WHOLE, warm=THIS)."
-            )
         obs = check_observation(obs, spec.observations)
         streams = len(next(iter(obs.values())))
         self._runtime.require_streams(streams)

@@ -131,6 +131,15 @@ class Runtime:
         """
         return self._used.frames.learn(obs, stop)
 
+    def of_last_steps(self, artifact: Artifact) -> Runtime:
+        """The runtime of the last steps of this loop, dense, and with these weights where the backend can share them.
+
+        Args:
+            artifact: ``artifact.rest.with_last_steps`` of this one's.
+        """
+        backend = self._opened_for(DENSE).backend
+        return Runtime(artifact, getattr(backend, "of_last_steps", self._open_backend), DENSE)
+
     def _end_episode(self) -> None:
         self._written = self._dropped = None
 

@@ -3,7 +3,7 @@
     first call     noise                                               whole loop    chunk
     later calls    chunk, moved by what was executed, with new noise   last steps    chunk
 
-This is a warm start (Falcon, arXiv 2503.00339). The whole loop and its last steps are artifacts of their own.
+This is a warm start (Falcon, arXiv 2503.00339). The last steps are dense.
 """
 
 from __future__ import annotations
@@ -13,13 +13,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import numpy.typing as npt
 
 from ttscompile.artifact.load import Artifact
-from ttscompile.artifact.typed_json import to_json
+from ttscompile.artifact.manifest import DENSE
+from ttscompile.artifact.rest import with_last_steps
 from ttscompile.core.spec import FloatArray, Noise
-from ttscompile.core.start import Start
 from ttscompile.errors import ArtifactError, NonFiniteActionsError, ObservationError
 
 from .arrays import Array, check_noise, check_observation
@@ -27,36 +26,39 @@ from .frames import FrameWork
 from .info import PolicyInfo
 from .inpainting import check_prefix
 from .policy import CompiledPolicy
+from .runtime import Runtime
 
 NO_PREFIX = "its calls keep to the chunk of the call before already (it was loaded with warm=)"
 
 
 class WarmPolicy(CompiledPolicy):
-    """See ``load(warm=)``. The first call of an episode is the whole loop's, and all others are the rest's.
+    """See ``load(warm=)``. The first call of an episode computes the whole loop, and all others its last steps.
 
     A chunk is taken to have been executed as far as ``action`` goes when the next call is made: each call is one
     chunk later than the one before.
 
     Args:
-        artifact: of the whole loop, and what else ``CompiledPolicy`` takes.
-        rest: a policy of the last steps of the same loop; nobody else may call it.
+        artifact: of the whole loop.
+        runtime: opened on the same artifact.
+        arguments: what else ``CompiledPolicy`` takes.
+        last_steps: how many steps a later call computes.
 
     Raises:
-        ArtifactError: ``rest`` is not the rest of this loop.
+        SpecError: there are no fewer steps, or they do not tell what they begin with (``core.rest``).
     """
 
-    def __init__(self, artifact: Artifact, *arguments: Any, rest: CompiledPolicy) -> None:
-        self._start = _require_rest(artifact, rest._artifact)
-        self._rest = rest
-        super().__init__(artifact, *arguments)
+    def __init__(self, artifact: Artifact, runtime: Runtime, *arguments: Any, last_steps: int) -> None:
+        rest, self._start = with_last_steps(artifact, last_steps)
+        super().__init__(artifact, runtime, *arguments)
+        self._rest = CompiledPolicy(rest, runtime.of_last_steps(rest))
         self._prefix_refusal = NO_PREFIX
 
     @property
     def info(self) -> PolicyInfo:
-        """Of the whole loop; ``warm_steps`` and ``identity`` are of both."""
-        rest = self._rest.info
-        both = hashlib.sha256(f"{super().info.identity} {rest.identity}".encode()).hexdigest()
-        return replace(super().info, warm_steps=rest.K, identity=both)
+        """Of the whole loop; ``warm_steps`` and ``identity`` say how many steps later calls compute."""
+        own, steps = super().info, self._rest.info.K
+        both = hashlib.sha256(f"{own.identity} last {steps}".encode()).hexdigest()
+        return replace(own, warm_steps=steps, identity=both)
 
     def _reset(self) -> None:
         super()._reset()
@@ -91,12 +93,9 @@ class WarmPolicy(CompiledPolicy):
             raise ObservationError(f"{found}. Call reset() before changing the number of streams.")
         self._plan(plan)  # which is not of this call, but may be of no artifact
         fresh = check_noise(self._draw(streams) if noise is None else noise, streams, spec)
-        moved = np.minimum(np.arange(before.shape[1]) + spec.chunk.stop - spec.chunk.start, before.shape[1] - 1)
-        initial = np.float32(self._start.action) * before[:, moved] + np.float32(self._start.noise) * fresh.initial
-        steps = None if fresh.steps is None else fresh.steps[self._start.skipped :]
         self._report = self._sample = None  # a call that fails ends the episode
         try:
-            actions = self._rest._predict(obs, Noise(initial, steps), None)
+            actions = self._rest._predict(obs, self._start.noise_from(before, spec.chunk, fresh), DENSE)
         except Exception as error:
             self._runtime.reset()
             if isinstance(error, NonFiniteActionsError):
@@ -106,27 +105,14 @@ class WarmPolicy(CompiledPolicy):
         return actions
 
 
-def _require_rest(whole: Artifact, rest: Artifact) -> Start:
-    """Where the rest begins. Specifications and timesteps are compared; weights are not.
+def settled_steps(artifact: Artifact) -> int:
+    """The number of last steps that was settled for an artifact.
 
     Raises:
-        ArtifactError: it is not the rest of this loop.
+        ArtifactError: there is none.
     """
-    one, other = whole.manifest.spec, rest.manifest.spec
-    if one.start is not None:
-        found = f"expected a whole loop; found {one.start.told(one.sampler.steps)} of {one.sampler.name}"
-        raise ArtifactError(f"{whole.path}: {found}. Load it as ttscompile.load(WHOLE, warm=THIS).")
-    if other.start is None:
-        found = f"expected the last steps of a loop; found a whole one of {other.sampler.steps} steps"
-        raise ArtifactError(f"{rest.path}: {found}. Convert the checkpoint with --last-steps.")
-    ours, theirs = (to_json(replace(spec, sampler=one.sampler, start=None, source={})) for spec in (one, other))
-    differ = [name for name in ours if ours[name] != theirs[name]]
-    timesteps = one.sampler.timesteps[other.start.skipped :]
-    if one.sampler.name != other.sampler.name or not np.array_equal(timesteps, other.sampler.timesteps):
-        differ = ["sampler", *differ]
-    if differ:
-        expected = f"expected the rest of {whole.path}, of {one.sampler.steps} steps of {one.sampler.name}"
-        found = f"{other.start.told(other.sampler.steps)} of {other.sampler.name}, with another {', '.join(differ)}"
-        remedy = "Convert the same checkpoint with the same options and --last-steps"
-        raise ArtifactError(f"{rest.path}: {expected}; found {found}. {remedy}.")
-    return other.start
+    record = artifact.manifest.warm
+    if record is None:
+        remedy = f"Run 'ttscompile warm-start {artifact.path} --trajectories FILE', or give a number of steps"
+        raise ArtifactError(f"{artifact.path}: how many steps a warm call needs was not settled. {remedy}: warm=3.")
+    return record.last_steps

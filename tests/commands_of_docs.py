@@ -14,6 +14,7 @@ NOT_RUN = {
     ".venv/bin/ruff": "make lint",
     "ttscompile serve": "has no end; tests/executor/test_serve.py and test_locked.py start it",
     "ttscompile distill": "ends with 1 after so short a training; tests/calibration/test_distill.py trains",
+    "ttscompile warm-start": "on recordings of its own: tests/calibration/test_warm_start.py runs it",
     "ttscompile reuse-tokens": "of an image encoder with tokens: tests/calibration/test_tokens.py runs it",
     "ttscompile fleet": "has no end; tests/fleet/test_command.py starts it",
     "curl": "needs a server; tests/executor/test_metrics.py and tests/fleet ask the same of one",

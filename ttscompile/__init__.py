@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from .calibration.pipeline import calibrate as calibrate
     from .calibration.tokens import TokenCalibration as TokenCalibration
     from .calibration.tokens import reuse_tokens as reuse_tokens
+    from .calibration.warm_start import WarmCalibration as WarmCalibration
+    from .calibration.warm_start import warm_start as warm_start
     from .core.lattice import Source as Source
     from .core.lattice import legalize as legalize
     from .core.spec import Affine as Affine
@@ -49,6 +51,7 @@ _HOMES = {
         "calibration.distill": ("distill",),
         "calibration.pipeline": ("calibrate",),
         "calibration.tokens": ("TokenCalibration", "reuse_tokens"),
+        "calibration.warm_start": ("WarmCalibration", "warm_start"),
         "core.lattice": ("Source", "legalize"),
         "core.spec": ("Affine", "ChunkSpec", "Noise", "ObservationSpec", "PolicySpec", "SamplerTable"),
         "driver": ("compile_denoiser", "convert"),

@@ -79,7 +79,6 @@ def convert(
     encoders: str | os.PathLike[str] | None = None,
     without_cameras: Sequence[str] | None = None,
     prediction_horizon: int | None = None,
-    last_steps: int | None = None,
     precision: str = FP32,
     keep_fp32: Collection[str] = (),
     single_file: str | os.PathLike[str] | None = None,
@@ -106,7 +105,6 @@ def convert(
         without_cameras: of a vision-language-action model: names of cameras that it was trained with and that the robot
             lacks. None leaves out only those that lerobot calls empty.
         prediction_horizon: predict only the first so many steps of the policy's horizon; see ``compile_denoiser``.
-        last_steps: compile so many steps at the end of the loop alone, for ``load(warm=)``; None: the whole loop.
         precision: of the weights: ``fp32``, ``int8`` or ``auto``; see ``compile_denoiser``.
         keep_fp32: what stays in fp32 beside another precision; see ``compile_denoiser``.
         single_file: where one ONNX file of the whole call goes too, for programs without ttscompile; None for none.
@@ -124,7 +122,7 @@ def convert(
         checkpoint, base = fetched.path, {"base": fetched.origin}
         if fetched.licence is not None:
             base["base_licence"] = fetched.licence
-    options = LoadOptions(sampler, steps, spacing, task, encoders, without_cameras, last_steps)
+    options = LoadOptions(sampler, steps, spacing, task, encoders, without_cameras)
     module, spec = load_checkpoint_policy(checkpoint, format, options)
     spec = replace(spec, source={**spec.source, **base})
     beside = files_beside(checkpoint, spec)

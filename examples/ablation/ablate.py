@@ -216,13 +216,16 @@ def measured(
 
 
 def keep(found: Found, directory: Path) -> None:
-    """Have the artifact in ``directory`` execute what was found, with its correction, as the plan ``found``."""
+    """Have the artifact in ``directory`` execute what was found, with its correction, as the plan ``found``.
+
+    Of a head the mean of its plans is beside it, as ``calibrate`` leaves it.
+    """
     schedule = found.pruner is None
     corrections = {"found": found.correction if schedule else found.pruner_correction}
     update_calibration(
         directory,
         found.pruner,
-        {"found": found.schedule} if schedule else {},
+        {"found" if schedule else "mean": found.schedule},
         "found",
         {"strategy": "ablation", **found.notes},
         corrections={name: one for name, one in corrections.items() if one is not None},

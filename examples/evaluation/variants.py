@@ -16,8 +16,9 @@ from ttscompile.cli.output import results_console as results_console
 from ttscompile.cli.output import run as run
 from ttscompile.runtimes.info import PolicyInfo
 
-PINNED = ":pinned"
-"""After a plan: the noise of an episode's first call in all of its calls."""
+PINNED, WARM = "pinned", "warm="
+"""What may stand after a directory beside a plan: the noise of an episode's first call in all of its calls; and calls
+that begin with the chunk of the call before (``ttscompile.load(warm=)``)."""
 
 Plan: TypeAlias = str | npt.NDArray[np.int8]
 """``dense``, the name of a plan in the artifact, or a matrix ``[K, blocks]``."""
@@ -83,22 +84,22 @@ def open_variant(text: str, runtime: str, threads: int) -> Variant:
 
     Args:
         text: ``DIR`` for the artifact's default plan, ``DIR:dense``, or ``DIR:NAME`` for a plan that it holds.
-            ``DIR+REST`` is ``ttscompile.load(DIR, warm=REST)``. With ``:pinned`` after the plan all calls of an episode
-            have the same noise.
+            With ``:pinned`` after it all calls of an episode have the same noise, and with ``:warm=N`` calls begin with
+            the chunk of the call before.
         runtime: of ``ttscompile.load``.
         threads: of ``ttscompile.load``.
 
     Returns:
         The variant, its label being the text.
     """
-    named = text.removesuffix(PINNED)
-    folders, colon, plan = named.partition(":")
-    directory, rest = folders, ""
-    if not Path(folders).exists():  # a name may have a plus in it
-        directory, _, rest = folders.partition("+")
-    policy = ttscompile.load(Path(directory), runtime=runtime, threads=threads, warm=rest or None)
-    noise = replace(noise_shape(policy.info), pinned=named != text)
-    return Variant(text, policy, plan if colon else None, noise)
+    directory, *words = text.split(":")
+    warm = [int(word.removeprefix(WARM)) for word in words if word.startswith(WARM)]
+    plans = [word for word in words if word != PINNED and not word.startswith(WARM)]
+    if max(len(plans), len(warm)) > 1:
+        raise click.BadParameter(f"{text}: expected one plan, and one {WARM}N; found {':'.join(words)}.")
+    policy = ttscompile.load(Path(directory), runtime=runtime, threads=threads, warm=warm[0] if warm else None)
+    noise = replace(noise_shape(policy.info), pinned=PINNED in words)
+    return Variant(text, policy, plans[0] if plans else None, noise)
 
 
 def seeded_noise(shape: NoiseShape, seeds: Sequence[int], call: int) -> ttscompile.Noise:

@@ -145,20 +145,18 @@ def main(
     make = environment_class(environment)
     with TemporaryDirectory() as folder, Progress(console=Console(stderr=True)) as progress:
 
-        def compiled(name: str, steps: int | None, last_steps: int | None = None) -> str:
-            options = {"sampler": sampler, "steps": steps, "task": task, "last_steps": last_steps}
-            ttscompile.convert(checkpoint, Path(folder, name), **options)
+        def compiled(name: str, steps: int | None) -> str:
+            ttscompile.convert(checkpoint, Path(folder, name), sampler=sampler, steps=steps, task=task)
             return str(Path(folder, name))
 
-        def opened(label: str, text: str) -> Variant:
-            return replace(open_variant(f"{text}:dense", "onnxruntime", threads), label=label)
+        def opened(label: str, text: str, warm: str = "") -> Variant:
+            return replace(open_variant(f"{text}:dense{warm}", "onnxruntime", threads), label=label)
 
         whole = compiled("whole", steps)
         cold = opened("the whole loop", whole)
         variants, warm = [cold], dict[str, Policy]()
         for number in evaluations:
-            rest = compiled(f"last-{number}", steps, number)
-            variants.append(opened(f"its last {number} steps, warm", f"{whole}+{rest}"))
+            variants.append(opened(f"its last {number} steps, warm", whole, f":warm={number}"))
             warm[variants[-1].label] = variants[-1].policy
             variants.append(opened(f"{number} steps", compiled(f"few-{number}", number)))
         bar = progress.add_task("episodes", total=count * len(variants))

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from ttscompile.artifact.load import Artifact
 from ttscompile.core.lattice import PlanArray
 from ttscompile.core.spec import FloatArray, Noise
-from ttscompile.runtimes.backend import Call
+from ttscompile.runtimes.backend import Call, fitting
 from ttscompile.runtimes.frames import FramePieces
 from ttscompile.runtimes.instructions import Instructions, instructions_of
 from ttscompile.runtimes.liveness import readable_rollout
@@ -30,6 +31,8 @@ class OnnxBackend:
     Args:
         artifact: loaded and checked.
         threads: threads of arithmetic; one runs on the caller's thread.
+        whole: of the whole loop, where the artifact has its last steps: with its sessions and the frames that it
+            remembers. Its calls and these are made in turn. None: with its own.
 
     Attributes:
         keeps: entries of the rollout cache that some plan of the artifact can read.
@@ -42,7 +45,7 @@ class OnnxBackend:
         ArtifactError: onnxruntime refuses a graph.
     """
 
-    def __init__(self, artifact: Artifact, threads: int = 1) -> None:
+    def __init__(self, artifact: Artifact, threads: int = 1, whole: OnnxBackend | None = None) -> None:
         self._manifest = artifact.manifest
         self._artifact, self._threads = artifact, threads
         groups, plans = self._manifest.groups, artifact.schedules.values()
@@ -50,10 +53,12 @@ class OnnxBackend:
         self._schedules = tuple(self._lowered.values())
         self._pruned = any(plan.pruned for plan in self._manifest.plans.values())
         self._blocks = self._pruned or any(one.partial for one in self._schedules)  # whether these have sessions
-        self.sessions = open_sessions(artifact, threads, self._blocks)
+        self.sessions: dict[str, Any] = (
+            open_sessions(artifact, threads, self._blocks) if whole is None else whole.sessions
+        )
         self._run = partial(run_piece, self.sessions, self._manifest.pieces)  # which does not keep the backend alive
         self._renew = partial(renew_piece, self.sessions, self._manifest.pieces)
-        self.frames = self._open_frames()
+        self.frames: FramePieces = self._open_frames() if whole is None else whole.frames
         self.keeps = readable_rollout(artifact)
         self.workspace: Workspace | None = self._open_workspace(1)
 
@@ -99,6 +104,11 @@ class OnnxBackend:
         """See ``Backend.other_steps``."""
         decode_rest(self._work, plans, self._keep)
         return self._work.result()
+
+    def of_last_steps(self, artifact: Artifact) -> OnnxBackend:
+        """See ``Backend``."""
+        with artifact.reading(), fitting(artifact):
+            return OnnxBackend(artifact, self._threads, self)
 
     def _open_frames(self) -> FramePieces:
         """Frame pieces that remember nothing yet."""

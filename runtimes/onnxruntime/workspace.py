@@ -83,7 +83,9 @@ class Workspace:
         self.idle: IdleSteps | None = None
         if IDLE in manifest.pieces:
             self.idle = IdleSteps(sessions[IDLE], self._sampler, manifest.spec.sample, streams, shape)
-        self._no_correction = no_correction(self._steps, manifest.spec.sample)
+        # The last steps of a loop take an update in as many groups as all of its steps do.
+        (update,) = (one for one in sessions[ADVANCE].get_inputs() if one.name == pieces.UPDATE)
+        self._no_correction = no_correction(self._steps, manifest.spec.sample, update.shape[0])
         # By the correction's identity, which the entry keeps from reuse, and whether there is a prefix.
         self._advances: dict[tuple[int, bool], _Advances] = {}
         self._advance = self.advances_with(self._no_correction)

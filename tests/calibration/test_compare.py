@@ -18,7 +18,7 @@ from tests.families import cameras
 from tests.once import Once
 from ttscompile import SamplerTable
 from ttscompile.artifact.load import Artifact, load_artifact
-from ttscompile.artifact.reuse import update_reuse
+from ttscompile.artifact.settle import settle
 from ttscompile.artifact.tokens import ReuseRecord
 from ttscompile.artifact.write import update_calibration
 from ttscompile.calibration.compare import _require_same_policy, compare
@@ -261,7 +261,7 @@ def test_the_truth_has_all_tokens(once: Once, tmp_path: Path) -> None:
     recorded = tmp_path / "calls.npz"
     np.savez(recorded, state=np.zeros((8, 2, 4), np.float32), episode_ends=np.array([4, 8]), **views)
     for reuse, differs in ((None, False), (ReuseRecord(100.0, 64, 0.5, 0.0, 0.0, 1), True)):
-        update_reuse(folder, reuse)
+        settle(folder, reuse=reuse)
         (dense,) = compare(folder, [recorded], [], [], calls=1).points
         assert (dense.error > 0) == differs
 

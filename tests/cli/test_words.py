@@ -53,6 +53,7 @@ NEEDED = {
     "reuse-tokens": ("A", "--trajectories", "calls.npz", "--calls", "2"),
     "serve": ("A", "--control-hz", "1", "--port", "0", "--margin-ticks", "0"),
     "verify": ("A", "--calls", "1"),
+    "warm-start": ("A", "--trajectories", "calls.npz", "--calls", "2"),
 }
 """A command line of each command that can be run, and ends soon."""
 

@@ -18,7 +18,7 @@ from tests.literal_tokens import LiteralTokens
 from tests.once import Once
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import PieceRecord
-from ttscompile.artifact.reuse import update_reuse
+from ttscompile.artifact.settle import settle
 from ttscompile.artifact.size import check_size
 from ttscompile.artifact.tokens import ReuseRecord
 from ttscompile.errors import ArtifactError
@@ -122,10 +122,10 @@ def test_it_is_off_until_it_was_settled(compiled: Path, tmp_path: Path) -> None:
 
     identity = load_artifact(folder).manifest.identity
     assert tokens() == (0, 0)
-    assert update_reuse(folder, REUSE).identity != identity
+    assert settle(folder, reuse=REUSE).identity != identity
     assert tokens() == (5, 37)
     assert tokens(reuse_tokens=False) == tokens(runtime="reference") == (0, 0)
-    assert update_reuse(folder, None).identity == identity
+    assert settle(folder, reuse=None).identity == identity
     assert tokens() == (0, 0)
 
 

@@ -7,20 +7,23 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 import ttscompile
 from tests.once import Once
 from ttscompile import Noise
-from ttscompile.cli import main
+from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.rest import with_last_steps
+from ttscompile.core.correction import groups_of
+from ttscompile.core.rest import rest_of
 from ttscompile.errors import (
     ArtifactError,
-    CalibrationError,
     ExecutorError,
     IllegalPlanError,
     ObservationError,
+    SpecError,
     TtscompileError,
 )
+from ttscompile.runtimes.load import open_policy
 from ttscompile.runtimes.policy import CompiledPolicy
 
 STEPS, LAST, EXECUTED = 8, 3, 8
@@ -28,28 +31,26 @@ SHAPE = (2, 16, 2)
 
 
 @pytest.fixture(scope="module")
-def loops(one_layer_checkpoint: Path, once: Once) -> tuple[Path, Path]:
-    """The whole loop, of a sampler that draws noise, and its last steps."""
+def whole(one_layer_checkpoint: Path, once: Once) -> Path:
+    """Of a sampler that draws noise."""
 
-    def convert(name: str, **options: Any) -> Path:
-        given = {"sampler": "ddpm", "steps": STEPS, **options}
-        return once.compiled(f"warm {name}", lambda path: ttscompile.convert(one_layer_checkpoint, path, **given))[0]
+    def convert(path: Path) -> None:
+        ttscompile.convert(one_layer_checkpoint, path, sampler="ddpm", steps=STEPS)
 
-    return convert("whole"), convert("rest", last_steps=LAST)
+    return once.compiled("warm whole", convert)[0]
 
 
 @pytest.fixture(params=["onnxruntime", "torch", "reference"])
-def policies(request: pytest.FixtureRequest, loops: tuple[Path, Path]) -> tuple[CompiledPolicy, ...]:
-    """Both in one, the whole loop alone, and the rest alone."""
-    whole, rest = loops
-    runtime = request.param
-    warm = ttscompile.load(whole, runtime, seed=0, warm=rest)
-    return warm, ttscompile.load(whole, runtime), ttscompile.load(rest, runtime)
+def policies(request: pytest.FixtureRequest, whole: Path) -> tuple[CompiledPolicy, ...]:
+    """Warm calls, the whole loop alone, and the rest alone."""
+    warm, cold = (ttscompile.load(whole, request.param, seed=0, warm=warm) for warm in (LAST, None))
+    rest, _ = with_last_steps(load_artifact(whole), LAST)
+    return warm, cold, open_policy(rest, request.param)
 
 
 @pytest.fixture
-def warm(loops: tuple[Path, Path]) -> CompiledPolicy:
-    return ttscompile.load(loops[0], seed=0, warm=loops[1])
+def warm(whole: Path) -> CompiledPolicy:
+    return ttscompile.load(whole, seed=0, warm=LAST)
 
 
 def drawn(call: int, streams: int = 2) -> tuple[dict[str, Any], Noise]:
@@ -61,10 +62,9 @@ def drawn(call: int, streams: int = 2) -> tuple[dict[str, Any], Noise]:
     )
 
 
-def continued(policy: CompiledPolicy, rest: CompiledPolicy, before: Any, noise: Noise) -> Noise:
+def continued(policy: CompiledPolicy, before: Any, noise: Noise) -> Noise:
     """What the rest is given after actions ``before``."""
-    start = rest._artifact.manifest.spec.start
-    assert start is not None
+    start = rest_of(policy._artifact.manifest.spec.sampler, LAST)[1]
     assert noise.steps is not None
     normalizer = policy.info.action.normalizer
     assert normalizer is not None
@@ -74,15 +74,15 @@ def continued(policy: CompiledPolicy, rest: CompiledPolicy, before: Any, noise: 
 
 
 def test_calls_after_the_first_are_the_rest_of_the_loop(policies: tuple[CompiledPolicy, ...]) -> None:
-    both, whole, rest = policies
+    both, cold, rest = policies
     for _ in range(2):  # an episode, and one more
         both.reset()
         obs, noise = drawn(0)
         made = both.predict_action(obs, noise)["action_pred"]
-        np.testing.assert_allclose(made, whole.predict_action(obs, noise)["action_pred"], atol=1e-3)
+        np.testing.assert_allclose(made, cold.predict_action(obs, noise)["action_pred"], atol=1e-3)
         for call in (1, 2):
             obs, noise = drawn(call)
-            expected = rest.predict_action(obs, continued(whole, rest, made, noise))["action_pred"]
+            expected = rest.predict_action(obs, continued(cold, made, noise))["action_pred"]
             made = both.predict_action(obs, noise)["action_pred"]
             np.testing.assert_allclose(made, expected, atol=0.01)  # px, of 512: the normaliser there and back
             report = both.last_report
@@ -90,16 +90,48 @@ def test_calls_after_the_first_are_the_rest_of_the_loop(policies: tuple[Compiled
             assert report.plan.shape[1] == LAST
 
 
-def test_it_says_what_it_is(warm: CompiledPolicy, loops: tuple[Path, Path]) -> None:
-    whole, rest = (ttscompile.load(path).info for path in loops)
-    assert (warm.info.warm_steps, whole.warm_steps, rest.K) == (LAST, None, LAST)
-    assert len(warm.info.identity) == len(whole.identity)
-    assert warm.info.identity not in (whole.identity, rest.identity)
+def test_it_says_what_it_is(warm: CompiledPolicy, whole: Path) -> None:
+    cold, shorter = ttscompile.load(whole).info, ttscompile.load(whole, warm=LAST - 1).info
+    assert (warm.info.warm_steps, cold.warm_steps, shorter.warm_steps) == (LAST, None, LAST - 1)
+    assert len({warm.info.identity, cold.identity, shorter.identity}) == 3
+    assert len(warm.info.identity) == len(cold.identity)
     assert warm.info.K == STEPS
+    assert ttscompile.load(whole, warm=False).info.warm_steps is None
 
 
-def test_actions_one_by_one_begin_chunks_in_turn(warm: CompiledPolicy, loops: tuple[Path, Path]) -> None:
-    again = ttscompile.load(loops[0], seed=0, warm=loops[1])
+def test_the_weights_are_there_once(warm: CompiledPolicy) -> None:
+    sessions = [policy._runtime.backend.sessions for policy in (warm, warm._rest)]  # type: ignore[attr-defined]
+    assert sessions[0] is sessions[1]
+
+
+def test_the_arithmetic_of_the_rest_is_counted(warm: CompiledPolicy, whole: Path) -> None:
+    cold, (rest, _) = load_artifact(whole), with_last_steps(load_artifact(whole), LAST)
+    warm.predict_action(*drawn(0))
+    warm.predict_action(*drawn(1))
+    report, own, all_steps = warm.last_report, rest.manifest.flops, cold.manifest.flops
+    assert report is not None
+    step = own.stem + own.tail + sum(own.blocks)
+    assert report.flops == (own.prologue + LAST * step,) * 2
+    assert own.prologue <= all_steps.prologue
+    assert own.dense == all_steps.dense * LAST // STEPS
+
+
+def test_an_update_in_fewer_groups_than_the_rest_would_have(
+    one_layer_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a long loop corrections share a matrix between dimensions, and its graph wants that of its rest, too."""
+    monkeypatch.setattr("ttscompile.core.correction.LARGEST", 7 * 2 * 6 * 16 * 16)
+    ttscompile.convert(one_layer_checkpoint, tmp_path / "whole", sampler="ddim", steps=STEPS)
+    warm = ttscompile.load(tmp_path / "whole", seed=0, warm=LAST)
+    assert (groups_of(STEPS, (16, 2)), groups_of(LAST, (16, 2))) == (1, 2)
+    for call in range(2):
+        obs, noise = drawn(call)
+        made = warm.predict_action(obs, Noise(noise.initial))["action"]
+    assert np.isfinite(made).all()
+
+
+def test_actions_one_by_one_begin_chunks_in_turn(warm: CompiledPolicy, whole: Path) -> None:
+    again = ttscompile.load(whole, seed=0, warm=LAST)
     rng = np.random.default_rng(5)
     frames = rng.uniform(100, 400, (EXECUTED + 1, 2, 20)).astype(np.float32)
     one_by_one = [warm.select_action({"obs": frame}) for frame in frames]
@@ -149,44 +181,16 @@ def test_nobody_prepares_a_frame_during_a_call(warm: CompiledPolicy) -> None:
         warm.forget_frames()
 
 
-def test_what_cannot_go_together_is_refused(loops: tuple[Path, Path], warm: CompiledPolicy, tmp_path: Path) -> None:
-    whole, rest = loops
+def test_what_cannot_go_together_is_refused(whole: Path, warm: CompiledPolicy) -> None:
     obs, noise = drawn(0)
     warm.predict_action(obs, noise)
     with pytest.raises(ObservationError, match="keep to the chunk of the call before already"):
         warm.predict_action(obs, noise, prefix=np.zeros((2, 1, 2), np.float32))
-    with pytest.raises(ObservationError, match=r"holds the last 3 of 8 steps.*ttscompile.load\(WHOLE, warm=THIS\)"):
-        ttscompile.load(rest).predict_action(obs)
-    with pytest.raises(ArtifactError, match=r"expected the last steps of a loop; found a whole one of 8 steps"):
-        ttscompile.load(whole, warm=whole)
-    with pytest.raises(ArtifactError, match=r"expected a whole loop; found the last 3 of 8 steps of ddpm"):
-        ttscompile.load(rest, warm=rest)
     with pytest.raises(ExecutorError, match=r"loaded with warm=.*Load it without"):
         ttscompile.AsyncExecutor(warm, 10)
-    recording = tmp_path / "calls.npz"
-    np.savez(recording, obs=np.arange(320, dtype=np.float32).reshape(8, 2, 20), episode_ends=[4, 8])
-    with pytest.raises(CalibrationError, match=r"last 3 of 8 steps.*Calibrate the artifact of the whole loop"):
-        ttscompile.calibrate(rest, [recording], 0.5, "interval", progress=False)
-
-
-def test_the_rest_of_another_loop_is_refused(
-    one_layer_checkpoint: Path, loops: tuple[Path, Path], tmp_path: Path
-) -> None:
-    ttscompile.convert(one_layer_checkpoint, tmp_path / "other", sampler="ddim", steps=STEPS, last_steps=LAST)
-    with pytest.raises(ArtifactError, match=r"the rest of .*, of 8 steps of ddpm; found the last 3.*another sampler\."):
-        ttscompile.load(loops[0], warm=tmp_path / "other")
-    shorter = {"sampler": "ddpm", "steps": STEPS, "last_steps": LAST, "prediction_horizon": 12}
-    ttscompile.convert(one_layer_checkpoint, tmp_path / "shorter", **shorter)
-    with pytest.raises(ArtifactError, match=r"found the last 3 of 8 steps of ddpm, with another sample, left_out\."):
-        ttscompile.load(loops[0], warm=tmp_path / "shorter")
-
-
-def test_an_artifact_of_the_rest_is_one_like_any_other(loops: tuple[Path, Path], tmp_path: Path) -> None:
-    rest, page = str(loops[1]), str(tmp_path / "report.html")
-    assert ttscompile.verify(rest).passed
-    for words in (["inspect", rest], ["report", rest, "-o", page, "--runs", "1"], ["doctor", rest]):
-        result = CliRunner().invoke(main, words)
-        assert result.exit_code == 0, result.output
-        told = page if words[0] == "report" else None
-        shown = " ".join((Path(told).read_text() if told else result.output).split())
-        assert "last 3" in shown, words
+    with pytest.raises(SpecError, match=r"last_steps is 8; expected fewer than the 8 steps of the loop"):
+        ttscompile.load(whole, warm=STEPS)
+    with pytest.raises(SpecError, match=r"last_steps.*'rest'"):
+        ttscompile.load(whole, warm="rest")  # type: ignore[arg-type]
+    with pytest.raises(ArtifactError, match=r"was not settled. Run 'ttscompile warm-start .*warm=3"):
+        ttscompile.load(whole, warm=True)

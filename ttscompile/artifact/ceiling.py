@@ -21,12 +21,9 @@ def usual_sparsity(steps: int) -> float:
 
 
 def few_steps(manifest: Manifest) -> str | None:
-    """A warning where the steps are too few for ``TYPICAL_SPARSITY``, with the ceiling; None where they are not.
-
-    The rest of a loop is not calibrated, and has none.
-    """
+    """A warning where the steps are too few for ``TYPICAL_SPARSITY``, with the ceiling; None where they are not."""
     steps = manifest.steps
-    if manifest.spec.start is not None or (most := 1 - 1 / steps) >= TYPICAL_SPARSITY:
+    if (most := 1 - 1 / steps) >= TYPICAL_SPARSITY:
         return None
     return (
         f"K = {steps} denoising steps: step 0 is always computed, so at most {most:.1%} of the cells can be reused, and"

@@ -192,6 +192,8 @@ def _check_tokens(manifest: Manifest, fields: Mapping[str, Value]) -> None:
             fields["tokens"].members()[name].fail("what the pieces of its tokens read and give")
     if manifest.reuse is not None and not manifest.tokens:
         fields["reuse"].fail("none, because no frame piece has tokens")
+    if manifest.warm is not None and manifest.warm.last_steps >= manifest.steps:
+        fields["warm"].fail(f"fewer than the {manifest.steps} steps of the loop")
 
 
 def _check_precision(manifest: Manifest, record: PrecisionRecord, value: Value) -> None:

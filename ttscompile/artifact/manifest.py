@@ -18,6 +18,7 @@ from ..ir.graph import TensorType
 from ..ir.pieces import PRUNER, is_block, part_of
 from ..ir.program import Binding
 from .tokens import ReuseRecord, TokensRecord
+from .warm import WarmRecord
 
 FORMAT = "ttscompile artifact"
 SCHEMA_VERSION = 10
@@ -305,6 +306,7 @@ class Manifest:
         distilled: weights of the plan of this name; None where there is no such plan.
         tokens: by frame piece, the tokens of those that are vision transformers.
         reuse: how the onnxruntime runtime reuses them; None for not at all.
+        warm: of calls that begin with the chunk of the call before; None where that was not settled.
     """
 
     schema_version: int
@@ -327,6 +329,7 @@ class Manifest:
     distilled: DistilledRecord | None = None
     tokens: Mapping[str, TokensRecord] = field(default_factory=dict)
     reuse: ReuseRecord | None = None
+    warm: WarmRecord | None = None
 
     @property
     def precision_name(self) -> str:

@@ -178,16 +178,7 @@ def prepare_calls(
         seed: the seed of the noise.
         window: see ``Calls``.
         pinned: whether all calls of a window have the noise of its first; else each has noise of its own.
-
-    Raises:
-        CalibrationError: the artifact holds the rest of a loop.
     """
-    if spec.start is not None:
-        held = spec.start.told(spec.sampler.steps)
-        raise CalibrationError(
-            f"the artifact holds {held}, which begin with the chunk of the call before; recordings have none."
-            " Calibrate the artifact of the whole loop."
-        )
     initial, noise = draw_noise(spec, len(chosen), seed)
     if pinned:
         first = torch.arange(len(chosen)) // window * window

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..artifact.load import Artifact, load_artifact
-from ..artifact.reuse import update_reuse
+from ..artifact.settle import settle
 from ..artifact.tokens import ReuseRecord
 from ..artifact.write import locked
 from ..core.given import integer
@@ -122,7 +122,7 @@ def reuse_tokens(
         reuse = replace(
             best.reuse, computed=held.computed, error=held.error, other_noise=judged.other_noise, calls=judged.count
         )
-        update_reuse(path, reuse, held=True)
+        settle(path, held=True, reuse=reuse)
         return TokenCalibration(reuse, (judged.frame_ms, held.frame_ms))
 
 

@@ -25,6 +25,7 @@ from ttscompile.cli.report import report
 from ttscompile.cli.reuse_tokens import reuse_tokens
 from ttscompile.cli.serve import serve
 from ttscompile.cli.verify import verify
+from ttscompile.cli.warm_start import warm_start
 
 
 @click.group(
@@ -46,6 +47,7 @@ for _command, _what in (
     (calibrate, "Learn from recorded episodes what an artifact may leave out."),
     (distill, "Train weights for a plan of very few steps, as a last resort."),
     (reuse_tokens, "Compute of new pictures the parts that changed."),
+    (warm_start, "Begin calls with the chunk of the call before."),
     (inspect, "What is in an artifact; a picture of a plan."),
     (verify, "Does it do what the original did, and do its plans engage?"),
     (report, "All about an artifact on one page."),

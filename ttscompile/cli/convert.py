@@ -75,12 +75,6 @@ from ttscompile.report.summary import document
     " compute, the same actions. Refused where attention is not causal.",
     default=None,
 )
-@count_option(
-    "--last-steps",
-    "Compile so many steps at the end of the loop alone, for calls that begin with the chunk of the call before:"
-    " ttscompile.load(WHOLE, warm=OUTPUT). The other options must be those of WHOLE.",
-    default=None,
-)
 @click.option(
     "--precision",
     type=click.Choice((*PRECISIONS, AUTO)),
@@ -107,7 +101,6 @@ def convert(
     checkpoint: Path | str,
     directory: Path,
     prediction_horizon: int | None,
-    last_steps: int | None,
     precision: str,
     keep_fp32: tuple[str, ...],
     single_file: Path | None,
@@ -140,7 +133,6 @@ def convert(
             checkpoint,
             directory,
             prediction_horizon=prediction_horizon,
-            last_steps=last_steps,
             precision=precision,
             keep_fp32=keep_fp32,
             single_file=single_file,

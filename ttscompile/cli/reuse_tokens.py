@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 import ttscompile
-from ttscompile.artifact.reuse import update_reuse
+from ttscompile.artifact.settle import settle
 from ttscompile.cli.options import artifact_argument, count_option, json_option, seed_option
 from ttscompile.cli.output import (
     counted_parts,
@@ -56,7 +56,7 @@ def reuse_tokens(
     if off == bool(trajectories):
         raise click.UsageError("give --trajectories FILE..., or --off.")
     if off:
-        manifest = update_reuse(directory, None)
+        manifest = settle(directory, reuse=None)
         document: dict[str, Any] = {"identity": manifest.identity, "reuse": None}
         told = "all tokens of new frames are computed"
     else:

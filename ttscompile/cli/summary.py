@@ -40,18 +40,17 @@ def print_summary(artifact: Artifact, console: Console) -> None:
         f"{cache['read']} of {cache['cells']} residuals a stream, {cache['bytes_read'] / 1e6:.1f} MB, for its plans;"
         f" {cache['bytes_most'] / 1e6:.1f} MB for plans that you give"
     )
-    start, steps = manifest.spec.start, sampler["steps"]
-    loop = f"K = {steps} steps" if start is None else f"K = {steps}: {start.told(steps)}"
     rows = (
         ("identity", manifest.short_identity),
         ("from", ", ".join(f"{k} {v}" for k, v in summary["source"].items()) or "a module"),
-        ("sampler", f"{sampler['name']}, {loop}" + ", draws noise" * sampler["stochastic"]),
+        ("sampler", f"{sampler['name']}, K = {sampler['steps']} steps" + ", draws noise" * sampler["stochastic"]),
         *((f"observation {k!r}", f"{o['dtype']}{o['shape']} a stream") for k, o in summary["observations"].items()),
         ("action", action),
         ("rollout cache", kept),
         ("precision", _told_precision(summary["precision"], len(summary["blocks"]))),
         *((f"piece {one['piece']}", _told_frames(one, captured)) for one in summary["frames"]),
         *facts.tokens(manifest),
+        *([] if manifest.warm is None else [("warm start", facts.told_warm(manifest.warm, manifest.steps))]),
     )
     about = table("artifact", summary["path"], rows=rows)
     about.columns[1].justify = "left"
@@ -61,9 +60,6 @@ def print_summary(artifact: Artifact, console: Console) -> None:
     console.print(table("FLOPs a call, one stream", "", "of the captured policy", rows=costs))
     _print_facts(console, facts.plan_table(artifact))
     record = manifest.calibration
-    if start is not None:
-        console.print(facts.last_steps(start, manifest.steps))
-        return
     if record is None:
         console.print("Not calibrated: every call is dense. Run 'ttscompile calibrate' to give it a plan.")
         return

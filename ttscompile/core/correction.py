@@ -171,9 +171,9 @@ def groups_of(steps: int, sample: tuple[int, int]) -> int:
     return dimensions if steps * dimensions * FEATURES * horizon * horizon <= LARGEST else 1
 
 
-def no_correction(steps: int, sample: tuple[int, int]) -> Correction:
-    """The correction of K steps and samples ``(T, D)`` that changes nothing."""
-    groups, (horizon, dimensions) = groups_of(steps, sample), sample
+def no_correction(steps: int, sample: tuple[int, int], groups: int | None = None) -> Correction:
+    """The correction of K steps and samples ``(T, D)`` that changes nothing; None: in ``groups_of`` groups."""
+    groups, (horizon, dimensions) = groups_of(steps, sample) if groups is None else groups, sample
     return Correction(
         anchors=np.zeros(steps, np.bool_),
         weights=np.zeros((steps, groups, FEATURES * horizon, horizon), np.float32),

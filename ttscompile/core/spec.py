@@ -16,7 +16,6 @@ import numpy.typing as npt
 from ..errors import SpecError
 from .given import integer, listed, numbers
 from .rules import DType, Positive
-from .start import Start
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -327,7 +326,6 @@ class PolicySpec:
         source: what this was compiled from, for people: format and variant, no path.
         left_out: steps that the original predicts after the last one of the sample (``ttscompile.capture.narrow``).
         instruction: of a policy that is told its task in words, which a text alone gives; None for all others.
-        start: of a loop that is the rest of a longer one (``samplers.rest``); None of a whole one.
     """
 
     sample: tuple[Positive, Positive]
@@ -339,7 +337,6 @@ class PolicySpec:
     source: Mapping[str, str] = field(default_factory=dict)
     left_out: int = 0
     instruction: Instruction | None = None
-    start: Start | None = None
 
     def __post_init__(self) -> None:
         sizes = tuple(integer(n, "a size in the sample's shape", SpecError, 1) for n in self.sample)

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.paths import require_free_or_path
 from ..core.spec import PolicySpec
 from ..errors import CheckpointError
-from ..samplers.rest import rest_of
 from .families import AS_SAVED, LoadOptions, find_family
 
 if TYPE_CHECKING:
@@ -37,11 +35,7 @@ def load_checkpoint_policy(
         SpecError: the sampler asked for is not possible.
     """
     require_free_or_path(path, CheckpointError, "Give a file or a directory that was trained.")
-    module, spec = find_family(Path(path), format).load(Path(path), options)
-    if options.last_steps is None:
-        return module, spec
-    rest, start = rest_of(spec.sampler, options.last_steps)
-    return module, replace(spec, sampler=rest, start=start)
+    return find_family(Path(path), format).load(Path(path), options)
 
 
 def files_beside(path: str | os.PathLike[str], spec: PolicySpec) -> dict[str, bytes]:

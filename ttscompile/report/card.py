@@ -218,9 +218,7 @@ def _made(manifest: Manifest, base: HubName | None) -> Section:
     if manifest.precision is not None:
         precision += "".join(f" --keep-fp32 {p}" for p in manifest.precision.parts if p not in manifest.precision.kept)
     spec = manifest.spec
-    more = "" if spec.start is None else f" --last-steps {steps}"
-    steps += 0 if spec.start is None else spec.start.skipped
-    more += " --task TASK" * ("task" in spec.source)
+    more = " --task TASK" * ("task" in spec.source)
     more += "".join(f" --without-camera {_word(name)}" for name in spec.source.get(WITHOUT, "").split())
     more += f" --prediction-horizon {spec.sample[0]}" * (spec.left_out > 0)
     lines = [f"ttscompile convert {checkpoint} -o DIR --sampler {sampler.name} --steps {steps}{more}{precision}"]

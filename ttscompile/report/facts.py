@@ -11,7 +11,7 @@ from ..artifact.ceiling import few_steps
 from ..artifact.load import Artifact
 from ..artifact.manifest import DENSE, DISTILLED, BlockRecord, Manifest, PlanRecord, marked
 from ..artifact.tokens import ReuseRecord
-from ..core.start import Start
+from ..artifact.warm import WarmRecord
 from ..ir.flops import frames_flops, graph_flops
 from ..ir.program import Binding
 from ..measure.units import flops, plain, share
@@ -71,6 +71,15 @@ def told_reuse(reuse: ReuseRecord) -> str:
         f"of new frames {reuse.computed:.0%} of the tokens were computed, actions off by {reuse.error:.4g} on"
         f" {reuse.calls} held-out calls, other noise by {reuse.other_noise:.4g}; a patch has changed above"
         f" {reuse.threshold:g}, one frame of {reuse.refresh} is whole"
+    )
+
+
+def told_warm(warm: WarmRecord, steps: int) -> str:
+    """What calls may begin with, in words."""
+    return (
+        f"load(DIR, warm=True): calls after the first of an episode begin with the chunk before, and compute the last"
+        f" {warm.last_steps} of {steps} steps; on {warm.calls} recorded calls {warm.same:.3g} times as far from a dense"
+        f" call as two dense calls are apart, {warm.changed:.3g} times where the world has changed"
     )
 
 
@@ -282,20 +291,12 @@ def _mapping(value: object) -> Mapping[str, Any]:
     return value if isinstance(value, Mapping) else {}
 
 
-def last_steps(start: Start, steps: int) -> str:
-    """What the rest of a loop is for."""
-    told = f"These are {start.told(steps)}, which begin with the chunk of the call before"
-    return f"{told}. Load them with the whole loop: ttscompile.load(WHOLE, warm=THIS)."
-
-
 def limits(artifact: Artifact) -> Section:
     """What a reader should not expect, from the artifact's own facts."""
     manifest = artifact.manifest
     sampler = manifest.spec.sampler
     points = []
-    if manifest.spec.start is not None:
-        points.append(last_steps(manifest.spec.start, manifest.steps))
-    elif manifest.calibration is None or manifest.default_plan == DENSE:
+    if manifest.calibration is None or manifest.default_plan == DENSE:
         points.append("Not calibrated: its default plan computes everything. It is as slow as a dense call.")
     else:
         points.append(

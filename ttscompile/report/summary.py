@@ -25,7 +25,6 @@ def document(artifact: Artifact) -> dict[str, Any]:
         "ttscompile_version": manifest.ttscompile_version,
         "source": dict(spec.source),
         "sampler": {name: getattr(spec.sampler, name) for name in ("name", "steps", "stochastic", "clip")},
-        "start": None if spec.start is None else dict(vars(spec.start)),
         "sample": list(spec.sample),
         "left_out": spec.left_out,
         "observations": {k: {"shape": list(o.shape), "dtype": o.dtype} for k, o in spec.observations.items()},
@@ -41,6 +40,7 @@ def document(artifact: Artifact) -> dict[str, Any]:
         ],
         "tokens": {name: {"tokens": one.tokens, "fixed": one.fixed} for name, one in manifest.tokens.items()},
         "reuse": None if manifest.reuse is None else dict(vars(manifest.reuse)),
+        "warm": None if manifest.warm is None else dict(vars(manifest.warm)),
         "flops": _flops(manifest),
         "ceiling": {"sparsity": 1 - 1 / manifest.steps, "flops": manifest.flops.ceiling(manifest.steps)},
         "plans": {

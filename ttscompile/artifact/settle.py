@@ -1,4 +1,4 @@
-"""Whether and how an artifact reuses tokens from frame to frame: one record of its manifest."""
+"""What is settled beside plans: one record of the manifest each, whether and how."""
 
 from __future__ import annotations
 
@@ -12,26 +12,28 @@ from .files import replace_file
 from .load import load_artifact
 from .manifest import MANIFEST, Manifest
 from .tokens import ReuseRecord
+from .warm import WarmRecord
 from .write import identified, locked, require_unzipped
 
 
-def update_reuse(path: str | os.PathLike[str], reuse: ReuseRecord | None, held: bool = False) -> Manifest:
-    """Have an artifact reuse tokens in another way: at once, or not at all. Plans and weights stay.
+def settle(path: str | os.PathLike[str], *, held: bool = False, **record: ReuseRecord | WarmRecord | None) -> Manifest:
+    """Have an artifact reuse tokens, or begin calls with the chunk before, in another way. Plans and weights stay.
 
     Args:
         path: the artifact's directory.
-        reuse: how; None for not at all.
         held: whether the caller has the artifact ``locked``.
+        record: ``reuse`` or ``warm`` of the manifest: how; None for not at all.
 
     Returns:
         The new manifest.
 
     Raises:
-        ArtifactError: no artifact, a zipped one, one that is being updated, or one without tokens.
+        ArtifactError: no artifact, a zipped one, one that is being updated, or one that cannot be so.
     """
     directory = require_unzipped(path)
     with nullcontext() if held else locked(directory):
-        content = encode(identified(replace(load_artifact(directory).manifest, reuse=reuse)))
+        manifest = replace(load_artifact(directory).manifest, **record)  # type: ignore[arg-type]
+        content = encode(identified(manifest))
         manifest = decode(content)  # refuses what nobody could load
         try:
             replace_file(directory / MANIFEST, content)

@@ -1,20 +1,49 @@
 """The rest of a denoising loop, for calls that begin with the chunk of the call before: a warm start.
 
 Falcon (arXiv 2503.00339) begins a call with earlier actions and as much noise as a step in the middle of the loop has.
-Numpy only.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
-from ..core.given import integer
-from ..core.spec import SamplerTable
-from ..core.start import Start
+import numpy as np
+
 from ..errors import SpecError
+from .given import integer
+from .spec import ChunkSpec, FloatArray, Noise, SamplerTable
 
 TOLERANCE = 1e-3
 """Of what the shares of action and noise are known by: the table is in float32."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """What the rest of a longer loop begins with.
+
+    Attributes:
+        skipped: steps of the longer loop that come before it.
+        action: share of the action, normalised, in the sample that it begins with.
+        noise: share of noise.
+    """
+
+    skipped: int
+    action: float
+    noise: float
+
+    def noise_from(self, before: FloatArray, chunk: ChunkSpec, fresh: Noise) -> Noise:
+        """The noise of the rest, whose initial sample goes on with a chunk.
+
+        The chunk is moved by what was executed of it, and its last step is repeated where none is left.
+
+        Args:
+            before: the denoised sample of the call before, float32 ``[B, T, D]``.
+            chunk: which steps of it were executed.
+            fresh: noise of the whole loop, of as many streams.
+        """
+        moved = np.minimum(np.arange(before.shape[1]) + chunk.stop - chunk.start, before.shape[1] - 1)
+        initial = np.float32(self.action) * before[:, moved] + np.float32(self.noise) * fresh.initial
+        return Noise(initial, None if fresh.steps is None else fresh.steps[self.skipped :])
 
 
 def rest_of(table: SamplerTable, last_steps: int) -> tuple[SamplerTable, Start]:

@@ -9,11 +9,11 @@ import pytest
 import torch
 from diffusers import DDIMScheduler, DDPMScheduler, DPMSolverMultistepScheduler
 
+from ttscompile.core.rest import rest_of
 from ttscompile.core.spec import SamplerTable
 from ttscompile.errors import SpecError
 from ttscompile.runtimes.reference.sampler import TorchSampler
 from ttscompile.samplers.flow import flow_matching_table
-from ttscompile.samplers.rest import rest_of
 from ttscompile.samplers.table import sampler_table
 
 ROUNDING = 1e-3

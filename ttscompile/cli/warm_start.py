@@ -1,0 +1,75 @@
+"""``ttscompile warm-start``: begin calls with the chunk of the call before."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+import ttscompile
+from ttscompile.artifact.settle import settle
+from ttscompile.cli.options import artifact_argument, count_option, json_option, seed_option
+from ttscompile.cli.output import (
+    counted_parts,
+    manifest_of,
+    only_results_on_stdout,
+    print_json,
+    results,
+    say,
+    table,
+)
+from ttscompile.cli.recordings import FilesCommand, Sources, require_recordings, trajectories_options
+from ttscompile.cli.types import ERROR
+from ttscompile.report.facts import told_warm
+
+
+@click.command("warm-start", cls=FilesCommand)
+@artifact_argument
+@trajectories_options(required=False)
+@count_option("--calls", "To measure, at most.", default=512, least=2)
+@click.option(
+    "--max-distance",
+    type=ERROR,
+    default=1.4,
+    show_default=True,
+    help="How far actions may be from those of a dense call with other noise; 1 is how far two dense calls are apart.",
+)
+@seed_option("Of the noise.")
+@click.option("--off", is_flag=True, help="Forget what was settled.")
+@json_option
+def warm_start(
+    directory: Path,
+    trajectories: tuple[Path, ...],
+    sources: Sources,
+    off: bool,
+    as_json: bool,
+    **settings: Any,  # ttscompile.warm_start takes them by the same names
+) -> None:
+    """Settle from which step on calls of the artifact DIRECTORY may go on with the chunk of the call before.
+
+    A program that loads it with warm=True then computes the whole loop in the first call of an episode, and these last
+    steps in all others. The fewest steps are taken with which actions are like dense ones, also where the world changed
+    into that of another episode between two calls. Exit status 1: there are none, and nothing was changed.
+    """
+    manifest_of(directory)
+    if off == bool(trajectories):
+        raise click.UsageError("give --trajectories FILE..., or --off.")
+    if off:
+        settle(directory, warm=None)
+        if as_json:
+            print_json({"warm": None, "tried": []})
+        else:
+            say(results(), "calls begin with noise")
+        return
+    require_recordings(trajectories)
+    with only_results_on_stdout(), counted_parts() as tell:
+        found = ttscompile.warm_start(directory, list(trajectories), observation=sources, progress=tell, **settings)
+    if as_json:
+        print_json({"warm": vars(found.warm), "tried": [vars(one) for one in found.tried]})
+        return
+    head = ("last steps", "distance from a dense call", "where the world has changed")
+    rows = [(str(one.last_steps), f"{one.same:.3g}", f"{one.changed:.3g}") for one in found.tried]
+    results().print(table(*head, rows=rows))
+    say(results(), "A distance of 1 is that of two dense calls with different noise.")
+    say(results(), told_warm(found.warm, manifest_of(directory).steps))
