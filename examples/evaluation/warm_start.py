@@ -85,6 +85,7 @@ def reaction(warm: Policy, cold: Variant, episodes: Sequence[Episode]) -> Reacti
             def windows(number: int, order: Sequence[int] = order) -> dict[str, Array]:
                 return stacked([{key: array[number] for key, array in episodes[i].windows.items()} for i in order])
 
+            cold.policy.reset()  # of however many episodes its last call was
             warm.reset()
             warm.predict_action(windows(call - 1, own), noise=seeded_noise(cold.noise, seeds, call - 1))
             made = warm.predict_action(windows(call), noise=noises[0])["action"]

