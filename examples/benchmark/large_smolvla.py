@@ -28,6 +28,19 @@ _FEATURES = {
     **{key: {"type": "VISUAL", "shape": [3, 480, 640]} for key in CAMERAS},
     ACTION: {"type": "ACTION", "shape": [6]},
 }
+_SIZES = {
+    "chunk_size": 50,
+    "num_steps": 10,
+    "max_state_dim": 32,
+    "max_action_dim": 32,
+    "tokenizer_max_length": 48,
+    "num_vlm_layers": 16,
+    "self_attn_every_n_layers": 2,
+    "expert_width_multiplier": 0.75,
+    "min_period": 4e-3,
+    "max_period": 4.0,
+}
+"""Lerobot's own, which a saved configuration has, and other programs read."""
 _MODES = {"VISUAL": "IDENTITY", "STATE": "MEAN_STD", "ACTION": "MEAN_STD"}
 
 
@@ -39,6 +52,7 @@ def save(directory: Path) -> None:
         "input_features": {key: each for key, each in _FEATURES.items() if key != ACTION},
         "output_features": {ACTION: _FEATURES[ACTION]},
         "vlm_model_name": MODEL,
+        **_SIZES,
     }
     _write(directory / "config.json", entries)
     statistics = {f"{key}.{name}": torch.full((6,), float(name == "std")) for key in (STATE, ACTION) for name in _NAMES}

@@ -1,0 +1,18 @@
+"""What vla.cpp is given: pictures as lerobot resizes them."""
+
+import numpy as np
+import pytest
+import vla_cpp
+
+
+@pytest.mark.parametrize(("height", "width"), [(480, 640), (512, 512), (640, 480)])
+def test_they_are_square_and_start_with_padding(height: int, width: int) -> None:
+    made = vla_cpp.squared(np.ones((1, 3, height, width), np.float32))
+    assert made.shape == (512, 512, 3)
+    rows, columns = (np.flatnonzero(made[:, :, 0].any(axis=axis)) for axis in (1, 0))
+    assert (rows[-1], columns[-1]) == (511, 511)
+    assert len(rows) * width == pytest.approx(len(columns) * height, rel=0.01)
+
+
+def test_the_structures_have_the_sizes_of_the_interface() -> None:
+    assert (vla_cpp.ctypes.sizeof(vla_cpp.Image), vla_cpp.ctypes.sizeof(vla_cpp.Inputs)) == (24, 80)
