@@ -141,9 +141,6 @@ def timed(run: Callable[[], Any]) -> float:
 @click.argument("folder", type=click.Path(exists=True, path_type=Path))
 @click.option("--library", required=True, type=click.Path(exists=True, path_type=Path))
 @click.option("--model", required=True, type=click.Path(exists=True, path_type=Path))
-@click.option(
-    "--config", type=click.Path(exists=True, path_type=Path), help="Its config.json, with its runtime options."
-)
 @click.option("--threads", default=1, type=click.IntRange(1))
 @click.option("--rounds", default=7, type=click.IntRange(1), help="That are counted.")
 def main(folder: Path, library: Path, model: Path, threads: int, rounds: int) -> None:
