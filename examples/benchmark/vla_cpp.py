@@ -3,12 +3,14 @@
     python examples/benchmark/large.py --smolvla --output DIR
     python examples/benchmark/vla_cpp.py DIR --library libvla.so --model smolvla.gguf [--threads 1]
 
-``DIR`` is what ``large.py`` leaves. ``libvla.so`` is vla.cpp's own. ``smolvla.gguf`` is what its
+``DIR`` is what ``large.py`` leaves. ``libvla.so`` is vla.cpp's own: build it with its CMakeLists, which takes ggml from
+llama.cpp. A ggml that is built by itself leaves ``GGML_LLAMAFILE`` off, and is slower. ``smolvla.gguf`` is what its
 ``convert_smolvla_to_gguf.py`` makes of ``DIR/smolvla``, once that has what vla.cpp wants of released checkpoints:
 ``text_model.norm.weight``, here ones, and ``embed_tokens.weight`` in bf16.
 
-vla.cpp is given pictures of 512 by 512, resized beforehand and not timed; ours resizes in the call. Seconds are of the
-clock, so let the machine be quiet.
+In every round both cameras have a new picture in which only an arm has moved. The last contestant reuses tokens, and
+the others compute all of it. vla.cpp is given pictures of 512 by 512, resized beforehand. Seconds are of the clock, so
+let the machine be quiet.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ import ctypes
 import os
 import statistics
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -26,14 +28,20 @@ import numpy as np
 import torch
 from large_calls import plans_of
 from large_smolvla import CAMERAS, STATE, call
+from moving import REUSE, arm, picture
 from torch.nn import functional
 
-import ttscompile
+from ttscompile import Noise
 from ttscompile.artifact.load import load_artifact
+from ttscompile.runtimes.load import open_policy
+from ttscompile.runtimes.policy import CompiledPolicy
 
-SIDE = 512
-FLOATS, PHASES = 1, 1
-"""Of vla.cpp's interface (``vla.h``): pixels as floats from 0 to 1, and times of each phase."""
+SIDE, PRECISIONS = 512, ("fp32", "int8")
+FLOATS = 1
+"""Of vla.cpp's interface (``vla.h``): pixels are floats from 0 to 1."""
+
+UNCOUNTED = 2
+"""Rounds: where tokens are reused, the first frame is whole, and the second may be the first of its size."""
 
 
 class Image(ctypes.Structure):
@@ -88,11 +96,10 @@ class Rival:
         if not self._model:
             raise SystemExit(f"{model}: vla.cpp cannot load it.")
 
-    def predict(self, obs: Mapping[str, np.ndarray], noise: np.ndarray, detail: int = 0) -> np.ndarray:
-        """The actions ``[T, D]``, of all channels."""
-        pictures = [squared(obs[key]) for key in CAMERAS]
+    def predict(self, pictures: Sequence[np.ndarray], obs: Mapping[str, np.ndarray], noise: Noise) -> np.ndarray:
+        """The actions ``[T, D]``, of all channels; ``pictures`` are ``squared``."""
         images = (Image * len(pictures))(*(Image(each.ctypes.data, SIDE, SIDE, FLOATS) for each in pictures))
-        state, initial = np.zeros(32, np.float32), np.ascontiguousarray(noise[0])
+        state, initial = np.zeros(32, np.float32), np.ascontiguousarray(noise.initial[0])
         state[: obs[STATE].size] = obs[STATE].reshape(-1)
         (tokens,) = (np.ascontiguousarray(obs[key], np.int32) for key in obs if key.endswith("tokens"))
         given = Inputs(
@@ -102,7 +109,6 @@ class Rival:
             n_lang=tokens.size,
             state=state.ctypes.data,
             noise=initial.ctypes.data,
-            timing_detail=detail,
         )
         found, count = ctypes.POINTER(ctypes.c_float)(), ctypes.c_int64()
         status = self._library.vla_predict(self._model, ctypes.byref(given), ctypes.byref(found), ctypes.byref(count))
@@ -112,11 +118,11 @@ class Rival:
         self._library.vla_free_actions(found)
         return actions
 
-    def phases(self) -> Stats:
-        """Of the last call, which was asked for them."""
+    def parts(self) -> list[float]:
+        """Seconds of the last call: of both pictures, and of all the rest."""
         stats = Stats()
         self._library.vla_last_stats(self._model, ctypes.byref(stats))
-        return stats
+        return [stats.vision / 1e3, (stats.total - stats.vision) / 1e3]
 
 
 def squared(picture: np.ndarray) -> np.ndarray:
@@ -130,11 +136,26 @@ def squared(picture: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(padded[0].permute(1, 2, 0).numpy())
 
 
-def timed(run: Callable[[], Any]) -> float:
-    """Seconds of the clock."""
+def timed(policy: CompiledPolicy, obs: Mapping[str, np.ndarray], noise: Noise, plan: Any) -> tuple[list[float], Any]:
+    """Seconds of a call of ours, of the clock: before the loop, and in it; and the actions ``[T, D]``."""
     start = time.perf_counter()
-    run()
-    return time.perf_counter() - start
+    actions = policy.predict_action(obs, noise=noise, plan=plan)["action_pred"][0]
+    took = time.perf_counter() - start
+    assert policy.last_report is not None
+    before = took * policy.last_report.timings.prologue / policy.last_report.timings.total
+    return [before, took - before], actions
+
+
+def told(times: Mapping[str, Sequence[Sequence[float]]]) -> list[str]:
+    """A line for each contestant: medians of its calls that count, and how many of them one call of the first takes."""
+    first, lines = None, list[str]()
+    for name, calls in times.items():
+        counted = calls[UNCOUNTED:]
+        total = statistics.median(map(sum, counted))
+        first = first or total
+        parts = ", ".join(f"{statistics.median(part):.2f}" for part in zip(*counted, strict=True))
+        lines.append(f"{total:8.2f} s  {first / total:6.2f} times vla.cpp  {name}: {parts}")
+    return lines
 
 
 @click.command(context_settings={"show_default": True})
@@ -146,36 +167,40 @@ def timed(run: Callable[[], Any]) -> float:
 def main(folder: Path, library: Path, model: Path, threads: int, rounds: int) -> None:
     """Time calls of the policy in FOLDER, and of vla.cpp with the same weights."""
     artifact = load_artifact(folder / "compiled")
-    spec, rival = artifact.manifest.spec, Rival(library, model, threads)
-    obs, noise = call(spec)
+    rival, rng = Rival(library.absolute(), model, threads), np.random.default_rng(1)
+    obs, noise = call(artifact.manifest.spec)
     for key in obs:
         if key.endswith("mask"):
             obs[key] = np.ones_like(obs[key])
     policies = {
-        name: ttscompile.load(folder / "compiled", threads=threads, precision=name) for name in ("fp32", "int8")
+        name: open_policy(artifact.with_reuse(None), "onnxruntime", threads, precision=name) for name in PRECISIONS
     }
-    plans = plans_of(policies["fp32"].info, 2)
-    times: dict[str, list[float]] = {}
-    for _ in range(rounds + 1):  # the first does not count
-        times.setdefault("vla.cpp", []).append(timed(lambda: rival.predict(obs, noise.initial)))
+    reusing = open_policy(artifact.at_precision("int8").with_reuse(REUSE), "onnxruntime", threads)
+    plans = plans_of(reusing.info, 2)
+    few = list(plans)[-1]
+    still = {key: picture(obs[key].shape[-1], rng) for key in CAMERAS}
+    times: dict[str, list[list[float]]] = {}
+    off: dict[str, list[float]] = {}
+    for number in range(rounds + UNCOUNTED):
+        for place, key in enumerate(CAMERAS):
+            obs[key] = arm(still[key], place + 0.05 * number)[None, None]
+        pictures = [squared(obs[key]) for key in CAMERAS]
+        found = {"vla.cpp": rival.predict(pictures, obs, noise)}
+        times.setdefault("vla.cpp: pictures, the rest", []).append(rival.parts())
         for precision, policy in policies.items():
             for name, plan in plans.items():
                 policy.forget_frames()
-
-                def ours(policy: Any = policy, plan: Any = plan) -> Any:
-                    return policy.predict_action(obs, noise=noise, plan=plan)["action_pred"]
-
-                times.setdefault(f"{name}, {precision}", []).append(timed(ours))
-    policies["fp32"].forget_frames()
-    exact = policies["fp32"].predict_action(obs, noise=noise, plan="dense")["action_pred"][0]
-    off = np.abs(rival.predict(obs, noise.initial, PHASES)[:, : exact.shape[1]] - exact)
-    print(f"actions of vla.cpp are off ours by {off.mean():.2g} on average, of at most {np.abs(exact).max():.2g}")
-    phases = rival.phases()
-    print(f"vla.cpp: vision {phases.vision:.0f} ms, prefix {phases.prefill:.0f} ms, loop {phases.denoise:.0f} ms")
-    first = statistics.median(times["vla.cpp"][1:])
-    for name, seconds in times.items():
-        median = statistics.median(seconds[1:])
-        print(f"{median:8.3f} s  {first / median:6.2f} times vla.cpp  {name}")
+                seconds, found[f"{name}, {precision}"] = timed(policy, obs, noise, plan)
+                times.setdefault(f"{name}, {precision}: before the loop, loop", []).append(seconds)
+        seconds, _ = timed(reusing, obs, noise, plans[few])
+        times.setdefault(f"{few}, int8, tokens reused: before the loop, loop", []).append(seconds)
+        exact = found["dense, fp32"]
+        for name in ("vla.cpp", "dense, int8"):
+            off.setdefault(name, []).append(float(np.abs(found[name][:, : exact.shape[1]] - exact).mean()))
+    print("\n".join(told(times)))
+    size = np.abs(exact).mean()
+    for name, values in off.items():
+        print(f"{statistics.mean(values):8.2g}  {name}: actions off ours in fp32 on average, of {size:.2g}")
 
 
 if __name__ == "__main__":

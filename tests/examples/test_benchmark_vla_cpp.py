@@ -1,4 +1,4 @@
-"""What vla.cpp is given: pictures as lerobot resizes them."""
+"""What vla.cpp is given, and what is told of the times."""
 
 import numpy as np
 import pytest
@@ -16,3 +16,12 @@ def test_they_are_square_and_start_with_padding(height: int, width: int) -> None
 
 def test_the_structures_have_the_sizes_of_the_interface() -> None:
     assert (vla_cpp.ctypes.sizeof(vla_cpp.Image), vla_cpp.ctypes.sizeof(vla_cpp.Inputs)) == (24, 80)
+
+
+def test_medians_are_of_the_calls_that_count_and_beside_those_of_the_first() -> None:
+    uncounted = [[9.0, 9.0]] * vla_cpp.UNCOUNTED
+    times = {"theirs": [*uncounted, [3.0, 1.0], [4.0, 2.0], [30.0, 3.0]], "ours": [*uncounted, [1.0, 0.5]]}
+    assert [line.split() for line in vla_cpp.told(times)] == [
+        ["6.00", "s", "1.00", "times", "vla.cpp", "theirs:", "4.00,", "2.00"],
+        ["1.50", "s", "4.00", "times", "vla.cpp", "ours:", "1.00,", "0.50"],
+    ]
