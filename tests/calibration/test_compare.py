@@ -261,7 +261,7 @@ def test_the_truth_has_all_tokens(once: Once, tmp_path: Path) -> None:
     recorded = tmp_path / "calls.npz"
     np.savez(recorded, state=np.zeros((8, 2, 4), np.float32), episode_ends=np.array([4, 8]), **views)
     for reuse, differs in ((None, False), (ReuseRecord(100.0, 64, 0.5, 0.0, 0.0, 1), True)):
-        settle(folder, reuse=reuse)
+        settle(folder, "reuse", reuse)
         (dense,) = compare(folder, [recorded], [], [], calls=1).points
         assert (dense.error > 0) == differs
 

@@ -122,10 +122,10 @@ def test_it_is_off_until_it_was_settled(compiled: Path, tmp_path: Path) -> None:
 
     identity = load_artifact(folder).manifest.identity
     assert tokens() == (0, 0)
-    assert settle(folder, reuse=REUSE).identity != identity
+    assert settle(folder, "reuse", REUSE).identity != identity
     assert tokens() == (5, 37)
     assert tokens(reuse_tokens=False) == tokens(runtime="reference") == (0, 0)
-    assert settle(folder, reuse=None).identity == identity
+    assert settle(folder, "reuse", None).identity == identity
     assert tokens() == (0, 0)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from contextlib import nullcontext
 from dataclasses import replace
+from typing import Literal
 
 from ..errors import ArtifactError
 from .codec import decode, encode
@@ -16,13 +17,19 @@ from .warm import WarmRecord
 from .write import identified, locked, require_unzipped
 
 
-def settle(path: str | os.PathLike[str], *, held: bool = False, **record: ReuseRecord | WarmRecord | None) -> Manifest:
+def settle(
+    path: str | os.PathLike[str],
+    what: Literal["reuse", "warm"],
+    record: ReuseRecord | WarmRecord | None,
+    held: bool = False,
+) -> Manifest:
     """Have an artifact reuse tokens, or begin calls with the chunk before, in another way. Plans and weights stay.
 
     Args:
         path: the artifact's directory.
+        what: the field of the manifest.
+        record: what it will be; None for not at all.
         held: whether the caller has the artifact ``locked``.
-        record: ``reuse`` or ``warm`` of the manifest: how; None for not at all.
 
     Returns:
         The new manifest.
@@ -32,7 +39,7 @@ def settle(path: str | os.PathLike[str], *, held: bool = False, **record: ReuseR
     """
     directory = require_unzipped(path)
     with nullcontext() if held else locked(directory):
-        manifest = replace(load_artifact(directory).manifest, **record)  # type: ignore[arg-type]
+        manifest = replace(load_artifact(directory).manifest, **{what: record})  # type: ignore[arg-type]
         content = encode(identified(manifest))
         manifest = decode(content)  # refuses what nobody could load
         try:

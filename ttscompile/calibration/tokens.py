@@ -122,7 +122,7 @@ def reuse_tokens(
         reuse = replace(
             best.reuse, computed=held.computed, error=held.error, other_noise=judged.other_noise, calls=judged.count
         )
-        settle(path, held=True, reuse=reuse)
+        settle(path, "reuse", reuse, held=True)
         return TokenCalibration(reuse, (judged.frame_ms, held.frame_ms))
 
 

@@ -56,7 +56,7 @@ def reuse_tokens(
     if off == bool(trajectories):
         raise click.UsageError("give --trajectories FILE..., or --off.")
     if off:
-        manifest = settle(directory, reuse=None)
+        manifest = settle(directory, "reuse", None)
         document: dict[str, Any] = {"identity": manifest.identity, "reuse": None}
         told = "all tokens of new frames are computed"
     else:

@@ -56,7 +56,7 @@ def warm_start(
     if off == bool(trajectories):
         raise click.UsageError("give --trajectories FILE..., or --off.")
     if off:
-        settle(directory, warm=None)
+        settle(directory, "warm", None)
         if as_json:
             print_json({"warm": None, "tried": []})
         else:
