@@ -138,7 +138,7 @@ class Runtime:
             artifact: ``artifact.rest.with_last_steps`` of this one's.
         """
         backend = self._opened_for(DENSE).backend
-        return Runtime(artifact, getattr(backend, "of_last_steps", self._open_backend), DENSE)
+        return Runtime(artifact, getattr(backend, "of_last_steps", self._open_backend))
 
     def _end_episode(self) -> None:
         self._written = self._dropped = None

@@ -16,7 +16,7 @@ from typing import Any
 import numpy.typing as npt
 
 from ttscompile.artifact.load import Artifact
-from ttscompile.artifact.manifest import DENSE
+from ttscompile.artifact.manifest import WARM
 from ttscompile.artifact.rest import with_last_steps
 from ttscompile.core.spec import FloatArray, Noise
 from ttscompile.errors import ArtifactError, NonFiniteActionsError, ObservationError
@@ -95,7 +95,7 @@ class WarmPolicy(CompiledPolicy):
         fresh = check_noise(self._draw(streams) if noise is None else noise, streams, spec)
         self._report = self._sample = None  # a call that fails ends the episode
         try:
-            actions = self._rest._predict(obs, self._start.noise_from(before, spec.chunk, fresh), DENSE)
+            actions = self._rest._predict(obs, self._start.noise_from(before, spec.chunk, fresh), WARM)
         except Exception as error:
             self._runtime.reset()
             if isinstance(error, NonFiniteActionsError):

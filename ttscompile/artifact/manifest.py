@@ -27,6 +27,8 @@ DENSE = "dense"
 """The plan that computes every cell; every artifact has it without listing it."""
 UNIFORM = "uniform"
 """The plan that calibration adds for comparisons alone: as many steps computed, evenly spaced. Not for a robot."""
+WARM = "warm"
+"""The plan of calls that begin with the chunk of the call before: the last steps, dense (``artifact.rest``)."""
 DISTILLED = "distilled"
 """The plan whose residual blocks have weights of their own, which ``distill`` trained."""
 

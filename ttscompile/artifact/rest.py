@@ -5,15 +5,19 @@ from __future__ import annotations
 from dataclasses import replace
 from types import MappingProxyType
 
+from ..core.lattice import dense_plan
 from ..core.rest import Start, rest_of
 from ..ir.flops import graph_flops
 from ..ir.pieces import STEP
 from .load import Artifact
-from .manifest import DENSE
+from .manifest import WARM, PlanRecord
 
 
 def with_last_steps(artifact: Artifact, steps: int) -> tuple[Artifact, Start]:
-    """The artifact of the last steps of the loop alone, dense, and what they begin with. Its files are the same.
+    """The artifact of the last steps of the loop alone, and what they begin with. Its files are the same.
+
+    Its only plan beside ``dense`` computes all cells, too: ``warm``. Of a plan of the artifact a runtime keeps what
+    later calls can read, which is nothing here; of ``dense`` it keeps everything.
 
     Args:
         artifact: of the whole loop.
@@ -31,8 +35,8 @@ def with_last_steps(artifact: Artifact, steps: int) -> tuple[Artifact, Start]:
         own,
         spec=replace(own.spec, sampler=table),
         flops=flops,
-        plans={},
-        default_plan=DENSE,
+        plans={WARM: PlanRecord(kind="schedule", sparsity=0.0, flops_sparsity=0.0)},
+        default_plan=WARM,
         calibration=None,
         distilled=None,
         warm=None,
@@ -41,7 +45,7 @@ def with_last_steps(artifact: Artifact, steps: int) -> tuple[Artifact, Start]:
         artifact,
         manifest=rest,
         tables=MappingProxyType({name: rows[start.skipped :] for name, rows in artifact.tables.items()}),
-        schedules=MappingProxyType({}),
+        schedules=MappingProxyType({WARM: dense_plan(steps, len(own.blocks))}),
         corrections=MappingProxyType({}),
         distilled=MappingProxyType({}),
     ), start
