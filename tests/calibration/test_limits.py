@@ -33,6 +33,7 @@ from ttscompile.calibration.targets import draw_calls, with_targets
 from ttscompile.calibration.task import Clock
 from ttscompile.calibration.tokens import reuse_tokens
 from ttscompile.calibration.tts import Tts, switched
+from ttscompile.calibration.warm_start import warm_start
 from ttscompile.core.lattice import PlanArray, Source, uniform_plan
 from ttscompile.errors import CalibrationError, CalibrationFailedError
 from ttscompile.runtimes.reference.model import Contexts, ReferenceModel
@@ -210,7 +211,7 @@ def test_a_state_that_cannot_be_removed_is_an_error(
         calibrate(artifact, [recording], 0.7, progress=False)
 
 
-@pytest.mark.parametrize("change", [calibrate, distill, reuse_tokens])
+@pytest.mark.parametrize("change", [calibrate, distill, reuse_tokens, warm_start])
 def test_an_artifact_that_cannot_be_written_is_refused_before_any_work(
     change: Callable[..., Any], artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -135,7 +135,7 @@ def test_nobody_changes_the_artifact_meanwhile(folder: Path, tmp_path: Path) -> 
 
 def test_a_record_of_more_steps_than_there_are_is_refused(folder: Path) -> None:
     with pytest.raises(ArtifactError, match=r"warm: expected fewer than the 8 steps of the loop"):
-        settle(folder, warm=WarmRecord(STEPS, 1.0, 1.0, 1.1, 9))
+        settle(folder, "warm", WarmRecord(STEPS, 1.0, 1.0, 1.1, 9))
     assert load_artifact(folder).manifest.warm is None
 
 

@@ -9,20 +9,21 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from ..artifact.load import Artifact, load_artifact
-from ..artifact.manifest import DENSE, Manifest
+from ..artifact.manifest import DENSE
 from ..artifact.rest import with_last_steps
 from ..artifact.settle import settle
 from ..artifact.warm import WarmRecord
 from ..artifact.write import locked
 from ..core.given import integer
 from ..core.rest import Start
-from ..core.spec import FloatArray, Noise, PolicySpec
+from ..core.spec import FloatArray, Noise
 from ..errors import CalibrationError, CalibrationFailedError
 from ..runtimes.open import open_runtime
 from ..runtimes.random_calls import random_noise
@@ -117,7 +118,7 @@ def warm_start(
             raise _refused(path, f"{told} {best.changed:.3g}, and {max_distance:g} is allowed")
         chosen = tried[-1]
         record = WarmRecord(chosen.last_steps, chosen.same, chosen.changed, float(max_distance), measured.count)
-        settle(path, held=True, warm=record)
+        settle(path, "warm", record, held=True)
         return WarmCalibration(record, tuple(tried))
 
 
@@ -135,19 +136,16 @@ class _Measured:
 
     def __init__(self, artifact: Artifact, episodes: Sequence[Episode], calls: int, seed: int) -> None:
         self._spec, self._runtime = artifact.manifest.spec, open_runtime(artifact, plan=DENSE)
-        places = _places(episodes, calls)
-        self.count = len(places)
+        self._episodes, self._places = episodes, _places(episodes, calls)
+        self.count = len(self._places)
         rng = np.random.default_rng(seed)
-        before, other, self._noise, beside = ([random_noise(self._spec, rng) for _ in places] for _ in range(4))
-        self._now = [_normalized(self._spec, episodes[i], row) for i, row in places]
-        own = [_normalized(self._spec, episodes[i], row - 1) for i, row in places]
-        changed = [_normalized(self._spec, episodes[another(episodes, i, row, rng)], row - 1) for i, row in places]
-        dense = artifact.manifest
-        self._before = [
-            _samples(self._runtime, dense, seen, noise) for seen, noise in ((own, before), (changed, other))
-        ]
-        self._dense = self._executed(_samples(self._runtime, dense, self._now, beside))
-        self._apart = self._from_dense(_samples(self._runtime, dense, self._now, self._noise))
+        before, other, self._noise, beside = ([random_noise(self._spec, rng) for _ in self._places] for _ in range(4))
+        own = [(i, row - 1) for i, row in self._places]
+        changed = [(another(episodes, i, row, rng), row - 1) for i, row in self._places]
+        dense = partial(self._samples, self._runtime, artifact, DENSE)
+        self._before = dense(own, before), dense(changed, other)
+        self._dense = self._executed(dense(self._places, beside))
+        self._apart = self._from_dense(dense(self._places, self._noise))
 
     def tried(self, rest: Artifact, start: Start) -> Tried:
         """What the last steps of the loop answer."""
@@ -157,8 +155,32 @@ class _Measured:
                 start.noise_from(sample, self._spec.chunk, fresh)
                 for sample, fresh in zip(samples, self._noise, strict=True)
             ]
-            distances.append(self._from_dense(_samples(runtime, rest.manifest, self._now, noise)) / self._apart)
+            made = self._samples(runtime, rest, rest.manifest.default_plan, self._places, noise)
+            distances.append(self._from_dense(made) / self._apart)
         return Tried(rest.manifest.steps, *distances)
+
+    def _samples(
+        self,
+        runtime: Runtime,
+        artifact: Artifact,
+        plan: str,
+        places: Sequence[tuple[int, int]],
+        noises: Sequence[Noise],
+    ) -> list[FloatArray]:
+        """The denoised sample ``[1, T, D]`` of the call at each place, an episode and a row."""
+        made: list[FloatArray] = []
+        for begin in range(0, len(places), STREAMS):
+            some, fresh = places[begin : begin + STREAMS], noises[begin : begin + STREAMS]
+            obs = {
+                key: one.normalized(np.stack([self._episodes[i].observations[key][row] for i, row in some]))
+                for key, one in self._spec.observations.items()
+            }
+            steps = None if fresh[0].steps is None else np.concatenate([one.steps for one in fresh], axis=1)
+            noise = Noise(np.concatenate([one.initial for one in fresh]), steps)
+            runtime.reset()
+            sample, _ = runtime.predict(obs, noise, artifact.schedule(plan), plan_name=plan)
+            made += np.split(sample, len(some))
+        return made
 
     def _executed(self, samples: Sequence[FloatArray]) -> npt.NDArray[np.float64]:
         chunk = self._spec.chunk
@@ -182,25 +204,3 @@ def _places(episodes: Sequence[Episode], calls: int) -> list[tuple[int, int]]:
 def another(episodes: Sequence[Episode], own: int, row: int, rng: np.random.Generator) -> int:
     """The number of another episode that has a call of this number, drawn at random."""
     return int(rng.choice([i for i, episode in enumerate(episodes) if i != own and episode.calls > row]))
-
-
-def _normalized(spec: PolicySpec, episode: Episode, row: int) -> dict[str, FloatArray]:
-    """What is observed in one call, one stream."""
-    return {key: one.normalized(episode.observations[key][row : row + 1]) for key, one in spec.observations.items()}
-
-
-def _samples(
-    runtime: Runtime, manifest: Manifest, observations: Sequence[Mapping[str, FloatArray]], noises: Sequence[Noise]
-) -> list[FloatArray]:
-    """The denoised sample ``[1, T, D]`` of each call, dense."""
-    made: list[FloatArray] = []
-    plan = np.zeros((manifest.steps, len(manifest.blocks)), np.int8)
-    for begin in range(0, len(noises), STREAMS):
-        some, fresh = observations[begin : begin + STREAMS], noises[begin : begin + STREAMS]
-        steps = None if fresh[0].steps is None else np.concatenate([one.steps for one in fresh], axis=1)
-        obs = {key: np.concatenate([one[key] for one in some]) for key in some[0]}
-        noise = Noise(np.concatenate([one.initial for one in fresh]), steps)
-        runtime.reset()
-        sample, _ = runtime.predict(obs, noise, plan, plan_name=DENSE)
-        made += np.split(sample, len(some))
-    return made

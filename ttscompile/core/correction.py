@@ -172,7 +172,13 @@ def groups_of(steps: int, sample: tuple[int, int]) -> int:
 
 
 def no_correction(steps: int, sample: tuple[int, int], groups: int | None = None) -> Correction:
-    """The correction of K steps and samples ``(T, D)`` that changes nothing; None: in ``groups_of`` groups."""
+    """The correction of K steps and samples ``(T, D)`` that changes nothing.
+
+    Args:
+        steps: K.
+        sample: ``(T, D)``.
+        groups: of action dimensions; None for as many as ``groups_of`` has.
+    """
     groups, (horizon, dimensions) = groups_of(steps, sample) if groups is None else groups, sample
     return Correction(
         anchors=np.zeros(steps, np.bool_),

@@ -88,5 +88,5 @@ def _shares(table: SamplerTable, step: int) -> tuple[float, float]:
             return sample, -out
     raise SpecError(
         f"a loop of {table.name!r} does not tell what part of its sample is noise in the middle; expected ddpm, ddim,"
-        " dpmsolver++ or euler, and a network that predicts noise or velocity. Leave last_steps out."
+        " dpmsolver++ or euler, and a network that predicts noise or velocity. Load it without warm=."
     )
