@@ -9,33 +9,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from .layers import TimestepEmbedder
-
-
-class _Attention(nn.Module):
-    def __init__(self, width: int, heads: int) -> None:
-        super().__init__()
-        self.heads = heads
-        self.qkv, self.proj = nn.Linear(width, 3 * width), nn.Linear(width, width)
-
-    def forward(self, x: Tensor) -> Tensor:
-        q, k, v = (part.unflatten(-1, (self.heads, -1)).transpose(1, 2) for part in self.qkv(x).chunk(3, -1))
-        return self.proj(functional.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
-
-
-class _Mlp(nn.Module):
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.fc1, self.fc2 = nn.Linear(width, 4 * width), nn.Linear(4 * width, width)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.fc2(functional.gelu(self.fc1(x), approximate="tanh"))
+from .layers import TimestepEmbedder, TimmAttention, TimmMlp
 
 
 class _Layer(nn.Module):
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
-        self.attn, self.mlp = _Attention(width, heads), _Mlp(width)
+        self.attn, self.mlp = TimmAttention(width, heads), TimmMlp(width)
 
     def forward(self, x: Tensor) -> Tensor:
         x = x + self.attn(functional.layer_norm(x, x.shape[-1:], eps=1e-6))

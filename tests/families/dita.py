@@ -13,6 +13,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from .layers import GatedFeedForward
+
 Cache = list[tuple[Tensor, Tensor]]
 
 
@@ -52,20 +54,10 @@ def _rotated(x: Tensor, start: int) -> Tensor:
     return x * angle.cos() + torch.cat([-right, left], -1) * angle.sin()
 
 
-class _FeedForward(nn.Module):
-    def __init__(self, width: int, hidden: int) -> None:
-        super().__init__()
-        self.gate_proj, self.up_proj = (nn.Linear(width, hidden, bias=False) for _ in range(2))
-        self.down_proj = nn.Linear(hidden, width, bias=False)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.down_proj(functional.silu(self.gate_proj(x)) * self.up_proj(x))
-
-
 class _Layer(nn.Module):
     def __init__(self, width: int, heads: int, hidden: int) -> None:
         super().__init__()
-        self.self_attn, self.mlp = _Attention(width, heads), _FeedForward(width, hidden)
+        self.self_attn, self.mlp = _Attention(width, heads), GatedFeedForward(width, hidden, nn.SiLU())
         self.input_layernorm, self.post_attention_layernorm = _Norm(width), _Norm(width)
 
     def forward(self, x: Tensor, past: tuple[Tensor, Tensor] | None) -> tuple[Tensor, tuple[Tensor, Tensor]]:

@@ -46,6 +46,49 @@ class TimestepEmbedder(nn.Module):
         return self.mlp(torch.cat([angle.cos(), angle.sin()], -1))
 
 
+class TimmAttention(nn.Module):
+    """timm's self-attention, one projection for query, key and value; CogACT and ScaleDP have it."""
+
+    def __init__(self, width: int, count: int) -> None:
+        super().__init__()
+        self.count = count
+        self.qkv, self.proj = nn.Linear(width, 3 * width), nn.Linear(width, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        q, k, v = (heads(part, self.count) for part in self.qkv(x).chunk(3, -1))
+        return self.proj(functional.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
+
+
+class TimmMlp(nn.Module):
+    """timm's feed-forward, four times as wide inside; CogACT and ScaleDP have it."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.fc1, self.fc2 = nn.Linear(width, 4 * width), nn.Linear(4 * width, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.fc2(functional.gelu(self.fc1(x), approximate="tanh"))
+
+
+class GatedFeedForward(nn.Module):
+    """Llama's, with SiLU, and Gemma's, with GELU; SmolVLA, Dita and pi0 have them.
+
+    Args:
+        width: of the stream.
+        hidden: width inside.
+        activation: of the gate.
+    """
+
+    def __init__(self, width: int, hidden: int, activation: nn.Module) -> None:
+        super().__init__()
+        self.activation = activation
+        self.gate_proj, self.up_proj = (nn.Linear(width, hidden, bias=False) for _ in range(2))
+        self.down_proj = nn.Linear(hidden, width, bias=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.down_proj(self.activation(self.gate_proj(x)) * self.up_proj(x))
+
+
 def heads(x: Tensor, count: int) -> Tensor:
     """``[B, T, E]`` to ``[B, count, T, E / count]``."""
     return x.unflatten(-1, (count, -1)).transpose(1, 2)

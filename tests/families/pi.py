@@ -12,6 +12,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from .layers import GatedFeedForward
+
 
 class _Norm(nn.Module):
     """RMSNorm times 1 + weight; or modulated, with a gate for the branch behind it."""
@@ -55,20 +57,11 @@ def _turned(x: Tensor) -> Tensor:
     return torch.cat([-right, left], -1)
 
 
-class _FeedForward(nn.Module):
-    def __init__(self, width: int, hidden: int) -> None:
-        super().__init__()
-        self.gate_proj, self.up_proj = (nn.Linear(width, hidden, bias=False) for _ in range(2))
-        self.down_proj = nn.Linear(hidden, width, bias=False)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.down_proj(functional.gelu(self.gate_proj(x), approximate="tanh") * self.up_proj(x))
-
-
 class _Layer(nn.Module):
     def __init__(self, width: int, heads: int, groups: int, channels: int, hidden: int, adaptive: bool) -> None:
         super().__init__()
-        self.self_attn, self.mlp = _Attention(width, heads, groups, channels), _FeedForward(width, hidden)
+        self.self_attn = _Attention(width, heads, groups, channels)
+        self.mlp = GatedFeedForward(width, hidden, nn.GELU(approximate="tanh"))
         self.input_layernorm, self.post_attention_layernorm = _Norm(width, adaptive), _Norm(width, adaptive)
 
     def forward(

@@ -12,6 +12,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from .layers import GatedFeedForward
+
 
 class _Norm(nn.Module):
     def __init__(self, width: int) -> None:
@@ -42,23 +44,12 @@ class _Attention(nn.Module):
         return self.o_proj((scores.softmax(-1) @ v).transpose(1, 2).flatten(2))
 
 
-class _FeedForward(nn.Module):
-    def __init__(self, width: int, hidden: int) -> None:
-        super().__init__()
-        self.gate_proj = nn.Linear(width, hidden, bias=False)
-        self.up_proj = nn.Linear(width, hidden, bias=False)
-        self.down_proj = nn.Linear(hidden, width, bias=False)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.down_proj(functional.silu(self.gate_proj(x)) * self.up_proj(x))
-
-
 class _Layer(nn.Module):
     def __init__(self, width: int, heads: int, groups: int, channels: int, hidden: int, crosses: bool) -> None:
         super().__init__()
         self.crosses = crosses
         self.self_attn = _Attention(width, heads, groups, channels, groups * channels if crosses else width)
-        self.mlp = _FeedForward(width, hidden)
+        self.mlp = GatedFeedForward(width, hidden, nn.SiLU())
         self.input_layernorm, self.post_attention_layernorm = _Norm(width), _Norm(width)
 
     def forward(self, x: Tensor, keys: Tensor, values: Tensor, mask: Tensor) -> Tensor:
