@@ -64,13 +64,15 @@ def save(directory: Path) -> None:
     with torch.device("meta"):
         shapes = SmolVLA(config).state_dict()
     draw = torch.Generator().manual_seed(0)
-    save_file(
-        {f"model.{name}": _weight(name, value.shape, draw) for name, value in shapes.items()},
-        directory / "model.safetensors",
-    )
+    weights = {f"model.{name}": _weight(name, value.shape, draw) for name, value in shapes.items()}
+    # As in released checkpoints: embeddings in bf16, and a norm that no action depends on.
+    weights[f"{_TEXT}.embed_tokens.weight"] = weights[f"{_TEXT}.embed_tokens.weight"].bfloat16()
+    weights[f"{_TEXT}.norm.weight"] = torch.ones_like(weights[f"{_TEXT}.layers.0.input_layernorm.weight"])
+    save_file(weights, directory / "model.safetensors")
 
 
 _NAMES = ("mean", "std")
+_TEXT = "model.vlm_with_expert.vlm.model.text_model"
 
 
 def _weight(name: str, shape: torch.Size, draw: torch.Generator) -> torch.Tensor:

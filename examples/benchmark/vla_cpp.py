@@ -5,8 +5,7 @@
 
 ``DIR`` is what ``large.py`` leaves. ``libvla.so`` is vla.cpp's own: build it with its CMakeLists, which takes ggml from
 llama.cpp. A ggml that is built by itself leaves ``GGML_LLAMAFILE`` off, and is slower. ``smolvla.gguf`` is what its
-``convert_smolvla_to_gguf.py`` makes of ``DIR/smolvla``, once that has what vla.cpp wants of released checkpoints:
-``text_model.norm.weight``, here ones, and ``embed_tokens.weight`` in bf16.
+``convert_smolvla_to_gguf.py`` makes of ``DIR/smolvla``.
 
 In every round both cameras have a new picture in which only an arm has moved. The last contestant reuses tokens, and
 the others compute all of it. vla.cpp is given pictures of 512 by 512, resized beforehand. Seconds are of the clock, so
