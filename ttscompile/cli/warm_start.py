@@ -49,8 +49,9 @@ def warm_start(
     """Settle from which step on calls of the artifact DIRECTORY may go on with the chunk of the call before.
 
     A program that loads it with warm=True then computes the whole loop in the first call of an episode, and these last
-    steps in all others. The fewest steps are taken with which actions are like dense ones, also where the world changed
-    into that of another episode between two calls. Exit status 1: there are none, and nothing was changed.
+    steps in all others. This takes the fewest steps whose actions are close to those of a dense call: after the call
+    before, and after a call of another episode, as if the world had changed. Exit status 1: no number of steps up to
+    half of the loop is close enough, and nothing was changed.
     """
     manifest_of(directory)
     if off == bool(trajectories):
