@@ -15,6 +15,7 @@ from click.testing import CliRunner
 
 from ttscompile.artifact.write import update_calibration
 from ttscompile.cli import main
+from ttscompile.cli.bench import fewest_threads
 from ttscompile.core.lattice import uniform_plan
 
 
@@ -142,6 +143,32 @@ def test_bench_times_everybody_on_the_same_calls(scheduled: Path, one_layer_chec
     assert compiled["sparsity"] == pytest.approx(0.95)
     assert dense["sparsity"] == 0
     assert compiled["flops"] < dense["flops"] < eager["flops"]
+
+
+def test_bench_times_several_numbers_of_threads_and_takes_the_fewest_that_are_worth_it(scheduled: Path) -> None:
+    arguments = ("--runs", 2, "--threads", "2,1,2", "--against", "onnxruntime-dense")
+    made = json.loads(run("bench", scheduled, *arguments, "--json").stdout)
+    assert [one["label"] for one in made["contestants"]] == ["compiled", "compiled, threads: 1", "dense onnxruntime"]
+    assert made["threads"] == 2 and made["best_threads"] in (1, 2)
+    assert "Load it with threads=" in run("bench", scheduled, *arguments).stdout
+    assert "Load it with threads=" not in run("bench", scheduled, "--runs", 1).stdout
+    assert fewest_threads({4: 9.0, 2: 9.9, 1: 12.0}) == 2
+    assert fewest_threads({4: 8.0, 2: 9.9, 1: 12.0}) == 4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("--threads", "1,x"), "'x' is not a valid integer"),
+        (("--threads", "2,0"), "0 is not in the range 1<=x<="),
+        (("--threads", ""), "'' is not a valid integer"),
+        (("--threads", "1,2", "--runtime", "torch"), "give --threads one number"),
+    ],
+)
+def test_threads_that_bench_cannot_time(arguments: tuple[str, ...], told: str, scheduled: Path) -> None:
+    result = CliRunner().invoke(main, ["bench", str(scheduled), *arguments])
+    assert result.exit_code == 2
+    assert told in result.stderr
 
 
 def test_bench_prints_a_table_and_warns_of_a_dense_artifact(compiled_layer: Path) -> None:

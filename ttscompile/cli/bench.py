@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from ttscompile.cli.options import (
     runs_option,
     runtime_options,
     seed_option,
-    threads_option,
+    several_threads_option,
 )
 from ttscompile.cli.output import print_identity, print_json, progress, results, say, table
 from ttscompile.cli.timing import Compiled, Measurement, contestants, measure
@@ -31,10 +32,16 @@ RIVALS = ("original", "eager", "onnxruntime-dense", "onnxruntime")
 """The checkpoint with the sampler it was saved with; with the artifact's; the artifact computed in full; and the same
 plan of it on the CPU, for --runtime torch."""
 
+WORTH = 0.1
+"""Share of a call's time that more threads have to save: they take their cores from the rest of the robot."""
+
 
 @click.command()
 @artifact_argument
-@threads_option("Threads that each contestant computes with.")
+@several_threads_option(
+    "Threads that each contestant computes with. Of several, as in 1,2,4, the compiled policy is timed with each, and"
+    " its rivals with the first."
+)
 @runs_option("Calls of each contestant that are counted.")
 @click.option("--plan", type=TEXT, help="Plan of the compiled policy. Without this option its default plan runs.")
 @runtime_options
@@ -64,7 +71,7 @@ plan of it on the CPU, for --runtime torch."""
 @json_option
 def bench(
     directory: Path,
-    threads: int,
+    threads: tuple[int, ...],
     runs: int,
     plan: str | None,
     runtime: str,
@@ -82,11 +89,13 @@ def bench(
     """
     if {"eager", "original"}.intersection(against) and checkpoint is None:
         raise click.UsageError("--against eager or original runs the original network: give --checkpoint FILE too.")
+    if len(threads) > 1 and runtime == "torch":
+        raise click.UsageError("--runtime torch has one number of threads in a process: give --threads one number.")
     console, artifact = progress(), load_artifact(directory)
     identity = artifact.manifest.identity
     with console.status("loading"):
-        own = Compiled(runtime, device, precision, threads)
-        entered = contestants(artifact, own, plan, against, checkpoint, encoders)
+        own = Compiled(runtime, device, precision, threads[0])
+        entered = contestants(artifact, own, plan, against, checkpoint, encoders, threads[1:])
     if entered[0].plan == "dense":
         say(console, f"warning: {directory} runs dense: it is not calibrated, or --plan dense was given.")
     with console.status("timing") as status:
@@ -94,10 +103,12 @@ def bench(
     error = None
     if runtime == "torch" and precision not in (None, FP32):
         with console.status(f"comparing actions in {precision} and {FP32}"):
-            pair = (open_runtime(artifact, runtime, threads, device, each) for each in (precision, FP32))
+            pair = (open_runtime(artifact, runtime, threads[0], device, each) for each in (precision, FP32))
             error = measure_precision(artifact, (next(pair), next(pair)))
+    timed = dict(zip(threads, (m.median_ms for m in measured), strict=False))
     if as_json:
-        of = {"identity": identity, "machine": fingerprint(), "threads": threads, "runs": runs, "runtime": runtime}
+        of = {"identity": identity, "machine": fingerprint(), "threads": threads[0], "runs": runs, "runtime": runtime}
+        of |= {"best_threads": fewest_threads(timed)}
         of |= {"device": device or CPU, "precision_error": error and asdict(error)}
         print_json(of | {"contestants": [m.to_json() for m in measured]})
         return
@@ -107,9 +118,12 @@ def bench(
     output.print(table(*head, *parts, rows=[_row(m, measured[0], seeing) for m in measured]))
     say(
         output,
-        f"Medians of {runs} calls, one stream, {threads} thread{'s' * (threads > 1)}; plan {entered[0].plan!r}."
+        f"Medians of {runs} calls, one stream, {threads[0]} thread{'s' * (threads[0] > 1)}; plan {entered[0].plan!r}."
         " Speed-up: how many times faster the first row is. Prologue and pruner: their ms of the call.",
     )
+    if len(threads) > 1:
+        best = fewest_threads(timed)
+        say(output, f"Load it with threads={best}: more of these save less than {WORTH:.0%} of a call.")
     if runtime == "onnxruntime" and precision != FP32 and artifact.manifest.precision is not None:
         say(output, f"The first row computes in {told_precision(artifact.manifest)}.")
     if seeing:
@@ -125,6 +139,12 @@ def bench(
         )
     print_identity(identity, output)
     say(output, one_line(fingerprint()))
+
+
+def fewest_threads(medians: Mapping[int, float]) -> int:
+    """The smallest number of threads that no other one is faster than by more than ``WORTH``; ``medians`` by number."""
+    bound = min(medians.values()) / (1 - WORTH)
+    return min(number for number, median in medians.items() if median <= bound)
 
 
 def _row(m: Measurement, compiled: Measurement, seeing: bool) -> tuple[str, ...]:

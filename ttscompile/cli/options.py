@@ -37,6 +37,16 @@ def threads_option(help: str) -> Decorator:
     return count_option("--threads", help, most=MOST_THREADS)
 
 
+def several_threads_option(help: str) -> Decorator:
+    """``--threads``, one number or several with commas between, as ``tuple[int, ...]`` without repetitions."""
+    number = click.IntRange(1, MOST_THREADS)
+
+    def parsed(context: click.Context, option: click.Parameter, value: str) -> tuple[int, ...]:
+        return tuple(dict.fromkeys(number.convert(part.strip(), option, context) for part in value.split(",")))
+
+    return click.option("--threads", type=ANY_TEXT, default="1", show_default=True, callback=parsed, help=help)
+
+
 def runs_option(help: str, default: int = 20) -> Decorator:
     """``--runs``."""
     return count_option("--runs", help, default=default, most=MOST_RUNS)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -115,6 +115,7 @@ def contestants(
     against: Sequence[str],
     checkpoint: Path | None,
     encoders: Path | None = None,
+    other_threads: Sequence[int] = (),
 ) -> list[Contestant]:
     """The compiled policy first, then its rivals, in fp32; each with a policy, and caches, of its own.
 
@@ -125,6 +126,7 @@ def contestants(
         against: ``original``, ``eager``, ``onnxruntime-dense``, ``onnxruntime``.
         checkpoint: for ``original`` and ``eager``.
         encoders: the folder that ``convert`` was given with the checkpoint, if it was.
+        other_threads: numbers of threads that the compiled policy runs with, too; these come right after the first.
 
     Raises:
         ArtifactError: it cannot be run.
@@ -135,17 +137,19 @@ def contestants(
     chosen = plan or manifest.default_plan
 
     def compiled(label: str, plan: str, how: Compiled) -> Contestant:
-        policy = open_policy(artifact, how.runtime, threads, precision=how.precision, plan=plan, device=how.device)
+        policy = open_policy(artifact, how.runtime, how.threads, precision=how.precision, plan=plan, device=how.device)
         policy.reset()
         found = policy.info.precision
         return plan_contestant(label + f", {found}" * (found != FP32), policy, plan, manifest.spec)
 
-    made = [compiled("compiled" if own.runtime == "onnxruntime" else _where(own), chosen, own)]
+    label = "compiled" if own.runtime == "onnxruntime" else _where(own)
+    made = [compiled(label, chosen, own)]
+    made += [compiled(f"{label}, threads: {n}", chosen, replace(own, threads=n)) for n in other_threads]
     for rival in against:
         if rival == "onnxruntime-dense":
-            made.append(compiled("dense onnxruntime", "dense", Compiled(precision=FP32)))
+            made.append(compiled("dense onnxruntime", "dense", Compiled(precision=FP32, threads=threads)))
         elif rival == "onnxruntime":
-            made.append(compiled("onnxruntime", chosen, Compiled()))
+            made.append(compiled("onnxruntime", chosen, Compiled(threads=threads)))
         elif checkpoint is not None:
             made.append(_eager(checkpoint, encoders, threads, manifest, rival == "original"))
     return made
