@@ -6,7 +6,7 @@ against this one, and calibration trains through it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
@@ -164,6 +164,35 @@ class ReferenceModel:
         names = self._pieces.step.outputs
         rows = [self._step(self._contexts(self._pieces.step.inputs, k, contexts)) for k in range(self.steps)]
         return Contexts(streams, condition, tuple(dict(zip(names, row, strict=True)) for row in rows))
+
+    def joined(self, parts: Iterable[Contexts], streams: int) -> Contexts:
+        """What the loop reads for several batches of streams, as for one batch of all of them.
+
+        Args:
+            parts: one after the other; each is copied before the next is made.
+            streams: of all of them together, at least one.
+        """
+        read = [graph for graph in (self._pieces.condition, self._pieces.step) if graph is not None]
+        axes = {name: one.batch_axis for graph in read for name, one in graph.types().items()}
+
+        def room(values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+            """For all streams, of what belongs to streams."""
+            shapes = {name: list(value.shape) for name, value in values.items()}
+            for name, shape in shapes.items():
+                if (axis := axes[name]) is not None:
+                    shape[axis] = streams
+            return {n: v if axes[n] is None else v.new_empty(shapes[n]) for n, v in values.items()}
+
+        whole, begin = None, 0
+        for part in parts:
+            whole = whole or Contexts(streams, room(part.condition), tuple(map(room, part.steps)))
+            for into, values in zip((whole.condition, *whole.steps), (part.condition, *part.steps), strict=True):
+                for name, value in values.items():
+                    if (axis := axes[name]) is not None:
+                        into[name].narrow(axis, begin, part.streams).copy_(value)
+            begin += part.streams
+        assert whole is not None and begin == streams
+        return whole
 
     def condition(self, contexts: Contexts) -> Tensor:
         """What a correction reads of the observation: the pruner's features, one row a stream, ``[B, N]``."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.rounding import Counted, assert_equal_but_for_rounding
-from ttscompile.calibration import execute
+from ttscompile.calibration import calls, execute
 from ttscompile.core.lattice import Source, dense_plan
 from ttscompile.errors import IllegalPlanError
 
@@ -30,6 +30,26 @@ def test_plans_on_calls_equal_the_reference(make_task: MakeTask, computed: float
         with Counted() as counted:
             expected = executor.model.denoise(calls.contexts, calls.initial, calls.noise, plan).sample
         assert_equal_but_for_rounding(executor.run(plan, calls), expected, counted.terms)
+
+
+def test_observations_may_go_through_the_prologue_a_few_at_a_time(
+    make_task: MakeTask, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever the loop reads is then that of one batch, in the order of the calls."""
+    whole = make_task(calls=7).calls
+    monkeypatch.setattr(calls, "OBSERVED_AT_ONCE", 3)
+    found = make_task(calls=7).calls
+    assert found.contexts.streams == 7
+    pairs = zip(
+        (found.contexts.condition, *found.contexts.steps),
+        (whole.contexts.condition, *whole.contexts.steps),
+        strict=True,
+    )
+    for mine, theirs in pairs:
+        assert mine.keys() == theirs.keys()
+        for name, value in mine.items():
+            assert value.shape == theirs[name].shape
+            np.testing.assert_allclose(value, theirs[name], rtol=1e-5, atol=1e-6, err_msg=name)
 
 
 @pytest.mark.parametrize("streams", [1, 2, 256])

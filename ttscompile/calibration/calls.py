@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -159,6 +159,10 @@ def sample_windows(
     return [(n, row + i) for n, row in chosen for i in range(window)]
 
 
+OBSERVED_AT_ONCE = 64
+"""Observations that go through the prologue together: a few thousand with images would be more than the memory."""
+
+
 def prepare_calls(
     model: ReferenceModel,
     spec: PolicySpec,
@@ -183,9 +187,15 @@ def prepare_calls(
     if pinned:
         first = torch.arange(len(chosen)) // window * window
         initial, noise = initial[first], None if noise is None else noise[:, first]
-    observed = {key: np.stack([episodes[n].observations[key][row] for n, row in chosen]) for key in spec.observations}
+
+    def parts() -> Iterator[Contexts]:
+        for begin in range(0, len(chosen), OBSERVED_AT_ONCE):
+            some = chosen[begin : begin + OBSERVED_AT_ONCE]
+            seen = {key: np.stack([episodes[n].observations[key][row] for n, row in some]) for key in spec.observations}
+            yield model.prologue({key: torch.from_numpy(one) for key, one in normalized(spec, seen).items()})
+
     with torch.no_grad():
-        contexts = model.prologue({key: torch.from_numpy(one) for key, one in normalized(spec, observed).items()})
+        contexts = model.joined(parts(), len(chosen))
     return Calls(contexts, initial, noise, np.array([n for n, _ in chosen], np.int64), window=window)
 
 
