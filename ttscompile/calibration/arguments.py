@@ -57,13 +57,16 @@ def require_directory(path: Path) -> None:
         )
 
 
-def calls_to_learn_from(spec: PolicySpec, max_minutes: float, corrects: bool) -> tuple[int, int]:
+def calls_to_learn_from(
+    spec: PolicySpec, max_minutes: float, corrects: bool, most: int = MOST_CALLS
+) -> tuple[int, int]:
     """How many calls there have to be, and how many there are if the time is enough to answer them.
 
     Args:
         spec: of the policy.
         max_minutes: the time limit.
         corrects: whether a correction is fitted on them, which reads more the longer the horizon is.
+        most: of them, however much time there is.
     """
     fewest = min(CALLS_A_FEATURE * (FEATURES * spec.sample[0] + 1), MOST_NEEDED) if corrects else FEWEST_CALLS
-    return fewest, int(np.clip(EVALUATIONS_A_MINUTE / spec.sampler.steps * max_minutes, fewest, MOST_CALLS))
+    return fewest, int(np.clip(EVALUATIONS_A_MINUTE / spec.sampler.steps * max_minutes, fewest, most))

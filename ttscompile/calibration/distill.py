@@ -42,6 +42,9 @@ from .task import Clock
 UPDATES = 600
 """Of the weights, if there is time. On Push-T with 2 of 16 steps the held-out error has stopped falling by then."""
 
+MOST_LEARNED = 12288
+"""Calls to learn from at most: noise is free, and weights fit what they have seen more closely than a correction."""
+
 SAVED = 20
 """Updates from one saving of the state to the next."""
 
@@ -141,7 +144,7 @@ def distill(
         trainable(artifact, rank)  # before minutes of work
         episodes = load_episodes(spec, trajectories, observation)
         split = split_episodes(len(episodes), validation_fraction, seed)
-        fewest, limit = calls_to_learn_from(spec, max_minutes, corrects=True)
+        fewest, limit = calls_to_learn_from(spec, max_minutes, corrects=True, most=MOST_LEARNED)
         settings = {
             "model": artifact.manifest.model_identity[:16],
             "trajectories": digest_of(episodes),
@@ -168,7 +171,9 @@ def distill(
         weights = student.weights()
         tried = [executor.corrected(one) for one in (correction, known)]
         before = min((_score(artifact, one, schedule, sets["validation"]) for one in tried), key=lambda one: one.error)
-        after = _score(artifact, student.executor, schedule, sets["validation"])
+        # What the trained weights predict is corrected anew; what they were trained with they only began from.
+        correction = fit_correction(student.executor, schedule, sets["calibration"], known is None or known.reads > 0)
+        after = _score(artifact, student.executor.corrected(correction), schedule, sets["validation"])
         if not after.error < before.error:
             raise CalibrationFailedError(
                 f"plan {plan!r} is {before.error:.4g} off on average on the held-out calls, and {after.error:.4g} with"
