@@ -42,7 +42,7 @@ def several_threads_option(help: str) -> Decorator:
     number = click.IntRange(1, MOST_THREADS)
 
     def parsed(context: click.Context, option: click.Parameter, value: str) -> tuple[int, ...]:
-        return tuple(dict.fromkeys(number.convert(part.strip(), option, context) for part in value.split(",")))
+        return tuple(dict.fromkeys(number(part.strip(), option, context) for part in value.split(",")))
 
     return click.option("--threads", type=ANY_TEXT, default="1", show_default=True, callback=parsed, help=help)
 
