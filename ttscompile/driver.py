@@ -15,6 +15,7 @@ from .artifact.bind import LoweredPieces
 from .artifact.files import replace_file
 from .artifact.load import load_artifact
 from .artifact.write import require_replaceable, write_artifact
+from .capture.copies import own_copy
 from .capture.export import capture
 from .capture.narrow import narrow, unneeded
 from .core.given import integer
@@ -166,6 +167,7 @@ def compile_denoiser(
     Raises:
         TtscompileError: it cannot be captured, it has no residual blocks, or the artifact cannot be written.
     """
+    module = own_copy(module)  # the program, which is returned, shares memory with it
     return _compile(module, spec, directory, prediction_horizon, precision, keep_fp32, single_file, explain, {})
 
 
@@ -180,7 +182,10 @@ def _compile(
     explain: Explain,
     beside: Mapping[str, bytes],
 ) -> Program:
-    """See ``compile_denoiser``; ``beside`` goes into the directory, for other programs."""
+    """See ``compile_denoiser``; ``beside`` goes into the directory, for other programs.
+
+    Nobody else may change the module: the program shares memory with it.
+    """
     require_precision(precision, keep_fp32)
     if prediction_horizon is not None:
         prediction_horizon = integer(prediction_horizon, "prediction_horizon", SpecError, 1)
@@ -272,7 +277,7 @@ def _lower_pieces(
 
 
 def transform(module: nn.Module, spec: PolicySpec, *, explain: Explain = _silent) -> Program:
-    """Everything up to lowering: capture, analysis and passes."""
+    """Everything up to lowering: capture, analysis and passes. Weights share memory with the module's parameters."""
     graph, weights = capture(module, spec)
     megabytes = sum(w.nbytes for w in weights.values()) / 1e6
     explain("capture", (f"{len(graph.nodes)} operations, {megabytes:.1f} MB of weights",))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import inspect
 import logging
 import operator
@@ -26,6 +25,7 @@ from ..errors import CaptureError
 from ..ir.evaluate import Evaluator, without_stack_traces
 from ..ir.graph import GETITEM, Argument, Batch, Enum, Graph, Node, Ref, Size, TensorType
 from .batch import BATCHES, REMEDY, unify_batch
+from .copies import sharing_copy
 from .stacks import AS_CAT
 
 EXAMPLE_STREAMS = 3
@@ -43,7 +43,8 @@ Weights = dict[str, npt.NDArray[np.generic]]
 def capture(module: nn.Module, spec: PolicySpec) -> tuple[Graph, Weights]:
     """Capture ``module(sample, timestep, **observations)``, one denoising step, for any number of streams.
 
-    The module is copied to the CPU, set to eval mode and to float32; the user's object is not touched.
+    A copy is captured, on the CPU, in eval mode and float32; the module itself is not touched. Constants share memory
+    with its parameters where these are so already.
 
     Args:
         module: takes ``spec.sample_argument`` float32 ``[B, T, D]``, ``spec.timestep_argument`` ``[B]`` of the dtype of
@@ -58,13 +59,7 @@ def capture(module: nn.Module, spec: PolicySpec) -> tuple[Graph, Weights]:
         CaptureError: torch.export failed; the graph uses what the compiler cannot express, of which it names the node;
             or what the module computes for a stream depends on the others, or on how many there are.
     """
-    try:
-        module = copy.deepcopy(module).cpu().float().eval()
-    except RuntimeError as error:
-        raise CaptureError(
-            f"{type(module).__name__} cannot be copied: {error} Of a weight that is computed from others, call"
-            " torch.nn.utils.remove_weight_norm or parametrize.remove_parametrizations first."
-        ) from error
+    module = sharing_copy(module)
     try:
         graph, weights = _Converter(*_traced(module, spec, EXAMPLE_STREAMS, symbolic=True)).convert(spec)
     except CaptureError as error:
@@ -246,7 +241,7 @@ class _Converter:
                 )
             self.names[fx_node] = target
             constants[target] = self._type(fx_node, fx_node.meta["val"])
-            weights[target] = state[target].detach().cpu().contiguous().numpy()  # the module is a copy
+            weights[target] = state[target].detach().cpu().contiguous().numpy()
         self.taken = {*inputs, *constants}
         for fx_node in self.exported.graph.nodes:
             if fx_node.op == "call_function" and (node := self._node(fx_node)) is not None:

@@ -6,7 +6,6 @@ before it, so those at the end can be left out of sample and graph; what is left
 
 from __future__ import annotations
 
-import copy
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +15,7 @@ from torch import nn
 from ..core.spec import PolicySpec
 from ..errors import SpecError
 from ..frontends.eager import evaluation
+from .copies import sharing_copy
 
 TOLERANCE = 1e-4
 """Of the prediction's deviation. Rounding is a hundredth of it; a network that attends to later steps is far above."""
@@ -76,7 +76,7 @@ def _difference(module: nn.Module, spec: PolicySpec, steps: int) -> float:
     sample = torch.from_numpy(draw.standard_normal((_STREAMS, *spec.sample), dtype=np.float32))
     timesteps, found = torch.from_numpy(spec.sampler.timesteps), list[float]()
     with torch.inference_mode():
-        evaluate = evaluation(copy.deepcopy(module).cpu().float().eval(), spec, observations)
+        evaluate = evaluation(sharing_copy(module), spec, observations)
         for k in (0, spec.sampler.steps // 2, spec.sampler.steps - 1):
             timestep = timesteps[k].expand(_STREAMS)
             whole = evaluate(sample, timestep)[:, :steps]

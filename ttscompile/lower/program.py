@@ -15,6 +15,7 @@ from dataclasses import replace
 from itertools import islice
 from typing import Any
 
+import numpy as np
 import onnx
 import torch
 
@@ -149,7 +150,8 @@ def _run_exporter(graphs: list[Graph]) -> onnx.ModelProto:
     for i, graph in enumerate(graphs):
         streams = torch.export.Dim(f"B{i}", min=1)
         for type_ in (*graph.inputs.values(), *graph.constants.values()):
-            examples.append(torch.zeros(type_.at(EXAMPLE_STREAMS), dtype=getattr(torch, type_.dtype)))
+            # numpy's zeros take no memory until they are written, which these never are; torch's take it at once.
+            examples.append(torch.from_numpy(np.zeros(type_.at(EXAMPLE_STREAMS), type_.dtype)))
             sizes = [(axis, n.multiple) for axis, n in enumerate(type_.shape) if isinstance(n, Batch)]
             dynamic.append({axis: multiple * streams if multiple > 1 else streams for axis, multiple in sizes})
     with _quiet(), without_stack_traces(), torch.no_grad():

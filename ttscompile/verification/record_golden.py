@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -18,6 +17,7 @@ from torch import nn
 from ..artifact.golden import DIGITS, Golden, GoldenPlan, load_golden, pattern, probe_stream, project
 from ..artifact.load import Artifact
 from ..artifact.manifest import DISTILLED
+from ..capture.copies import sharing_copy
 from ..core.spec import FloatArray, Noise
 from ..errors import CaptureError
 from ..frontends.eager import eager_policy
@@ -85,7 +85,7 @@ def _record_original(module: nn.Module, program: Program) -> Golden:
     initial = draw.standard_normal(shape, dtype=np.float32)
     draws = draw.standard_normal((steps, *shape), dtype=np.float32) if spec.sampler.stochastic else None
 
-    copied = copy.deepcopy(module).cpu().float().eval()
+    copied = sharing_copy(module)
     evaluations: list[tuple[FloatArray, FloatArray]] = []
 
     def watch(_: nn.Module, args: tuple[Any, ...], kwargs: dict[str, Any], output: torch.Tensor) -> None:
