@@ -15,7 +15,6 @@ from .artifact.bind import LoweredPieces
 from .artifact.files import replace_file
 from .artifact.load import load_artifact
 from .artifact.write import require_replaceable, write_artifact
-from .capture.copies import own_copy
 from .capture.export import capture
 from .capture.narrow import narrow, unneeded
 from .core.given import integer
@@ -23,6 +22,7 @@ from .core.paths import on_hub, require_free_or_path
 from .core.spec import AUTO, FP32, INT8, PolicySpec
 from .errors import ArtifactError, LoweringError, NoResidualBlocksError, PassError, SpecError
 from .frontends import files_beside, load_checkpoint_policy
+from .frontends.copies import own_copy
 from .frontends.encoded import parts
 from .frontends.families import LoadOptions
 from .hub import fetch_checkpoint

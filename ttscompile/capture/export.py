@@ -22,10 +22,10 @@ from torch.export.graph_signature import InputKind, OutputKind
 
 from ..core.spec import PolicySpec
 from ..errors import CaptureError
+from ..frontends.copies import sharing_copy
 from ..ir.evaluate import Evaluator, without_stack_traces
 from ..ir.graph import GETITEM, Argument, Batch, Enum, Graph, Node, Ref, Size, TensorType
 from .batch import BATCHES, REMEDY, unify_batch
-from .copies import sharing_copy
 from .stacks import AS_CAT
 
 EXAMPLE_STREAMS = 3

@@ -17,9 +17,9 @@ from torch import nn
 from ..artifact.golden import DIGITS, Golden, GoldenPlan, load_golden, pattern, probe_stream, project
 from ..artifact.load import Artifact
 from ..artifact.manifest import DISTILLED
-from ..capture.copies import sharing_copy
 from ..core.spec import FloatArray, Noise
 from ..errors import CaptureError
+from ..frontends.copies import sharing_copy
 from ..frontends.eager import eager_policy
 from ..frontends.encoded import parts
 from ..ir.dataflow import reachable_from
