@@ -1,4 +1,6 @@
-"""Convert a policy and print the most anonymous memory that it took: ``python -m tests.frontends.anonymous POLICY OUT``.
+"""Convert a policy and print the most anonymous memory that it took.
+
+    python -m tests.frontends.anonymous POLICY OUT [PRECISION]
 
 Pages of mapped files are not counted: the system takes them back when others need the room.
 """

@@ -17,8 +17,8 @@ from .anonymous import ROLLUP
 
 ROOT = Path(__file__).resolve().parents[2]
 
-MOST = 0.8
-"""Of the weights. Of these 390 MiB it is what torch's exporter takes, whatever the size; each copy adds 1."""
+MOST = 1.2
+"""Of the weights, 386 MiB: it was 0.7, and 2.3 with a copy for the capture and one for the exporter's examples."""
 
 
 @pytest.mark.skipif(not ROLLUP.exists(), reason="needs /proc/self/smaps_rollup")

@@ -14,9 +14,8 @@ from safetensors.torch import load_file
 from ..errors import CheckpointError
 from ..measure.machine import memory_bytes
 
-TIMES = 5
-"""Memory that compiling takes, as a multiple of the weights in float32: 4.7 for SmolVLA, less for smaller networks of
-the same kind; measured with ``examples/benchmark/large.py``."""
+TIMES = 4
+"""Memory that compiling takes, as a multiple of the weights in float32, at most: see ``docs/decisions.md``."""
 
 SHOWN = 6
 """Names that a message holds; it counts the others."""
