@@ -40,7 +40,8 @@ from .targets import draw_calls, with_targets
 from .task import Clock
 
 UPDATES = 600
-"""Of the weights, if there is time. On Push-T with 2 of 16 steps the held-out error has stopped falling by then."""
+"""Of the weights, if there is time. On Push-T with 2 of 16 steps and 3,072 calls the held-out error has stopped falling
+by then; with 12,288 calls it still falls after four times as many."""
 
 MOST_LEARNED = 12288
 """Calls to learn from at most: noise is free, and weights fit what they have seen more closely than a correction."""
