@@ -82,7 +82,7 @@ def find_tokens(tower: Graph, weights: Weights) -> TokenStream | str:
 
 def evaluator(graph: Graph, weights: Weights) -> Evaluator:
     """The graph with its weights, to be run."""
-    return Evaluator(graph, {name: torch.from_numpy(np.array(weights[name])) for name in graph.constants})
+    return Evaluator(graph, {name: torch.from_numpy(np.asarray(weights[name])) for name in graph.constants})
 
 
 def _reached(graph: Graph, names: Iterable[str]) -> set[str]:
