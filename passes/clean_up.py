@@ -9,7 +9,7 @@ import numpy.typing as npt
 import torch
 
 from ttscompile.ir.dataflow import reaching
-from ttscompile.ir.evaluate import Evaluator
+from ttscompile.ir.evaluate import evaluator
 from ttscompile.ir.graph import Argument, Enum, Graph, Node, Ref, TensorType
 from ttscompile.ir.operations import Movement, operation
 from ttscompile.ir.program import Phase
@@ -113,7 +113,7 @@ def fold_constants(graph: Graph, weights: Weights) -> Graph:
     wanted = tuple(n.name for n in folded if n.name in read and len(n.types) == 1)
     fragment = drop_dead(Graph({}, graph.constants, tuple(folded), wanted))
     with torch.no_grad():
-        values = Evaluator(fragment, {n: torch.from_numpy(weights[n]) for n in fragment.constants})({})
+        values = evaluator(fragment, weights)({})
     constants = dict(graph.constants)
     for name, value in zip(wanted, values, strict=True):
         constants[name] = types[name]

@@ -12,7 +12,7 @@ import torch
 
 from ttscompile.core.spec import SamplerTable
 from ttscompile.ir.binding import bindings, input_bindings, numbering
-from ttscompile.ir.evaluate import Evaluator
+from ttscompile.ir.evaluate import evaluator
 from ttscompile.ir.flops import graph_flops
 from ttscompile.ir.graph import Graph, Node, Ref, TensorType, backward_slice
 from ttscompile.ir.program import Binding, Cut, Pieces, Program
@@ -152,7 +152,7 @@ def _evaluate_tables(
         return {}
     graph = backward_slice(prologue, tuple(names), {})
     graph = replace(graph, inputs={timestep: prologue.inputs[timestep]})  # which says that the batch is one
-    run = Evaluator(graph, {n: torch.from_numpy(np.asarray(weights[n])) for n in graph.constants})
+    run = evaluator(graph, weights)
     rows: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in names}
     with torch.no_grad():
         for t in torch.from_numpy(sampler.timesteps):

@@ -8,11 +8,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 
+from ttscompile.ir.evaluate import evaluator
 from ttscompile.ir.graph import Argument, Batch, Graph, Node, Ref, Size, TensorType, backward_slice
 from ttscompile.ir.operations import Movement, operation
 from ttscompile.ir.pieces import INDEX, PIXELS, frame_name, pixels_name, renewed_name, tokens_name
 from ttscompile.ir.program import Program
-from ttscompile.ir.tokens import ATTENTION, TokenStream, evaluator, find_tokens
+from ttscompile.ir.tokens import ATTENTION, TokenStream, find_tokens
 
 from .base import Pass, PassResult
 

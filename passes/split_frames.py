@@ -10,7 +10,7 @@ import numpy.typing as npt
 import torch
 
 from ttscompile.core.spec import ObservationSpec
-from ttscompile.ir.evaluate import Evaluator
+from ttscompile.ir.evaluate import evaluator
 from ttscompile.ir.flops import node_flops
 from ttscompile.ir.graph import Argument, Batch, Graph, Node, Ref, TensorType, backward_slice
 from ttscompile.ir.operations import Movement, operation
@@ -314,7 +314,7 @@ def _one_frame_a_row(
     if tower.rows == 1:
         return True
     before, rng = backward_slice(graph, tower.entries, {}), np.random.default_rng(0)
-    run = Evaluator(before, {name: torch.from_numpy(np.asarray(weights[name])) for name in before.constants})
+    run = evaluator(before, weights)
     obs = {name: _drawn(type_, 1, rng) for name, type_ in before.inputs.items()}
     with torch.no_grad():
         (rows,) = run(obs)
@@ -335,7 +335,7 @@ def _drawn(type_: TensorType, rows: int, rng: np.random.Generator) -> torch.Tens
 
 def _require_apart(each: SplitFrames, tower: Graph, weights: Mapping[str, npt.NDArray[np.generic]]) -> None:
     """Raise unless a row gives the same beside another and alone."""
-    run = Evaluator(tower, {name: torch.from_numpy(np.asarray(weights[name])) for name in tower.constants})
+    run = evaluator(tower, weights)
     rng = np.random.default_rng(0)
     rows = {name: _drawn(type_, 2, rng) for name, type_ in tower.inputs.items()}
     with torch.no_grad():

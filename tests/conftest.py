@@ -43,6 +43,7 @@ def pytest_configure(config: pytest.Config) -> None:
         import torch
 
         torch.set_num_threads(1)
+        torch.set_warn_always(True)  # a warning that is given once is an error of whichever test comes first
 
 
 def pytest_terminal_summary(terminalreporter: TerminalReporter) -> None:

@@ -11,7 +11,7 @@ import torch
 from tests.lower.modules import ALL, captured, random_values
 from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile.errors import CaptureError, ObservationError
-from ttscompile.ir.evaluate import Evaluator, bind_batch, evaluate, resolve_op, without_stack_traces
+from ttscompile.ir.evaluate import Evaluator, bind_batch, evaluate, evaluator, resolve_op, without_stack_traces
 from ttscompile.ir.graph import Argument, Batch, Enum, Graph, Node, Ref, TensorType
 
 B = Batch()
@@ -25,21 +25,33 @@ def one_node(op: str, *args: Argument, inputs: dict[str, TensorType] | None = No
 @pytest.mark.parametrize("name", ALL)
 def test_equals_the_module(name: str) -> None:
     module, graph, weights = captured(name)
-    evaluator = Evaluator(graph, weights)
+    run = Evaluator(graph, weights)
     for streams in (1, 2, 5):
         inputs = random_values(graph.inputs, streams)
-        (result,) = evaluator(inputs)
+        (result,) = run(inputs)
         with torch.no_grad(), Counted() as counted:
             expected = module(**inputs)
         assert_equal_but_for_rounding(result, expected, counted.terms)
 
 
+def test_weights_that_may_only_be_read_are_neither_copied_nor_warned_of() -> None:
+    module, graph, weights = captured("FeedForward")
+    arrays = {name: value.detach().numpy() for name, value in weights.items()}
+    for array in arrays.values():
+        array.flags.writeable = False
+    run, inputs = evaluator(graph, arrays), random_values(graph.inputs, 2)
+    with torch.no_grad():
+        torch.testing.assert_close(run(inputs)[0], module(**inputs))
+        weights["down.weight"].zero_()
+        torch.testing.assert_close(run(inputs)[0], inputs["sample"])
+
+
 def test_gradients_reach_weights_and_inputs_and_updates_in_place_show() -> None:
     module, graph, weights = captured("FeedForward")
     weights = {name: value.requires_grad_() for name, value in weights.items()}
-    evaluator = Evaluator(graph, weights)
+    run = Evaluator(graph, weights)
     inputs = {n: v.requires_grad_(v.is_floating_point()) for n, v in random_values(graph.inputs, 2).items()}
-    evaluator(inputs)[0].square().sum().backward()
+    run(inputs)[0].square().sum().backward()
     sample = inputs["sample"].detach().clone().requires_grad_()
     with Counted() as counted:
         module(sample, inputs["timestep"], inputs["obs"]).square().sum().backward()
@@ -47,10 +59,10 @@ def test_gradients_reach_weights_and_inputs_and_updates_in_place_show() -> None:
     for name, parameter in module.named_parameters():
         assert_equal_but_for_rounding(weights[name].grad, parameter.grad, counted.terms)
     with torch.no_grad():
-        before = evaluator(inputs)[0]
+        before = run(inputs)[0]
         weights["down.weight"].zero_()
-        assert not torch.equal(evaluator(inputs)[0], before)
-        torch.testing.assert_close(evaluator(inputs)[0], inputs["sample"].detach())
+        assert not torch.equal(run(inputs)[0], before)
+        torch.testing.assert_close(run(inputs)[0], inputs["sample"].detach())
 
 
 def test_values_are_freed_after_their_last_use() -> None:
@@ -58,7 +70,7 @@ def test_values_are_freed_after_their_last_use() -> None:
     type_ = TensorType((B,), "float32")
     names = ["x", *(f"v{i}" for i in range(6))]
     nodes = tuple(Node(b, "aten.neg.default", (Ref(a),), (), (type_,)) for a, b in itertools.pairwise(names))
-    evaluator = Evaluator(Graph({"x": type_}, {}, nodes, ("v5",)), {})
+    run = Evaluator(Graph({"x": type_}, {}, nodes, ("v5",)), {})
     most = 0
 
     class Watch(torch.overrides.TorchFunctionMode):
@@ -72,7 +84,7 @@ def test_values_are_freed_after_their_last_use() -> None:
 
     x = torch.ones(3)
     with Watch():
-        evaluator({"x": x})
+        run({"x": x})
     assert len(alive) == 6
     assert most == 2  # the argument and the result
 

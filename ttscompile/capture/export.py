@@ -23,7 +23,7 @@ from torch.export.graph_signature import InputKind, OutputKind
 from ..core.spec import PolicySpec
 from ..errors import CaptureError
 from ..frontends.copies import sharing_copy
-from ..ir.evaluate import Evaluator, without_stack_traces
+from ..ir.evaluate import evaluator, without_stack_traces
 from ..ir.graph import GETITEM, Argument, Batch, Enum, Graph, Node, Ref, Size, TensorType
 from .batch import BATCHES, REMEDY, unify_batch
 from .stacks import AS_CAT
@@ -83,7 +83,7 @@ def _require_streams_alike(module: nn.Module, spec: PolicySpec, graph: Graph, we
 
     It is run with two streams, and with the second alone.
     """
-    run = Evaluator(graph, {name: torch.from_numpy(np.asarray(value)) for name, value in weights.items()})
+    run = evaluator(graph, weights)
     rng, both, made = np.random.default_rng(0), _examples(spec, 2), list[torch.Tensor]()
     for key, one in spec.observations.items():
         both[key] = torch.from_numpy(one.draw_normalized(rng, 2))

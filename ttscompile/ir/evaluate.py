@@ -7,10 +7,13 @@ ONNX models are checked against it.
 from __future__ import annotations
 
 import operator
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, TypeAlias
 
+import numpy as np
+import numpy.typing as npt
 import torch
 import torch.fx.config
 
@@ -86,6 +89,17 @@ def evaluate(
 ) -> tuple[torch.Tensor, ...]:
     """Run ``graph`` once; see ``Evaluator`` for shapes, errors, and for running it many times."""
     return Evaluator(graph, weights)(inputs)
+
+
+def evaluator(graph: Graph, weights: Mapping[str, npt.NDArray[Any]]) -> Evaluator:
+    """The graph with its weights, which are read where they are: also where nobody may write, as in an artifact.
+
+    Torch warns of such an array because somebody could write to its tensor. A graph writes to none of its constants.
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "The given NumPy array is not writable", UserWarning)
+        tensors = {name: torch.from_numpy(np.asarray(weights[name])) for name in graph.constants if name in weights}
+    return Evaluator(graph, tensors)
 
 
 class Evaluator:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from .evaluate import Evaluator
+from .evaluate import evaluator
 from .flops import graph_flops, node_flops
 from .graph import GETITEM, Argument, Graph, Node, Ref, TensorType, backward_slice
 from .operations import Movement, axes_along, operation, permutation
@@ -78,11 +78,6 @@ def find_tokens(tower: Graph, weights: Weights) -> TokenStream | str:
         where = next(node for node in whole if stream.axes.keys() & set(node.refs()))
         return f"at %{where.name} ({where.op}) tokens come together otherwise than by attention"
     return stream
-
-
-def evaluator(graph: Graph, weights: Weights) -> Evaluator:
-    """The graph with its weights, to be run."""
-    return Evaluator(graph, {name: torch.from_numpy(np.asarray(weights[name])) for name in graph.constants})
 
 
 def _reached(graph: Graph, names: Iterable[str]) -> set[str]:

@@ -23,7 +23,7 @@ from ..frontends.copies import sharing_copy
 from ..frontends.eager import eager_policy
 from ..frontends.encoded import parts
 from ..ir.dataflow import reachable_from
-from ..ir.evaluate import Evaluator
+from ..ir.evaluate import evaluator
 from ..ir.graph import Graph, backward_slice
 from ..ir.layers import layers
 from ..ir.program import Block, Program
@@ -180,7 +180,7 @@ class _Inside:
 
     def __init__(self, program: Program, observations: Mapping[str, torch.Tensor], streams: int) -> None:
         self._spec, self._blocks, self._streams = program.spec, program.blocks, streams
-        self._weights = {name: torch.from_numpy(np.asarray(value)) for name, value in program.weights.items()}
+        self._weights = program.weights
         self._observations = dict(observations)
         whole = program.denoiser
         self._closed = replace(whole, outputs=tuple(block.stream for block in self._blocks))
@@ -192,7 +192,7 @@ class _Inside:
         """Standard deviation of the stream before each block, in the evaluation of this sample at step k."""
         inputs = {self._spec.sample_argument: torch.from_numpy(sample), **self._at(k)}
         with torch.inference_mode():
-            streams = Evaluator(self._closed, self._weights)(inputs)
+            streams = evaluator(self._closed, self._weights)(inputs)
         return np.array([max(float(stream.std()), 1e-3) for stream in streams], np.float32)
 
     def alone(self, steps: npt.NDArray[np.int64], scales: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -205,9 +205,9 @@ class _Inside:
             torch.from_numpy(probe_stream(block.index, block.type, self._streams, float(scale)))
             for block, scale in zip(self._blocks, scales, strict=True)
         ]
-        run = Evaluator(self._loop, self._weights)
+        run = evaluator(self._loop, self._weights)
         with torch.inference_mode():
-            values = Evaluator(self._condition, self._weights)(self._observations)
+            values = evaluator(self._condition, self._weights)(self._observations)
         fixed = dict(zip(self._condition.outputs, values, strict=True))
         given = dict(zip(list(self._open.inputs)[-len(probes) :], probes, strict=True))
         blocks, layers = len(self._blocks), len(self._open.outputs) - len(self._blocks)
