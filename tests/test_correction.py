@@ -9,6 +9,7 @@ import pytest
 
 from ttscompile.core.correction import (
     COMPONENTS,
+    HIDDEN,
     LARGEST,
     MOST_NUMBERS,
     Correction,
@@ -16,10 +17,14 @@ from ttscompile.core.correction import (
     condition_flops,
     correction_flops,
     groups_of,
+    jump_flops,
+    jumps_of,
     no_correction,
     numbers_of,
 )
 from ttscompile.errors import IllegalPlanError
+
+from .runtimes.plans import random_jumps
 
 
 def test_no_correction_has_the_shapes_of_the_policy() -> None:
@@ -84,10 +89,62 @@ def reading(numbers: int, read: int, dimensions: int = 2) -> Correction:
 def test_what_it_reads_of_the_condition_is_added_to_every_step() -> None:
     correction = reading(7, 3)
     condition = np.random.default_rng(1).standard_normal((2, 7)).astype(np.float32)
-    added = correction.from_condition(condition)
+    added = correction.from_condition(correction.read(condition))
     assert added.shape == (5, 2, 2, 4)
     by_hand = sum(condition[1] @ correction.reading[:, f] * correction.observed[f, 3, 1, 2] for f in range(3))
     np.testing.assert_allclose(added[3, 1, 1, 2], by_hand, rtol=1e-5)
+
+
+def jumping(anchors: list[bool], read: int = 3, horizon: int = 4) -> Correction:
+    rng = np.random.default_rng(2)
+    like = no_correction(len(anchors), (horizon, 2))
+    flags = np.array(anchors)
+    return replace(
+        like,
+        anchors=flags,
+        reading=rng.standard_normal((7, read)).astype(np.float32),
+        observed=np.zeros((read, *like.observed.shape[1:]), np.float32),
+        **dict(zip(("inner", "middle", "outer"), random_jumps(rng, flags, (horizon, 2), read), strict=True)),
+    )
+
+
+def test_a_jump_goes_from_an_anchor_to_the_step_before_the_next() -> None:
+    assert jumps_of(np.array([1, 0, 0, 1, 1, 0, 1, 0], np.bool_)) == {0: 2, 4: 5}
+    assert jumping([True, False, False, True, True, False, True, False]).landings == {2: 0, 5: 1}
+    assert no_correction(5, (4, 2)).landings == {}
+
+
+def test_a_jump_is_two_hidden_layers_on_what_is_read_and_the_history() -> None:
+    correction = jumping([True, False, False, True, False, True])
+    rng = np.random.default_rng(3)
+    read, history = (rng.standard_normal(shape).astype(np.float32) for shape in ((2, 3), (2, 2, 16)))
+    added = correction.jump(1, read, history)
+    assert added.shape == (2, 2, 4)
+    value = np.concatenate([read[1], history[0, 1], history[1, 1]])
+    for layer in (correction.inner[1], correction.middle[1]):
+        value = np.maximum(sum(layer[i] * value[i] for i in range(len(value))) + layer[-1], 0)
+    by_hand = sum(value[i] * correction.outer[1, i] for i in range(HIDDEN)) + correction.outer[1, -1]
+    np.testing.assert_allclose(added[:, 1].reshape(-1), by_hand, rtol=1e-4, atol=1e-5)
+    assert jump_flops((4, 2), 3) == 2 * (35 * HIDDEN + HIDDEN * HIDDEN + HIDDEN * 8)
+
+
+@pytest.mark.parametrize("change", ["anchors", "inner", "middle", "outer", "dtype", "chunk", "nan"])
+def test_jumps_that_fit_nothing_are_refused(change: str) -> None:
+    good = jumping([True, False, True, False, False])
+    if change == "chunk":
+        with pytest.raises(IllegalPlanError, match="none of a chunk of more than 1024 numbers"):
+            jumping([True, False, True], horizon=513)
+        return
+    changed = {
+        "anchors": {"anchors": np.array([True, False, True, False, True])},
+        "inner": {"inner": good.inner[:, 1:]},
+        "middle": {"middle": good.middle[:, :, :-1]},
+        "outer": {"outer": np.zeros((0, 0, 0), np.float32)},
+        "dtype": {"outer": good.outer.astype(np.float64)},
+        "nan": {"outer": good.outer * np.float32(np.nan)},
+    }[change]
+    with pytest.raises(IllegalPlanError, match="not finite" if change == "nan" else "jumps"):
+        replace(good, **changed)
 
 
 @pytest.mark.parametrize(
@@ -115,3 +172,6 @@ def test_a_single_file_has_an_input_for_each_of_its_arrays() -> None:
     inputs = reading(7, 3).inputs()
     assert inputs["correction_reading"].shape == (7, 3)
     assert inputs["correction_observed"].shape == (3, 5, 2, 4)
+    inputs = jumping([True, False, True, False, False]).inputs()
+    assert inputs["correction_jumps"].tolist() == [-1, 0, -1, -1, -1]
+    assert inputs["correction_inner"].shape == (1, 7 + 33, HIDDEN)

@@ -65,6 +65,11 @@ class IdleSteps:
         self._to_x0 = np.stack([sampler.sample_to_x0, sampler.out_to_x0], axis=1)[:, None]
 
     @property
+    def history(self) -> FloatArray:
+        """The history as it is now, ``[D, B, 4 T]``."""
+        return self._history
+
+    @property
     def nbytes(self) -> int:
         """Memory of the arrays."""
         own = (self.total, self._base, self._product, self._shift, self._parts, self._features, self._to_x0)

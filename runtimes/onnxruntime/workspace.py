@@ -80,6 +80,8 @@ class Workspace:
         size = self._sampler.memories * horizon
         self._memory = [np.zeros((dimensions, streams, size), np.float32) for _ in range(2 * bool(size))]
         self._prediction = np.zeros_like(self.sample[0])
+        self._known: Known | None = None
+        self._read = self._unread = np.zeros((streams, 0), np.float32)
         self.idle: IdleSteps | None = None
         if IDLE in manifest.pieces:
             self.idle = IdleSteps(sessions[IDLE], self._sampler, manifest.spec.sample, streams, shape)
@@ -107,8 +109,10 @@ class Workspace:
             self._memory[0].fill(0)
         fill_offset(self._offset, self._sampler, noise, correction)
         self._contexts.fill(obs)
+        self._known, self._read = known, self._unread
         if correction is not None and correction.reads:
-            self._offset += correction.from_condition(self._contexts.condition())
+            self._read = correction.read(self._contexts.condition())
+            self._offset += correction.from_condition(self._read)
         if known is not None:
             hold_known(self._offset, known)
 
@@ -128,6 +132,7 @@ class Workspace:
         self._advance.steps[k].run()
         if self._advance.anchors[k]:
             remember(self._history, self.sample[k % 2], self._prediction)
+            self._jump_from(k, self._history)
 
     def enter_idle(self, k: int) -> None:
         """Hand the state of step k over to ``idle``."""
@@ -137,7 +142,22 @@ class Workspace:
     def run_idle(self, first: int, stop: int) -> None:
         """Steps that all add the total that ``idle`` has been prepared for."""
         assert self.idle is not None
+        for k in range(first, stop):
+            if k in self._advance.jumps:
+                self.idle.run(first, k + 1, self._advance.updates, self._offset, self._advance.anchors)
+                self._jump_from(k, self.idle.history)
+                first = k + 1
         self.idle.run(first, stop, self._advance.updates, self._offset, self._advance.anchors)
+
+    def _jump_from(self, anchor: int, history: FloatArray) -> None:
+        """What is added where the run of steps after an anchor ends: known now, and so a part of that step's offset."""
+        if anchor not in self._advance.jumps:
+            return
+        j, landing = self._advance.jumps[anchor]
+        added = self._advance.correction.jump(j, self._read, history)
+        if self._known is not None:
+            added[self._known.channels, :, self._known.positions] = 0
+        self._offset[landing] += added
 
     def leave_idle(self, k: int) -> None:
         """Take the state of step k back from ``idle``, and make the stream as that step begins."""
@@ -232,7 +252,9 @@ class Workspace:
                 masked = MaskedUpdates(self.advances_with(correction).updates, self._manifest.spec.chunk)
             updates = matrices(self._sampler, correction) if masked is None else masked.updates
             steps = [self._bind_advance(k, updates[k]) for k in range(self._steps)]
-            made = _Advances(correction, correction.anchors.tolist(), updates, steps, masked)
+            numbers = correction.landings
+            jumps = {anchor: (numbers[end], end) for anchor, end in correction.jumps.items() if end in numbers}
+            made = _Advances(correction, correction.anchors.tolist(), jumps, updates, steps, masked)
             self._advances[id(correction), known is not None] = made
         if made.masked is not None and known is not None:
             made.masked.mask(known.values.shape[2])
@@ -306,6 +328,7 @@ class _Advances(NamedTuple):
 
     correction: Correction
     anchors: list[bool]  # of each step, whether it enters the history
+    jumps: dict[int, tuple[int, int]]  # by anchor: the number of its jump, and the step after which that is added
     updates: Array  # float32 [K, G, R, T]
     steps: list[Bound]
     masked: MaskedUpdates | None  # what the updates are of, with a prefix

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -74,9 +75,13 @@ class TorchSampler:
         if correction is None:
             return uncorrected
         weights, bias = torch.tensor(correction.weights[k]), torch.tensor(correction.bias[k])
+        read = sample.new_zeros(len(sample), 0)
         if condition is not None and correction.reads:
-            observed = torch.tensor(correction.observed[:, k])
-            bias = bias + torch.einsum("bn,nf,fdt->dbt", condition, torch.tensor(correction.reading), observed)
+            read = condition @ torch.tensor(correction.reading)
+            bias = bias + torch.einsum("bf,fdt->dbt", read, torch.tensor(correction.observed[:, k]))
+        if (j := correction.landings.get(k)) is not None:
+            layers = [torch.tensor(array[j]) for array in (correction.inner, correction.middle, correction.outer)]
+            bias = bias + jump(layers, read, history)
         return self.bounded(correct(carried, prediction, uncorrected, weights, bias, bool(correction.anchors[k])), k)
 
     def bounded(self, corrected: Carried, k: int) -> Carried:
@@ -88,6 +93,22 @@ class TorchSampler:
 def features(carried: Carried, prediction: Tensor) -> Tensor:
     """What the correction of a step is linear in, ``[D, B, 6 T]``: see ``core.correction``."""
     return torch.cat([carried.sample, prediction, carried.history], dim=1).permute(2, 0, 1)
+
+
+def jump(layers: Sequence[Tensor], read: Tensor, history: Tensor) -> Tensor:
+    """What a jump adds to the sample, ``[D, B, T]``: see ``core.correction``.
+
+    Args:
+        layers: inner, middle and outer, each with the row that is added last.
+        read: of the condition, ``[B, F]``.
+        history: after the jump's anchor, ``[B, 4 T, D]``.
+    """
+    streams, width, dimensions = history.shape
+    value = torch.cat([read, history.transpose(1, 2).reshape(streams, -1)], 1)
+    for layer in layers[:-1]:
+        value = (value @ layer[:-1] + layer[-1]).relu()
+    added = value @ layers[-1][:-1] + layers[-1][-1]
+    return added.reshape(streams, dimensions, width // HISTORY).transpose(0, 1)
 
 
 def correct(

@@ -18,7 +18,7 @@ from ttscompile.core.lattice import BoolArray
 from ttscompile.runtimes.instructions import Instructions
 
 from .idle_steps import IdleSteps
-from .sampler import Advance, begin
+from .sampler import Advance, State, begin
 
 
 class Network(Protocol):
@@ -61,6 +61,8 @@ def denoise(
     initial: Tensor,
     offset: Sequence[Tensor],
     rollout: Mapping[int, Tensor],
+    read: Tensor | None = None,
+    free: Tensor | None = None,
 ) -> Denoised:
     """All steps of a call in which every stream follows one plan.
 
@@ -72,7 +74,20 @@ def denoise(
         initial: the sample at step 0, ``[B, T, D]``.
         offset: what each step adds to the sample, K of ``[D, B, (1 + S) T]``.
         rollout: entries of the rollout cache that the plan reads, by flat index.
+        read: what the correction reads of the condition, ``[B, F]``; None if it reads nothing.
+        free: ``[D, 1, T]``, 0 for what a prefix makes known and 1 elsewhere; None without a prefix.
     """
+    offset = list(offset)
+
+    def go_on(state: State, prediction: Tensor, k: int) -> State:
+        """Step k; what its jump adds where the steps after it end is known now."""
+        state = advance(state, prediction, k, offset[k])
+        if k in advance.jumps:
+            added, landing = advance.jump(k, read, state.history), advance.jumps[k][1]
+            added = added if free is None else added * free
+            offset[landing] = offset[landing] + torch.nn.functional.pad(added, (0, advance.memories * advance.horizon))
+        return state
+
     steps, blocks = keep.shape
     state, residuals = begin(initial, advance), dict[int, Tensor]()
     lane, cells, k = _Lane(plan, blocks, rollout), iter(plan.cells), 0
@@ -81,7 +96,7 @@ def denoise(
             count = plan.alike[k]
             known = network.idle.prepare(lane.total(count))
             for step in range(k, k + count):
-                state = advance(state, network.idle.predict(known, state.sample), step, offset[step])
+                state = go_on(state, network.idle.predict(known, state.sample), step)
             k += count
             continue
         first = stream = network.stem(state.sample.permute(1, 2, 0), k)
@@ -99,7 +114,7 @@ def denoise(
         if plan.counts[k] == blocks:
             lane.whole = stream - first
         prediction = network.tail(stream, k).permute(2, 0, 1)
-        state = advance(state, prediction, k, offset[k])
+        state = go_on(state, prediction, k)
         k += 1
     return Denoised(state.sample.permute(1, 2, 0), residuals)
 

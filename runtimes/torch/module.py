@@ -146,11 +146,13 @@ class SparseCall(nn.Module):
                 raise ObservationError(f"steps must be {expected}, since the sampler draws noise; found {found}.")
             offset = offset + steps.permute(0, 3, 1, 2) * own["noise"]
         advance = self._advance.on(self._kept("advance"))
-        added = None if advance.reading is None else advance.of_condition(network.condition(self._features))
-        offset = offset if added is None else offset + added
+        read = None
+        if advance.reading is not None:
+            read, added = advance.of_condition(network.condition(self._features))
+            offset = offset + added
         offset = nn.functional.pad(offset, (0, advance.memories * horizon))
         nothing = np.zeros(self._plan.computed.shape, np.bool_)
-        sample = denoise(network, self._plan, nothing, advance, initial, offset.unbind(), {}).sample
+        sample = denoise(network, self._plan, nothing, advance, initial, offset.unbind(), {}, read).sample
         if self._bound is not None:
             sample = sample.clamp(-self._bound, self._bound)
         actions = sample[..., : spec.chunk.action_dim]

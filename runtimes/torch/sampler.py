@@ -16,6 +16,9 @@ from ttscompile.core.update import clips, matrices
 
 from . import devices
 
+LAYERS = ("inner", "middle", "outer")
+"""Of a correction's jumps, by the names of their tensors."""
+
 
 class State(NamedTuple):
     """What the loop carries from one step to the next.
@@ -44,6 +47,8 @@ class Advance:
         memories: S.
         reading: ``[N, F]``, what the correction reads of the condition; None if it reads nothing.
         observed: ``[F, K D T]``, what that adds; None if it reads nothing.
+        layers: inner, middle and outer of its jumps; none if it has none.
+        jumps: by anchor, the number of its jump, and the step after which that is added.
     """
 
     def __init__(self, spec: PolicySpec, correction: Correction | None, device: torch.device) -> None:
@@ -59,6 +64,10 @@ class Advance:
         if correction is not None and correction.reads:
             self.reading = devices.placed(correction.reading, device)
             self.observed = devices.placed(correction.observed.reshape(correction.reads, -1), device)
+        self.layers: tuple[Tensor, ...] = ()
+        if used.landings:
+            self.layers = tuple(devices.placed(array, device) for array in (used.inner, used.middle, used.outer))
+        self.jumps = {a: (used.landings[end], end) for a, end in used.jumps.items() if end in used.landings}
 
     @property
     def updates(self) -> FloatArray:
@@ -75,23 +84,42 @@ class Advance:
         other._plain = tensors["updates"]
         other._of_step = [one.expand(len(each), -1, -1) for one, each in zip(other._plain, self._of_step, strict=True)]
         other.reading, other.observed = tensors.get("reading"), tensors.get("observed")
+        other.layers = tuple(tensors[name] for name in LAYERS if name in tensors)
         return other
 
     def tensors(self) -> dict[str, Tensor]:
         """What it computes with, by name."""
         named = {"updates": self._plain, "reading": self.reading, "observed": self.observed}
+        named |= zip(LAYERS, self.layers, strict=False)
         return {name: tensor for name, tensor in named.items() if tensor is not None}
 
-    def of_condition(self, condition: Tensor) -> Tensor | None:
-        """What the observation adds to the sample of every step, ``[K, D, B, T]``; None if nothing.
+    def of_condition(self, condition: Tensor) -> tuple[Tensor, Tensor]:
+        """What the correction reads, ``[B, F]``, and what that adds to the sample of every step, ``[K, D, B, T]``.
 
         Args:
             condition: ``[B, N]``.
         """
-        if self.reading is None or self.observed is None:
-            return None
-        added = (condition @ self.reading) @ self.observed
-        return added.reshape(len(condition), self.steps, -1, self.horizon).permute(1, 2, 0, 3)
+        assert self.reading is not None and self.observed is not None
+        read = condition @ self.reading
+        added = (read @ self.observed).reshape(len(condition), self.steps, -1, self.horizon)
+        return read, added.permute(1, 2, 0, 3)
+
+    def jump(self, anchor: int, read: Tensor | None, history: Tensor) -> Tensor:
+        """What the jump from an anchor adds, ``[D, B, T]``.
+
+        Args:
+            anchor: one that has a jump.
+            read: of the condition, ``[B, F]``; None if nothing is.
+            history: after the anchor, ``[D, B, 4 T]``.
+        """
+        dimensions, streams, _ = history.shape
+        value = history.permute(1, 0, 2).reshape(streams, -1)
+        value = value if read is None else torch.cat([read, value], 1)
+        inner, middle, outer = (layer[self.jumps[anchor][0]] for layer in self.layers)
+        for layer in (inner, middle):
+            value = torch.addmm(layer[-1], value, layer[:-1]).relu()
+        added = torch.addmm(outer[-1], value, outer[:-1])
+        return added.reshape(streams, dimensions, self.horizon).permute(1, 0, 2)
 
     def __call__(self, state: State, prediction: Tensor, k: int, offset: Tensor) -> State:
         """What is carried to step k + 1.

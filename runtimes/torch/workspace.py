@@ -103,11 +103,12 @@ class Workspace:
     def call(self, plan: Instructions, keep: BoolArray, advance: Advance) -> None:
         """The loop, from what was loaded and the prologue made to ``result`` and the rollout cache."""
         offset = self._offset.tensor
-        added = None if advance.reading is None else advance.of_condition(self.network.condition())
-        if added is not None:
+        read = None
+        if advance.reading is not None:
+            read, added = advance.of_condition(self.network.condition())
             own, rest = offset[..., : self._horizon], offset[..., self._horizon :]
             offset = torch.cat([own + added * self._free.tensor, rest], 3)
-        read = np.flatnonzero(plan.rollout).tolist()
+        stored = np.flatnonzero(plan.rollout).tolist()
         made = denoise(
             self.network,
             plan,
@@ -115,7 +116,9 @@ class Workspace:
             advance,
             self._initial.tensor,
             offset.unbind(),
-            {cell: self.rollout[cell] for cell in read},
+            {cell: self.rollout[cell] for cell in stored},
+            read,
+            self._free.tensor,
         )
         self.result.copy_(made.sample)
         for cell, residual in made.residuals.items():

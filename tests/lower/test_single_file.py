@@ -20,13 +20,13 @@ from tests.lower.whole_call import Arrays, Episode, groups, inputs, make, policy
 from tests.passes.modules import MODULES, spec
 from tests.rounding import allowed, assert_equal_but_for_rounding, bound
 from tests.runtimes.agreement import call_terms
-from tests.runtimes.plans import random_plan, random_reading
+from tests.runtimes.plans import random_jumps, random_plan, random_reading
 from tests.runtimes.toys import pencil_program, toy_program
 from ttscompile import Noise, legalize
 from ttscompile.artifact import load_artifact
 from ttscompile.artifact.bind import LoweredPieces
 from ttscompile.artifact.write import write_artifact
-from ttscompile.core.correction import OBSERVED, READING, Correction, no_correction
+from ttscompile.core.correction import INNER, JUMPS, MIDDLE, OBSERVED, OUTER, READING, Correction, no_correction
 from ttscompile.core.lattice import Source
 from ttscompile.driver import compile_denoiser
 from ttscompile.errors import ArtifactError, LoweringError
@@ -89,8 +89,10 @@ def test_a_schedule_with_a_correction(tmp_path: Path, noise: float) -> None:
     weights, bias = (rng.normal(0, 0.1, each.shape).astype(np.float32) for each in (empty.weights, empty.bias))
     anchors = np.array([True, False, True, True, False, True, False])
     numbers = load_artifact(tmp_path / "artifact").manifest.condition_numbers
-    correction = Correction(anchors, weights, bias, *random_reading(rng, numbers, empty))
+    reading, jumps = random_reading(rng, numbers, empty), random_jumps(rng, anchors, program.spec.sample, 3)
+    correction = Correction(anchors, weights, bias, *reading, *jumps)
     assert correction.reads == 3
+    assert correction.landings == {1: 0, 4: 1}
     feeds = correction.inputs()
     reference = open_runtime(load_artifact(tmp_path / "artifact"), "reference")
     plan = np.zeros((7, 5), np.int8)
@@ -111,6 +113,8 @@ def test_a_schedule_with_a_correction(tmp_path: Path, noise: float) -> None:
         assert np.abs(found - without).max() > 1e-2
         blind = {name: value for name, value in feeds.items() if name not in (READING, OBSERVED)}
         assert np.abs(found - Episode(model, streams).call(obs, drawn, plan, **blind)["action_pred"]).max() > 1e-2
+        grounded = {name: value for name, value in feeds.items() if name not in (JUMPS, INNER, MIDDLE, OUTER)}
+        assert np.abs(found - Episode(model, streams).call(obs, drawn, plan, **grounded)["action_pred"]).max() > 1e-2
 
 
 def test_with_a_pencil(tmp_path: Path) -> None:

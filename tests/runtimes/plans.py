@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from ttscompile import legalize
 from ttscompile.artifact import Artifact
-from ttscompile.core.correction import Correction, no_correction
+from ttscompile.core.correction import HIDDEN, HISTORY, Correction, jumps_of, no_correction
 from ttscompile.core.lattice import BoolArray, PlanArray
 
 
@@ -30,12 +30,29 @@ def random_correction(artifact: Artifact, rng: np.random.Generator) -> Correctio
     manifest = artifact.manifest
     like = no_correction(manifest.steps, manifest.spec.sample)
     scale = 0.3 / np.sqrt(like.weights.shape[2])
+    anchors = rng.random(manifest.steps) < 0.5
+    reading = random_reading(rng, manifest.condition_numbers, like)
     return Correction(
-        rng.random(manifest.steps) < 0.5,
+        anchors,
         (scale * rng.standard_normal(like.weights.shape)).astype(np.float32),
         (0.1 * rng.standard_normal(like.bias.shape)).astype(np.float32),
-        *random_reading(rng, manifest.condition_numbers, like),
+        *reading,
+        *random_jumps(rng, anchors, manifest.spec.sample, reading[0].shape[1]),
     )
+
+
+def random_jumps(
+    rng: np.random.Generator, anchors: BoolArray, sample: tuple[int, int], read: int
+) -> list[npt.NDArray[np.float32]]:
+    """The three layers of the jumps between these anchors."""
+    count, chunk = len(jumps_of(anchors)), sample[0] * sample[1]
+    shapes = ((read + HISTORY * chunk + 1, HIDDEN), (HIDDEN + 1, HIDDEN), (HIDDEN + 1, chunk))
+    return [
+        (rng.standard_normal((count, *shape)) / np.sqrt(shape[0])).astype(np.float32)
+        if count
+        else np.zeros((0, 0, 0), np.float32)
+        for shape in shapes
+    ]
 
 
 def random_reading(

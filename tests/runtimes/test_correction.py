@@ -31,7 +31,7 @@ def test_runtimes_agree_on_random_corrections(toy_artifact: Artifact, streams: i
     written = np.zeros((streams, manifest.steps, len(manifest.groups)), np.bool_)
     # A correction adds six numbers for each action of the chunk: sample and prediction, now and at two anchors.
     terms = call_terms(toy_artifact) + manifest.steps * 6 * manifest.spec.sample[0]
-    for _ in range(4):
+    for _ in range(4):  # some of these have jumps, and some of those end in steps without a computed block
         plans = np.stack([random_plan(rng, manifest.steps, manifest.groups, cells) for cells in written])
         obs, noise = random_inputs(toy_artifact, rng, streams)
         correction = random_correction(toy_artifact, rng)

@@ -102,7 +102,8 @@ def test_runs_of_idle_steps_go_through_numpy_and_prepare_once(
     monkeypatch.setattr(IdleSteps, "prepare", lambda self: prepared.append(1) or prepare(self))  # type: ignore[func-returns-value]
     obs, noise = random_inputs(artifact, np.random.default_rng(0), 1)
     correction = random_correction(artifact, np.random.default_rng(1))
-    runtime.predict(obs, noise, plan, correction=replace(correction, anchors=np.ones(STEPS, np.bool_)))
+    without = dict.fromkeys(("inner", "middle", "outer"), np.zeros((0, 0, 0), np.float32))
+    runtime.predict(obs, noise, plan, correction=replace(correction, anchors=np.ones(STEPS, np.bool_), **without))
     assert (runs, len(prepared)) == ([(1, 4), (8, 12)], 2)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -37,7 +37,9 @@ from .tokens import ReuseRecord
 
 TABLE_PREFIX = "table/"
 CORRECTION_PREFIX = "correction/"
-CORRECTION_FIELDS = tuple(field.name for field in fields(Correction))
+CORRECTION_FIELDS = tuple(field.name for field in fields(Correction) if field.default_factory is MISSING)
+JUMP_FIELDS = tuple(field.name for field in fields(Correction) if field.name not in CORRECTION_FIELDS)
+"""Of a correction that has jumps; others do without."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -363,17 +365,19 @@ def _plans(directory: Path, manifest: Manifest) -> tuple[Mapping[str, PlanArray]
         raise ArtifactError(f"{where}: expected schedules {expected}; found {sorted(schedules)}. {REMEDY}")
     parts = {name.removeprefix(CORRECTION_PREFIX): array for name, array in stored.items() if name not in schedules}
     names = sorted({name.rpartition("/")[0] for name in parts})
-    if not set(names) <= set(manifest.plans) or {f"{n}/{f}" for n in names for f in CORRECTION_FIELDS} != set(parts):
+    jumping = [name for name in names if f"{name}/{JUMP_FIELDS[0]}" in parts]
+    wanted = [(n, f) for n in names for f in (*CORRECTION_FIELDS, *(JUMP_FIELDS if n in jumping else ()))]
+    if not set(names) <= set(manifest.plans) or {f"{n}/{f}" for n, f in wanted} != set(parts):
         raise ArtifactError(
             f"{where}: expected corrections of plans among {sorted(manifest.plans)}, each with"
-            f" {', '.join(CORRECTION_FIELDS)}; found {sorted(parts)}. {REMEDY}"
+            f" {', '.join(CORRECTION_FIELDS)}, and perhaps {', '.join(JUMP_FIELDS)}; found {sorted(parts)}. {REMEDY}"
         )
     corrections = {}
     try:
         for name, plan in schedules.items():
             check_schedule(name, plan, manifest)
         for name in names:
-            corrections[name] = Correction(**{field: parts[f"{name}/{field}"] for field in CORRECTION_FIELDS})
+            corrections[name] = Correction(**{field: parts[f"{n}/{field}"] for n, field in wanted if n == name})
             corrections[name].require_fit(manifest.steps, manifest.spec.sample, manifest.condition_numbers)
     except IllegalPlanError as error:
         raise ArtifactError(f"{where}: {name}: {error} {REMEDY}") from error

@@ -40,6 +40,7 @@ from .graph_json import graph_to_json
 from .load import (
     CORRECTION_FIELDS,
     CORRECTION_PREFIX,
+    JUMP_FIELDS,
     TABLE_PREFIX,
     Artifact,
     load_artifact,
@@ -332,7 +333,8 @@ def _plan_arrays(
         if plan not in manifest.plans:
             raise ArtifactError(f"correction of {plan!r}: expected a plan of the artifact, {sorted(manifest.plans)}.")
         correction.require_fit(manifest.steps, manifest.spec.sample, manifest.condition_numbers)
-        arrays |= {f"{CORRECTION_PREFIX}{plan}/{name}": getattr(correction, name) for name in CORRECTION_FIELDS}
+        names = (*CORRECTION_FIELDS, *(JUMP_FIELDS if correction.landings else ()))
+        arrays |= {f"{CORRECTION_PREFIX}{plan}/{name}": getattr(correction, name) for name in names}
     return arrays
 
 

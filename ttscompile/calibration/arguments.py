@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 
 import numpy as np
 
 from ..artifact.load import load_artifact
-from ..core.correction import FEATURES
-from ..core.spec import PolicySpec
+from ..artifact.manifest import Manifest
+from ..core.correction import FEATURES, MOST_OF_A_CHUNK
 from ..errors import CalibrationError
+from ..ir.program import Binding
 
 EVALUATIONS_A_MINUTE = 6400
 """Of the network, to make the calls to learn from, for each minute of the time limit."""
 
 FEWEST_CALLS, MOST_CALLS = 64, 3072
+
+MOST_LEARNED = 12288
+"""Calls to learn from at most where a network does, in a jump or in a distillation: it fits what it has seen more
+closely than a linear correction does, and noise is free."""
+
+ROOM = 2 << 30
+"""Bytes that the contexts of more than ``MOST_CALLS`` may take."""
 
 MOST_NEEDED = 1024
 """Calls that a correction needs at most, however much it reads: these are answered whatever the time."""
@@ -58,15 +67,25 @@ def require_directory(path: Path) -> None:
 
 
 def calls_to_learn_from(
-    spec: PolicySpec, max_minutes: float, corrects: bool, most: int = MOST_CALLS
+    manifest: Manifest, max_minutes: float, corrects: bool, distils: bool = False
 ) -> tuple[int, int]:
     """How many calls there have to be, and how many there are if the time is enough to answer them.
 
     Args:
-        spec: of the policy.
+        manifest: of the policy.
         max_minutes: the time limit.
         corrects: whether a correction is fitted on them, which reads more the longer the horizon is.
-        most: of them, however much time there is.
+        distils: whether weights are trained on them.
     """
+    spec, most = manifest.spec, MOST_CALLS
+    if distils or (corrects and math.prod(spec.sample) <= MOST_OF_A_CHUNK):
+        most = int(np.clip(ROOM // _context_bytes(manifest), MOST_CALLS, MOST_LEARNED))
     fewest = min(CALLS_A_FEATURE * (FEATURES * spec.sample[0] + 1), MOST_NEEDED) if corrects else FEWEST_CALLS
     return fewest, int(np.clip(EVALUATIONS_A_MINUTE / spec.sampler.steps * max_minutes, fewest, most))
+
+
+def _context_bytes(manifest: Manifest) -> int:
+    """Of all that the loop of one call reads beside the stream."""
+    repeats = {Binding.CONDITION: 1, Binding.STEP: manifest.steps, Binding.TABLE: 0}
+    each = ((record.type, repeats[record.binding]) for record in manifest.contexts.values())
+    return max(1, sum(math.prod(kind.at(1)) * np.dtype(kind.dtype).itemsize * count for kind, count in each))

@@ -43,9 +43,6 @@ UPDATES = 600
 """Of the weights, if there is time. On Push-T with 2 of 16 steps and 3,072 calls the held-out error has stopped falling
 by then; with 12,288 calls it still falls after four times as many."""
 
-MOST_LEARNED = 12288
-"""Calls to learn from at most: noise is free, and weights fit what they have seen more closely than a correction."""
-
 SAVED = 20
 """Updates from one saving of the state to the next."""
 
@@ -145,7 +142,7 @@ def distill(
         trainable(artifact, rank)  # before minutes of work
         episodes = load_episodes(spec, trajectories, observation)
         split = split_episodes(len(episodes), validation_fraction, seed)
-        fewest, limit = calls_to_learn_from(spec, max_minutes, corrects=True, most=MOST_LEARNED)
+        fewest, limit = calls_to_learn_from(artifact.manifest, max_minutes, corrects=True, distils=True)
         settings = {
             "model": artifact.manifest.model_identity[:16],
             "trajectories": digest_of(episodes),

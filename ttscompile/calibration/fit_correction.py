@@ -3,12 +3,15 @@
 At step k the sparse loop, corrected so far, has features; the correction of the step is the ridge regression, on these
 and on the principal components of the condition, of what is missing to the sample that the dense policy has after the
 step with the same noise. Then all calls go on with it. So every step is fitted where the loop will be when it gets
-there, and what one step leaves over the next can still repair. One pass of sparse calls: seconds.
+there, and what one step leaves over the next can still repair. One pass of sparse calls: seconds. Where the steps
+between two anchors end, a jump is fitted to what the corrections leave over, if it holds on other episodes.
 """
 
 from __future__ import annotations
 
-from ..core.correction import Correction
+import math
+
+from ..core.correction import MOST_OF_A_CHUNK, Correction
 from ..core.lattice import PlanArray
 from .calls import Calls
 from .execute import Executor
@@ -26,4 +29,5 @@ def fit_correction(executor: Executor, plan: PlanArray, calls: Calls, reads: boo
         reads: whether it may read the observation.
     """
     loop = SparseLoop(executor, calls, None, reads=reads, whole=is_whole(plan))
-    return loop.correction(loop.end(plan))
+    jumps = math.prod(calls.initial.shape[1:]) <= MOST_OF_A_CHUNK
+    return loop.correction(loop.end(plan, jumps))

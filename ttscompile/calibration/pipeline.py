@@ -140,7 +140,7 @@ def calibrate(
         episodes = load_episodes(spec, trajectories, observation)
         split = split_episodes(len(episodes), validation_fraction, seed)
         corrects = chosen.fits_correction or correct
-        fewest, limit = calls_to_learn_from(spec, max_minutes, corrects)
+        fewest, limit = calls_to_learn_from(artifact.manifest, max_minutes, corrects)
         state = StateFile(
             Path(path),
             {

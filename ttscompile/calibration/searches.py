@@ -100,7 +100,7 @@ class Searches:
                 continue
             found, cut = one
             told[series] = {"notes": dict(found.notes), "error": found.error, "cut": cut}
-            correction = {} if found.correction is None else vars(found.correction)
+            correction = {} if found.correction is None else {name: getattr(found.correction, name) for name in _FIELDS}
             self._state.put(f"{key}/{series}", {"schedule": found.schedule, **correction})
         self._told[key] = told
         self._save()

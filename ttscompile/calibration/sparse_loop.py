@@ -7,18 +7,19 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..core.correction import Correction, components_of, groups_of, numbers_of
+from ..core.correction import Correction, components_of, groups_of, jumps_of, numbers_of
 from ..core.lattice import BoolArray, PlanArray, Source
 from ..runtimes.reference.sampler import correct, features
 from .calls import Calls
 from .execute import Executor, State, workers
+from .jumps import Layers, applied, fit_jump
 from .regression import Components, Solved, solve
 
 STREAMS = 64
@@ -50,6 +51,7 @@ class Place:
         judged: others, that only go along.
         solved: the corrections of the steps before.
         anchors: whether these steps are anchors.
+        jumps: those that ended so far, in order; None for one that was no better than none.
     """
 
     step: int
@@ -57,6 +59,7 @@ class Place:
     judged: tuple[_Lane, ...]
     solved: tuple[Solved, ...] = ()
     anchors: tuple[bool, ...] = ()
+    jumps: tuple[Layers | None, ...] = ()
 
     @property
     def samples(self) -> Tensor:
@@ -95,6 +98,7 @@ class SparseLoop:
             self._components, self._groups = Components.of(condition, most), groups_of(steps, sample)
             others = [] if judged is None else [self._components.of_others(executor.model.condition(judged.contexts))]
             self._known = torch.cat([self._components.values, *others]).float()
+            self._episodes = fitted.episodes
 
         def lanes(calls: Calls | None) -> tuple[_Lane, ...]:
             if calls is None:
@@ -105,13 +109,14 @@ class SparseLoop:
 
         self.begin = Place(0, lanes(fitted), lanes(judged))
 
-    def after(self, place: Place, rows: PlanArray, pool: ThreadPoolExecutor) -> Place:
+    def after(self, place: Place, rows: PlanArray, pool: ThreadPoolExecutor, lands: bool = False) -> Place:
         """The place after one step more.
 
         Args:
             place: before it.
             rows: of the plan of all calls, ``[1, blocks]``, or of the plan of each.
             pool: see ``execute.workers``; the lanes go through the network beside each other.
+            lands: whether a jump ends after the step.
         """
         lanes, anchor = [lane.fork() for lane in (*place.fitted, *place.judged)], bool(anchors_of(rows[:, None])[0])
         ends = np.cumsum([len(lane.sample) for lane in lanes])[:-1]
@@ -124,14 +129,33 @@ class SparseLoop:
             added = solved[-1].bias + torch.einsum("nf,fdt->dnt", self._known, solved[-1].observed)
             for lane, part in zip(lanes, added.tensor_split(ends.tolist(), dim=1), strict=True):
                 lane.correct(solved[-1].weight, part, anchor)
-        return Place(place.step + 1, fitted, judged, solved, (*place.anchors, anchor))
+        jumps = (*place.jumps, self._jump(fitted, judged, place.step)) if lands else place.jumps
+        return Place(place.step + 1, fitted, judged, solved, (*place.anchors, anchor), jumps)
 
-    def end(self, plan: PlanArray) -> Place:
-        """The place after the last step of a plan ``[K, blocks]``, or of one for each call, ``[N, K, blocks]``."""
+    def _jump(self, fitted: tuple[_Lane, ...], judged: tuple[_Lane, ...], step: int) -> Layers | None:
+        """Fit the jump that ends after a step, and let all calls go along."""
+        known = torch.cat([self._known, torch.cat([lane.history for lane in (*fitted, *judged)])], 1)
+        missing = torch.cat([lane.left for lane in fitted])
+        found = fit_jump(known[: len(missing)], missing, self._episodes, step)
+        if found is None:
+            return None
+        layers, added = found
+        lanes, added = (*fitted, *judged), torch.cat([added, applied(layers, known[len(missing) :])])
+        ends = np.cumsum([len(lane.sample) for lane in lanes])[:-1].tolist()
+        for lane, part in zip(lanes, added.tensor_split(ends), strict=True):
+            lane.add(part)
+        return layers
+
+    def end(self, plan: PlanArray, jumps: bool = False) -> Place:
+        """The place after the last step of a plan ``[K, blocks]``, or of one for each call, ``[N, K, blocks]``.
+
+        Where ``jumps`` are fitted, they end where the correction of the plan has them.
+        """
         place, plans = self.begin, plan.reshape(-1, *plan.shape[-2:])
+        landings = set(jumps_of(anchors_of(plan)).values()) if jumps else set()
         with workers() as pool:
             for k in range(plans.shape[1]):
-                place = self.after(place, plans[:, k], pool)
+                place = self.after(place, plans[:, k], pool, k in landings)
         return place
 
     def correction(self, place: Place) -> Correction | None:
@@ -144,7 +168,18 @@ class SparseLoop:
         observed = np.ascontiguousarray(observed.transpose(1, 0, 2, 3))
         biases = biases - np.einsum("f,fkdt->kdt", self._components.center, observed)[:, :, None]
         anchors, reading = np.array(place.anchors), self._components.reading
-        return Correction(anchors, weights, biases.astype(np.float32), reading, observed)
+        without = Correction(anchors, weights, biases.astype(np.float32), reading, observed)
+        made = next((layers for layers in place.jumps if layers is not None), None)
+        if made is None:
+            return without
+        absent = tuple(torch.zeros_like(layer) for layer in made)
+        inner, middle, outer = (
+            np.stack([layer.numpy() for layer in column])
+            for column in zip(*(layers or absent for layers in place.jumps), strict=True)
+        )
+        inner[:, -1] -= self._components.center @ inner[:, : reading.shape[1]]
+        found = (np.isfinite(layer).all() for layer in (inner, middle, outer))
+        return replace(without, inner=inner, middle=middle, outer=outer) if all(found) else None
 
 
 class _Lane:
@@ -199,6 +234,23 @@ class _Lane:
         assert self._calls.path is not None
         missing = (self._calls.path[:, self._k] - self._carried.sample).permute(2, 0, 1)
         return features(self._before, self._prediction), missing
+
+    @property
+    def history(self) -> Tensor:
+        """What a jump reads of it, ``[n, D 4 T]``."""
+        return self._carried.history.transpose(1, 2).reshape(len(self.sample), -1)
+
+    @property
+    def left(self) -> Tensor:
+        """What is missing after the corrected step, ``[n, D T]``."""
+        assert self._calls.path is not None
+        return (self._calls.path[:, self._k] - self.sample).transpose(1, 2).reshape(len(self.sample), -1)
+
+    def add(self, added: Tensor) -> None:
+        """Add ``[n, D T]`` to the sample."""
+        _, horizon, dimensions = self.sample.shape
+        part = added.reshape(-1, dimensions, horizon).transpose(1, 2)
+        self._carried = self._carried._replace(sample=self.sample + part)
 
     def correct(self, weight: Tensor, added: Tensor, anchor: bool) -> None:
         """Correct the step: weights ``[G, 6 T, T]``, and what is added beside, ``[D, n, T]``."""

@@ -13,6 +13,15 @@ It mixes time steps of the chunk, never action dimensions, and costs ``12 T^2 D`
 The second line reads the observation, as the policy's own encoder gives it to the pruner: ``condition [B, N]``. It
 depends on nothing in the loop, so one product before the loop makes it for all steps.
 
+Where enough was recorded, there are *jumps*, too. From an anchor to the next one all is known once the anchor is
+computed, so a small network with two hidden layers says what the steps between them leave over. It mixes everything::
+
+    known         = [condition @ reading, history]                                  [B, F + 4 T D], history as D, 4 T
+    sample_e+1   += relu(relu(known @ inner[j]) @ middle[j]) @ outer[j]             [B, T D], as D, T
+
+Each of the three has a last row that is added. The history is that after anchor j, and e is the last step before the
+next anchor; an anchor that the next one follows at once has no jump, and neither has the last.
+
 The idea is that of solvers fitted to one model (Bespoke solvers, arXiv 2310.19075; DPM-Solver-v3, arXiv 2310.13268),
 here fitted to one model *and* one schedule of reuse, by least squares, with the policy's own noise.
 """
@@ -21,7 +30,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -38,6 +49,7 @@ HISTORY = 4
 
 CORRECTION, CORRECTION_BIAS, ANCHORS = "correction", "correction_bias", "correction_anchors"
 READING, OBSERVED = "correction_reading", "correction_observed"
+JUMPS, INNER, MIDDLE, OUTER = "correction_jumps", "correction_inner", "correction_middle", "correction_outer"
 """Inputs of a single ONNX file that carry a schedule's correction."""
 
 LARGEST = 4 << 20
@@ -50,6 +62,17 @@ MOST_NUMBERS = 16384
 """Of the condition, above which the correction does not read it: the keys of a prefix are millions."""
 
 
+HIDDEN = 128
+"""H, the width of a jump's hidden layers. On Push-T 256 is no better, and one layer is worse."""
+
+MOST_OF_A_CHUNK = 1024
+"""Numbers of a chunk, T times D, above which there are no jumps: they would read four times as many."""
+
+
+def _no_jumps() -> FloatArray:
+    return np.zeros((0, 0, 0), np.float32)
+
+
 @dataclass(frozen=True, eq=False)
 class Correction:
     """The correction that belongs to one schedule.
@@ -60,6 +83,9 @@ class Correction:
         bias: float32 ``[K, D, 1, T]``.
         reading: float32 ``[N, F]``; from the condition's N numbers to the F that are read. F is 0 where none are.
         observed: float32 ``[F, K, D, T]``; what each of these adds to the sample of every step.
+        inner: float32 ``[J, F + 4 T D + 1, H]``; J is the number of jumps, or 0 where there are none.
+        middle: float32 ``[J, H + 1, H]``.
+        outer: float32 ``[J, H + 1, T D]``.
 
     Raises:
         IllegalPlanError: shapes or dtypes that do not fit each other, or numbers that are not finite.
@@ -70,6 +96,9 @@ class Correction:
     bias: npt.NDArray[np.float32]
     reading: npt.NDArray[np.float32]
     observed: npt.NDArray[np.float32]
+    inner: npt.NDArray[np.float32] = field(default_factory=_no_jumps)
+    middle: npt.NDArray[np.float32] = field(default_factory=_no_jumps)
+    outer: npt.NDArray[np.float32] = field(default_factory=_no_jumps)
 
     def __post_init__(self) -> None:
         steps, groups, _, horizon = self.weights.shape if self.weights.ndim == 4 else (0, 0, 0, 0)
@@ -89,8 +118,29 @@ class Correction:
                 "a correction has anchors bool[K], and in float32 weights [K, G, 6 T, T], a bias [K, D, 1, T], a"
                 f" reading [N, F] and what is observed [F, K, D, T]; found {shown}."
             )
-        if not all(np.isfinite(array).all() for array in arrays[1:]):
+        networks = (self.inner, self.middle, self.outer)
+        chunk, count = horizon * dimensions, len(self.jumps)
+        jumping = ((count, read + HISTORY * chunk + 1, HIDDEN), (count, HIDDEN + 1, HIDDEN), (count, HIDDEN + 1, chunk))
+        shapes = tuple(array.shape for array in networks)
+        known = shapes in (jumping, ((0, 0, 0),) * 3) and all(array.dtype == np.float32 for array in networks)
+        if not known or (len(self.inner) and not 0 < chunk <= MOST_OF_A_CHUNK):
+            shown = ", ".join(f"{array.dtype}{list(array.shape)}" for array in networks)
+            raise IllegalPlanError(
+                f"a correction with these anchors has {count} jumps of float32 {', '.join(map(str, jumping))}, or none"
+                f" of a chunk of more than {MOST_OF_A_CHUNK} numbers; found {shown}."
+            )
+        if not all(np.isfinite(array).all() for array in (*arrays[1:], *networks)):
             raise IllegalPlanError("a correction holds numbers that are not finite. Calibrate the artifact again.")
+
+    @cached_property
+    def jumps(self) -> dict[int, int]:
+        """The last step before the next anchor, by the anchor, in order: where jumps are, or could be."""
+        return jumps_of(self.anchors)
+
+    @cached_property
+    def landings(self) -> dict[int, int]:
+        """The number of the jump that is added after a step, by the step; empty where there are no jumps."""
+        return {end: j for j, end in enumerate(self.jumps.values())} if len(self.inner) else {}
 
     @property
     def reads(self) -> int:
@@ -118,17 +168,56 @@ class Correction:
     def inputs(self) -> dict[str, npt.NDArray[Any]]:
         """Its arrays by the names of the inputs of a single ONNX file (``lower.single_file``)."""
         named = {ANCHORS: self.anchors, CORRECTION: self.weights, CORRECTION_BIAS: self.bias}
-        return named | ({READING: self.reading, OBSERVED: self.observed} if self.reads else {})
+        if self.reads:
+            named |= {READING: self.reading, OBSERVED: self.observed}
+        if self.landings:
+            which = np.full(len(self.anchors), -1, np.int64)
+            which[list(self.landings)] = list(self.landings.values())
+            # There the first layer reads the condition itself, so that no size is unknown but the number of jumps.
+            inner = np.concatenate([self.reading @ self.inner[:, : self.reads], self.inner[:, self.reads :]], 1)
+            named |= {JUMPS: which, INNER: inner, MIDDLE: self.middle, OUTER: self.outer}
+        return named
 
-    def from_condition(self, condition: FloatArray) -> FloatArray:
+    def read(self, condition: FloatArray) -> FloatArray:
+        """What it reads of the condition ``[B, N]``: float32 ``[B, F]``."""
+        return np.asarray(condition @ self.reading, np.float32)
+
+    def from_condition(self, read: FloatArray) -> FloatArray:
         """What the observation adds to the sample of every step, float32 ``[K, D, B, T]``.
 
         Args:
-            condition: float32 ``[B, N]``.
+            read: of the condition, float32 ``[B, F]``.
         """
-        read, *shape = self.observed.shape
-        added = (condition @ self.reading) @ self.observed.reshape(read, -1)
+        count, *shape = self.observed.shape
+        added = read @ self.observed.reshape(count, -1)
         return np.asarray(added, np.float32).reshape(-1, *shape).transpose(1, 2, 0, 3)
+
+    def jump(self, j: int, read: FloatArray, history: FloatArray) -> FloatArray:
+        """What jump number j adds to the sample, float32 ``[D, B, T]``.
+
+        Args:
+            j: of the jumps.
+            read: of the condition, float32 ``[B, F]``.
+            history: after the jump's anchor, ``[D, B, 4 T]``.
+        """
+        dimensions, streams, width = history.shape
+        value = np.concatenate([read, history.transpose(1, 0, 2).reshape(streams, -1)], 1)
+        for layer in (self.inner[j], self.middle[j]):
+            value = np.maximum(value @ layer[:-1] + layer[-1], 0)
+        added = value @ self.outer[j, :-1] + self.outer[j, -1]
+        return np.asarray(added, np.float32).reshape(streams, dimensions, width // HISTORY).transpose(1, 0, 2)
+
+
+def jumps_of(anchors: npt.NDArray[np.bool_]) -> dict[int, int]:
+    """The last step before the next anchor, by the anchor; without anchors that the next one follows at once."""
+    steps = np.flatnonzero(anchors).tolist()
+    return {anchor: after - 1 for anchor, after in pairwise(steps) if after - 1 > anchor}
+
+
+def jump_flops(sample: tuple[int, int], read: int) -> int:
+    """FLOPs of one jump of one stream of samples ``(T, D)``, with F numbers that are read of the condition."""
+    chunk = sample[0] * sample[1]
+    return 2 * HIDDEN * (read + HISTORY * chunk + HIDDEN + chunk)
 
 
 def remember(history: FloatArray, sample: FloatArray, prediction: FloatArray) -> None:

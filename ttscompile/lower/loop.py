@@ -47,6 +47,25 @@ GROUP = 6
 
 
 @dataclass(frozen=True)
+class Jumps:
+    """Names of values that jumps read (``core.correction``).
+
+    Attributes:
+        which: int64 [K]; the number of the jump that is added after a step, -1 for none.
+        inner: [J, N + 4 T D + 1, H]; with the condition itself.
+        middle: [J, H + 1, H].
+        outer: [J, H + 1, T D].
+        condition: [B, N]; None where a correction cannot read it.
+    """
+
+    which: str
+    inner: str
+    middle: str
+    outer: str
+    condition: str | None
+
+
+@dataclass(frozen=True)
 class LoopInputs:
     """Names of values that the loop reads.
 
@@ -59,6 +78,7 @@ class LoopInputs:
         memory: of the sampler, before step 0: [D, B, S T]; None if it has none.
         rows: rollout cache [R, E], with a residual as a row of E numbers.
         index: int64 [K, N]; which row is the residual of a cell.
+        jumps: of the correction; None where it cannot have any.
     """
 
     initial: str
@@ -69,6 +89,7 @@ class LoopInputs:
     memory: str | None
     rows: str
     index: str
+    jumps: Jumps | None
 
 
 @dataclass(frozen=True)
@@ -274,6 +295,8 @@ class DenoisingLoop:
         feeds = {STREAM: state.stream, SAMPLE: state.sample, HISTORY: state.history}
         feeds |= zip([MEMORY] * len(state.memory), state.memory, strict=True)
         feeds |= {name: w.op("Gather", values, k) for name, values in by_step.items()}
+        if self._inputs.jumps is not None:
+            feeds[OFFSET] = self._jumped(w, self._inputs.jumps, feeds[OFFSET], state.history, k)
         for name, piece in ((TAIL, self._pieces.tail), (STEM, self._pieces.stem)):
             for context, type_ in piece.contexts.items():
                 at = k if name == TAIL else self._following(w, k)
@@ -282,6 +305,25 @@ class DenoisingLoop:
         is_anchor = w.op("Gather", self._inputs.anchors, k)
         history = self._remembered(w, is_anchor, state.sample, prediction, state.history)
         return _State(sample, stream, history, tuple(memory))
+
+    def _jumped(self, w: GraphWriter, jumps: Jumps, offset: str, history: str, k: str) -> str:
+        """The offset of step k with the jump that ends there, if one does: ``Correction.jump`` in ONNX."""
+        jumping, staying = w.inner(), w.inner()
+        j = w.op("Gather", jumps.which, k)
+        flat = jumping.op("Reshape", jumping.op("Transpose", history, perm=[1, 0, 2]), jumping.constant([0, -1]))
+        value = flat if jumps.condition is None else jumping.op("Concat", jumps.condition, flat, axis=1)
+        layers = [jumping.op("Gather", layer, j) for layer in (jumps.inner, jumps.middle, jumps.outer)]
+        zero, last, end = (jumping.constant([n]) for n in (0, -1, 2**31 - 1))
+        for number, layer in enumerate(layers):
+            matrix, row = (jumping.op("Slice", layer, *ends, zero) for ends in ((zero, last), (last, end)))
+            value = jumping.op("Add", jumping.op("MatMul", value, matrix), row)
+            value = value if number == 2 else jumping.op("Relu", value)
+        # [B, D T] to [D, B, T]
+        shape = jumping.op("Concat", jumping.constant([0]), jumping.op("Shape", offset, start=0, end=1), last, axis=0)
+        added = jumping.op("Transpose", jumping.op("Reshape", value, shape), perm=[1, 0, 2])
+        jumped, same = jumping.op("Add", offset, added), staying.op("Identity", offset)
+        any_jump = w.op("GreaterOrEqual", j, w.constant(0))
+        return w.choose(any_jump, jumping.body("jump", jumped), staying.body("no_jump", same))[0]
 
     def _remembered(self, w: GraphWriter, is_anchor: str, sample: str, prediction: str, history: str) -> str:
         """The history after a step: sample and prediction enter it if the step is an anchor, and the oldest leave."""

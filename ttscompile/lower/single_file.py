@@ -19,8 +19,9 @@ All B streams of a batch follow one plan. For K steps and N blocks the inputs ar
 ======================= =================== ==========================================================================
 
 A schedule that has a correction wants it as further inputs, which ``Correction.inputs`` gives: ``correction``,
-``correction_bias`` and ``correction_anchors``, and if it reads the observation ``correction_reading`` and
-``correction_observed``. Inputs that are left out correct nothing. onnxruntime warns, when it loads the file, that these
+``correction_bias`` and ``correction_anchors``, if it reads the observation ``correction_reading`` and
+``correction_observed``, and if it has jumps ``correction_jumps``, ``correction_inner``, ``correction_middle`` and
+``correction_outer``. Inputs that are left out correct nothing. onnxruntime warns, when it loads the file, that these
 have values and can be overridden. The outputs are
 
 ======================= =================== ==========================================================================
@@ -35,6 +36,7 @@ have values and can be overridden. The outputs are
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -45,8 +47,14 @@ from ..core.correction import (
     CORRECTION,
     CORRECTION_BIAS,
     FEATURES,
+    HIDDEN,
     HISTORY,
+    INNER,
+    JUMPS,
+    MIDDLE,
+    MOST_OF_A_CHUNK,
     OBSERVED,
+    OUTER,
     READING,
     no_correction,
     numbers_of,
@@ -58,7 +66,7 @@ from ..ir.graph import TensorType
 from ..ir.program import Program
 from .contexts import Contexts
 from .graph_writer import GraphWriter, Weights, tensor
-from .loop import GROUP, DenoisingLoop, LoopInputs
+from .loop import GROUP, DenoisingLoop, Jumps, LoopInputs
 from .onnx_model import opsets, own_model
 from .plan import LoweredPlan, lower_plan
 
@@ -95,13 +103,19 @@ def lower_single_file(program: Program, models: Mapping[str, ModelProto], weight
         inputs.append(tensor(name, array.dtype, array.shape))
         main.default(name, array)
     update, offset = _update(main, spec, streams)
+    condition = None
     if numbers := numbers_of(program.pieces.condition.types()[name].at(1) for name in program.pieces.features):
+        condition = contexts.condition()
         inputs += _condition_inputs(main, spec, numbers)
-        offset = main.op("Add", offset, _observed(main, spec, contexts.condition()))
+        offset = main.op("Add", offset, _observed(main, spec, condition))
+    jumping = math.prod(spec.sample) <= MOST_OF_A_CHUNK
+    if jumping:
+        inputs += _jump_inputs(main, spec, numbers)
+    jumps = Jumps(JUMPS, INNER, MIDDLE, OUTER, condition) if jumping else None
     history, memories = _zeros(main, spec, streams, HISTORY), spec.sampler.memories
     memory = _zeros(main, spec, streams, memories) if memories else None
     loop = DenoisingLoop(main, program, models, weights, contexts)
-    values = LoopInputs("initial_noise", offset, update, ANCHORS, history, memory, stored, "rollout_index")
+    values = LoopInputs("initial_noise", offset, update, ANCHORS, history, memory, stored, "rollout_index", jumps)
     sample, residuals = loop.write(plan, values)
     if (bound := spec.sampler.bound) is not None:  # without a correction no number is beyond it
         sample = main.op("Clip", sample, *(main.constant(end, np.float32) for end in (-bound, bound)))
@@ -182,6 +196,18 @@ def _condition_inputs(main: GraphWriter, spec: PolicySpec, numbers: int) -> list
         tensor(READING, np.float32, [numbers, "F"]),
         tensor(OBSERVED, np.float32, ["F", steps, dimensions, horizon]),
     ]
+
+
+def _jump_inputs(main: GraphWriter, spec: PolicySpec, numbers: int) -> list[ValueInfoProto]:
+    """The inputs of jumps that read N numbers of the condition; by default there are none."""
+    steps, chunk = spec.sampler.steps, math.prod(spec.sample)
+    main.default(JUMPS, np.full(steps, -1, np.int64))
+    inputs = [tensor(JUMPS, np.int64, [steps])]
+    layers = {INNER: (numbers + HISTORY * chunk + 1, HIDDEN), MIDDLE: (HIDDEN + 1, HIDDEN), OUTER: (HIDDEN + 1, chunk)}
+    for name, shape in layers.items():
+        main.default(name, np.zeros((1, *shape), np.float32))
+        inputs.append(tensor(name, np.float32, ["J", *shape]))
+    return inputs
 
 
 def _observed(main: GraphWriter, spec: PolicySpec, condition: str) -> str:

@@ -109,7 +109,9 @@ class Probe:
         spec, blocks, groups = self._manifest.spec, self._manifest.blocks, self._manifest.groups
         sampler, horizon = spec.sampler, spec.sample[0]
         correction = correction or no_correction(sampler.steps, spec.sample)
-        read = np.concatenate(self._condition, 1) @ correction.reading if correction.reads else None
+        read = np.zeros((self.streams, 0), np.float32)
+        if correction.reads:
+            read = correction.read(np.concatenate(self._condition, 1))
         updates, own, shared = matrices(sampler, correction), dict[int, Array](), dict[int, Array]()
         sample = noise.initial.transpose(2, 0, 1)
         dimensions = sample.shape[0]
@@ -139,7 +141,9 @@ class Probe:
                 denoised = sampler.sample_to_x0[k] * sample + sampler.out_to_x0[k] * prediction
                 parts.append(np.clip(denoised, -sampler.clip, sampler.clip))
             product = np.concatenate([*parts, memory], 2) @ updates[k]
-            seen = 0.0 if read is None else np.einsum("bf,fdt->dbt", read, correction.observed[:, k])
+            seen = np.einsum("bf,fdt->dbt", read, correction.observed[:, k])
+            if k in correction.landings:
+                seen = seen + correction.jump(correction.landings[k], read, history)
             following, memory = product[..., :horizon] + correction.bias[k] + seen, product[..., horizon:]
             if noise.steps is not None:
                 following = following + sampler.noise_to_next[k] * noise.steps[k].transpose(2, 0, 1)
