@@ -224,7 +224,7 @@ class Runtime:
             plan_name=plan_name or (PRUNER if plan is None else GIVEN),
             computed=tuple(int(n) for n in np.count_nonzero(computed, axis=(1, 2))),
             legalised=settled.legalised,
-            flops=tuple(self._manifest.flops.call(one, plan is None) for one in settled.plans),
+            flops=tuple(self._manifest.flops.call(one, plan is None, correction) for one in settled.plans),
             frames=self._used.frames.work,
             timings=Timings(
                 prologue=_milliseconds(start, prologue),

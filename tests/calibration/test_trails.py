@@ -12,10 +12,11 @@ import torch
 
 from ttscompile.calibration import trails
 from ttscompile.calibration.crowded import FEW, crowded_family, other_placements
-from ttscompile.calibration.fit_correction import fit_correction
 from ttscompile.calibration.sparse_loop import SparseLoop
 from ttscompile.calibration.task import Task
 from ttscompile.calibration.trails import Trails
+from ttscompile.core.correction import Correction
+from ttscompile.core.lattice import PlanArray
 from ttscompile.runtimes.reference.model import ReferenceModel
 from ttscompile.runtimes.reference.sampler import TorchSampler
 
@@ -57,14 +58,19 @@ def trails_of(task: Task, reads: bool | None, bytes_: int = trails.BYTES) -> Tra
     return Trails(loop, model.steps, model.blocks, bytes_)
 
 
+def without_jumps(task: Task, plan: PlanArray, reads: bool) -> Correction | None:
+    """The correction of a plan as searches fit it."""
+    loop = SparseLoop(task.executor, task.executor.select(task.calls, range(30)), None, reads=reads, whole=True)
+    return loop.correction(loop.end(plan))
+
+
 @pytest.mark.parametrize("reads", [True, False, None])
 def test_calls_beside_end_where_the_fitted_correction_leads_them(task: Task, reads: bool | None) -> None:
     judged, made = task.executor.select(task.calls, range(30, 40)), trails_of(task, reads)
     for steps in SCHEDULES:
         plan, executor = task.whole.plan(steps), task.executor
         if reads is not None:
-            fitted = executor.select(task.calls, range(30))
-            executor = executor.corrected(fit_correction(executor, plan, fitted, reads))
+            executor = executor.corrected(without_jumps(task, plan, reads))
         torch.testing.assert_close(made.end(steps).samples, executor.run(plan, judged), rtol=1e-4, atol=1e-4)
 
 
@@ -75,7 +81,7 @@ def test_what_is_judged_is_bounded_as_a_call_is(task: Task, monkeypatch: pytest.
     columns = {name: np.where(last, float(name == "x0_to_next"), getattr(table, name)) for name in table.COLUMNS[2:]}
     monkeypatch.setattr(model, "sampler", TorchSampler(replace(table, clip=0.05, **columns)))
     judged, plan = task.executor.select(task.calls, range(30, 40)), task.whole.plan((0, 2, 5))
-    correction = fit_correction(task.executor, plan, task.executor.select(task.calls, range(30)), reads=True)
+    correction = without_jumps(task, plan, reads=True)
     found = trails_of(task, reads=True).end((0, 2, 5)).samples
     assert found.abs().max() == torch.tensor(0.05)
     torch.testing.assert_close(found, task.executor.corrected(correction).run(plan, judged), rtol=1e-4, atol=1e-4)

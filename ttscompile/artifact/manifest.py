@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-from ..core.correction import numbers_of
+from ..core.correction import Correction, numbers_of
 from ..core.lattice import PlanArray, plan_flops
 from ..core.rules import NotNegative, Positive, Rule, Sha256, Share
 from ..core.spec import FP32, PolicySpec
@@ -115,14 +115,16 @@ class FlopsRecord:
     tail: int
     blocks: tuple[int, ...]
 
-    def call(self, plan: PlanArray, pruned: bool) -> float:
+    def call(self, plan: PlanArray, pruned: bool, correction: Correction | None = None) -> float:
         """FLOPs of one call of one stream.
 
         Args:
             plan: int8 ``[K, blocks]``.
             pruned: whether the pruner ran to make it.
+            correction: of the plan; its jumps are counted.
         """
-        fixed = self.prologue + (self.pruner if pruned else 0) + len(plan) * (self.stem + self.tail)
+        fixed = 0 if correction is None else correction.flops
+        fixed += self.prologue + (self.pruner if pruned else 0) + len(plan) * (self.stem + self.tail)
         return fixed + plan_flops(plan, self.blocks)
 
     def ceiling(self, steps: int) -> float:

@@ -59,14 +59,15 @@ def judge(artifact: Artifact, executor: Executor, plans: Mapping[str, Found], ca
     def errors(correction: Correction | None, plan: PlanArray) -> FloatArray:
         return actions.errors(executor.corrected(correction).run(plan, calls), calls.targets, units=True)
 
-    scores = {
-        name: PlanScore.of(errors(found.correction, found.schedule), found.schedule[None], flops, pruned=False)
-        for name, found in plans.items()
-    }
+    scores = dict[str, PlanScore]()
+    for name, one in plans.items():
+        off, own = errors(one.correction, one.schedule), one.schedule[None]
+        scores[name] = PlanScore.of(off, own, flops, pruned=False, correction=one.correction)
     found = plans[SCHEDULE]
     if found.pruner is not None:
         made = pruner_plan(executor.logits(calls, found.pruner))
-        scores[PRUNER] = PlanScore.of(errors(found.pruner_correction, made), made, flops, pruned=True)
+        shared = found.pruner_correction
+        scores[PRUNER] = PlanScore.of(errors(shared, made), made, flops, pruned=True, correction=shared)
     return scores
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..artifact.manifest import FlopsRecord
+from ..core.correction import Correction
 from ..core.lattice import PlanArray, plan_flops, sparsity
 from .calls import FloatArray
 
@@ -34,7 +35,14 @@ class PlanScore:
     flops_saved: float
 
     @classmethod
-    def of(cls, errors: FloatArray, plans: PlanArray, flops: FlopsRecord, pruned: bool) -> PlanScore:
+    def of(
+        cls,
+        errors: FloatArray,
+        plans: PlanArray,
+        flops: FlopsRecord,
+        pruned: bool,
+        correction: Correction | None,
+    ) -> PlanScore:
         """Make a score of the error of each call and its plan.
 
         Args:
@@ -42,6 +50,7 @@ class PlanScore:
             plans: ``[N, K, blocks]``, or ``[1, K, blocks]`` for all calls.
             flops: the FLOPs of the policy's parts.
             pruned: whether the pruner makes the plan.
+            correction: of the plan, or of all that the pruner makes; None for none.
         """
         total = plans.shape[1] * sum(flops.blocks)
         return cls(
@@ -49,7 +58,7 @@ class PlanScore:
             error_p90=float(np.quantile(errors, 0.9)),
             sparsity=sparsity(plans),
             flops_sparsity=1 - float(np.mean([plan_flops(plan, flops.blocks) for plan in plans])) / total,
-            flops_saved=1 - float(np.mean([flops.call(plan, pruned) for plan in plans])) / flops.dense,
+            flops_saved=1 - float(np.mean([flops.call(plan, pruned, correction) for plan in plans])) / flops.dense,
         )
 
 

@@ -147,15 +147,10 @@ class Task:
     def whole_steps(self, steps: Sequence[int], **notes: Any) -> Found:
         """The schedule that computes these steps, with its correction.
 
-        The notes get the steps, and how many numbers of the condition the correction reads.
+        The notes get the steps, how many numbers of the condition the correction reads, and how many jumps it has.
         """
         correction = self.whole.correction(steps)
-        reads = 0 if correction is None else correction.reads
-        return Found(
-            self.whole.plan(steps),
-            {"steps": list(steps), "numbers_read_of_the_observation": reads, **notes},
-            correction,
-        )
+        return Found(self.whole.plan(steps), {"steps": list(steps), **_of_correction(correction), **notes}, correction)
 
     def corrected(self, found: Found) -> Found:
         """What a strategy found, with corrections where they are better: of the schedule, and of the pruner's plans.
@@ -171,13 +166,18 @@ class Task:
                 " Leave --correct out, or take another strategy."
             )
         correction = self.whole.correction_of(found.schedule)
-        reads = 0 if correction is None else correction.reads
-        notes = {**found.notes, "corrected": correction is not None, "numbers_read_of_the_observation": reads}
+        notes = {**found.notes, "corrected": correction is not None, **_of_correction(correction)}
         if (weights := found.pruner) is None:
             return replace(found, correction=correction, notes=notes)
         own = self.whole.correction_of(lambda calls: pruner_plan(self.executor.logits(calls, weights)))
         notes["pruner_corrected"] = own is not None
         return replace(found, correction=correction, pruner_correction=own, notes=notes)
+
+
+def _of_correction(correction: Correction | None) -> dict[str, int]:
+    """What the notes say of it."""
+    reads, jumps = (0, 0) if correction is None else (correction.reads, len(correction.landings))
+    return {"numbers_read_of_the_observation": reads, "jumps": jumps}
 
 
 class Search(Protocol):

@@ -143,6 +143,11 @@ class Correction:
         return {end: j for j, end in enumerate(self.jumps.values())} if len(self.inner) else {}
 
     @property
+    def flops(self) -> int:
+        """Of its jumps, for one stream. A call's record counts all else whether there is a correction or not."""
+        return len(self.landings) * jump_flops((self.weights.shape[3], self.bias.shape[1]), self.reads)
+
+    @property
     def reads(self) -> int:
         """F: how many numbers of the condition it reads; 0 if it does not read the observation."""
         return int(self.reading.shape[1])

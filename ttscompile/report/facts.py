@@ -168,7 +168,8 @@ def plan_flops(artifact: Artifact, name: str) -> float | None:
     own = plans_of(manifest)[name]
     if own.flops_sparsity is None:
         return None
-    dense = manifest.flops.call(artifact.schedule(DENSE), pruned=own.pruned)
+    correction = artifact.corrections.get(name)
+    dense = manifest.flops.call(artifact.schedule(DENSE), own.pruned, correction)
     return dense - own.flops_sparsity * manifest.steps * sum(manifest.flops.blocks)
 
 
