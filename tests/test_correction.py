@@ -24,7 +24,7 @@ from ttscompile.core.correction import (
 )
 from ttscompile.errors import IllegalPlanError
 
-from .runtimes.plans import random_jumps
+from .runtimes.plans import jumping
 
 
 def test_no_correction_has_the_shapes_of_the_policy() -> None:
@@ -93,19 +93,6 @@ def test_what_it_reads_of_the_condition_is_added_to_every_step() -> None:
     assert added.shape == (5, 2, 2, 4)
     by_hand = sum(condition[1] @ correction.reading[:, f] * correction.observed[f, 3, 1, 2] for f in range(3))
     np.testing.assert_allclose(added[3, 1, 1, 2], by_hand, rtol=1e-5)
-
-
-def jumping(anchors: list[bool], read: int = 3, horizon: int = 4) -> Correction:
-    rng = np.random.default_rng(2)
-    like = no_correction(len(anchors), (horizon, 2))
-    flags = np.array(anchors)
-    return replace(
-        like,
-        anchors=flags,
-        reading=rng.standard_normal((7, read)).astype(np.float32),
-        observed=np.zeros((read, *like.observed.shape[1:]), np.float32),
-        **dict(zip(("inner", "middle", "outer"), random_jumps(rng, flags, (horizon, 2), read), strict=True)),
-    )
 
 
 def test_a_jump_goes_from_an_anchor_to_the_step_before_the_next() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -53,6 +54,20 @@ def random_jumps(
         else np.zeros((0, 0, 0), np.float32)
         for shape in shapes
     ]
+
+
+def jumping(anchors: list[bool], read: int = 3, horizon: int = 4) -> Correction:
+    """A correction that is zeros but for jumps that read some of seven numbers of the condition."""
+    rng = np.random.default_rng(2)
+    like = no_correction(len(anchors), (horizon, 2))
+    flags = np.array(anchors)
+    return replace(
+        like,
+        anchors=flags,
+        reading=rng.standard_normal((7, read)).astype(np.float32),
+        observed=np.zeros((read, *like.observed.shape[1:]), np.float32),
+        **dict(zip(("inner", "middle", "outer"), random_jumps(rng, flags, (horizon, 2), read), strict=True)),
+    )
 
 
 def random_reading(

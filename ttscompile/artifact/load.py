@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import MISSING, dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -25,6 +25,7 @@ from ..ir.program import Binding, Pieces
 from . import tensors
 from .archive import Unpacked, is_checkpoint, unpack
 from .codec import MAX_MANIFEST_BYTES, decode, identities
+from .corrections import PREFIX, read_corrections
 from .files import check_file, read_file
 from .folder import Folder, Stamp
 from .graph_json import graph_from_json
@@ -36,10 +37,6 @@ from .strict_json import REMEDY, Value, parse
 from .tokens import ReuseRecord
 
 TABLE_PREFIX = "table/"
-CORRECTION_PREFIX = "correction/"
-CORRECTION_FIELDS = tuple(field.name for field in fields(Correction) if field.default_factory is MISSING)
-JUMP_FIELDS = tuple(field.name for field in fields(Correction) if field.name not in CORRECTION_FIELDS)
-"""Of a correction that has jumps; others do without."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -359,25 +356,16 @@ def _plans(directory: Path, manifest: Manifest) -> tuple[Mapping[str, PlanArray]
     """Schedules, and the corrections that belong to plans."""
     stored = _optional(directory, manifest.stores.plans)
     where = directory / (manifest.stores.plans or MANIFEST)
-    schedules = {name: array for name, array in stored.items() if not name.startswith(CORRECTION_PREFIX)}
+    schedules = {name: array for name, array in stored.items() if not name.startswith(PREFIX)}
     expected = sorted(name for name, plan in manifest.plans.items() if not plan.pruned)
     if expected != sorted(schedules):
         raise ArtifactError(f"{where}: expected schedules {expected}; found {sorted(schedules)}. {REMEDY}")
-    parts = {name.removeprefix(CORRECTION_PREFIX): array for name, array in stored.items() if name not in schedules}
-    names = sorted({name.rpartition("/")[0] for name in parts})
-    jumping = [name for name in names if f"{name}/{JUMP_FIELDS[0]}" in parts]
-    wanted = [(n, f) for n in names for f in (*CORRECTION_FIELDS, *(JUMP_FIELDS if n in jumping else ()))]
-    if not set(names) <= set(manifest.plans) or {f"{n}/{f}" for n, f in wanted} != set(parts):
-        raise ArtifactError(
-            f"{where}: expected corrections of plans among {sorted(manifest.plans)}, each with"
-            f" {', '.join(CORRECTION_FIELDS)}, and perhaps {', '.join(JUMP_FIELDS)}; found {sorted(parts)}. {REMEDY}"
-        )
-    corrections = {}
+    name = "corrections"
     try:
+        corrections = read_corrections(stored, manifest.plans, str(where))
         for name, plan in schedules.items():
             check_schedule(name, plan, manifest)
-        for name in names:
-            corrections[name] = Correction(**{field: parts[f"{n}/{field}"] for n, field in wanted if n == name})
+        for name in corrections:
             corrections[name].require_fit(manifest.steps, manifest.spec.sample, manifest.condition_numbers)
     except IllegalPlanError as error:
         raise ArtifactError(f"{where}: {name}: {error} {REMEDY}") from error

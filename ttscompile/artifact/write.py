@@ -22,6 +22,7 @@ from ..measure.versions import VERSION
 from . import records, tensors
 from .bind import LoweredPieces, bind, places_of, store_pieces
 from .codec import decode, encode, identities
+from .corrections import correction_arrays
 from .distilled import DistilledWeights, store_distilled
 from .files import (
     PARTIAL,
@@ -38,9 +39,6 @@ from .files import (
 from .golden import Golden, GoldenPlan, plan_arrays
 from .graph_json import graph_to_json
 from .load import (
-    CORRECTION_FIELDS,
-    CORRECTION_PREFIX,
-    JUMP_FIELDS,
     TABLE_PREFIX,
     Artifact,
     load_artifact,
@@ -333,8 +331,7 @@ def _plan_arrays(
         if plan not in manifest.plans:
             raise ArtifactError(f"correction of {plan!r}: expected a plan of the artifact, {sorted(manifest.plans)}.")
         correction.require_fit(manifest.steps, manifest.spec.sample, manifest.condition_numbers)
-        names = (*CORRECTION_FIELDS, *(JUMP_FIELDS if correction.landings else ()))
-        arrays |= {f"{CORRECTION_PREFIX}{plan}/{name}": getattr(correction, name) for name in names}
+        arrays |= correction_arrays(plan, correction)
     return arrays
 
 

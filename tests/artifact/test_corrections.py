@@ -1,0 +1,41 @@
+"""Corrections among the arrays of an artifact: with and without jumps, and what is missing or too much."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.runtimes.plans import jumping
+from ttscompile.artifact.corrections import correction_arrays, read_corrections
+from ttscompile.core.correction import no_correction
+from ttscompile.errors import ArtifactError
+
+FIVE = [True, False, True, False, False]
+WITH, WITHOUT = jumping(FIVE), no_correction(5, (4, 2))
+
+
+def test_what_is_stored_is_read_again() -> None:
+    stored = {"a/b": np.zeros(1), **correction_arrays("fast", WITH), **correction_arrays("a/b", WITHOUT)}
+    found = read_corrections(stored, ["a/b", "fast", "other"], "here")
+    assert set(found) == {"a/b", "fast"}
+    assert not found["a/b"].landings and found["fast"].landings == {1: 0}
+    np.testing.assert_array_equal(found["fast"].outer, WITH.outer)
+
+
+def test_one_without_jumps_has_no_arrays_for_them() -> None:
+    """An artifact that has none is what it was before there were any."""
+    named = {name.rpartition("/")[2] for name in correction_arrays("fast", WITHOUT)}
+    assert named == {"anchors", "weights", "bias", "reading", "observed"}
+
+
+@pytest.mark.parametrize("change", ["no plan", "less", "less of the jumps", "more"])
+def test_others_are_refused(change: str) -> None:
+    stored, plans = correction_arrays("fast", WITH), ["fast"]
+    if change == "no plan":
+        plans = ["slow"]
+    elif change == "more":
+        stored["correction/fast/more"] = np.zeros(1)
+    else:
+        del stored["correction/fast/" + ("bias" if change == "less" else "middle")]
+    with pytest.raises(ArtifactError, match="^here: expected corrections of plans among"):
+        read_corrections(stored, plans, "here")
