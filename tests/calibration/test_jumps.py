@@ -8,6 +8,7 @@ import torch
 
 from ttscompile.calibration import sparse_loop
 from ttscompile.calibration.calls import IntArray
+from ttscompile.calibration.fit_correction import fit_correction
 from ttscompile.calibration.jumps import FOLDS, Layers, applied, fit_jump
 from ttscompile.calibration.sparse_loop import SparseLoop
 from ttscompile.core.correction import HIDDEN
@@ -108,3 +109,24 @@ def test_without_a_jump_that_holds_there_are_none(make_task: MakeTask, monkeypat
     loop = SparseLoop(task.executor, task.calls, None, reads=True, whole=True)
     correction = loop.correction(loop.end(plan, jumps=True))
     assert correction is not None and not correction.landings
+
+
+@pytest.mark.parametrize("helps", [True, False])
+def test_jumps_stay_if_the_loop_ends_nearer_to_the_dense_policy(
+    make_task: MakeTask, monkeypatch: pytest.MonkeyPatch, helps: bool
+) -> None:
+    """Each jump may hold by itself, and the corrections after it be worse for it."""
+    task = make_task(calls=60)
+
+    def exact_or_worse(
+        known: torch.Tensor, missing: torch.Tensor, episodes: IntArray, seed: int
+    ) -> tuple[Layers, torch.Tensor]:
+        sizes = (known.shape[1], HIDDEN), (HIDDEN, HIDDEN), (HIDDEN, missing.shape[1])
+        inner, middle, outer = (torch.zeros(a + 1, b) for a, b in sizes)
+        draw = torch.Generator().manual_seed(seed)
+        return (inner, middle, outer), missing if helps else torch.randn(missing.shape, generator=draw)
+
+    monkeypatch.setattr(sparse_loop, "fit_jump", exact_or_worse)
+    correction = fit_correction(task.executor, task.whole.plan([0, 6]), task.calls, True)
+    assert correction is not None
+    assert bool(correction.landings) == helps

@@ -67,6 +67,11 @@ class Place:
         return torch.cat([lane.sample for lane in self.judged])
 
     @property
+    def fits(self) -> Tensor:
+        """Those of the calls that corrections are fitted on, ``[N, T, D]``."""
+        return torch.cat([lane.sample for lane in self.fitted])
+
+    @property
     def held(self) -> list[Tensor]:
         """The samples and residuals of it; places share those that nothing changed between them."""
         return [tensor for lane in (*self.fitted, *self.judged) for tensor in lane.held]

@@ -162,7 +162,7 @@ class WholeSteps:
     def correcting(self, full_steps: int) -> float:
         """Seconds that ``correction`` of a schedule takes, by the comparisons so far; 0 before any."""
         share = self._calls.count / (self._fitted.count + 2 * self._compared.count)
-        return (1 + share) * self.comparing(full_steps)
+        return (1 + 2 * share) * self.comparing(full_steps)  # without jumps, and with them
 
     def _errors(self, samples: Tensor) -> Errors:
         """Of the samples that the calls to compare on end with."""
