@@ -116,7 +116,7 @@ def test_jumps_stay_if_the_loop_ends_nearer_to_the_dense_policy(
     make_task: MakeTask, monkeypatch: pytest.MonkeyPatch, helps: bool
 ) -> None:
     """Each jump may hold by itself, and the corrections after it be worse for it."""
-    task = make_task(calls=60)
+    task = make_task(calls=400)
 
     def exact_or_worse(
         known: torch.Tensor, missing: torch.Tensor, episodes: IntArray, seed: int
