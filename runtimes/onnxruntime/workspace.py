@@ -143,7 +143,7 @@ class Workspace:
         """Steps that all add the total that ``idle`` has been prepared for."""
         assert self.idle is not None
         for k in range(first, stop):
-            if k in self._advance.jumps:
+            if k in self._advance.correction.jumps:
                 self.idle.run(first, k + 1, self._advance.updates, self._offset, self._advance.anchors)
                 self._jump_from(k, self.idle.history)
                 first = k + 1
@@ -151,10 +151,11 @@ class Workspace:
 
     def _jump_from(self, anchor: int, history: FloatArray) -> None:
         """What is added where the run of steps after an anchor ends: known now, and so a part of that step's offset."""
-        if anchor not in self._advance.jumps:
+        correction = self._advance.correction
+        if anchor not in correction.jumps:
             return
-        j, landing = self._advance.jumps[anchor]
-        added = self._advance.correction.jump(j, self._read, history)
+        j, landing = correction.jumps[anchor]
+        added = correction.jump(j, self._read, history)
         if self._known is not None:
             added[self._known.channels, :, self._known.positions] = 0
         self._offset[landing] += added
@@ -252,9 +253,7 @@ class Workspace:
                 masked = MaskedUpdates(self.advances_with(correction).updates, self._manifest.spec.chunk)
             updates = matrices(self._sampler, correction) if masked is None else masked.updates
             steps = [self._bind_advance(k, updates[k]) for k in range(self._steps)]
-            numbers = correction.landings
-            jumps = {anchor: (numbers[end], end) for anchor, end in correction.jumps.items() if end in numbers}
-            made = _Advances(correction, correction.anchors.tolist(), jumps, updates, steps, masked)
+            made = _Advances(correction, correction.anchors.tolist(), updates, steps, masked)
             self._advances[id(correction), known is not None] = made
         if made.masked is not None and known is not None:
             made.masked.mask(known.values.shape[2])
@@ -328,7 +327,6 @@ class _Advances(NamedTuple):
 
     correction: Correction
     anchors: list[bool]  # of each step, whether it enters the history
-    jumps: dict[int, tuple[int, int]]  # by anchor: the number of its jump, and the step after which that is added
     updates: Array  # float32 [K, G, R, T]
     steps: list[Bound]
     masked: MaskedUpdates | None  # what the updates are of, with a prefix

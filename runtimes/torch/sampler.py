@@ -65,9 +65,9 @@ class Advance:
             self.reading = devices.placed(correction.reading, device)
             self.observed = devices.placed(correction.observed.reshape(correction.reads, -1), device)
         self.layers: tuple[Tensor, ...] = ()
-        if used.landings:
+        if used.jumps:
             self.layers = tuple(devices.placed(array, device) for array in (used.inner, used.middle, used.outer))
-        self.jumps = {a: (used.landings[end], end) for a, end in used.jumps.items() if end in used.landings}
+        self.jumps = used.jumps
 
     @property
     def updates(self) -> FloatArray:

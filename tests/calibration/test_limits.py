@@ -17,7 +17,8 @@ import torch
 
 from ttscompile import ObservationSpec
 from ttscompile.artifact.load import load_artifact
-from ttscompile.calibration import targets
+from ttscompile.calibration import arguments, targets
+from ttscompile.calibration.arguments import MOST_CALLS, MOST_LEARNED, calls_to_learn_from
 from ttscompile.calibration.budget import _pruner_ms
 from ttscompile.calibration.calls import LARGEST, Actions, split_episodes
 from ttscompile.calibration.compare import _error, compare
@@ -233,3 +234,18 @@ def test_the_pruner_is_timed_with_observations_as_the_network_takes_them(compile
     runtime: Any = SimpleNamespace(predict=predict, reset=lambda: None)
     assert _pruner_ms(replace(artifact, manifest=manifest), runtime) == 0.25
     assert given[0] == {"obs": "float32", "tokens": "int64"}
+
+
+def test_a_network_learns_from_more_calls_where_their_contexts_fit(
+    compiled: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    manifest = load_artifact(compiled).manifest
+    assert calls_to_learn_from(manifest, 1e6, corrects=False)[1] == MOST_CALLS
+    assert calls_to_learn_from(manifest, 1e6, corrects=True)[1] == MOST_LEARNED
+    assert calls_to_learn_from(manifest, 1e6, corrects=False, distils=True)[1] == MOST_LEARNED
+    large = replace(manifest, spec=replace(manifest.spec, sample=(513, 2)))
+    assert calls_to_learn_from(large, 1e6, corrects=True)[1] == MOST_CALLS
+    monkeypatch.setattr(arguments, "ROOM", 5000 * arguments._context_bytes(manifest))
+    assert calls_to_learn_from(manifest, 1e6, corrects=True)[1] == 5000
+    monkeypatch.setattr(arguments, "ROOM", 1)
+    assert calls_to_learn_from(manifest, 1e6, corrects=True)[1] == MOST_CALLS

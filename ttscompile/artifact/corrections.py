@@ -21,7 +21,7 @@ _OF_JUMPS = tuple(field.name for field in fields(Correction) if field.name not i
 
 def correction_arrays(plan: str, correction: Correction) -> dict[str, npt.NDArray[Any]]:
     """The arrays of a plan's correction, by name."""
-    names = (*_OF_ALL, *(_OF_JUMPS if correction.landings else ()))
+    names = (*_OF_ALL, *(_OF_JUMPS if correction.jumps else ()))
     return {f"{PREFIX}{plan}/{name}": np.asarray(getattr(correction, name)) for name in names}
 
 

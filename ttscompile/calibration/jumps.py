@@ -29,12 +29,12 @@ def fit_jump(known: Tensor, missing: Tensor, episodes: IntArray, seed: int) -> t
 
     Args:
         known: what it reads, ``[n, I]``.
-        missing: what should be added, ``[n, T D]``.
+        missing: what should be added, ``[n, D T]``.
         episodes: of each call, ``[n]``.
         seed: of the weights that training begins with, and of the order of the calls.
 
     Returns:
-        Its layers, each with the row that is added last, and ``[n, T D]``. None where that leaves over more than is
+        Its layers, each with the row that is added last, and ``[n, D T]``. None where that leaves over more than is
         missing, or there are fewer episodes than ``FOLDS``.
     """
     numbers, of_call = np.unique(episodes, return_inverse=True)
@@ -50,7 +50,7 @@ def fit_jump(known: Tensor, missing: Tensor, episodes: IntArray, seed: int) -> t
 
 
 def applied(layers: Layers, known: Tensor) -> Tensor:
-    """What a jump adds, ``[n, T D]``."""
+    """What a jump adds, ``[n, D T]``."""
     inner, middle, outer = layers
     for layer in (inner, middle):
         known = torch.addmm(layer[-1], known, layer[:-1]).relu()

@@ -119,7 +119,7 @@ class Correction:
                 f" reading [N, F] and what is observed [F, K, D, T]; found {shown}."
             )
         networks = (self.inner, self.middle, self.outer)
-        chunk, count = horizon * dimensions, len(self.jumps)
+        chunk, count = horizon * dimensions, len(jumps_of(self.anchors))
         jumping = ((count, read + HISTORY * chunk + 1, HIDDEN), (count, HIDDEN + 1, HIDDEN), (count, HIDDEN + 1, chunk))
         shapes = tuple(array.shape for array in networks)
         known = shapes in (jumping, ((0, 0, 0),) * 3) and all(array.dtype == np.float32 for array in networks)
@@ -133,19 +133,19 @@ class Correction:
             raise IllegalPlanError("a correction holds numbers that are not finite. Calibrate the artifact again.")
 
     @cached_property
-    def jumps(self) -> dict[int, int]:
-        """The last step before the next anchor, by the anchor, in order: where jumps are, or could be."""
-        return jumps_of(self.anchors)
+    def jumps(self) -> dict[int, tuple[int, int]]:
+        """By anchor, in order: the number of its jump, and the step after which that is added; empty without jumps."""
+        return {anchor: (j, end) for j, (anchor, end) in enumerate(jumps_of(self.anchors).items()) if len(self.inner)}
 
     @cached_property
     def landings(self) -> dict[int, int]:
-        """The number of the jump that is added after a step, by the step; empty where there are no jumps."""
-        return {end: j for j, end in enumerate(self.jumps.values())} if len(self.inner) else {}
+        """By the step after which a jump is added: the number of the jump."""
+        return {end: j for j, end in self.jumps.values()}
 
     @property
     def flops(self) -> int:
         """Of its jumps, for one stream. A call's record counts all else whether there is a correction or not."""
-        return len(self.landings) * jump_flops((self.weights.shape[3], self.bias.shape[1]), self.reads)
+        return len(self.jumps) * jump_flops((self.weights.shape[3], self.bias.shape[1]), self.reads)
 
     @property
     def reads(self) -> int:
@@ -175,7 +175,7 @@ class Correction:
         named = {ANCHORS: self.anchors, CORRECTION: self.weights, CORRECTION_BIAS: self.bias}
         if self.reads:
             named |= {READING: self.reading, OBSERVED: self.observed}
-        if self.landings:
+        if self.jumps:
             which = np.full(len(self.anchors), -1, np.int64)
             which[list(self.landings)] = list(self.landings.values())
             # There the first layer reads the condition itself, so that no size is unknown but the number of jumps.
