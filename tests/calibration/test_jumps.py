@@ -90,7 +90,7 @@ def test_calls_end_where_the_fitted_jumps_lead_them(
     monkeypatch.setattr(sparse_loop, "fit_jump", drawn_jump)
     some, others = (task.executor.select(task.calls, part) for part in (range(40), range(40, 60)))
     loop = SparseLoop(task.executor, some, others, reads=reads, whole=True)
-    place = loop.end(plan, jumps=True)
+    plain, place = loop.ends(plan)
     correction = loop.correction(place)
     assert correction is not None
     assert made == [2, 5, 8]
@@ -98,7 +98,7 @@ def test_calls_end_where_the_fitted_jumps_lead_them(
     assert not correction.outer[1].any() and correction.outer[0].any()
     ran = task.executor.corrected(correction).run(plan, others)
     torch.testing.assert_close(place.samples, ran, rtol=1e-4, atol=1e-4)
-    plain = SparseLoop(task.executor, some, others, reads=reads, whole=True).end(plan)
+    torch.testing.assert_close(plain.samples, loop.end(plan).samples)
     assert (plain.samples - place.samples).abs().max() > 1e-3
 
 
@@ -107,8 +107,10 @@ def test_without_a_jump_that_holds_there_are_none(make_task: MakeTask, monkeypat
     task = make_task(calls=60)
     plan: PlanArray = task.whole.plan([0, 5])
     loop = SparseLoop(task.executor, task.calls, None, reads=True, whole=True)
-    correction = loop.correction(loop.end(plan, jumps=True))
-    assert correction is not None and not correction.landings
+    plain, jumping = loop.ends(plan)
+    assert plain is jumping
+    correction = loop.correction(jumping)
+    assert correction is not None and not correction.jumps
 
 
 @pytest.mark.parametrize("helps", [True, False])

@@ -105,14 +105,14 @@ def test_a_limit_holds_within_an_interval(
 
 
 def test_a_family_is_not_begun_that_cannot_be_finished(make_task: MakeTask, tmp_path: Path) -> None:
-    """Compared, then fitted on all calls and judged."""
+    """Compared, then fitted on all calls, without jumps and with them, and judged."""
     whole = make_task(20, calls=24).whole
     assert whole.comparing(3) == whole.correcting(3) == 0.0  # nothing is known yet
     begun = time.monotonic()
     whole.errors((0, 4, 8))
     pace = whole.comparing(1)
     assert 0 < 3 * pace <= time.monotonic() - begun
-    assert whole.correcting(1) == pytest.approx((1 + 24 / (18 + 2 * 6)) * pace)
+    assert whole.correcting(1) == pytest.approx((1 + 2 * 24 / (18 + 2 * 6)) * pace)
     needed = 2 * whole.comparing(4) + whole.correcting(4)
     with Bar(shown=False) as bar:
         for limit, made in ((0.9 * needed, False), (1.1 * needed, True)):

@@ -12,11 +12,11 @@ from __future__ import annotations
 
 import math
 
-from ..core.correction import MOST_OF_A_CHUNK, Correction, jumps_of
+from ..core.correction import MOST_OF_A_CHUNK, Correction
 from ..core.lattice import PlanArray
 from .calls import Calls
 from .execute import Executor
-from .sparse_loop import SparseLoop, anchors_of, is_whole
+from .sparse_loop import SparseLoop, is_whole
 
 
 def fit_correction(executor: Executor, plan: PlanArray, calls: Calls, reads: bool) -> Correction | None:
@@ -30,8 +30,7 @@ def fit_correction(executor: Executor, plan: PlanArray, calls: Calls, reads: boo
         reads: whether it may read the observation.
     """
     loop = SparseLoop(executor, calls, None, reads=reads, whole=is_whole(plan))
-    found = loop.end(plan)
-    if math.prod(calls.initial.shape[1:]) <= MOST_OF_A_CHUNK and jumps_of(anchors_of(plan)):
-        jumping = loop.end(plan, jumps=True)
-        found = min(found, jumping, key=lambda place: float((place.fits - calls.targets).abs().mean()))
-    return loop.correction(found)
+    if math.prod(calls.initial.shape[1:]) > MOST_OF_A_CHUNK:
+        return loop.correction(loop.end(plan))
+    nearest = min(loop.ends(plan), key=lambda place: float((place.fits - calls.targets).abs().mean()))
+    return loop.correction(nearest)

@@ -114,14 +114,13 @@ class SparseLoop:
 
         self.begin = Place(0, lanes(fitted), lanes(judged))
 
-    def after(self, place: Place, rows: PlanArray, pool: ThreadPoolExecutor, lands: bool = False) -> Place:
+    def after(self, place: Place, rows: PlanArray, pool: ThreadPoolExecutor) -> Place:
         """The place after one step more.
 
         Args:
             place: before it.
             rows: of the plan of all calls, ``[1, blocks]``, or of the plan of each.
             pool: see ``execute.workers``; the lanes go through the network beside each other.
-            lands: whether a jump ends after the step.
         """
         lanes, anchor = [lane.fork() for lane in (*place.fitted, *place.judged)], bool(anchors_of(rows[:, None])[0])
         ends = np.cumsum([len(lane.sample) for lane in lanes])[:-1]
@@ -134,34 +133,46 @@ class SparseLoop:
             added = solved[-1].bias + torch.einsum("nf,fdt->dnt", self._known, solved[-1].observed)
             for lane, part in zip(lanes, added.tensor_split(ends.tolist(), dim=1), strict=True):
                 lane.correct(solved[-1].weight, part, anchor)
-        jumps = (*place.jumps, self._jump(fitted, judged, place.step)) if lands else place.jumps
-        return Place(place.step + 1, fitted, judged, solved, (*place.anchors, anchor), jumps)
+        return Place(place.step + 1, fitted, judged, solved, (*place.anchors, anchor), place.jumps)
 
-    def _jump(self, fitted: tuple[_Lane, ...], judged: tuple[_Lane, ...], step: int) -> Layers | None:
-        """Fit the jump that ends after a step, and let all calls go along."""
-        known = torch.cat([self._known, torch.cat([lane.history for lane in (*fitted, *judged)])], 1)
+    def end(self, plan: PlanArray) -> Place:
+        """The place after the last step of a plan ``[K, blocks]``, or of one for each call, ``[N, K, blocks]``."""
+        place, plans = self.begin, plan.reshape(-1, *plan.shape[-2:])
+        with workers() as pool:
+            for k in range(plans.shape[1]):
+                place = self.after(place, plans[:, k], pool)
+        return place
+
+    def ends(self, plan: PlanArray) -> tuple[Place, Place]:
+        """The same without jumps, and with those that hold on other episodes; one place twice where none does."""
+        plain, plans = self.begin, plan.reshape(-1, *plan.shape[-2:])
+        landings = set(jumps_of(anchors_of(plan)).values())
+        jumping, missed = None, self.begin.jumps
+        with workers() as pool:
+            for k in range(plans.shape[1]):
+                jumping = jumping and self.after(jumping, plans[:, k], pool)
+                plain = self.after(plain, plans[:, k], pool)
+                if k in landings:
+                    jumped = self._jumped(jumping or replace(plain, jumps=missed))
+                    missed, held = jumped.jumps, any(layers is not None for layers in jumped.jumps)
+                    jumping = jumped if held else None
+        return plain, jumping or plain
+
+    def _jumped(self, place: Place) -> Place:
+        """The place after the jump that ends there, which is None if it does not hold."""
+        lanes = [lane.fork() for lane in (*place.fitted, *place.judged)]
+        fitted, judged = tuple(lanes[: len(place.fitted)]), tuple(lanes[len(place.fitted) :])
+        known = torch.cat([self._known, torch.cat([lane.history for lane in lanes])], 1)
         missing = torch.cat([lane.left for lane in fitted])
-        found = fit_jump(known[: len(missing)], missing, self._episodes, step)
+        found = fit_jump(known[: len(missing)], missing, self._episodes, place.step - 1)
         if found is None:
-            return None
+            return replace(place, jumps=(*place.jumps, None))
         layers, added = found
-        lanes, added = (*fitted, *judged), torch.cat([added, applied(layers, known[len(missing) :])])
+        added = torch.cat([added, applied(layers, known[len(missing) :])])
         ends = np.cumsum([len(lane.sample) for lane in lanes])[:-1].tolist()
         for lane, part in zip(lanes, added.tensor_split(ends), strict=True):
             lane.add(part)
-        return layers
-
-    def end(self, plan: PlanArray, jumps: bool = False) -> Place:
-        """The place after the last step of a plan ``[K, blocks]``, or of one for each call, ``[N, K, blocks]``.
-
-        Where ``jumps`` are fitted, they end where the correction of the plan has them.
-        """
-        place, plans = self.begin, plan.reshape(-1, *plan.shape[-2:])
-        landings = set(jumps_of(anchors_of(plan)).values()) if jumps else set()
-        with workers() as pool:
-            for k in range(plans.shape[1]):
-                place = self.after(place, plans[:, k], pool, k in landings)
-        return place
+        return replace(place, fitted=fitted, judged=judged, jumps=(*place.jumps, layers))
 
     def correction(self, place: Place) -> Correction | None:
         """What was fitted, at the place after the last step of a loop with corrections; None if that is no numbers."""
