@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -14,9 +17,15 @@ FIVE = [True, False, True, False, False]
 WITH, WITHOUT = jumping(FIVE), no_correction(5, (4, 2))
 
 
+def of_plans(*names: str) -> Any:
+    """What a manifest says of a policy of five steps, with plans of these names."""
+    spec = SimpleNamespace(sample=(4, 2))
+    return SimpleNamespace(plans=dict.fromkeys(names), steps=5, spec=spec, condition_numbers=7)
+
+
 def test_what_is_stored_is_read_again() -> None:
     stored = {"a/b": np.zeros(1), **correction_arrays("fast", WITH), **correction_arrays("a/b", WITHOUT)}
-    found = read_corrections(stored, ["a/b", "fast", "other"], "here")
+    found = read_corrections(stored, of_plans("a/b", "fast", "other"), "here")
     assert set(found) == {"a/b", "fast"}
     assert not found["a/b"].landings and found["fast"].landings == {1: 0}
     np.testing.assert_array_equal(found["fast"].outer, WITH.outer)
@@ -30,12 +39,18 @@ def test_one_without_jumps_has_no_arrays_for_them() -> None:
 
 @pytest.mark.parametrize("change", ["no plan", "less", "less of the jumps", "more"])
 def test_others_are_refused(change: str) -> None:
-    stored, plans = correction_arrays("fast", WITH), ["fast"]
+    stored, plans = correction_arrays("fast", WITH), of_plans("fast")
     if change == "no plan":
-        plans = ["slow"]
+        plans = of_plans("slow")
     elif change == "more":
         stored["correction/fast/more"] = np.zeros(1)
     else:
         del stored["correction/fast/" + ("bias" if change == "less" else "middle")]
     with pytest.raises(ArtifactError, match="^here: expected corrections of plans among"):
         read_corrections(stored, plans, "here")
+
+
+def test_one_of_another_policy_is_refused_by_its_name() -> None:
+    stored = correction_arrays("fast", no_correction(6, (4, 2)))
+    with pytest.raises(ArtifactError, match="^here: fast: .*this policy needs"):
+        read_corrections(stored, of_plans("fast"), "here")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import MISSING, fields
 from typing import Any
 
@@ -10,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.correction import Correction
-from ..errors import ArtifactError
+from ..errors import ArtifactError, IllegalPlanError
+from .manifest import Manifest
 from .strict_json import REMEDY
 
 PREFIX = "correction/"
@@ -25,26 +26,32 @@ def correction_arrays(plan: str, correction: Correction) -> dict[str, npt.NDArra
     return {f"{PREFIX}{plan}/{name}": np.asarray(getattr(correction, name)) for name in names}
 
 
-def read_corrections(
-    stored: Mapping[str, npt.NDArray[Any]], plans: Collection[str], where: str
-) -> dict[str, Correction]:
+def read_corrections(stored: Mapping[str, npt.NDArray[Any]], manifest: Manifest, where: str) -> dict[str, Correction]:
     """The corrections among some arrays, by the name of the plan.
 
     Args:
         stored: arrays; those of other names are left alone.
-        plans: names of the artifact's plans.
+        manifest: of the artifact.
         where: for messages.
 
     Raises:
-        ArtifactError: a correction of no plan, or one that lacks a field or has another.
-        IllegalPlanError: its arrays do not fit each other.
+        ArtifactError: a correction of no plan, with too few or too many fields, or that does not fit the policy.
     """
     parts = {name.removeprefix(PREFIX): array for name, array in stored.items() if name.startswith(PREFIX)}
-    names = sorted({name.rpartition("/")[0] for name in parts})
-    wanted = {name: _OF_ALL + _OF_JUMPS * (f"{name}/{_OF_JUMPS[0]}" in parts) for name in names}
-    if not set(names) <= set(plans) or {f"{name}/{one}" for name in names for one in wanted[name]} != set(parts):
+    wanted = dict[str, tuple[str, ...]]()
+    for name in sorted({name.rpartition("/")[0] for name in parts}):
+        wanted[name] = (*_OF_ALL, *_OF_JUMPS) if f"{name}/{_OF_JUMPS[0]}" in parts else _OF_ALL
+    plans = set(manifest.plans)
+    if not wanted.keys() <= plans or {f"{name}/{one}" for name, of in wanted.items() for one in of} != set(parts):
         raise ArtifactError(
             f"{where}: expected corrections of plans among {sorted(plans)}, each with {', '.join(_OF_ALL)}, and"
             f" {', '.join(_OF_JUMPS)} if it has jumps; found {sorted(parts)}. {REMEDY}"
         )
-    return {name: Correction(**{one: parts[f"{name}/{one}"] for one in wanted[name]}) for name in names}
+    found = dict[str, Correction]()
+    for name, of in wanted.items():
+        try:
+            found[name] = Correction(**{one: parts[f"{name}/{one}"] for one in of})
+            found[name].require_fit(manifest.steps, manifest.spec.sample, manifest.condition_numbers)
+        except IllegalPlanError as error:
+            raise ArtifactError(f"{where}: {name}: {error} {REMEDY}") from error
+    return found

@@ -360,15 +360,12 @@ def _plans(directory: Path, manifest: Manifest) -> tuple[Mapping[str, PlanArray]
     expected = sorted(name for name, plan in manifest.plans.items() if not plan.pruned)
     if expected != sorted(schedules):
         raise ArtifactError(f"{where}: expected schedules {expected}; found {sorted(schedules)}. {REMEDY}")
-    name = "corrections"
-    try:
-        corrections = read_corrections(stored, manifest.plans, str(where))
-        for name, plan in schedules.items():
+    for name, plan in schedules.items():
+        try:
             check_schedule(name, plan, manifest)
-        for name in corrections:
-            corrections[name].require_fit(manifest.steps, manifest.spec.sample, manifest.condition_numbers)
-    except IllegalPlanError as error:
-        raise ArtifactError(f"{where}: {name}: {error} {REMEDY}") from error
+        except IllegalPlanError as error:
+            raise ArtifactError(f"{where}: {name}: {error} {REMEDY}") from error
+    corrections = read_corrections(stored, manifest, str(where))
     return MappingProxyType(schedules), MappingProxyType(corrections)
 
 
