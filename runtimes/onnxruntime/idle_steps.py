@@ -35,6 +35,7 @@ class IdleSteps:
 
     Attributes:
         total: what the steps add to the stream, of its shape; read by ``prepare``.
+        history: of the correction, ``[D, B, 4 T]``, as it is after the last step that was run.
     """
 
     def __init__(
@@ -58,16 +59,11 @@ class IdleSteps:
         self._parts, self._memory = parts, parts[before:]
         self._features = np.zeros((dimensions, streams, rows(sampler, horizon)), np.float32)
         first, last = 2 * horizon, FEATURES * horizon
-        self._history = self._features[:, :, first:last]
+        self.history = self._features[:, :, first:last]
         self._copies = [(_by_part(self._features[:, :, :first], horizon), parts[:2])]
         if len(parts) > 2:
             self._copies.append((_by_part(self._features[:, :, last:], horizon), parts[2:]))
         self._to_x0 = np.stack([sampler.sample_to_x0, sampler.out_to_x0], axis=1)[:, None]
-
-    @property
-    def history(self) -> FloatArray:
-        """The history as it is now, ``[D, B, 4 T]``."""
-        return self._history
 
     @property
     def nbytes(self) -> int:
@@ -78,14 +74,14 @@ class IdleSteps:
     def enter(self, sample: FloatArray, history: FloatArray, memory: FloatArray | None) -> None:
         """Take in the state before a step: ``[D, B, T]``, ``[D, B, 4 T]`` and, with memories, ``[D, B, S T]``."""
         np.copyto(self._parts[0], sample)
-        np.copyto(self._history, history)
+        np.copyto(self.history, history)
         if memory is not None:
             np.copyto(self._memory, _by_part(memory, self._horizon))
 
     def leave(self, sample: FloatArray, history: FloatArray, memory: FloatArray | None) -> None:
         """Give it out again, to the same arrays or others."""
         np.copyto(sample, self._parts[0])
-        np.copyto(history, self._history)
+        np.copyto(history, self.history)
         if memory is not None:
             np.copyto(_by_part(memory, self._horizon), self._memory)
 
@@ -136,7 +132,7 @@ class IdleSteps:
             if self._memories:
                 self._memory[...] = next_memory
             if anchors[k]:
-                remember(self._history, self._features[:, :, :horizon], self._features[:, :, horizon : 2 * horizon])
+                remember(self.history, self._features[:, :, :horizon], self._features[:, :, horizon : 2 * horizon])
 
 
 def _by_part(array: FloatArray, horizon: int) -> FloatArray:

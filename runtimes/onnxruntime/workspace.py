@@ -81,7 +81,7 @@ class Workspace:
         self._memory = [np.zeros((dimensions, streams, size), np.float32) for _ in range(2 * bool(size))]
         self._prediction = np.zeros_like(self.sample[0])
         self._known: Known | None = None
-        self._read = self._unread = np.zeros((streams, 0), np.float32)
+        self._read = np.zeros((streams, 0), np.float32)
         self.idle: IdleSteps | None = None
         if IDLE in manifest.pieces:
             self.idle = IdleSteps(sessions[IDLE], self._sampler, manifest.spec.sample, streams, shape)
@@ -109,7 +109,7 @@ class Workspace:
             self._memory[0].fill(0)
         fill_offset(self._offset, self._sampler, noise, correction)
         self._contexts.fill(obs)
-        self._known, self._read = known, self._unread
+        self._known, self._read = known, np.zeros((self.streams, 0), np.float32)
         if correction is not None and correction.reads:
             self._read = correction.read(self._contexts.condition())
             self._offset += correction.from_condition(self._read)
@@ -142,12 +142,13 @@ class Workspace:
     def run_idle(self, first: int, stop: int) -> None:
         """Steps that all add the total that ``idle`` has been prepared for."""
         assert self.idle is not None
-        for k in range(first, stop):
-            if k in self._advance.correction.jumps:
-                self.idle.run(first, k + 1, self._advance.updates, self._offset, self._advance.anchors)
-                self._jump_from(k, self.idle.history)
-                first = k + 1
-        self.idle.run(first, stop, self._advance.updates, self._offset, self._advance.anchors)
+        rows = self._advance.updates, self._offset, self._advance.anchors
+        for anchor in self._advance.correction.jumps:
+            if first <= anchor < stop:
+                self.idle.run(first, anchor + 1, *rows)
+                self._jump_from(anchor, self.idle.history)
+                first = anchor + 1
+        self.idle.run(first, stop, *rows)
 
     def _jump_from(self, anchor: int, history: FloatArray) -> None:
         """What is added where the run of steps after an anchor ends: known now, and so a part of that step's offset."""

@@ -104,11 +104,15 @@ def jump(layers: Sequence[Tensor], read: Tensor, history: Tensor) -> Tensor:
         history: after the jump's anchor, ``[B, 4 T, D]``.
     """
     streams, width, dimensions = history.shape
-    value = torch.cat([read, history.transpose(1, 2).reshape(streams, -1)], 1)
-    for layer in layers[:-1]:
-        value = (value @ layer[:-1] + layer[-1]).relu()
-    added = value @ layers[-1][:-1] + layers[-1][-1]
+    added = through(layers, torch.cat([read, history.transpose(1, 2).reshape(streams, -1)], 1))
     return added.reshape(streams, dimensions, width // HISTORY).transpose(0, 1)
+
+
+def through(layers: Sequence[Tensor], value: Tensor) -> Tensor:
+    """``[B, I]`` through the layers of a jump, ``[B, D T]``."""
+    for layer in layers[:-1]:
+        value = torch.addmm(layer[-1], value, layer[:-1]).relu()
+    return torch.addmm(layers[-1][-1], value, layers[-1][:-1])
 
 
 def correct(

@@ -9,10 +9,11 @@ import torch
 from ttscompile.calibration import sparse_loop
 from ttscompile.calibration.calls import IntArray
 from ttscompile.calibration.fit_correction import fit_correction
-from ttscompile.calibration.jumps import FOLDS, Layers, applied, fit_jump
+from ttscompile.calibration.jumps import FOLDS, Layers, fit_jump
 from ttscompile.calibration.sparse_loop import SparseLoop
 from ttscompile.core.correction import HIDDEN
 from ttscompile.core.lattice import PlanArray
+from ttscompile.runtimes.reference.sampler import through
 
 from .tasks import MakeTask
 
@@ -31,7 +32,7 @@ def test_it_finds_what_is_not_linear() -> None:
     assert found is not None
     layers, added = found
     assert [tuple(layer.shape) for layer in layers] == [(9, HIDDEN), (HIDDEN + 1, HIDDEN), (HIDDEN + 1, 2)]
-    assert (missing - applied(layers, known)).square().mean() < 0.02 * missing.var()
+    assert (missing - through(layers, known)).square().mean() < 0.02 * missing.var()
     assert (missing - added).square().mean() < 0.05 * missing.var()
 
 
@@ -85,7 +86,7 @@ def test_calls_end_where_the_fitted_jumps_lead_them(
         draw = torch.Generator().manual_seed(seed)
         sizes = (known.shape[1], HIDDEN), (HIDDEN, HIDDEN), (HIDDEN, missing.shape[1])
         inner, middle, outer = (torch.randn(a + 1, b, generator=draw) / a for a, b in sizes)
-        return (inner, middle, outer), applied((inner, middle, outer), known)
+        return (inner, middle, outer), through((inner, middle, outer), known)
 
     monkeypatch.setattr(sparse_loop, "fit_jump", drawn_jump)
     some, others = (task.executor.select(task.calls, part) for part in (range(40), range(40, 60)))

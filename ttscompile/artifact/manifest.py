@@ -123,7 +123,7 @@ class FlopsRecord:
             pruned: whether the pruner ran to make it.
             correction: of the plan; its jumps are counted.
         """
-        fixed = 0 if correction is None else correction.flops
+        fixed = 0 if correction is None else correction.flops_of_jumps
         fixed += self.prologue + (self.pruner if pruned else 0) + len(plan) * (self.stem + self.tail)
         return fixed + plan_flops(plan, self.blocks)
 

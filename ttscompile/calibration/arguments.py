@@ -10,7 +10,7 @@ import numpy as np
 
 from ..artifact.load import load_artifact
 from ..artifact.manifest import Manifest
-from ..core.correction import FEATURES, MOST_OF_A_CHUNK
+from ..core.correction import FEATURES, may_jump
 from ..errors import CalibrationError
 from ..ir.program import Binding
 
@@ -78,7 +78,7 @@ def calls_to_learn_from(
         distils: whether weights are trained on them.
     """
     spec, most = manifest.spec, MOST_CALLS
-    if distils or (corrects and math.prod(spec.sample) <= MOST_OF_A_CHUNK):
+    if distils or (corrects and may_jump(spec.sample)):
         most = int(np.clip(ROOM // _context_bytes(manifest), MOST_CALLS, MOST_LEARNED))
     fewest = min(CALLS_A_FEATURE * (FEATURES * spec.sample[0] + 1), MOST_NEEDED) if corrects else FEWEST_CALLS
     return fewest, int(np.clip(EVALUATIONS_A_MINUTE / spec.sampler.steps * max_minutes, fewest, most))

@@ -231,7 +231,7 @@ def _train(student: Student, calls: Calls, state: StateFile, clock: Clock, bar: 
 
 def _score(artifact: Artifact, executor: Executor, schedule: PlanArray, calls: Calls) -> PlanScore:
     errors = Actions(artifact.manifest.spec).errors(executor.run(schedule, calls), calls.targets, units=True)
-    return PlanScore.of(errors, schedule[None], artifact.manifest.flops, False, executor.correction)
+    return PlanScore.of(errors, schedule[None], artifact.manifest.flops, pruned=False, correction=executor.correction)
 
 
 def _in_precision(artifact: Artifact, weights: Mapping[str, Any]) -> dict[str, Any]:

@@ -10,9 +10,7 @@ if the loop then ends nearer to the dense policy, with each call moved by jumps 
 
 from __future__ import annotations
 
-import math
-
-from ..core.correction import MOST_OF_A_CHUNK, Correction
+from ..core.correction import Correction, may_jump
 from ..core.lattice import PlanArray
 from .calls import Calls
 from .execute import Executor
@@ -30,7 +28,5 @@ def fit_correction(executor: Executor, plan: PlanArray, calls: Calls, reads: boo
         reads: whether it may read the observation.
     """
     loop = SparseLoop(executor, calls, None, reads=reads, whole=is_whole(plan))
-    if math.prod(calls.initial.shape[1:]) > MOST_OF_A_CHUNK:
-        return loop.correction(loop.end(plan))
-    nearest = min(loop.ends(plan), key=lambda place: float((place.fits - calls.targets).abs().mean()))
-    return loop.correction(nearest)
+    ends = loop.ends(plan) if may_jump(executor.artifact.manifest.spec.sample) else (loop.end(plan),)
+    return loop.correction(min(ends, key=lambda place: float((place.fitted_samples - calls.targets).abs().mean())))

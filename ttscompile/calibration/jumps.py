@@ -7,13 +7,15 @@ import torch
 from torch import Tensor
 
 from ..core.correction import HIDDEN
+from ..runtimes.reference.sampler import through
 from .calls import IntArray
 
 EPOCHS, BATCH = 60, 256
 """Passes over the calls, and calls an update: after twice as many it is no better."""
 
 RATE, DECAY = 2e-3, 0.3
-"""The largest step of AdamW, half a cosine from there to zero; and the decay of the weights."""
+"""The largest step of AdamW, which grows to that in the first third of the updates and falls to zero in the others; and
+the decay of the weights."""
 
 FOLDS = 4
 """Parts of the episodes; each call is judged by a network that was fitted on the other parts."""
@@ -43,18 +45,10 @@ def fit_jump(known: Tensor, missing: Tensor, episodes: IntArray, seed: int) -> t
     added = torch.zeros_like(missing)
     for fold in range(FOLDS):
         apart = torch.from_numpy(of_call % FOLDS == fold)
-        added[apart] = applied(_trained(known[~apart], missing[~apart], seed), known[apart])
+        added[apart] = through(_trained(known[~apart], missing[~apart], seed), known[apart])
     if not (missing - added).square().mean() < missing.square().mean():
         return None
     return _trained(known, missing, seed), added
-
-
-def applied(layers: Layers, known: Tensor) -> Tensor:
-    """What a jump adds, ``[n, D T]``."""
-    inner, middle, outer = layers
-    for layer in (inner, middle):
-        known = torch.addmm(layer[-1], known, layer[:-1]).relu()
-    return torch.addmm(outer[-1], known, outer[:-1])
 
 
 def _trained(known: Tensor, missing: Tensor, seed: int) -> Layers:
@@ -78,7 +72,7 @@ def _trained(known: Tensor, missing: Tensor, seed: int) -> Layers:
             for begin in range(0, len(known) - size + 1, size):
                 some = order[begin : begin + size]
                 adam.zero_grad()
-                (applied(layers, read[some]) - wanted[some]).square().mean().backward()  # type: ignore[no-untyped-call]
+                (through(layers, read[some]) - wanted[some]).square().mean().backward()  # type: ignore[no-untyped-call]
                 adam.step()
                 rates.step()
     inner, middle, outer = (layer.detach() for layer in layers)

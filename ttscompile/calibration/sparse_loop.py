@@ -5,9 +5,10 @@ A place in the loop is a value: several schedules can go on from one, and what t
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -16,10 +17,10 @@ from torch import Tensor
 
 from ..core.correction import Correction, components_of, groups_of, jumps_of, numbers_of
 from ..core.lattice import BoolArray, PlanArray, Source
-from ..runtimes.reference.sampler import correct, features
+from ..runtimes.reference.sampler import correct, features, through
 from .calls import Calls
 from .execute import Executor, State, workers
-from .jumps import Layers, applied, fit_jump
+from .jumps import Layers, fit_jump
 from .regression import Components, Solved, solve
 
 STREAMS = 64
@@ -51,7 +52,7 @@ class Place:
         judged: others, that only go along.
         solved: the corrections of the steps before.
         anchors: whether these steps are anchors.
-        jumps: those that ended so far, in order; None for one that was no better than none.
+        jumps: those that hold, by the step after which they were added.
     """
 
     step: int
@@ -59,7 +60,7 @@ class Place:
     judged: tuple[_Lane, ...]
     solved: tuple[Solved, ...] = ()
     anchors: tuple[bool, ...] = ()
-    jumps: tuple[Layers | None, ...] = ()
+    jumps: Mapping[int, Layers] = field(default_factory=dict)
 
     @property
     def samples(self) -> Tensor:
@@ -67,7 +68,7 @@ class Place:
         return torch.cat([lane.sample for lane in self.judged])
 
     @property
-    def fits(self) -> Tensor:
+    def fitted_samples(self) -> Tensor:
         """Those of the calls that corrections are fitted on, ``[N, T, D]``."""
         return torch.cat([lane.sample for lane in self.fitted])
 
@@ -147,32 +148,31 @@ class SparseLoop:
         """The same without jumps, and with those that hold on other episodes; one place twice where none does."""
         plain, plans = self.begin, plan.reshape(-1, *plan.shape[-2:])
         landings = set(jumps_of(anchors_of(plan)).values())
-        jumping, missed = None, self.begin.jumps
+        jumping = None  # while no jump has held, the two are one
         with workers() as pool:
             for k in range(plans.shape[1]):
                 jumping = jumping and self.after(jumping, plans[:, k], pool)
                 plain = self.after(plain, plans[:, k], pool)
                 if k in landings:
-                    jumped = self._jumped(jumping or replace(plain, jumps=missed))
-                    missed, held = jumped.jumps, any(layers is not None for layers in jumped.jumps)
-                    jumping = jumped if held else None
+                    jumping = self._jumped(jumping or plain) or jumping
         return plain, jumping or plain
 
-    def _jumped(self, place: Place) -> Place:
-        """The place after the jump that ends there, which is None if it does not hold."""
+    def _jumped(self, place: Place) -> Place | None:
+        """The place after the jump that ends there; None if that does not hold."""
         lanes = [lane.fork() for lane in (*place.fitted, *place.judged)]
         fitted, judged = tuple(lanes[: len(place.fitted)]), tuple(lanes[len(place.fitted) :])
         known = torch.cat([self._known, torch.cat([lane.history for lane in lanes])], 1)
         missing = torch.cat([lane.left for lane in fitted])
-        found = fit_jump(known[: len(missing)], missing, self._episodes, place.step - 1)
+        landing = place.step - 1
+        found = fit_jump(known[: len(missing)], missing, self._episodes, landing)
         if found is None:
-            return replace(place, jumps=(*place.jumps, None))
+            return None
         layers, added = found
-        added = torch.cat([added, applied(layers, known[len(missing) :])])
+        added = torch.cat([added, through(layers, known[len(missing) :])])
         ends = np.cumsum([len(lane.sample) for lane in lanes])[:-1].tolist()
         for lane, part in zip(lanes, added.tensor_split(ends), strict=True):
             lane.add(part)
-        return replace(place, fitted=fitted, judged=judged, jumps=(*place.jumps, layers))
+        return replace(place, fitted=fitted, judged=judged, jumps={**place.jumps, landing: layers})
 
     def correction(self, place: Place) -> Correction | None:
         """What was fitted, at the place after the last step of a loop with corrections; None if that is no numbers."""
@@ -185,13 +185,12 @@ class SparseLoop:
         biases = biases - np.einsum("f,fkdt->kdt", self._components.center, observed)[:, :, None]
         anchors, reading = np.array(place.anchors), self._components.reading
         without = Correction(anchors, weights, biases.astype(np.float32), reading, observed)
-        made = next((layers for layers in place.jumps if layers is not None), None)
-        if made is None:
+        if not place.jumps:
             return without
-        absent = tuple(torch.zeros_like(layer) for layer in made)
+        absent = tuple(torch.zeros_like(layer) for layer in next(iter(place.jumps.values())))
+        all_jumps = [place.jumps.get(landing, absent) for landing in jumps_of(anchors).values()]
         inner, middle, outer = (
-            np.stack([layer.numpy() for layer in column])
-            for column in zip(*(layers or absent for layers in place.jumps), strict=True)
+            np.stack([layer.numpy() for layer in column]) for column in zip(*all_jumps, strict=True)
         )
         inner[:, -1] -= self._components.center @ inner[:, : reading.shape[1]]
         found = (np.isfinite(layer).all() for layer in (inner, middle, outer))

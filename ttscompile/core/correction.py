@@ -123,11 +123,11 @@ class Correction:
         jumping = ((count, read + HISTORY * chunk + 1, HIDDEN), (count, HIDDEN + 1, HIDDEN), (count, HIDDEN + 1, chunk))
         shapes = tuple(array.shape for array in networks)
         known = shapes in (jumping, ((0, 0, 0),) * 3) and all(array.dtype == np.float32 for array in networks)
-        if not known or (len(self.inner) and not 0 < chunk <= MOST_OF_A_CHUNK):
+        if not known or (len(self.inner) and not may_jump((horizon, dimensions))):
             shown = ", ".join(f"{array.dtype}{list(array.shape)}" for array in networks)
             raise IllegalPlanError(
-                f"a correction with these anchors has {count} jumps of float32 {', '.join(map(str, jumping))}, or none"
-                f" of a chunk of more than {MOST_OF_A_CHUNK} numbers; found {shown}."
+                f"between these anchors jumps have layers float32 {', '.join(map(str, jumping))}, or there are none;"
+                f" there are none of a chunk of more than {MOST_OF_A_CHUNK} numbers; found {shown}."
             )
         if not all(np.isfinite(array).all() for array in (*arrays[1:], *networks)):
             raise IllegalPlanError("a correction holds numbers that are not finite. Calibrate the artifact again.")
@@ -143,8 +143,8 @@ class Correction:
         return {end: j for j, end in self.jumps.values()}
 
     @property
-    def flops(self) -> int:
-        """Of its jumps, for one stream. A call's record counts all else whether there is a correction or not."""
+    def flops_of_jumps(self) -> int:
+        """For one stream. The FLOPs of all else are in the policy's record, whether there is a correction or not."""
         return len(self.jumps) * jump_flops((self.weights.shape[3], self.bias.shape[1]), self.reads)
 
     @property
@@ -217,6 +217,11 @@ def jumps_of(anchors: npt.NDArray[np.bool_]) -> dict[int, int]:
     """The last step before the next anchor, by the anchor; without anchors that the next one follows at once."""
     steps = np.flatnonzero(anchors).tolist()
     return {anchor: after - 1 for anchor, after in pairwise(steps) if after - 1 > anchor}
+
+
+def may_jump(sample: tuple[int, int]) -> bool:
+    """Whether a correction of samples ``(T, D)`` may have jumps."""
+    return 0 < sample[0] * sample[1] <= MOST_OF_A_CHUNK
 
 
 def jump_flops(sample: tuple[int, int], read: int) -> int:

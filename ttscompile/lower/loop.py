@@ -314,11 +314,14 @@ class DenoisingLoop:
         value = flat if jumps.condition is None else jumping.op("Concat", jumps.condition, flat, axis=1)
         layers = [jumping.op("Gather", layer, j) for layer in (jumps.inner, jumps.middle, jumps.outer)]
         zero, last, end = (jumping.constant([n]) for n in (0, -1, 2**31 - 1))
-        for number, layer in enumerate(layers):
+
+        def affine(value: str, layer: str) -> str:
             matrix, row = (jumping.op("Slice", layer, *ends, zero) for ends in ((zero, last), (last, end)))
-            value = jumping.op("Add", jumping.op("MatMul", value, matrix), row)
-            value = value if number == 2 else jumping.op("Relu", value)
-        # [B, D T] to [D, B, T]
+            return jumping.op("Add", jumping.op("MatMul", value, matrix), row)
+
+        for layer in layers[:-1]:
+            value = jumping.op("Relu", affine(value, layer))
+        value = affine(value, layers[-1])  # [B, D T], as the offset is [D, B, T]
         shape = jumping.op("Concat", jumping.constant([0]), jumping.op("Shape", offset, start=0, end=1), last, axis=0)
         added = jumping.op("Transpose", jumping.op("Reshape", value, shape), perm=[1, 0, 2])
         jumped, same = jumping.op("Add", offset, added), staying.op("Identity", offset)

@@ -52,10 +52,10 @@ from ..core.correction import (
     INNER,
     JUMPS,
     MIDDLE,
-    MOST_OF_A_CHUNK,
     OBSERVED,
     OUTER,
     READING,
+    may_jump,
     no_correction,
     numbers_of,
 )
@@ -108,10 +108,10 @@ def lower_single_file(program: Program, models: Mapping[str, ModelProto], weight
         condition = contexts.condition()
         inputs += _condition_inputs(main, spec, numbers)
         offset = main.op("Add", offset, _observed(main, spec, condition))
-    jumping = math.prod(spec.sample) <= MOST_OF_A_CHUNK
-    if jumping:
+    jumps = None
+    if may_jump(spec.sample):
         inputs += _jump_inputs(main, spec, numbers)
-    jumps = Jumps(JUMPS, INNER, MIDDLE, OUTER, condition) if jumping else None
+        jumps = Jumps(JUMPS, INNER, MIDDLE, OUTER, condition)
     history, memories = _zeros(main, spec, streams, HISTORY), spec.sampler.memories
     memory = _zeros(main, spec, streams, memories) if memories else None
     loop = DenoisingLoop(main, program, models, weights, contexts)
