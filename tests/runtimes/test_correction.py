@@ -31,7 +31,8 @@ def test_runtimes_agree_on_random_corrections(toy_artifact: Artifact, streams: i
     written = np.zeros((streams, manifest.steps, len(manifest.groups)), np.bool_)
     # A correction adds six numbers for each action of the chunk: sample and prediction, now and at two anchors.
     terms = call_terms(toy_artifact) + manifest.steps * 6 * manifest.spec.sample[0]
-    for _ in range(4):  # some of these have jumps, and some of those end in steps without a computed block
+    jumps = 0
+    for _ in range(4):
         plans = np.stack([random_plan(rng, manifest.steps, manifest.groups, cells) for cells in written])
         obs, noise = random_inputs(toy_artifact, rng, streams)
         correction = random_correction(toy_artifact, rng)
@@ -39,6 +40,8 @@ def test_runtimes_agree_on_random_corrections(toy_artifact: Artifact, streams: i
         for each in ours:
             assert_equal_but_for_rounding(each, theirs, terms)
         written |= plans == Source.COMPUTE
+        jumps += len(correction.jumps)
+    assert jumps > 0
 
 
 @pytest.mark.parametrize("runtime", ["onnxruntime", "torch", "reference"])

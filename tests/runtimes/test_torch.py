@@ -371,7 +371,9 @@ def test_everything_of_a_call_is_on_its_device(make_artifact: MakeArtifact, vari
     offset = torch.zeros((5, channels, 2, horizon), device=device).unbind()
     entry = parts.tensor(manifest.blocks[0].type, 2)
     rollout = dict.fromkeys(np.flatnonzero(lowered.rollout).tolist(), entry)
-    made = denoise(network, lowered, np.ones((5, 5), np.bool_), advance, initial, offset, rollout)
+    read, _ = advance.of_condition(network.condition())
+    assert advance.jumps
+    made = denoise(network, lowered, np.ones((5, 5), np.bool_), advance, initial, offset, rollout, read)
     results = [made.sample, network.logits(), network.condition(), *made.residuals.values()]
     assert len(results) == 3 + np.count_nonzero(plan == Source.COMPUTE)
     assert {each.device.type for each in results} == {"meta"}

@@ -16,6 +16,7 @@ import torch
 
 import ttscompile
 from tests.rounding import PROMISED
+from tests.runtimes.plans import random_correction
 from ttscompile import Affine
 from ttscompile.artifact import tensors
 from ttscompile.artifact.golden import DIGITS, load_golden, load_golden_plans
@@ -209,6 +210,18 @@ def _with(artifact: Path, plan: np.ndarray, correction: Correction | None = None
     corrections = {} if correction is None else {"mine": correction}
     update_calibration(artifact, None, {"mine": plan}, "mine", {}, corrections=corrections, golden=record_plans)
     return artifact
+
+
+def test_a_jump_that_was_changed(artifact: Path) -> None:
+    """As it is, the plan holds; with another last layer the sample differs after the step that the jump is added to."""
+    correction = random_correction(load_artifact(artifact), np.random.default_rng(0))
+    landing = next(iter(correction.landings))
+    rungs = ttscompile.verify(_with(artifact, policy.sparse(), correction), calls=8).rungs
+    assert [rung.status for rung in rungs if rung.name == "plans"] == [PASSED]
+    with edited(artifact, "plans") as arrays:
+        arrays["correction/mine/outer"][0] += 0.1
+    rung = failure(artifact)
+    assert (rung.name, rung.step) == ("plans", landing)
 
 
 def test_a_plan_that_computes_everything_is_inert(artifact: Path) -> None:
