@@ -61,7 +61,7 @@ def denoise(
     initial: Tensor,
     offset: Sequence[Tensor],
     rollout: Mapping[int, Tensor],
-    read: Tensor | None = None,
+    read: Tensor | None,
     free: Tensor | None = None,
 ) -> Denoised:
     """All steps of a call in which every stream follows one plan.
