@@ -1,15 +1,17 @@
-"""The eager baseline is timed on the artifact's own policy, or not at all."""
+"""What takes part in a timing, what a turn is, and how times are written."""
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import numpy as np
 
 from tests.passes.specs import toy_spec
-from ttscompile import Affine
-from ttscompile.cli.timing import _different_statistics
+from ttscompile import Affine, Noise
+from ttscompile.cli.timing import Contestant, _different_statistics, measure
 from ttscompile.measure.units import ms
+from ttscompile.runtimes.random_calls import Observation
 
 
 def test_policies_of_one_shape_are_told_apart_by_their_statistics() -> None:
@@ -22,6 +24,26 @@ def test_policies_of_one_shape_are_told_apart_by_their_statistics() -> None:
     assert _different_statistics(observed, observed) == []
     assert _different_statistics(plain, observed) == ["observation 'obs'"]
     assert _different_statistics(acting, moved) == ["the action"]
+
+
+def test_of_several_calls_in_a_row_the_last_is_timed_and_all_have_one_observation() -> None:
+    seen: dict[str, list[float]] = {"slow at first": [], "quick": []}
+
+    def contestant(label: str) -> Contestant:
+        def call(obs: Observation, noise: Noise) -> None:
+            seen[label].append(float(obs["obs"].sum()))
+            time.sleep(0.02 if label == "slow at first" and len(seen[label]) % 3 else 0)
+
+        return Contestant(label, "dense", call, lambda: None, spec, None)
+
+    spec = toy_spec()
+    slow, quick = measure([contestant(label) for label in seen], runs=3, seed=0, warm_up=1, in_a_row=3)
+    assert len(slow.times_ms) == len(quick.times_ms) == 3
+    assert slow.median_ms < 15
+    for observations in seen.values():
+        assert len(observations) == 12
+        assert [len(set(observations[i : i + 3])) for i in range(0, 12, 3)] == [1] * 4
+        assert len(set(observations)) == 4
 
 
 def test_long_times_have_no_exponent() -> None:

@@ -10,7 +10,9 @@ import click
 
 from ttscompile.artifact.load import load_artifact
 from ttscompile.cli.options import (
+    MOST_RUNS,
     artifact_argument,
+    count_option,
     json_option,
     names_option,
     runs_option,
@@ -43,6 +45,13 @@ WORTH = 0.1
     " its rivals with the first."
 )
 @runs_option("Calls of each contestant that are counted.")
+@count_option(
+    "--in-a-row",
+    "Calls that a contestant makes in its turn; the last one counts. Before the first, what the others did has taken"
+    " the processor's caches, as a robot's other work does.",
+    default=1,
+    most=MOST_RUNS,
+)
 @click.option("--plan", type=TEXT, help="Plan of the compiled policy. Without this option its default plan runs.")
 @runtime_options
 @click.option(
@@ -73,6 +82,7 @@ def bench(
     directory: Path,
     threads: tuple[int, ...],
     runs: int,
+    in_a_row: int,
     plan: str | None,
     runtime: str,
     device: str | None,
@@ -99,7 +109,13 @@ def bench(
     if entered[0].plan == "dense":
         say(console, f"warning: {directory} runs dense: it is not calibrated, or --plan dense was given.")
     with console.status("timing") as status:
-        measured = measure(entered, runs, seed, lambda done, total: status.update(f"timing: round {done} of {total}"))
+        measured = measure(
+            entered,
+            runs,
+            seed,
+            lambda done, total: status.update(f"timing: round {done} of {total}"),
+            in_a_row=in_a_row,
+        )
     error = None
     if runtime == "torch" and precision not in (None, FP32):
         with console.status(f"comparing actions in {precision} and {FP32}"):
@@ -108,7 +124,7 @@ def bench(
     timed = dict(zip(threads, (m.median_ms for m in measured), strict=False))
     if as_json:
         of = {"identity": identity, "machine": fingerprint(), "threads": threads[0], "runs": runs, "runtime": runtime}
-        of |= {"best_threads": fewest_threads(timed)}
+        of |= {"best_threads": fewest_threads(timed), "in_a_row": in_a_row}
         of |= {"device": device or CPU, "precision_error": error and asdict(error)}
         print_json(of | {"contestants": [m.to_json() for m in measured]})
         return
@@ -121,6 +137,8 @@ def bench(
         f"Medians of {runs} calls, one stream, {threads[0]} thread{'s' * (threads[0] > 1)}; plan {entered[0].plan!r}."
         " Speed-up: how many times faster the first row is. Prologue and pruner: their ms of the call.",
     )
+    if in_a_row > 1:
+        say(output, f"A contestant makes {in_a_row} calls in a row, of which the last counts: its caches are warm.")
     if len(threads) > 1:
         best = fewest_threads(timed)
         say(output, f"Load it with threads={best}: more of these save less than {WORTH:.0%} of a call.")
