@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 from math import inf, isfinite
+from numbers import Real
 from typing import TYPE_CHECKING, Any, Protocol
 
 from ttscompile.core.given import integer
@@ -120,10 +121,10 @@ class ExecutorSettings:
             object.__setattr__(self, "cores", cores)
         for name in ("policy_hz", "max_age"):
             value = getattr(self, name)
-            if value is not None and not 0 < value < inf:
-                raise ExecutorError(f"{name} must be positive and finite; found {value}.")
-        if not 0 < self.rate_tolerance < 0.5:
-            raise ExecutorError(f"rate_tolerance must be between 0 and 0.5 periods; found {self.rate_tolerance}.")
+            if value is not None:
+                _require_positive(value, name)
+        if not isinstance(self.rate_tolerance, Real) or not 0 < self.rate_tolerance < 0.5:
+            raise ExecutorError(f"rate_tolerance must be between 0 and 0.5 periods; found {self.rate_tolerance!r}.")
         if self.interpolation not in INTERPOLATIONS:
             raise ExecutorError(f"interpolation must be one of {INTERPOLATIONS}; found {self.interpolation!r}.")
         if self.seam not in SEAMS:
@@ -131,6 +132,11 @@ class ExecutorSettings:
         text = isinstance(self.tiers, str)  # whose letters would be taken for names
         if self.tiers is not None and (text or not self.tiers or len(set(self.tiers)) < len(self.tiers)):
             raise ExecutorError(f"tiers must be a tuple of names of plans, each once; found {self.tiers!r}.")
+
+
+def _require_positive(value: object, name: str) -> None:
+    if not isinstance(value, Real) or not 0 < float(value) < inf:
+        raise ExecutorError(f"{name} must be a number, positive and finite; found {value!r}.")
 
 
 @dataclass(frozen=True)
@@ -174,8 +180,7 @@ def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> 
     Raises:
         ExecutorError: they do not fit.
     """
-    if not 0 < control_hz < inf:
-        raise ExecutorError(f"control_hz must be positive and finite; found {control_hz}.")
+    _require_positive(control_hz, "control_hz")
     policy_hz = settings.policy_hz or control_hz
     ticks = control_hz / policy_hz
     ticks_per_step = round(ticks) if isfinite(ticks) else 0

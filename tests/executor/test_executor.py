@@ -289,9 +289,11 @@ def test_the_guard_refuses_and_the_loop_goes_on_with_what_it_has() -> None:
 @pytest.mark.parametrize(
     ("made", "message"),
     [
-        ({"policy_hz": -1}, "policy_hz must be positive"),
-        ({"max_age": inf}, "max_age must be positive and finite"),
+        ({"policy_hz": -1}, "policy_hz must be a number, positive"),
+        ({"max_age": inf}, "max_age must be a number, positive and finite"),
+        ({"policy_hz": "10"}, "policy_hz must be a number, positive and finite; found '10'"),
         ({"max_hold": -1}, "max_hold must be an integer of at least 0"),
+        ({"rate_tolerance": "0.3"}, "rate_tolerance must be between 0 and 0.5 periods; found '0.3'"),
         ({"rate_tolerance": 0.5}, "rate_tolerance must be between"),
         ({"seam": "glue"}, "seam must be one of"),
         ({"interpolation": "cubic"}, "interpolation must be one of"),
@@ -308,8 +310,9 @@ def test_settings_are_checked(made: dict[str, object], message: str) -> None:
 @pytest.mark.parametrize(
     ("made", "hz", "message"),
     [
-        ({}, 0, "control_hz must be positive"),
-        ({}, inf, "control_hz must be positive and finite"),
+        ({}, 0, "control_hz must be a number, positive"),
+        ({}, inf, "control_hz must be a number, positive and finite"),
+        ({}, "10", "control_hz must be a number, positive and finite; found '10'"),
         ({"policy_hz": 1e-320}, 10, "no multiple of policy_hz"),
         ({"policy_hz": 20}, 50, "no multiple of policy_hz = 20: an action would last 2.5 ticks"),
         ({"policy_hz": 20}, 10, "no multiple"),
