@@ -15,7 +15,7 @@ from ttscompile.calibration import regression
 from ttscompile.calibration.fit_correction import fit_correction
 from ttscompile.calibration.sparse_loop import anchors_of
 from ttscompile.calibration.task import Found, Task
-from ttscompile.calibration.whole_steps import WholeSteps, _set_apart
+from ttscompile.calibration.whole_steps import WholeSteps, _set_apart, _sizes
 from ttscompile.core.lattice import PlanArray, Source, dense_plan, uniform_plan
 from ttscompile.errors import CalibrationError
 
@@ -127,6 +127,11 @@ def test_a_plan_that_reads_earlier_calls_is_not_corrected(make_task: MakeTask, p
 
 def test_calls_of_one_episode_do_not_tell_whether_reading_helps(make_task: MakeTask) -> None:
     assert make_task(calls=60, episodes=range(1)).whole.reads(2) is False
+
+
+def test_where_there_are_many_calls_candidates_see_more_of_them() -> None:
+    assert _sizes(100) == _sizes(3072) == (384, 128)
+    assert _sizes(12_288) == (1536, 512)
 
 
 def test_schedules_are_compared_on_other_episodes_than_they_were_fitted_on() -> None:
