@@ -219,7 +219,7 @@ def _train(student: Student, calls: Calls, state: StateFile, clock: Clock, bar: 
         with state.reading():
             student.restore(state.get("student"), done)
     bar.stage("distil", updates, done)
-    first = clock.elapsed()
+    first = float(state.progress.setdefault("training began", clock.elapsed()))  # the rate falls with what it has taken
     for _ in clock.in_time(range(done, updates)):
         loss = student.update(lesson, (clock.elapsed() - first) / max(clock.limit - first, 1e-9))
         bar.update(student.done, f"loss {loss:.2e}", clock.left())

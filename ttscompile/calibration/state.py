@@ -162,8 +162,9 @@ def _members(array: Array | None, name: str) -> dict[str, Any]:
 def _check_progress(progress: Value) -> None:
     """Raise unless the numbers that all work of a kind reads are such numbers."""
     members = progress.members()
-    if "seconds" in members and members["seconds"].number() < 0:
-        members["seconds"].fail("a time that is not negative")
+    for name in {"seconds", "training began"} & set(members):
+        if members[name].number() < 0:
+            members[name].fail("a time that is not negative")
     for name in {"calls", "intervals", "updates", "calibration targets", "validation targets"} & set(members):
         members[name].integer()
     if "latency" in members:
