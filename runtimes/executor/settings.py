@@ -123,8 +123,7 @@ class ExecutorSettings:
             value = getattr(self, name)
             if value is not None:
                 _require_positive(value, name)
-        if not isinstance(self.rate_tolerance, Real) or not 0 < self.rate_tolerance < 0.5:
-            raise ExecutorError(f"rate_tolerance must be between 0 and 0.5 periods; found {self.rate_tolerance!r}.")
+        _require_positive(self.rate_tolerance, "rate_tolerance", 0.5, "between 0 and 0.5 periods")
         if self.interpolation not in INTERPOLATIONS:
             raise ExecutorError(f"interpolation must be one of {INTERPOLATIONS}; found {self.interpolation!r}.")
         if self.seam not in SEAMS:
@@ -134,9 +133,9 @@ class ExecutorSettings:
             raise ExecutorError(f"tiers must be a tuple of names of plans, each once; found {self.tiers!r}.")
 
 
-def _require_positive(value: object, name: str) -> None:
-    if not isinstance(value, Real) or not 0 < float(value) < inf:
-        raise ExecutorError(f"{name} must be a number, positive and finite; found {value!r}.")
+def _require_positive(value: object, name: str, below: float = inf, wanted: str = "positive and finite") -> None:
+    if isinstance(value, bool) or not isinstance(value, Real) or not 0 < float(value) < below:
+        raise ExecutorError(f"{name} must be a number, {wanted}; found {value!r}.")
 
 
 @dataclass(frozen=True)

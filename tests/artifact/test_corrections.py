@@ -33,12 +33,15 @@ def test_what_is_stored_is_read_again() -> None:
 
 
 def test_jumps_that_read_nothing_of_the_condition_have_inputs_for_it_in_a_single_file() -> None:
-    blind = replace(jumping(FIVE, read=0), reading=np.zeros((0, 0), np.float32))  # as calibration makes it
+    blind = jumping(FIVE, read=0)
     found = read_corrections(correction_arrays("fast", blind), of_plans("fast"), "here")["fast"]
     inner = found.inputs()["correction_inner"]
     assert inner.shape == (1, 7 + 4 * 4 * 2 + 1, 128)
     assert not inner[:, :7].any()
     np.testing.assert_array_equal(inner[:, 7:], blind.inner)
+    unknown = replace(blind, reading=np.zeros((0, 0), np.float32))
+    with pytest.raises(ArtifactError, match="^here: fast: .*0 numbers of the condition.*this policy has 7"):
+        read_corrections(correction_arrays("fast", unknown), of_plans("fast"), "here")
 
 
 def test_one_without_jumps_has_no_arrays_for_them() -> None:

@@ -21,7 +21,7 @@ from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import DENSE, DISTILLED, MANIFEST
 from ttscompile.artifact.write import update_calibration
 from ttscompile.calibration import student
-from ttscompile.calibration.distill import Distilled, distill
+from ttscompile.calibration.distill import SAVED, Distilled, distill
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.state import FILE
 from ttscompile.cli import main
@@ -206,6 +206,26 @@ def test_a_distillation_that_was_killed_goes_on_to_the_same_bytes(
     assert load_artifact(copied).manifest.identity == before  # the artifact works as it did
     train(copied, recording, resume=True)
     assert contents(copied) == contents(distilled[0])
+
+
+def test_the_rate_of_a_distillation_that_goes_on_is_not_what_it_began_with(
+    copied: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    update, passed = student.Student.update, list[float]()
+
+    def told(self: student.Student, lesson: student.Lesson, share: float) -> float:
+        passed.append(share)
+        if len(passed) == SAVED + 2:
+            raise KeyboardInterrupt
+        return update(self, lesson, share)
+
+    monkeypatch.setattr(student.Student, "update", told)
+    with pytest.raises(KeyboardInterrupt):
+        train(copied, recording)
+    train(copied, recording, resume=True)
+    saved, went_on = passed[SAVED - 1], passed[SAVED + 2 :]
+    assert len(went_on) == UPDATES - SAVED
+    assert passed[0] < saved < went_on[0]
 
 
 def test_an_interrupted_calibration_and_an_interrupted_distillation_do_not_know_each_other(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import MISSING, fields, replace
+from dataclasses import MISSING, fields
 from typing import Any
 
 import numpy as np
@@ -50,11 +50,8 @@ def read_corrections(stored: Mapping[str, npt.NDArray[Any]], manifest: Manifest,
     found = dict[str, Correction]()
     for name, of in wanted.items():
         try:
-            correction = Correction(**{one: parts[f"{name}/{one}"] for one in of})
-            if correction.jumps and not correction.reads:  # in a single file they have inputs for the condition still
-                correction = replace(correction, reading=np.zeros((manifest.condition_numbers, 0), np.float32))
-            correction.require_fit(manifest.steps, manifest.spec.sample, manifest.condition_numbers)
-            found[name] = correction
+            found[name] = Correction(**{one: parts[f"{name}/{one}"] for one in of})
+            found[name].require_fit(manifest.steps, manifest.spec.sample, manifest.condition_numbers)
         except IllegalPlanError as error:
             raise ArtifactError(f"{where}: {name}: {error} {REMEDY}") from error
     return found

@@ -96,11 +96,12 @@ class SparseLoop:
         self, executor: Executor, fitted: Calls | None, judged: Calls | None, *, reads: bool, whole: bool
     ) -> None:
         self._components: Components | None = None
-        self._groups, self._known = 0, torch.empty(0, 0)
+        self._groups, self._numbers, self._known = 0, 0, torch.empty(0, 0)
         if fitted is not None:
             steps, sample = executor.model.steps, (fitted.initial.shape[1], fitted.initial.shape[2])
             condition = executor.model.condition(fitted.contexts)
-            most = components_of(steps, sample, numbers_of([tuple(condition.shape[1:])])) if reads else 0
+            self._numbers = numbers_of([tuple(condition.shape[1:])])
+            most = components_of(steps, sample, self._numbers) if reads else 0
             self._components, self._groups = Components.of(condition, most), groups_of(steps, sample)
             others = [] if judged is None else [self._components.of_others(executor.model.condition(judged.contexts))]
             self._known = torch.cat([self._components.values, *others]).float()
@@ -194,7 +195,9 @@ class SparseLoop:
         )
         inner[:, -1] -= self._components.center @ inner[:, : reading.shape[1]]
         found = (np.isfinite(layer).all() for layer in (inner, middle, outer))
-        return replace(without, inner=inner, middle=middle, outer=outer) if all(found) else None
+        if not reading.shape[1]:
+            reading = np.zeros((self._numbers, 0), np.float32)
+        return replace(without, reading=reading, inner=inner, middle=middle, outer=outer) if all(found) else None
 
 
 class _Lane:

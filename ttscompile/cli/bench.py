@@ -10,7 +10,6 @@ import click
 
 from ttscompile.artifact.load import load_artifact
 from ttscompile.cli.options import (
-    MOST_RUNS,
     artifact_argument,
     count_option,
     json_option,
@@ -34,6 +33,9 @@ RIVALS = ("original", "eager", "onnxruntime-dense", "onnxruntime")
 """The checkpoint with the sampler it was saved with; with the artifact's; the artifact computed in full; and the same
 plan of it on the CPU, for --runtime torch."""
 
+MOST_IN_A_ROW = 100
+"""Calls of a turn, whose observations are drawn before it."""
+
 WORTH = 0.1
 """Share of a call's time that more threads have to save: they take their cores from the rest of the robot."""
 
@@ -49,8 +51,7 @@ WORTH = 0.1
     "--in-a-row",
     "Calls that a contestant makes in its turn; the last one counts. Before the first, what the others did has taken"
     " the processor's caches, as a robot's other work does.",
-    default=1,
-    most=MOST_RUNS,
+    most=MOST_IN_A_ROW,
 )
 @click.option("--plan", type=TEXT, help="Plan of the compiled policy. Without this option its default plan runs.")
 @runtime_options

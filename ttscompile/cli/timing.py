@@ -169,8 +169,8 @@ def measure(
 ) -> list[Measurement]:
     """Time the contestants in turn, so that whatever else the machine does hits all of them.
 
-    What the others did in between has the processor's caches, as a robot's other work does. Of several calls in a row
-    the last one finds there what the one before it read.
+    What the others do in between takes the processor's caches, as a robot's other work does. Of several calls in a row
+    the last one finds in them the weights that the one before it read.
 
     Args:
         entered: at least one; those of one specification get the same observations and noise.
@@ -187,7 +187,7 @@ def measure(
     reports: list[list[Any]] = [[] for _ in entered]
     specs = {id(one.spec): one.spec for one in entered}
     for number in range(warm_up + runs):
-        # Each call sees frames of its own: those that are known cost a compiled policy nothing.
+        # Each call has frames of its own: those that are known would cost a compiled policy nothing.
         numbers = range(number * in_a_row, (number + 1) * in_a_row)
         calls = {name: [random_call(spec, each, seed) for each in numbers] for name, spec in specs.items()}
         for i in timer.round():

@@ -81,7 +81,8 @@ class Correction:
         anchors: bool ``[K]``; after these steps sample and prediction enter the history.
         weights: float32 ``[K, G, 6 T, T]``; G is the number of action dimensions, or 1 where they share.
         bias: float32 ``[K, D, 1, T]``.
-        reading: float32 ``[N, F]``; from the condition's N numbers to the F that are read. F is 0 where none are.
+        reading: float32 ``[N, F]``; from the condition's N numbers to the F that are read. F is 0 where none are; N is
+            what it is all the same where there are jumps, which a single ONNX file has read the condition itself.
         observed: float32 ``[F, K, D, T]``; what each of these adds to the sample of every step.
         inner: float32 ``[J, F + 4 T D + 1, H]``; J is the number of jumps, or 0 where there are none.
         middle: float32 ``[J, H + 1, H]``.
@@ -164,7 +165,7 @@ class Correction:
                 f"the correction has weights {list(self.weights.shape)}; this policy needs {list(expected)}."
             )
         found, wanted = (len(self.reading), self.observed.shape[2]), (numbers, sample[1])
-        if self.reads > components_of(steps, sample, numbers) or (self.reads and found != wanted):
+        if self.reads > components_of(steps, sample, numbers) or ((self.reads or self.jumps) and found != wanted):
             raise IllegalPlanError(
                 f"the correction reads {self.reads} combinations of {found[0]} numbers of the condition for"
                 f" {found[1]} action dimensions; this policy has {numbers} such numbers and {sample[1]} dimensions."
