@@ -1,6 +1,6 @@
 """What callers give, checked against the policy's specification. Imports no torch.
 
-Everything comes through ``core.given.plain`` first, so that what is checked here is what is computed with.
+Everything comes through ``core.coercion.plain`` first, so that what is checked here is what is computed with.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.core.given import integer, is_tensor, plain
+from ttscompile.core.coercion import integer, is_tensor, plain
 from ttscompile.core.images import fitted
 from ttscompile.core.spec import FloatArray, Noise, ObservationSpec, PolicySpec
 from ttscompile.core.values import check_numbers, check_values

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ttscompile.core.coercion import plain
 from ttscompile.core.correction import groups_of
-from ttscompile.core.given import plain
 from ttscompile.core.spec import ChunkSpec, FloatArray, PolicySpec, SamplerTable
 from ttscompile.core.values import check_numbers
 from ttscompile.errors import ObservationError

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ttscompile.artifact.load import Artifact
-from ttscompile.core.given import integer
+from ttscompile.core.coercion import integer
 from ttscompile.core.spec import BF16, FP16, FP32
 from ttscompile.errors import RuntimeUnavailableError
 

@@ -327,7 +327,7 @@ def test_the_policy_family_of_the_contributing_guide(tmp_path: Path, monkeypatch
 def test_the_strategy_of_the_contributing_guide(once: Once, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The module, its row and its test as they stand in the guide."""
     written, row, its_test = guide("A strategy")
-    contributed(written, "ttscompile.calibration.published.ends", tmp_path, monkeypatch)
+    contributed(written, "ttscompile.rivals.ends", tmp_path, monkeypatch)
     monkeypatch.setattr(strategies, "STRATEGIES", (*strategies.STRATEGIES, eval(row, vars(strategies))))
     test = contributed(its_test, "contributed_test", tmp_path, monkeypatch)
     make_task = partial(tasks.make_task, policies.compiled(once), policies.record(tmp_path / "calls.npz"))

@@ -17,7 +17,7 @@ from .artifact.load import load_artifact
 from .artifact.write import require_replaceable, write_artifact
 from .capture.export import capture
 from .capture.narrow import narrow, unneeded
-from .core.given import integer
+from .core.coercion import integer
 from .core.paths import on_hub, require_free_or_path
 from .core.spec import AUTO, FP32, INT8, PolicySpec
 from .errors import ArtifactError, LoweringError, NoResidualBlocksError, PassError, SpecError

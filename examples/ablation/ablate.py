@@ -39,7 +39,7 @@ from ttscompile.calibration.calls import (
 )
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.judge import dense_with_other_noise, uniform_of
-from ttscompile.calibration.published.paper import UPDATES, Paper
+from ttscompile.calibration.pruner.paper import UPDATES, Paper
 from ttscompile.calibration.search import search_plan
 from ttscompile.calibration.targets import REPEATS, dense_rounds
 from ttscompile.calibration.task import Clock, Found, Search, Task

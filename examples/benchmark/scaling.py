@@ -21,11 +21,11 @@ import torch
 
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.calls import Calls, prepare_calls
-from ttscompile.calibration.crowded import crowded_family
 from ttscompile.calibration.execute import Executor
-from ttscompile.calibration.pool import RayPool
+from ttscompile.calibration.step_counts import crowded_family
 from ttscompile.calibration.targets import dense_rounds
 from ttscompile.calibration.task import Task
+from ttscompile.pool import RayPool
 from ttscompile.runtimes.random_calls import random_calls
 from ttscompile.trajectories.episodes import Episode
 

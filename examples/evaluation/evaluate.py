@@ -42,9 +42,9 @@ from variants import (
 )
 
 from ttscompile.artifact.manifest import abbreviated
-from ttscompile.calibration.pool import RayPool
 from ttscompile.cli.options import ray_option
 from ttscompile.measure.machine import fingerprint, one_line
+from ttscompile.pool import RayPool
 
 TIMED_CALLS = 15
 

@@ -13,7 +13,7 @@ from episodes import Episodes
 from rollout import Episode, run_episodes
 from variants import Variant, open_variant
 
-from ttscompile.calibration.pool import Pool, Work
+from ttscompile.pool import Pool, Work
 
 Part = tuple[str, list[int]]
 """A variant, as ``open_variant`` takes it, and seeds."""
@@ -22,7 +22,7 @@ _opened = lru_cache(open_variant)  # one for each process
 
 
 class Processes:
-    """A pool of processes of this machine; see ``ttscompile.calibration.pool``.
+    """A pool of processes of this machine; see ``ttscompile.pool``.
 
     Args:
         count: of them.

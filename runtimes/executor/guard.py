@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ttscompile.core.given import numbers
+from ttscompile.core.coercion import numbers
 from ttscompile.core.spec import Affine, FloatArray
 from ttscompile.errors import ExecutorError
 

@@ -7,7 +7,7 @@ from math import inf, isfinite
 from numbers import Real
 from typing import TYPE_CHECKING, Any, Protocol
 
-from ttscompile.core.given import integer
+from ttscompile.core.coercion import integer
 from ttscompile.errors import ExecutorError
 
 from .feasibility import Feasibility

@@ -1,6 +1,6 @@
 """The server that a fleet of robots asks: it checks what they send, and lets the copies of the policy answer.
 
-``executor.listener`` says who may come in. A robot is a client and has one request at a time; those of many robots are
+``server.listener`` says who may come in. A robot is a client and has one request at a time; those of many robots are
 under way together, and copies answer those of one plan in batches (``copies``).
 """
 
@@ -22,13 +22,13 @@ from ttscompile.errors import (
     ObservationError,
     OverloadedError,
 )
-from ttscompile.runtimes.executor.limits import ServerLimits
-from ttscompile.runtimes.executor.listener import Listener
-from ttscompile.runtimes.executor.lock import Lock
-from ttscompile.runtimes.executor.metrics import Metric
-from ttscompile.runtimes.executor.protocol import Request, read_arrays
 from ttscompile.runtimes.executor.window import Array
 from ttscompile.runtimes.liveness import reading_earlier_calls
+from ttscompile.runtimes.server.limits import ServerLimits
+from ttscompile.runtimes.server.listener import Listener
+from ttscompile.runtimes.server.lock import Lock
+from ttscompile.runtimes.server.metrics import Metric
+from ttscompile.runtimes.server.protocol import Request, read_arrays
 
 METHODS = {"info": frozenset[str](), "predict": frozenset({"obs", "plan"})}
 

@@ -14,16 +14,16 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration import budget as budgets
 from ttscompile.calibration import pipeline
 from ttscompile.calibration.budget import Goal, cells_of, goal_of, measure_budget
-from ttscompile.calibration.crowded import CrowdedSchedules, budget_of_error
-from ttscompile.calibration.oracle import oracle
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.progress import Bar
 from ttscompile.calibration.result import CalibrationResult
 from ttscompile.calibration.state import FILE, StateFile
+from ttscompile.calibration.step_counts import CrowdedSchedules, budget_of_error
 from ttscompile.calibration.task import Clock
 from ttscompile.calibration.whole_steps import Errors, WholeSteps
 from ttscompile.core.lattice import Source
 from ttscompile.errors import CalibrationError, CalibrationFailedError
+from ttscompile.rivals.oracle import oracle
 
 from .killed import killed
 
@@ -224,7 +224,7 @@ def test_of_one_step_nothing_can_be_reused(artifact: Path, recording: Path, monk
     for asked in ({"max_action_error": 1.0}, {"latency_ms": 1.0}, {"target_sparsity": 0.5}, {}):
         with pytest.raises(CalibrationError, match="one denoising step, which every plan computes"):
             quick(artifact, recording, **asked)
-    monkeypatch.setattr(sys.modules["ttscompile.calibration.oracle"], "load_artifact", lambda _: single)
+    monkeypatch.setattr(sys.modules["ttscompile.rivals.oracle"], "load_artifact", lambda _: single)
     with pytest.raises(CalibrationError, match="1 denoising step; expected three at least"):
         oracle(artifact, [recording], 2)
 

@@ -16,11 +16,11 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.calls import split_episodes
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.pipeline import calibrate
-from ttscompile.calibration.published import bac, static
 from ttscompile.calibration.result import CalibrationResult
 from ttscompile.calibration.state import FILE
 from ttscompile.core.lattice import Source, uniform_plan
 from ttscompile.errors import ArtifactError, CalibrationError, CalibrationFailedError
+from ttscompile.rivals import bac, static
 
 from . import policies
 from .killed import killed

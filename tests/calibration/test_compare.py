@@ -22,8 +22,8 @@ from ttscompile.artifact.settle import settle
 from ttscompile.artifact.tokens import ReuseRecord
 from ttscompile.artifact.write import update_calibration
 from ttscompile.calibration.compare import _require_same_policy, compare
+from ttscompile.calibration.saved_searches import Searches
 from ttscompile.calibration.search import plan_of
-from ttscompile.calibration.searches import Searches
 from ttscompile.calibration.state import StateFile
 from ttscompile.calibration.task import Found, Task
 from ttscompile.cli import main

@@ -22,13 +22,13 @@ from ttscompile.calibration.arguments import MOST_CALLS, MOST_LEARNED, calls_to_
 from ttscompile.calibration.budget import _pruner_ms
 from ttscompile.calibration.calls import LARGEST, Actions, split_episodes
 from ttscompile.calibration.compare import _error, compare
-from ttscompile.calibration.crowded import CrowdedSchedules
 from ttscompile.calibration.distill import distill
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.progress import Bar
 from ttscompile.calibration.search import open_search, search_plan
 from ttscompile.calibration.state import FILE, StateFile
+from ttscompile.calibration.step_counts import CrowdedSchedules
 from ttscompile.calibration.strategies import FITTED, NAMES, strategy_of
 from ttscompile.calibration.targets import draw_calls, with_targets
 from ttscompile.calibration.task import Clock

@@ -10,7 +10,7 @@ import pytest
 
 import ttscompile
 from ttscompile.artifact.load import load_artifact
-from ttscompile.calibration import crowded
+from ttscompile.calibration import step_counts
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.result import CalibrationResult
 from ttscompile.core.lattice import Source
@@ -92,7 +92,7 @@ def test_a_plan_that_is_no_safer_is_left_out_with_the_reason(
     artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The time limit ends the search for ``safe`` at its first candidate, which is bad."""
-    monkeypatch.setattr(crowded.CrowdedSchedules, "best", lambda *_: crowded.Best(tuple(range(8)), 1.0))
+    monkeypatch.setattr(step_counts.CrowdedSchedules, "best", lambda *_: step_counts.Best(tuple(range(8)), 1.0))
     result = calibrate(artifact, [recording], 0.6, progress=False, max_minutes=1)
     assert "safe" not in result.plans
     assert result.skipped["safe"].endswith("off, no safer than schedule: its search was cut short")

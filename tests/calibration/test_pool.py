@@ -17,8 +17,8 @@ import ttscompile
 from tests.once import Once
 from ttscompile.calibration import pipeline
 from ttscompile.calibration.compare import compare
-from ttscompile.calibration.pool import Here, RayPool, Work
 from ttscompile.errors import ClusterError, RuntimeUnavailableError
+from ttscompile.pool import Here, RayPool, Work
 
 from . import policies
 
@@ -135,7 +135,7 @@ def test_a_comparison_whose_cluster_goes_goes_on_in_this_process(
 
 
 def test_another_artifact_on_a_machine_of_the_cluster_is_refused(artifact: Path, tmp_path: Path) -> None:
-    from ttscompile.calibration.pool import artifact_elsewhere
+    from ttscompile.pool import artifact_elsewhere
 
     with pytest.raises(ttscompile.errors.CalibrationError, match="has another artifact there"):
         artifact_elsewhere(str(artifact), "another")

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 import ttscompile
-from ttscompile.calibration.published import evo, gates, online, paper
+from ttscompile.calibration.pruner import paper
 from ttscompile.calibration.search import open_search, plan_of
 from ttscompile.calibration.strategies import DEFAULT, FITTED, NAMES, STRATEGIES, Strategy, strategy_of
 from ttscompile.calibration.task import Found, Search
 from ttscompile.core.lattice import Source, illegal_cells
 from ttscompile.errors import CalibrationError
+from ttscompile.rivals import evo, gates, online
 
 from .tasks import MakeTask
 
@@ -134,9 +135,9 @@ def test_names_are_given_once_and_the_first_is_the_default() -> None:
 
 def test_a_name_without_a_maker_is_an_error() -> None:
     with pytest.raises(AttributeError, match="no attribute 'magic'"):
-        Strategy("magic", "none", "published.bac:magic").make()
+        Strategy("magic", "none", "rivals.bac:magic").make()
     with pytest.raises(ModuleNotFoundError, match="magic"):
-        Strategy("magic", "none", "published.magic:magic").make()
+        Strategy("magic", "none", "rivals.magic:magic").make()
 
 
 def test_the_table_is_read_without_torch() -> None:

@@ -101,7 +101,7 @@ def test_what_is_not_there_is_said_before_the_compiler_is_imported(
     (tmp_path / "compiled").symlink_to(toy_compiled)
     (tmp_path / "here.ckpt").touch()
     monkeypatch.chdir(tmp_path)
-    for module in ("driver", "calibration.pipeline", "calibration.compare", "calibration.oracle"):
+    for module in ("driver", "calibration.pipeline", "calibration.compare", "rivals.oracle"):
         monkeypatch.setitem(sys.modules, f"ttscompile.{module}", None)
     for name in ("convert", "calibrate"):
         monkeypatch.delitem(vars(ttscompile), name, raising=False)

@@ -17,7 +17,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from ttscompile.cli import main
-from ttscompile.runtimes.executor import listener
+from ttscompile.runtimes.server import listener
 
 NO_TEXT = os.fsdecode(b"\xff\xfe.html")
 UNKIND = (

@@ -12,7 +12,7 @@ import ttscompile
 from tests.calibration import policies
 from tests.once import Once
 from ttscompile.calibration import tts
-from ttscompile.calibration.published.paper import UPDATES
+from ttscompile.calibration.pruner.paper import UPDATES
 
 WAYS = ["searched", "switched", "gates", "head", "refined"]
 

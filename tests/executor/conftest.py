@@ -11,7 +11,7 @@ import pytest
 
 from tests.once import Once
 from tests.runtimes.toys import toy_program, written_artifact
-from ttscompile.runtimes.executor.door import AUDIT
+from ttscompile.runtimes.server.admission import AUDIT
 
 from .simulation import workers
 

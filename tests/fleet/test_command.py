@@ -19,8 +19,8 @@ import pytest
 from click.testing import CliRunner
 
 import ttscompile
-from tests.executor.serving import Client, ServerError
-from tests.executor.watching import figures, get
+from tests.server.serving import Client, ServerError
+from tests.server.watching import figures, get
 from ttscompile.cli import main
 
 WRONG = 11, 2

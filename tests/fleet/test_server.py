@@ -14,16 +14,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.executor.serving import LIMITS, Client, ServerError, connected, listening, vanish
-from tests.executor.watching import figures, get
 from tests.runtimes.toys import toy_program, written_artifact
+from tests.server.serving import LIMITS, Client, ServerError, connected, listening, vanish
+from tests.server.watching import figures, get
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import update_calibration
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import ClusterError, IllegalPlanError, NonFiniteActionsError
-from ttscompile.runtimes.executor.lock import Lock, hashed
 from ttscompile.runtimes.executor.window import Array
 from ttscompile.runtimes.fleet.server import Answered, FleetServer, Plans
+from ttscompile.runtimes.server.lock import Lock, hashed
 
 if importlib.util.find_spec("websockets") is None:
     pytest.skip("NO FLEET TESTS: websockets is not installed; pip install 'ttscompile[serve]'", allow_module_level=True)

@@ -217,7 +217,7 @@ def _forked(guard: Guard, run_case: Callable[[], None], told: Path) -> tuple[str
     """
     from tests.hostile.guard import Violation
     from tests.hostile.targets import outcome
-    from ttscompile.trajectories.apart import MORE_SECONDS
+    from ttscompile.trajectories.sandbox import MORE_SECONDS
 
     child = os.fork()
     if child == 0:
@@ -253,7 +253,7 @@ def _warm_up(target: str, make: Callable[..., Callable[[], None]], corpus: Path,
         torch.set_num_threads(1)
         importlib.import_module("ttscompile.runtimes.onnxruntime.backend")  # which only an artifact that opens imports
     if target in (*READ_APART, "mixed"):
-        from ttscompile.trajectories.apart import IMPORTS
+        from ttscompile.trajectories.sandbox import IMPORTS
 
         for name in (name for names in IMPORTS.values() for name in names):
             importlib.import_module(name)

@@ -98,11 +98,11 @@ def _ragged(rng: random.Random) -> Any:
 
 @cache
 def _server() -> Any:
-    from tests.executor.serving import Quick
     from tests.executor.simulation import FakeClock
+    from tests.server.serving import Quick
     from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
-    from ttscompile.runtimes.executor.limits import ServerLimits
-    from ttscompile.runtimes.executor.server import ExecutorServer
+    from ttscompile.runtimes.server.executor_server import ExecutorServer
+    from ttscompile.runtimes.server.limits import ServerLimits
 
     settings = ExecutorSettings(max_hold=1000)
     return ExecutorServer(

@@ -131,7 +131,7 @@ def recording(kind: str, write_bad: Callable[[random.Random, Path, Path], Path])
     def make(rng: random.Random, corpus: Path, folder: Path) -> Callable[[], None]:
         from tests.trajectories.data_sets import read_here
         from ttscompile.core.spec import ObservationSpec
-        from ttscompile.trajectories import apart, load_trajectories
+        from ttscompile.trajectories import load_trajectories, sandbox
 
         joined = {"obs": ObservationSpec((2, 8))}, {"obs": ("keypoint", "state:2")}
         images = {"image": ObservationSpec((2, 3, 5, 4)), "state": ObservationSpec((2, 5))}, {"image": ("img",)}
@@ -139,7 +139,7 @@ def recording(kind: str, write_bad: Callable[[random.Random, Path, Path], Path])
         observations, sources = rng.choice((joined, joined, images))
 
         def load() -> None:
-            with mock.patch.object(apart, "reader", read_here):
+            with mock.patch.object(sandbox, "reader", read_here):
                 episodes = load_trajectories([path], observations, 2, sources)
             for array in (array for episode in episodes for array in episode.observations.values()):
                 if not len(array) or (array == SECRET).any():

@@ -22,7 +22,7 @@ from tests.hostile.hdf5_changes import SECRET
 from tests.trajectories.data_sets import LOW, SOURCES, as_hdf5, as_lerobot, as_zarr, read_here
 from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import TrajectoryError
-from ttscompile.trajectories import apart, load_trajectories
+from ttscompile.trajectories import load_trajectories, sandbox
 
 IMAGES = {"image": ObservationSpec((2, 3, 5, 4))}
 
@@ -30,7 +30,7 @@ IMAGES = {"image": ObservationSpec((2, 3, 5, 4))}
 @pytest.fixture
 def _here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a process, which is what is tested where this is not asked for."""
-    monkeypatch.setattr(apart, "reader", read_here)
+    monkeypatch.setattr(sandbox, "reader", read_here)
 
 
 @pytest.mark.parametrize("write", [as_zarr, as_hdf5, as_lerobot])
@@ -38,7 +38,7 @@ def test_a_process_reads_what_this_one_would(write: Any, tmp_path: Path, monkeyp
     path = write(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path, "\udcff"])
     found = load_trajectories([path], LOW, 3, SOURCES)
-    monkeypatch.setattr(apart, "reader", read_here)
+    monkeypatch.setattr(sandbox, "reader", read_here)
     expected = load_trajectories([path], LOW, 3, SOURCES)
     assert [episode.name for episode in found] == [episode.name for episode in expected]
     for one, other in zip(found, expected, strict=True):
@@ -63,14 +63,14 @@ def test_a_chunk_that_unpacks_to_more_than_the_limit(tmp_path: Path) -> None:
 def test_a_library_that_crashes_is_an_error(
     name: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(apart, "_CODE", f"import os, signal; os.kill(os.getpid(), signal.{name})")
+    monkeypatch.setattr(sandbox, "_CODE", f"import os, signal; os.kill(os.getpid(), signal.{name})")
     with pytest.raises(TrajectoryError, match=message):
         load_trajectories([as_hdf5(tmp_path)], LOW, 3, SOURCES)
 
 
 def test_an_answer_that_is_cut_short_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     line = json.dumps({"names": ["state"]}) + "\n" + json.dumps({"own": "ends", "dtype": "<i8", "shape": [2]}) + "\n"
-    monkeypatch.setattr(apart, "_CODE", f"import sys; sys.stdin.read(); sys.stdout.write({line!r})")
+    monkeypatch.setattr(sandbox, "_CODE", f"import sys; sys.stdin.read(); sys.stdout.write({line!r})")
     with pytest.raises(TrajectoryError, match="the process that read it ended"):
         load_trajectories([as_hdf5(tmp_path)], LOW, 3, SOURCES)
 
@@ -78,7 +78,7 @@ def test_an_answer_that_is_cut_short_is_an_error(tmp_path: Path, monkeypatch: py
 def test_the_limits_of_the_process_hold(tmp_path: Path) -> None:
     code = f"""
 import resource
-from ttscompile.trajectories.apart import limit
+from ttscompile.trajectories.sandbox import limit
 limit(3 << 20, 3 << 20)
 try:
     bytearray(3 << 29)

@@ -20,7 +20,7 @@ import zarr
 from PIL import Image
 
 from ttscompile.core.spec import ObservationSpec
-from ttscompile.trajectories import apart
+from ttscompile.trajectories import sandbox
 
 LOW = {"obs": ObservationSpec((2, 8))}
 IMAGES = {"image": ObservationSpec((2, 3, 5, 4)), "state": ObservationSpec((2, 5))}
@@ -33,7 +33,7 @@ FPS = 10
 def read_here(request: Mapping[str, Any]) -> Iterator[BinaryIO]:
     """What the process that reads data sets does, without one: it takes half a second."""
     out = io.BytesIO()
-    apart.serve(request, out)
+    sandbox.serve(request, out)
     out.seek(0)
     yield out
 

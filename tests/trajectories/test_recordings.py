@@ -16,7 +16,7 @@ import zarr
 from tests.hostile.pickles import Runs
 from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import TrajectoryError
-from ttscompile.trajectories import Episode, apart, load_trajectories
+from ttscompile.trajectories import Episode, load_trajectories, sandbox
 from ttscompile.trajectories import frames as trajectories_frames
 
 from .data_sets import ENDS, IMAGES, LOW, SOURCES, arrays, as_hdf5, as_lerobot, as_npz, as_zarr, read_here
@@ -24,7 +24,7 @@ from .data_sets import ENDS, IMAGES, LOW, SOURCES, arrays, as_hdf5, as_lerobot, 
 
 @pytest.fixture(autouse=True)
 def _read_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(apart, "reader", read_here)
+    monkeypatch.setattr(sandbox, "reader", read_here)
 
 
 WRITERS = {

@@ -16,7 +16,7 @@ import pytest
 
 from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import TrajectoryError
-from ttscompile.trajectories import apart, load_trajectories
+from ttscompile.trajectories import load_trajectories, sandbox
 
 from .data_sets import ENDS, as_lerobot_with_videos, read_here, shade, write_video
 
@@ -28,7 +28,7 @@ SHADES = 8 / 255
 @pytest.fixture
 def here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a process for every reading."""
-    monkeypatch.setattr(apart, "reader", read_here)
+    monkeypatch.setattr(sandbox, "reader", read_here)
 
 
 @pytest.mark.parametrize(("version", "codec"), [(3, "libx264"), (2, "libx264"), (3, "libsvtav1"), (3, "libx265")])

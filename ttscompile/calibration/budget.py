@@ -15,7 +15,7 @@ import numpy as np
 from ..artifact.ceiling import TYPICAL_SPARSITY
 from ..artifact.load import Artifact
 from ..artifact.manifest import Manifest, PlanRecord
-from ..core.given import integer
+from ..core.coercion import integer
 from ..core.lattice import dense_plan, sparsity, uniform_plan
 from ..core.spec import Noise
 from ..errors import CalibrationError

@@ -22,13 +22,14 @@ import torch
 
 from ..artifact.load import Artifact, load_artifact
 from ..artifact.manifest import DENSE
+from ..core.coercion import integer
 from ..core.correction import FEATURES
-from ..core.given import integer
 from ..core.lattice import Source
 from ..core.spec import FP32, Noise
 from ..errors import CalibrationError
 from ..measure.points import Comparison, MeasuredPoint
 from ..measure.timer import Timer
+from ..pool import Pool, Work, artifact_elsewhere, opened_pool, place_of
 from ..runtimes.open import open_runtime
 from ..runtimes.policy import CompiledPolicy
 from ..runtimes.random_calls import random_noise
@@ -36,10 +37,9 @@ from ..trajectories.episodes import Episode
 from .budget import cells_of, goal_of, with_plans
 from .calls import LARGEST, Calls, Split, digest_of, load_episodes, sample_calls, split_episodes
 from .execute import Executor
-from .pool import Pool, Work, artifact_elsewhere, opened_pool, place_of
 from .progress import Progress
+from .saved_searches import Outcome, Searches
 from .search import plan_of
-from .searches import Outcome, Searches
 from .strategies import strategy_of
 from .targets import dense_rounds, draw_calls
 from .task import Array, Found, Task

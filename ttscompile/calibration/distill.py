@@ -19,8 +19,8 @@ from ..artifact.distilled import DistilledWeights
 from ..artifact.load import Artifact, load_artifact
 from ..artifact.manifest import DISTILLED
 from ..artifact.write import locked, update_calibration
+from ..core.coercion import integer
 from ..core.correction import Correction
-from ..core.given import integer
 from ..core.lattice import PlanArray, Source, whole_steps_plan
 from ..errors import CalibrationError, CalibrationFailedError
 from ..ir.pieces import is_block

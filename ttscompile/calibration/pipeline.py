@@ -13,16 +13,17 @@ from ..artifact.ceiling import few_steps, usual_sparsity
 from ..artifact.load import Artifact, load_artifact
 from ..artifact.manifest import UNIFORM
 from ..artifact.write import locked, update_calibration
-from ..core.given import integer
+from ..core.coercion import integer
 from ..core.lattice import sparsity
 from ..errors import CalibrationError
 from ..ir.pieces import PRUNER
+from ..pool import opened_pool
+from ..rivals.switches import has_head
 from ..runtimes.torch.devices import device_of, exact_arithmetic
 from ..verification.record_golden import record_plans
 from .arguments import JUDGED, calls_to_learn_from, require_directory, require_limits
 from .budget import ERROR, LATENCY, Budget, Goal, cells_of, goal_of, measure_budget
 from .calls import Calls, digest_of, load_episodes, split_episodes, window_of
-from .crowded import SAFE, SHARE, CrowdedSchedules, budget_of_error, named_plans
 from .execute import Executor
 from .judge import (
     SCHEDULE,
@@ -33,12 +34,11 @@ from .judge import (
     require_success,
     uniform_of,
 )
-from .pool import opened_pool
 from .progress import Bar
-from .pruner.switches import has_head
 from .result import CalibrationResult
 from .search import open_search, search_plan
 from .state import StateFile
+from .step_counts import SAFE, SHARE, CrowdedSchedules, budget_of_error, named_plans
 from .strategies import DEFAULT, FITTED, Strategy, strategy_of
 from .targets import draw_calls, with_targets
 from .task import Clock, Found, Search, Task

@@ -28,7 +28,7 @@ class Strategy:
     Attributes:
         name: what users call it.
         source: where the method is from.
-        maker: where the function is that makes a ``Search`` of a ``Task``, as ``module:function`` below this package.
+        maker: where the function is that makes a ``Search`` of a ``Task``, as ``module:function`` below ``ttscompile``.
         least: how many cells its plans compute at least, of ``(steps, blocks)``; by default those of step 0.
         fits_correction: whether its schedule is of whole steps, with a correction of the sampler that is fitted to it.
             Only then are there plans for an error budget, and plans beside the target.
@@ -55,7 +55,7 @@ class Strategy:
             AttributeError: the module has no such function.
         """
         module, _, function = self.maker.partition(":")
-        found: Callable[[Task], Search] = getattr(importlib.import_module(f"{__package__}.{module}"), function)
+        found: Callable[[Task], Search] = getattr(importlib.import_module(f"ttscompile.{module}"), function)
         return found
 
     def require_reach(self, steps: int, blocks: int, budget: int) -> None:
@@ -77,61 +77,61 @@ STRATEGIES = (
     Strategy(
         "tts",
         "test-time sparsity, arXiv 2605.13316; this project's own",
-        "tts:Tts",
+        "calibration.tts:Tts",
         fits_correction=True,
     ),
     Strategy(
         "tts-switches",
         "the same, and single cells moved by the observation",
-        "tts:switched",
+        "calibration.tts:switched",
         fits_correction=True,
         uses_pruner=True,
     ),
     Strategy(
         "tts-paper",
         "test-time sparsity as published: gates trained for each observation, arXiv 2605.13316",
-        "published.paper:Paper",
+        "calibration.pruner.paper:Paper",
         uses_pruner=True,
         consecutive=True,
     ),
     Strategy(
         "interval",
         "FORA, arXiv 2407.01425; EfficientVLA (arXiv 2506.10100)",
-        "published.static:interval",
+        "rivals.static:interval",
         baseline=True,
     ),
-    Strategy("bac", "block-wise adaptive caching (arXiv 2506.13456)", "published.bac:bac"),
+    Strategy("bac", "block-wise adaptive caching (arXiv 2506.13456)", "rivals.bac:bac"),
     Strategy(
         "delta-dit",
         "Delta-DiT (arXiv 2406.01125)",
-        "published.static:delta_dit",
+        "rivals.static:delta_dit",
         least=lambda steps, blocks: blocks + steps - 1,  # one block of every step after step 0
     ),
     Strategy(
         "deepcache",
         "DeepCache (arXiv 2312.00858)",
-        "published.static:deepcache",
+        "rivals.static:deepcache",
         least=lambda steps, blocks: blocks + (steps - 1) * min(2, blocks),  # the first and the last block of every step
     ),
-    Strategy("sag", "Sparse ActionGen (arXiv 2601.12894)", "published.gates:sag"),
-    Strategy("dip-go", "DiP-GO (arXiv 2410.16942)", "published.gates:dip_go"),
+    Strategy("sag", "Sparse ActionGen (arXiv 2601.12894)", "rivals.gates:sag"),
+    Strategy("dip-go", "DiP-GO (arXiv 2410.16942)", "rivals.gates:dip_go"),
     Strategy(
         "l2c",
         "Learning-to-Cache (arXiv 2406.01733)",
-        "published.gates:l2c",
+        "rivals.gates:l2c",
         least=lambda steps, blocks: blocks * -(-steps // 2),  # every other step
     ),
-    Strategy("evo", "genetic search (arXiv 2607.20293)", "published.evo:Evo"),
+    Strategy("evo", "genetic search (arXiv 2607.20293)", "rivals.evo:Evo"),
     Strategy(
         "teacache",
         "TeaCache (arXiv 2411.19108)",
-        "published.teacache:teacache",
+        "rivals.teacache:teacache",
         least=lambda steps, blocks: blocks * min(2, steps),  # the first step and the last
     ),
     Strategy(
         "dbcache",
         "DBCache of cache-dit",
-        "published.dbcache:dbcache",
+        "rivals.dbcache:dbcache",
         least=lambda steps, blocks: blocks + steps - 1,  # the first block of every step after step 0
     ),
 )

@@ -16,10 +16,10 @@ from ..artifact.load import Artifact
 from ..core.correction import Correction
 from ..core.lattice import PlanArray, Source
 from ..errors import CalibrationError
+from ..pool import Pool
 from ..runtimes.settle import pruner_plan
 from .calls import Actions, Calls
 from .execute import Executor
-from .pool import Pool
 from .whole_steps import WholeSteps
 
 Array = npt.NDArray[Any]

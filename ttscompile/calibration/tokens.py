@@ -15,7 +15,7 @@ from ..artifact.load import Artifact, load_artifact
 from ..artifact.settle import settle
 from ..artifact.tokens import ReuseRecord
 from ..artifact.write import locked
-from ..core.given import integer
+from ..core.coercion import integer
 from ..core.spec import Noise
 from ..errors import CalibrationError, CalibrationFailedError
 from ..runtimes.against_fp32 import SHARE

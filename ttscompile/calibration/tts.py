@@ -19,9 +19,9 @@ from functools import partial
 import numpy as np
 
 from ..core.lattice import PlanArray
-from .crowded import crowded_family, other_placements
-from .pruner.adaptation import Adaptation
-from .pruner.switches import has_head
+from ..rivals.adaptation import Adaptation
+from ..rivals.switches import has_head
+from .step_counts import crowded_family, other_placements
 from .task import Array, Found, Task
 
 DISTANCES = (8, 4, 2, 1)

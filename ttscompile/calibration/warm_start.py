@@ -21,7 +21,7 @@ from ..artifact.rest import with_last_steps
 from ..artifact.settle import settle
 from ..artifact.warm import WarmRecord
 from ..artifact.write import locked
-from ..core.given import integer
+from ..core.coercion import integer
 from ..core.rest import Start
 from ..core.spec import FloatArray, Noise
 from ..errors import CalibrationError, CalibrationFailedError

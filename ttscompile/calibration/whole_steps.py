@@ -12,12 +12,12 @@ from torch import Tensor
 
 from ..core.correction import Correction
 from ..core.lattice import BoolArray, PlanArray, whole_steps_plan
+from ..pool import Here, Pool, Work, artifact_elsewhere, place_of
 from .calls import Actions, Calls, IntArray
 from .execute import Executor
 from .fit_correction import fit_correction
-from .pool import Here, Pool, Work, artifact_elsewhere, place_of
+from .schedule_runs import Trails
 from .sparse_loop import SparseLoop, anchors_of
-from .trails import Trails
 
 FITTED, COMPARED = 384, 128
 """Calls on which a candidate's correction is fitted, and others on which its error is measured; fewer if there are

@@ -10,9 +10,9 @@ from typing import Any
 import click
 
 from ttscompile.artifact.load import load_artifact
-from ttscompile.cli.doors import Doorway, door_options
 from ttscompile.cli.options import artifact_argument, count_option, threads_option
 from ttscompile.cli.output import only_results_on_stdout, progress
+from ttscompile.cli.server_options import Doorway, door_options
 from ttscompile.cli.types import ANY_TEXT, TEXT, Number
 from ttscompile.runtimes.fleet.copies import LOCAL, FleetSettings, ray_copies
 from ttscompile.runtimes.fleet.server import FleetServer, Plans

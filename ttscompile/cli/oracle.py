@@ -13,7 +13,7 @@ from ttscompile.cli.recordings import FilesCommand, Sources, require_recordings,
 from ttscompile.errors import RuntimeUnavailableError
 
 if TYPE_CHECKING:
-    from ttscompile.calibration.oracle import Oracle
+    from ttscompile.rivals.oracle import Oracle
 
 
 @click.command(cls=FilesCommand)
@@ -31,7 +31,7 @@ def oracle(
     sources: Sources,
     computed_steps: int,
     as_json: bool,
-    **sizes: Any,  # ttscompile.calibration.oracle takes them by the same names
+    **sizes: Any,  # ttscompile.rivals.oracle takes them by the same names
 ) -> None:
     """Would it pay to decide for each call which steps are computed? For the policy of the artifact DIRECTORY.
 
@@ -41,7 +41,7 @@ def oracle(
     manifest_of(directory)
     require_recordings(trajectories)
     try:
-        from ttscompile.calibration.oracle import oracle as measure
+        from ttscompile.rivals.oracle import oracle as measure
     except ModuleNotFoundError as error:
         raise RuntimeUnavailableError(
             f"oracle needs {error.name}, which is not installed. Run: pip install 'ttscompile[compile]'."

@@ -10,13 +10,13 @@ from typing import Any
 import click
 
 import ttscompile
-from ttscompile.cli.doors import Doorway, door_options
 from ttscompile.cli.options import artifact_argument, count_option, loop_options, runtime_options, seed_option
 from ttscompile.cli.output import progress
+from ttscompile.cli.server_options import Doorway, door_options
 from ttscompile.cli.types import TEXT
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
-from ttscompile.runtimes.executor.server import ExecutorServer
 from ttscompile.runtimes.executor.settings import INTERPOLATIONS, SEAMS
+from ttscompile.runtimes.server.executor_server import ExecutorServer
 
 MOST_CLIENTS = 128
 """A socket each, and threads that wait for actions; a process may have 1024 files open where nothing else is said."""

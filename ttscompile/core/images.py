@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ObservationError
-from .given import Array, Errors
+from .coercion import Array, Errors
 from .spec import ObservationSpec
 from .values import check_values
 

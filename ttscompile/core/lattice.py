@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import IllegalPlanError
-from .given import listed
+from .coercion import listed
 
 PlanArray = npt.NDArray[np.int8]
 BoolArray = npt.NDArray[np.bool_]

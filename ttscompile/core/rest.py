@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..errors import SpecError
-from .given import integer
+from .coercion import integer
 from .spec import ChunkSpec, FloatArray, Noise, SamplerTable
 
 TOLERANCE = 1e-3

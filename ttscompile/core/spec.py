@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import SpecError
-from .given import integer, listed, numbers
+from .coercion import integer, listed, numbers
 from .rules import DType, Positive
 
 FloatArray = npt.NDArray[np.float32]

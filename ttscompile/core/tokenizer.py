@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from .given import Errors
+from .coercion import Errors
 
 FILE = "tokenizer.json"
 _MOST_BYTES = 64 * 2**20

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .given import Array, Errors
+from .coercion import Array, Errors
 from .spec import LARGEST, Affine, ObservationSpec
 
 

@@ -13,7 +13,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from ..core.given import integer
+from ..core.coercion import integer
 from ..core.spec import WITHOUT, PolicySpec
 from ..errors import CheckpointError, SpecError
 from ..samplers.flow import METHODS

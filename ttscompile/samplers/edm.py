@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from ..core.given import numbers
+from ..core.coercion import numbers
 from ..core.spec import SamplerTable
 from ..errors import SpecError
 from .flow import deterministic_table

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from ..core.given import integer, numbers
+from ..core.coercion import integer, numbers
 from ..core.spec import SamplerTable
 from ..errors import SpecError
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..core.given import integer
+from ..core.coercion import integer
 from ..core.spec import SamplerTable
 from ..errors import SpecError
 from .multistep import multistep_table, set_timesteps

@@ -19,15 +19,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.given import integer
+from ..core.coercion import integer
 from ..core.images import fitted
 from ..core.paths import require_path
 from ..core.spec import ObservationSpec
 from ..core.untrusted_json import parse_json
 from ..core.values import check_values
 from ..errors import TrajectoryError
-from .apart import frames_apart
 from .frames import Frames, few, observation_frames, one_error, require_proportion
+from .sandbox import sandboxed_frames
 
 Array = npt.NDArray[Any]
 
@@ -104,7 +104,7 @@ def _read(
     require_path(path, TrajectoryError, "Give the file or the directory of a recording.")
     other = _other_format(path)
     used = {part.partition(":")[0] for key in observations for part in sources.get(key, (key,))}
-    held, frames = _npz(path) if other is None else (frames_apart(path, other, sorted(used)), True)
+    held, frames = _npz(path) if other is None else (sandboxed_frames(path, other, sorted(used)), True)
     if sources and not frames:
         told = f"{path}: its rows are calls of the policy, and {sorted(sources)} are to be made of other arrays, which"
         raise TrajectoryError(f"{told} is for frames. Save each key of the observation as an array of its own.")

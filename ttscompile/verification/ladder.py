@@ -15,7 +15,7 @@ from ..artifact.files import check_file
 from ..artifact.golden import load_golden, load_golden_plans
 from ..artifact.load import Artifact, load_artifact, read_manifest, require_artifact_path
 from ..artifact.manifest import MANIFEST
-from ..core.given import integer
+from ..core.coercion import integer
 from ..core.spec import FP32
 from ..errors import ArtifactChangedError, ArtifactError, RuntimeUnavailableError, TtscompileError
 from ..runtimes.open import MOST_THREADS, open_runtime

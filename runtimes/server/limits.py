@@ -1,0 +1,49 @@
+"""What clients of the server may do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ttscompile.core.coercion import integer
+from ttscompile.errors import ExecutorError
+
+_COUNTS = ("clients", "message_bytes", "handshakes", "handshakes_per_address", "refusals_per_minute")
+
+
+@dataclass(frozen=True)
+class ServerLimits:
+    """What clients may do.
+
+    Attributes:
+        clients: at a time.
+        message_bytes: largest size of a request.
+        handshake_timeout: seconds for the opening handshake, and before that as many for TLS.
+        idle_timeout: seconds between two complete requests.
+        send_timeout: seconds that a client may take to read an answer, once its socket's buffers are full.
+        action_timeout: seconds that a client may wait for an action.
+        clients_per_address: of the clients, those of one address (of IPv6, one network of 64 bits); None for all.
+        requests_per_second: of one client, with a second's worth at once; the rest waits its turn.
+        handshakes: connections that are not clients yet, at a time.
+        handshakes_per_address: of these, those of one address.
+        refusals_per_minute: handshakes of one address that may fail. After that it is cut off, before TLS begins, until
+            a minute has gone by: each handshake takes time from the robot's processor.
+    """
+
+    clients: int = 8
+    message_bytes: int = 1 << 20
+    handshake_timeout: float = 5.0
+    idle_timeout: float = 60.0
+    send_timeout: float = 5.0
+    action_timeout: float = 30.0
+    clients_per_address: int | None = None
+    requests_per_second: float = 2000.0
+    handshakes: int = 64
+    handshakes_per_address: int = 16
+    refusals_per_minute: int = 20
+
+    def __post_init__(self) -> None:
+        for name in (*_COUNTS, *(["clients_per_address"] if self.clients_per_address is not None else [])):
+            object.__setattr__(self, name, integer(getattr(self, name), f"the server's {name}", ExecutorError, 1))
+        for name, value in vars(self).items():
+            if value is not None and not value > 0:
+                raise ExecutorError(f"the server's {name} must be positive; found {value}.")

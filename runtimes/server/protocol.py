@@ -1,0 +1,154 @@
+"""Messages of the executor's server: JSON texts, one answer a request. ``docs/serve.md`` has the protocol."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ttscompile.errors import ProtocolError
+from ttscompile.runtimes.executor.window import Array, FrameSpec
+
+Methods = Mapping[str, frozenset[str]]
+"""Method -> the parameters that it may have."""
+
+METHODS: Methods = {
+    "info": frozenset(),
+    "observe": frozenset({"obs", "t"}),
+    "action": frozenset({"t", "timeout"}),
+    "reset": frozenset({"seed"}),
+    "statistics": frozenset(),
+}
+"""Of the executor's server."""
+
+DTYPES = {
+    name: dtype
+    for dtype in map(np.dtype, ("<i1", "<i2", "<i4", "<i8", "<u1", "<u2", "<u4", "<u8", "<f2", "<f4", "<f8"))
+    for name in (dtype.name, dtype.str, dtype.str[1:])
+}
+"""What a packed array may be of, by each of its names: ``uint8``, ``|u1``, ``u1``."""
+KINDS = {"b": "biu", "i": "iu", "u": "iu", "f": "iuf"}
+"""By the kind of an expected dtype: the kinds that the numbers of lists may have."""
+MOST_SECONDS = 1e15
+"""Times are less than this, either way."""
+
+
+class Request(NamedTuple):
+    """A request: what the client called it, which is sent back; one of the methods; its parameters, checked so far."""
+
+    id: int | str | None
+    method: str
+    params: Mapping[str, Any]
+
+
+def read_request(text: str | bytes, methods: Methods = METHODS) -> Request:
+    """Read one message.
+
+    Raises:
+        ProtocolError: it is no request; ``request_id`` is set on the error if the message had one.
+    """
+    if isinstance(text, bytes):
+        raise ProtocolError("a request is a text message, not a binary one.")
+    try:
+        document = json.loads(text, parse_constant=_no_number)
+    except (ValueError, RecursionError) as error:
+        raise ProtocolError(f"the message is no JSON: {str(error)[:200]}.") from error
+    if not isinstance(document, dict):
+        raise ProtocolError(f"a request is a JSON object; found {type(document).__name__}.")
+    name = document.pop("id", None)
+    if not (name is None or isinstance(name, str) or (isinstance(name, int) and not isinstance(name, bool))):
+        raise ProtocolError("a request's id is a number without fraction, a string, or left out.")
+    try:
+        return Request(name, *_checked(document, methods))
+    except ProtocolError as error:
+        error.request_id = name  # type: ignore[attr-defined]
+        raise
+
+
+def _checked(document: dict[str, Any], methods: Methods) -> tuple[str, dict[str, Any]]:
+    method = document.pop("method", None)
+    allowed = methods.get(method) if isinstance(method, str) else None
+    if allowed is None:
+        raise ProtocolError(f"the method is one of {', '.join(methods)}; found {str(method)[:40]!r}.")
+    if unexpected := sorted(document.keys() - allowed):
+        raise ProtocolError(f"{method} takes {sorted(allowed)}; found {unexpected[0][:40]!r}.")
+    for key in ("t", "timeout"):
+        value = 0 if document.get(key) is None else document[key]
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MOST_SECONDS:
+            raise ProtocolError(f"{key} is a number of seconds; found {str(value)[:40]}.")
+    seed = document.get("seed")
+    if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 1 << 63):
+        raise ProtocolError("seed is a number without fraction, from 0 to 2**63 - 1.")
+    if "obs" in allowed and not isinstance(document.get("obs"), dict):
+        raise ProtocolError(f"{method} needs obs, an object with an array a key.")
+    if not isinstance(document.get("plan") or "", str):
+        raise ProtocolError("plan is the name of one, or left out.")
+    return str(method), document
+
+
+def read_frame(obs: Mapping[str, Any], frames: FrameSpec) -> dict[str, Array]:
+    """The arrays of a frame; shapes are left to ``observe``.
+
+    Raises:
+        ProtocolError: something is no array.
+    """
+    return read_arrays(obs, {key: spec.dtype for key, spec in frames.specs.items()})
+
+
+def read_arrays(obs: Mapping[str, Any], dtypes: Mapping[str, str]) -> dict[str, Array]:
+    """The arrays of an observation, by key, of these dtypes where they are lists.
+
+    Raises:
+        ProtocolError: something is no array.
+    """
+    return {key: _array(key, value, dtypes.get(key, "float32")) for key, value in obs.items()}
+
+
+def _array(key: str, value: Any, dtype: str) -> Array:
+    if isinstance(value, dict):
+        return _packed(key, value)
+    try:
+        array = np.asarray(value)
+        if array.dtype.kind not in KINDS[np.dtype(dtype).kind]:
+            of = "true and false" if dtype == "bool" else f"numbers that are {dtype}"
+            raise ProtocolError(f"observation {key[:40]!r} must be lists of {of}.")
+        if np.dtype(dtype).kind != "f" and array.size:
+            low, high = (0, 1) if dtype == "bool" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
+            if array.min() < low or array.max() > high:
+                raise ProtocolError(f"observation {key[:40]!r} has a number that is no {dtype}.")
+        with np.errstate(over="ignore"):  # what becomes infinite is refused as that
+            return array.astype(dtype)
+    except (ValueError, OverflowError) as error:
+        raise ProtocolError(f"observation {key[:40]!r} is no array: {str(error)[:200]}.") from error
+
+
+def _packed(key: str, value: dict[str, Any]) -> Array:
+    """``{"dtype": "uint8", "shape": [96, 96, 3], "base64": "..."}``: little-endian, the last axis fastest."""
+    try:
+        dtype = DTYPES.get(str(value["dtype"]))  # a look-up: numpy would parse what else it is given as Python
+        shape = tuple(value["shape"])
+        if dtype is None or not all(type(n) is int and n >= 0 for n in shape):
+            raise ProtocolError(f"observation {key[:40]!r} must be of integers or floats, with a shape that is one.")
+        content = base64.b64decode(value["base64"], validate=True)
+        array: Array = np.frombuffer(content, dtype).reshape(shape)
+        return array.astype(dtype.newbyteorder("="))
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        expected = "lists of numbers, or an object with dtype, shape and base64"
+        raise ProtocolError(f"observation {key[:40]!r} must be {expected}: {str(error)[:200]}.") from error
+
+
+def answer(request_id: int | str | None, result: Mapping[str, Any]) -> str:
+    """The text of an answer."""
+    return json.dumps({"id": request_id, "result": result}, allow_nan=False)
+
+
+def failure(request_id: int | str | None, error: Exception) -> str:
+    """The text of an answer that says what went wrong."""
+    return json.dumps({"id": request_id, "error": {"type": type(error).__name__, "message": str(error)}})
+
+
+def _no_number(name: str) -> float:
+    raise ValueError(f"{name} is no JSON number")

@@ -1,0 +1,263 @@
+"""Strategies that choose a criterion: it looks at each step and says which blocks are worth computing.
+
+A criterion is a few numbers, which the record of a calibration holds as JSON. Calibration asks it once a step, between
+two parts of the blocks; the runtimes execute one plan that it has decided::
+
+    stem -> blocks 0..always-1, computed -> decide(k, feature) -> the other blocks, all computed or all reused -> tail
+
+The feature is what the first ``always`` blocks add together, or the stream after the stem if there are none. What is
+reused is the block's own last residual, so a decided plan is an ordinary plan of COMPUTE and TIMESTEP: it can be
+reported, counted and replayed.
+
+Source of the criteria: ``teacache`` and ``dbcache``. The number of computed cells differs from call to call, so the
+budget is kept on average: the threshold is the lowest, found by bisection, with which the mean over some of the calls
+to learn from and two standard errors more are within it.
+
+The schedule that comes with a criterion is a decision of its own, frozen: of the plans that it decided on the calls to
+learn from, the one with the lowest error on all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import islice, repeat
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from ..calibration.calls import Calls, FloatArray
+from ..calibration.execute import Executor, State, last
+from ..calibration.task import Array, Found, Task
+from ..core.lattice import BoolArray, PlanArray, Source
+from ..errors import ArtifactError, CalibrationFailedError, IllegalPlanError
+from .fixed import COMPARED, best_of
+
+HALVINGS, DOUBLINGS = 9, 20
+"""How often the interval that the threshold is in is halved, and its upper end doubled before, at most."""
+
+COUNTED = 32
+"""Calls whose computed cells decide the last threshold; fewer if there are fewer."""
+
+FROZEN = 16
+"""Decided plans at most that are compared."""
+
+_TINY = 1e-12
+"""A feature smaller than this, on average, has no relative change worth dividing for."""
+
+
+@dataclass(frozen=True)
+class Criterion:
+    """When the blocks after the first ones are computed again.
+
+    Attributes:
+        name: of the strategy that it comes from.
+        always: how many blocks, from the first, are computed at every step; what they add together is the feature. 0:
+            the feature is the residual stream after the stem.
+        threshold: the blocks are computed where the estimated change is not below this.
+        polynomial: from the relative change of the feature to the estimate, highest power first; ``(1, 0)`` leaves it
+            as it is. Estimates below 0 count as 0.
+        accumulates: add up the estimates from step to step until they reach the threshold; otherwise compare with the
+            last step that was computed whole.
+        warmup: how many steps, from the first, are computed whole; at least 1.
+        closes: compute the last step whole.
+    """
+
+    name: str
+    always: int
+    threshold: float
+    polynomial: tuple[float, ...]
+    accumulates: bool
+    warmup: int
+    closes: bool
+
+    def __post_init__(self) -> None:
+        numbers = (self.threshold, *self.polynomial)
+        if self.always < 0 or self.warmup < 1 or not self.polynomial or not all(np.isfinite(numbers)):
+            raise ArtifactError(
+                f"the criterion {self.name!r} has always = {self.always}, warmup = {self.warmup}, threshold ="
+                f" {self.threshold}, polynomial = {self.polynomial}; expected always of at least 0, warmup of at"
+                " least 1 and finite numbers. Calibrate again."
+            )
+
+    def record(self) -> dict[str, Any]:
+        """As JSON."""
+        return {**asdict(self), "polynomial": list(self.polynomial)}
+
+
+class Decisions:
+    """What a criterion decides during one call of B streams. Streams do not influence each other.
+
+    Raises:
+        IllegalPlanError: the policy has no block after the first ``always`` ones.
+    """
+
+    def __init__(self, criterion: Criterion, steps: int, blocks: int, streams: int) -> None:
+        if criterion.always >= blocks:
+            raise IllegalPlanError(
+                f"the criterion {criterion.name!r} computes the first {criterion.always} blocks at every step; the"
+                f" policy has {blocks}, so that nothing is left to decide. Calibrate again."
+            )
+        self._criterion, self._steps, self._blocks = criterion, steps, blocks
+        self._accumulated = np.zeros(streams)
+        self._compared: FloatArray = np.empty((streams, 0), np.float32)
+
+    def decide(self, k: int, feature: FloatArray) -> PlanArray:
+        """The row of the plan at step k; to be asked for every step, in order.
+
+        Args:
+            k: the number of the step.
+            feature: ``[B, ...]``, see ``Criterion.always``.
+
+        Returns:
+            int8 ``[B, blocks]`` of COMPUTE and TIMESTEP; the first ``always`` blocks are COMPUTE.
+        """
+        rule = self._criterion
+        flat = feature.reshape(len(feature), -1)
+        whole = self._whole(k, flat)
+        if rule.accumulates or k == 0:
+            self._compared = flat.copy()
+        else:
+            self._compared[whole] = flat[whole]
+        row = np.full((len(flat), self._blocks), Source.COMPUTE, np.int8)
+        row[~whole, rule.always :] = Source.TIMESTEP
+        return row
+
+    def _whole(self, k: int, flat: FloatArray) -> BoolArray:
+        """Which streams compute all blocks at step k."""
+        rule = self._criterion
+        if k == 0:
+            return np.ones(len(flat), np.bool_)
+        change = relative_change(flat, self._compared)
+        estimate = np.maximum(np.polyval(rule.polynomial, change), 0)
+        if rule.accumulates:
+            self._accumulated += estimate
+            estimate = self._accumulated
+        whole: BoolArray = estimate >= rule.threshold
+        if k < rule.warmup or (rule.closes and k == self._steps - 1):
+            whole = np.ones(len(flat), np.bool_)
+        self._accumulated[whole] = 0
+        return whole
+
+
+def relative_change(now: FloatArray, before: FloatArray) -> npt.NDArray[np.float64]:
+    """Mean absolute difference over mean absolute value before, of each row: ``[B, ...]`` twice gives ``[B]``."""
+    rows = len(now)
+    difference = np.abs(now - before).reshape(rows, -1).mean(1, dtype=np.float64)
+    size = np.abs(before).reshape(rows, -1).mean(1, dtype=np.float64)
+    return np.asarray(difference / np.maximum(size, _TINY))
+
+
+@dataclass(frozen=True)
+class Decided:
+    """What a criterion decided on some calls.
+
+    Attributes:
+        plans: int8 ``[N, K, blocks]``.
+        samples: the denoised samples, ``[N, T, D]``.
+    """
+
+    plans: PlanArray
+    samples: Tensor
+
+    @property
+    def cells(self) -> Array:
+        """Computed cells of each call, ``[N]``."""
+        return np.asarray((self.plans == Source.COMPUTE).sum((1, 2)))
+
+
+def decide(executor: Executor, criterion: Criterion, calls: Calls) -> Decided:
+    """Run calls with plans that the criterion decides step by step."""
+    model, state = executor.model, State()
+    decisions = Decisions(criterion, model.steps, model.blocks, calls.count)
+    first, others = range(criterion.always), range(criterion.always, model.blocks)
+    computed = np.full((1, model.blocks), Source.COMPUTE, np.int8)
+    rows: list[PlanArray] = []
+
+    def blocks(k: int, stem: Tensor) -> Tensor:
+        stream = executor.step(computed, k, stem, calls, state, first)
+        feature = torch.stack([state.timestep[b] for b in first]).sum(0) if first else stem
+        rows.append(decisions.decide(k, np.ascontiguousarray(feature.movedim(executor.axes[0], 0).cpu().numpy())))
+        return executor.step(rows[-1], k, stream, calls, state, others)
+
+    with torch.no_grad():
+        sample = last(executor.samples(calls, blocks))
+    return Decided(np.stack(rows, 1), sample)
+
+
+def fit_threshold(
+    task: Task, criterion: Criterion, calls: Calls, low: float, high: float, probes: Iterator[object]
+) -> tuple[Criterion, Decided] | None:
+    """The criterion with the lowest threshold that keeps the budget, as far as bisection finds it.
+
+    Args:
+        task: see ``Task``.
+        criterion: with any threshold.
+        calls: whose computed cells are counted.
+        low: a threshold that is probably too low.
+        high: one that probably is not; doubled until it is not.
+        probes: as many as there is time for.
+
+    Returns:
+        The criterion, and what it decides on the calls; None if the time was up before one kept the budget.
+    """
+    found: tuple[Criterion, Decided] | None = None
+
+    def fits(threshold: float) -> bool:
+        nonlocal found
+        tried = replace(criterion, threshold=threshold)
+        decided = decide(task.executor, tried, calls)
+        kept = bool(decided.cells.mean() + 2 * decided.cells.std() / len(decided.cells) ** 0.5 <= task.budget)
+        found = (tried, decided) if kept else found
+        return kept
+
+    for _ in islice(probes, DOUBLINGS):
+        if fits(high):
+            break
+        low, high = high, 2 * high
+    for _ in islice(probes, HALVINGS):
+        middle = (low + high) / 2
+        low, high = (low, middle) if fits(middle) else (middle, high)
+    return found
+
+
+def online(task: Task, proposed: Sequence[tuple[Criterion, float]]) -> Found:
+    """Fit every criterion that is proposed, take the best, and fit it again on more calls.
+
+    Args:
+        task: see ``Task``.
+        proposed: criteria, each with a threshold to begin with.
+
+    Raises:
+        CalibrationFailedError: the time was up before one kept the budget.
+    """
+    probes, some, more = task.clock.in_time(repeat(None)), task.some_calls(COMPARED), task.some_calls(COUNTED)
+    fitted = [fit_threshold(task, criterion, some, 0.0, start, probes) for criterion, start in proposed]
+    kept = [one for one in fitted if one is not None]
+    if not kept:
+        raise CalibrationFailedError(
+            f"the time limit ended the search for a threshold of {proposed[0][0].name!r} before one kept the budget of"
+            f" {task.budget} computed cells. The artifact is as it was. Allow more time, or lower the target."
+        )
+    errors = [_error(task, decided, some) for _, decided in kept]
+    best, decided = kept[int(np.argmin(errors))]
+    near = max(best.threshold, 1e-6)
+    best, decided = fit_threshold(task, best, more, near / 2, near, probes) or (best, decided)
+    chosen = best_of(task, [(plan, {}) for plan in within(decided.plans, task.budget)[:FROZEN]])
+    cells = {"mean": float(decided.cells.mean()), "most": int(decided.cells.max())}
+    notes = {"criterion": best.record(), "computed_cells": cells}
+    return replace(chosen, notes=notes)
+
+
+def _error(task: Task, decided: Decided, calls: Calls) -> float:
+    """Mean error of the plans that were decided, normalised."""
+    return float(task.actions.errors(decided.samples, calls.targets, units=False).mean())
+
+
+def within(plans: PlanArray, budget: int) -> list[PlanArray]:
+    """The different ones of ``plans [N, K, blocks]`` that are within the budget, in order."""
+    computed = (plans == Source.COMPUTE).sum((1, 2))
+    return list({plan.tobytes(): plan for plan in plans[computed <= budget]}.values())
