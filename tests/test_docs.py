@@ -50,8 +50,12 @@ BLOCKS = [block for page in PAGES for block in examples.blocks(page)]
 TUTORIAL = ROOT / "docs" / "tutorial.md"
 COMMANDS = [command for block in BLOCKS if block.language == "console" for command in examples.commands(block)]
 COMMANDS.sort(key=lambda command: command.block.page != TUTORIAL)
-FOLLOWED = sorted({b.page for b in BLOCKS if b.language in ("console", "python")} - {ROOT / "CONTRIBUTING.md"})
-"""The commands of the guide are in ``NOT_RUN``; its two files have a test of their own."""
+EXTENDING = ROOT / "docs" / "extending"
+FOLLOWED = sorted(
+    {b.page for b in BLOCKS if b.language in ("console", "python") and b.page.parent != EXTENDING}
+    - {ROOT / "CONTRIBUTING.md"}
+)
+"""The commands of the guides are in ``NOT_RUN``; the files that the worked examples show have tests of their own."""
 
 
 @pytest.fixture(scope="module")
@@ -275,13 +279,9 @@ def test_every_page_is_in_the_navigation() -> None:
     assert listed == {str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")}
 
 
-def guide(section: str) -> list[str]:
-    """The Python files that a section of the contributing guide shows, in order."""
-    page = ROOT / "CONTRIBUTING.md"
-    headings = [i for i, line in enumerate(page.read_text().splitlines()) if line.startswith("## ")]
-    start = page.read_text().splitlines().index(f"## {section}")
-    stop = headings[headings.index(start) + 1]
-    shown = [block for block in examples.blocks(page) if block.language == "python" and start < block.line < stop]
+def guide(page: str) -> list[str]:
+    """The Python files that a worked example shows, in order."""
+    shown = [block for block in examples.blocks(EXTENDING / f"{page}.md") if block.language == "python"]
     return ["\n".join(block.lines) + "\n" for block in shown]
 
 
@@ -295,7 +295,7 @@ def contributed(text: str, name: str, folder: Path, monkeypatch: pytest.MonkeyPa
 
 def test_the_pass_of_the_contributing_guide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Both files as they stand in the guide, in the place that it gives them."""
-    written, its_test = guide("A pass")
+    written, its_test = guide("pass")
     contributed(written, "ttscompile.passes.drop_unit_scale", tmp_path, monkeypatch)
     test = contributed(its_test, "contributed_test", tmp_path, monkeypatch)
     test.test_a_multiplication_by_one_is_gone_and_the_numbers_stay()
@@ -308,7 +308,7 @@ def test_the_pass_of_the_contributing_guide(tmp_path: Path, monkeypatch: pytest.
 
 def test_the_policy_family_of_the_contributing_guide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its module, its row and its test as they stand in the guide."""
-    module, row, its_test = guide("A policy family")
+    module, row, its_test = guide("family")
     rows = eval(f"({row})", vars(families).copy())
     monkeypatch.setattr(families, "FAMILIES", (*rows, *families.FAMILIES))
     contributed(module, "ttscompile.frontends.action_dit", tmp_path, monkeypatch)
@@ -326,7 +326,7 @@ def test_the_policy_family_of_the_contributing_guide(tmp_path: Path, monkeypatch
 
 def test_the_strategy_of_the_contributing_guide(once: Once, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The module, its row and its test as they stand in the guide."""
-    written, row, its_test = guide("A strategy")
+    written, row, its_test = guide("strategy")
     contributed(written, "ttscompile.rivals.ends", tmp_path, monkeypatch)
     monkeypatch.setattr(strategies, "STRATEGIES", (*strategies.STRATEGIES, eval(row, vars(strategies))))
     test = contributed(its_test, "contributed_test", tmp_path, monkeypatch)
@@ -338,7 +338,7 @@ def test_the_strategy_of_the_contributing_guide(once: Once, tmp_path: Path, monk
 
 def test_the_runtime_of_the_contributing_guide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its module, how it is opened, its row and its test as they stand in the guide."""
-    module, opening, row, its_test = guide("A runtime")
+    module, opening, row, its_test = guide("runtime")
     contributed(module, "ttscompile.runtimes.resolved", tmp_path, monkeypatch)
     names = vars(open_module).copy()
     exec(opening, names)

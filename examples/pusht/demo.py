@@ -160,7 +160,7 @@ def conclusion(speeds: Sequence[Measurement], evaluations: Sequence[Evaluation])
         f" it is {original.median / compiled.median:.0f} times faster."
         f" {_told('the original', change)}"
         f" {_told('the same 16 steps, all computed', paired_difference(successes(sparse), successes(dense)))}"
-        f" These are {len(sparse.rollout.episodes)} episodes; docs/results.md has 200."
+        f" These are {len(sparse.rollout.episodes)} episodes; docs/evidence/results.md has 200."
     )
 
 

@@ -93,5 +93,5 @@ def test_without_a_distance_there_is_no_ratio(other_noise: float | None) -> None
 
 
 def test_the_sentence_is_of_a_section_that_is_there() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "results.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "evidence" / "results.md").read_text()
     assert "## What an error means" in page

@@ -82,7 +82,7 @@ def test_the_conclusion_says_whether_success_was_kept():
     assert kept.startswith("A compiled call takes 25 ms where the original takes 1000 ms: it is 40 times faster.")
     assert "Its success is not told apart from that of the original:" in kept
     assert "not told apart from that of the same 16 steps, all computed:" in kept
-    assert kept.endswith("These are 1 episodes; docs/results.md has 200.")
+    assert kept.endswith("These are 1 episodes; docs/evidence/results.md has 200.")
     lost = conclusion(SPEEDS, evaluations(0.97, 0.5, 0.6))
     assert "Its success is lower than that of the original." in lost
     assert "not told apart from that of the same 16 steps, all computed:" in lost

@@ -1,7 +1,7 @@
-"""The support table of the README: a row a family, asserted by its own tests, rendered from ``docs/support.json``.
+"""The table of ``docs/support.md``: a row a family, asserted by its own tests, rendered from ``docs/support.json``.
 
 A test of a family compiles it and calls ``record``, which compares what it finds with the committed row. Where they
-differ the message holds the row to paste. ``python -m tests.families.support`` writes the table into the README.
+differ the message holds the row to paste. ``python -m tests.families.support`` writes the table into the page.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ttscompile.ir.program import Block, Program
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORD = ROOT / "docs" / "support.json"
-README = ROOT / "README.md"
+PAGE = ROOT / "docs" / "support.md"
 COLUMNS = (
     "Policy",
     "Compared with, and largest difference allowed",
@@ -120,16 +120,16 @@ def _hoisted(each: Row) -> str:
     return f"{each['hoisted']:.1%}{batched}"
 
 
-def in_readme(text: str) -> str:
-    """The table as the README has it."""
-    assert text.count(BEGIN) == text.count(END) == 1, f"{README.name} needs {BEGIN} and {END}, once each"
+def in_page(text: str) -> str:
+    """The table as the page has it."""
+    assert text.count(BEGIN) == text.count(END) == 1, f"{PAGE.name} needs {BEGIN} and {END}, once each"
     return BEGIN + text.partition(BEGIN)[2].partition(END)[0] + END
 
 
 def main() -> None:
-    """Write the table into the README."""
-    text = README.read_text(encoding="utf-8")
-    README.write_text(text.replace(in_readme(text), render(read_record())), encoding="utf-8")
+    """Write the table into the page."""
+    text = PAGE.read_text(encoding="utf-8")
+    PAGE.write_text(text.replace(in_page(text), render(read_record())), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,15 +1,15 @@
-"""The README's support table is what the record says, and the record is what the tests of the families found."""
+"""The support table is what the record says, and the record is what the tests of the families found."""
 
 from __future__ import annotations
 
 from ttscompile.frontends.refusals import DIRECTORIES, POLICIES, STATES
 
-from .support import README, in_readme, read_record, render
+from .support import PAGE, in_page, read_record, render
 
 
-def test_readme_holds_the_table() -> None:
+def test_the_page_holds_the_table() -> None:
     """As ``python -m tests.families.support`` writes it."""
-    written = in_readme(README.read_text(encoding="utf-8"))
+    written = in_page(PAGE.read_text(encoding="utf-8"))
     assert written == render(read_record()), "run python -m tests.families.support"
 
 

@@ -1,7 +1,7 @@
 """The strategies: one record each, of what is known about a strategy before it runs.
 
 The command line and the pipeline read names, reach and properties here; so this module imports neither torch nor the
-modules of the strategies. A strategy is its module and its row in ``STRATEGIES``: see ``CONTRIBUTING.md``.
+modules of the strategies. A strategy is its module and its row in ``STRATEGIES``: see ``docs/extending``.
 
 TaylorSeer (arXiv 2503.06923) is not here. It adds ``r(o) + (k - o) * (r(o) - r(p)) / (o - p)``, a combination of two
 computed residuals with a weight that grows with the step. A cell of the lattice adds one computed residual; neither a

@@ -7,7 +7,7 @@ of crowded schedules. Where there are few others, it tries them all; else it mov
 at first, until no move helps. The winner's correction is fitted again, on all calls.
 
 ``switched`` then lets the pruner depart from the schedule (``pruner.adaptation``). That never made a plan better that
-could be told from chance (``docs/ablation.md``), so ``tts`` does without.
+could be told from chance (``docs/evidence/ablation.md``), so ``tts`` does without.
 """
 
 from __future__ import annotations

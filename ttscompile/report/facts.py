@@ -242,7 +242,8 @@ def other_noise(record: Mapping[str, Any]) -> tuple[str, ...]:
     told = (
         f"Two dense calls with different noise are {apart:.4g} apart on these episodes. On five policies errors up to"
         " a quarter as large cost at most 0.03 of the score and a tenth of the episodes, and one more than half as"
-        " large cost 0.43 of the score (docs/results.md, 'What an error means'). Yours may forgive less: evaluate it."
+        " large cost 0.43 of the score (docs/evidence/results.md, 'What an error means'). Yours may forgive less:"
+        " evaluate it."
     )
     return (told,)
 
