@@ -1,0 +1,109 @@
+"""What a call computes, as a value: every choice that can be made about a call is a field of ``Plan``.
+
+An artifact has plans by name. Others are made of them with ``dataclasses.replace``. ``docs/design.md`` section 2 says
+what the fields mean; no runtime has another way of being told what to compute.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+
+from ..errors import IllegalPlanError
+from .correction import Correction
+from .lattice import PlanArray
+from .rules import NotNegative, Positive
+
+ORIGINAL = "original"
+"""The loop that the policy was trained to run in; and the weights that it was trained to have."""
+DENSE = "dense"
+"""The plan that is the original policy: its loop, its weights, every cell computed. Every artifact has it."""
+FULL = "full"
+"""The plan that computes every cell of the loop, and in the precision, that ``convert`` was asked for."""
+UNIFORM = "uniform"
+"""The plan that calibration adds for comparisons alone: as many steps computed, evenly spaced. Not for a robot."""
+
+
+@dataclass(frozen=True)
+class TokenReuse:
+    """When a token of an image encoder is computed anew.
+
+    Attributes:
+        threshold: a patch has changed where its pixels, as the encoder reads them, differ by more than this on average
+            from those that its token was last computed for.
+        refresh: of so many new frames of a camera one is computed whole.
+    """
+
+    threshold: NotNegative
+    refresh: Positive
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What has to be opened for a plan, and is common to all plans that differ in cells and correction alone.
+
+    Attributes:
+        loop: see ``Plan``.
+        weights: see ``Plan``.
+        precision: see ``Plan``; pairs of a part and its precision, in order.
+        tokens: see ``Plan``.
+    """
+
+    loop: str = ORIGINAL
+    weights: str = ORIGINAL
+    precision: tuple[tuple[str, str], ...] = ()
+    tokens: TokenReuse | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What a call computes. Two plans are the same only if they are one object.
+
+    Attributes:
+        loop: name of a loop of the artifact: which sampler, at which timesteps, and whether it begins with noise or
+            with the chunk of the call before.
+        cells: int8 ``[K, blocks]`` of ``Source``, or ``[B, K, blocks]`` for streams that differ; None: the pruner makes
+            them for each observation.
+        correction: what is added to the sampler's steps, jumps included; None for nothing.
+        weights: name of the weights that residual blocks have from step 1 on.
+        precision: by part (``ir.pieces.part_of``) the precision of its weights; parts that are not named are in fp32.
+        tokens: when a token of an image encoder is computed anew; None: all tokens of all new frames are.
+        otherwise: of a loop that begins with the chunk of the call before, the plan of a call that has none: the first
+            of an episode, and one that is late. None for the loops that begin with noise.
+        repair: whether reads of what was never computed are replaced and counted (``lattice.legalize``), or the call is
+            refused. The plans of an artifact are repaired.
+    """
+
+    loop: str = ORIGINAL
+    cells: PlanArray | None = None
+    correction: Correction | None = None
+    weights: str = ORIGINAL
+    precision: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    tokens: TokenReuse | None = None
+    otherwise: Plan | None = None
+    repair: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("loop", "weights"):
+            if not isinstance(getattr(self, name), str):
+                raise IllegalPlanError(f"a plan's {name}: expected a name; found {getattr(self, name)!r:.80}.")
+        object.__setattr__(self, "precision", MappingProxyType(dict(self.precision)))
+
+    @property
+    def pruned(self) -> bool:
+        """Whether the pruner makes the cells."""
+        return self.cells is None
+
+    @property
+    def variant(self) -> Variant:
+        """What has to be opened for it."""
+        return Variant(self.loop, self.weights, tuple(sorted(self.precision.items())), self.tokens)
+
+    @property
+    def exact(self) -> Plan:
+        """The same with all parts in fp32 and all tokens computed, which every runtime can do; itself if it is so."""
+        if not self.precision and self.tokens is None:
+            return self
+        otherwise = None if self.otherwise is None else self.otherwise.exact
+        return replace(self, precision={}, tokens=None, otherwise=otherwise)
