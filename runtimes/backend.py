@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
-from ttscompile.artifact.load import Artifact
+from ttscompile.artifact.view import View
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import BoolArray, PlanArray
 from ttscompile.core.spec import FloatArray, Noise
@@ -42,7 +42,7 @@ class Call:
 
 
 class Backend(Protocol[Lowered]):
-    """Executes the calls of one artifact.
+    """Executes calls of plans of one variant: on one view of an artifact.
 
     ``Runtime`` calls the methods in this order::
 
@@ -54,9 +54,6 @@ class Backend(Protocol[Lowered]):
 
     A backend that has ``frames`` too, a ``FramePieces``, computes with it what depends on one frame alone, and so only
     for frames that are new; one that has none computes all of them in ``start``.
-
-    A backend that has ``of_last_steps`` too, which takes an artifact of the last steps of the same loop, makes with it
-    the backend of these, and shares its weights with it.
 
     Attributes:
         keeps: bool ``[K, blocks]``; entries of the rollout cache that are worth keeping when a plan of the artifact is
@@ -101,7 +98,7 @@ class Backend(Protocol[Lowered]):
 
 
 @contextmanager
-def fitting(artifact: Artifact) -> Iterator[None]:
+def fitting(view: View) -> Iterator[None]:
     """Within the block whatever fails is an error of the artifact: its hashes are right, and its parts do not fit.
 
     Raises:
@@ -113,4 +110,4 @@ def fitting(artifact: Artifact) -> Iterator[None]:
         raise
     except Exception as error:
         problem = f"its manifest, tables and graphs do not fit each other ({type(error).__name__}: {str(error)[:300]})"
-        raise ArtifactError(f"{artifact.path}: {problem}. Convert the checkpoint again.") from error
+        raise ArtifactError(f"{view.path}: {problem}. Convert the checkpoint again.") from error

@@ -24,7 +24,7 @@ class PolicyInfo:
     """What a compiled policy is.
 
     Attributes:
-        K: number of denoising steps.
+        K: number of denoising steps of the plan that it was loaded with.
         blocks: block table, in order of execution.
         dense_flops: of one call of the policy as it was before it was compiled, one stream.
         observation: specification of each key of the observation.
@@ -35,14 +35,15 @@ class PolicyInfo:
         identity: sha256 of what the artifact computes.
         model_identity: the same without plans, corrections and pruner: what calibration leaves as it is.
         plans: names that ``predict_action(plan=...)`` takes.
-        default_plan: the one that is taken when none is given.
-        precision: ``fp32``, or ``int8`` in the parts that the artifact has in it; on torch ``bf16`` and ``fp16``, too.
+        default_plan: the one that is taken when none is given; ``given`` for one that is none of the artifact's.
+        precision: ``fp32``, or what that plan has some parts in: ``int8``, or on torch ``bf16`` and ``fp16``.
         rollout: what keeping the rollout cache of one stream takes.
         prefix_refusal: why ``predict_action`` takes no ``prefix``; None if it does.
         frames: how many pieces depend on one frame alone, and are remembered by its content; 0 where there are none, or
             where the runtime computes all of them in every call.
         reuses_tokens: whether of new frames only some tokens are computed, so that a call depends on the frames before.
-        warm_steps: of a policy that was loaded with ``warm``, steps of all calls but the first; None for any other.
+        follows: whether that plan begins with the chunk of the call before, so that each call has to be one chunk later
+            than the one before (``CompiledPolicy.forget_chunk`` tells it of one that is not).
     """
 
     K: int
@@ -62,4 +63,4 @@ class PolicyInfo:
     prefix_refusal: str | None
     frames: int = 0
     reuses_tokens: bool = False
-    warm_steps: int | None = None
+    follows: bool = False

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ttscompile.artifact.load import Artifact
+from ttscompile.artifact.view import View
 from ttscompile.core.lattice import BoolArray, Source
 
 HEAD = ("pruner.base", "pruner.mask", "pruner.step", "pruner.block")
@@ -19,7 +19,7 @@ class RolloutNeeds:
     """The rollout cache of one stream.
 
     Attributes:
-        read: entries that the artifact's schedules and pruner can read.
+        read: entries that schedules and pruner of its plans can read.
         bytes_read: what these take.
         cells: K * blocks, what a plan that the caller gives can read.
         bytes_most: what these take.
@@ -31,36 +31,36 @@ class RolloutNeeds:
     bytes_most: int
 
 
-def rollout_needs(artifact: Artifact) -> RolloutNeeds:
+def rollout_needs(view: View) -> RolloutNeeds:
     """What keeping the rollout cache of one stream takes."""
-    entry = 4 * math.prod(artifact.manifest.blocks[0].type.at(1))  # residuals are float32
-    readable = readable_rollout(artifact)
+    entry = 4 * math.prod(view.manifest.blocks[0].type.at(1))  # residuals are float32
+    readable = readable_rollout(view)
     read = int(np.count_nonzero(readable))
     return RolloutNeeds(read, read * entry, readable.size, readable.size * entry)
 
 
-def readable_rollout(artifact: Artifact) -> BoolArray:
-    """Entries that some plan of the artifact can read, its schedules' and its pruner's: bool ``[K, blocks]``."""
-    manifest = artifact.manifest
+def readable_rollout(view: View) -> BoolArray:
+    """Entries that some plan of the view can read, its schedules' and its pruner's: bool ``[K, blocks]``."""
+    manifest = view.manifest
     readable = np.zeros((manifest.steps, len(manifest.blocks)), dtype=np.bool_)
-    for schedule in artifact.schedules.values():
+    for schedule in view.schedules.values():
         readable |= schedule == Source.ROLLOUT
-    if any(plan.pruned for plan in manifest.plans.values()):
-        readable |= _pruner_can_read(artifact)
+    if view.pruned:
+        readable |= _pruner_can_read(view)
     return readable
 
 
-def reading_earlier_calls(artifact: Artifact) -> set[str]:
+def reading_earlier_calls(view: View) -> set[str]:
     """Names of the plans that can read what an earlier call of the episode computed."""
-    reading = {name for name, schedule in artifact.schedules.items() if (schedule == Source.ROLLOUT).any()}
-    pruned = {name for name, plan in artifact.manifest.plans.items() if plan.pruned}
-    return reading | pruned if pruned and _pruner_can_read(artifact).any() else reading
+    reading = {name for name, schedule in view.schedules.items() if (schedule == Source.ROLLOUT).any()}
+    pruned = {name for name, plan in view.plans.items() if plan.pruned}
+    return reading | pruned if pruned and _pruner_can_read(view).any() else reading
 
 
-def _pruner_can_read(artifact: Artifact) -> BoolArray:
+def _pruner_can_read(view: View) -> BoolArray:
     """Cells in which the ROLLOUT logit can be the largest; every cell of a pruner that is not the head we know."""
-    shape = (artifact.manifest.steps, len(artifact.manifest.blocks), len(Source))
-    head = artifact.pruner
+    shape = (view.manifest.steps, len(view.manifest.blocks), len(Source))
+    head = view.pruner
     if not set(HEAD) <= set(head) or head["pruner.base"].shape != shape:
         return np.ones(shape[:2], dtype=np.bool_)
     fixed = head["pruner.base"].astype(np.float64) + head["pruner.mask"]

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
 
 from ttscompile.artifact.load import Artifact
+from ttscompile.artifact.view import View, require_held
 from ttscompile.core.coercion import integer
-from ttscompile.core.spec import BF16, FP16, FP32
+from ttscompile.core.plan import Plan
+from ttscompile.core.spec import BF16, FP16, INT8
 from ttscompile.errors import RuntimeUnavailableError
+from ttscompile.ir.pieces import BLOCKS
 
 from .backend import Backend, fitting
 from .runtime import Runtime
@@ -27,12 +30,13 @@ class Options:
     Attributes:
         threads: of arithmetic, one of which is the caller's. The reference runs with torch's own setting.
         device: where it computes.
-        precision: of the residual blocks, where the runtime makes it of weights in fp32 (``Kind.precisions``).
     """
 
     threads: int = 1
     device: str = CPU
-    precision: str = FP32
+
+
+Open: TypeAlias = Callable[[View], Backend[Any]]
 
 
 @dataclass(frozen=True)
@@ -40,42 +44,71 @@ class Kind:
     """One kind of runtime.
 
     Attributes:
-        make: its backend on an artifact; imports what it needs when it is called.
+        make: what opens its backends on views of one artifact, which share what they have in common; imports what it
+            needs when it is called.
         install: what pip has to install where its packages are missing.
-        precisions: those of residual blocks that it makes of the weights in fp32, which every artifact holds; empty
-            where it computes in those that the artifact holds.
+        held: the precisions beside fp32 that it computes in, from models that the artifact holds.
+        made: the precisions of residual blocks that it makes of the weights in fp32.
+        tokens: whether it can compute some of the tokens of an image encoder.
         devices: whether it computes anywhere else than on the CPU.
     """
 
-    make: Callable[[Artifact, Options], Backend[Any]]
+    make: Callable[[Options], Open]
     install: str
-    precisions: tuple[str, ...] = ()
+    held: tuple[str, ...] = ()
+    made: tuple[str, ...] = ()
+    tokens: bool = False
     devices: bool = False
 
 
-def _onnxruntime(artifact: Artifact, options: Options) -> Backend[Any]:
-    from .onnxruntime.backend import OnnxBackend
+def _onnxruntime(options: Options) -> Open:
+    from .onnxruntime.backend import OnnxBackends
 
-    return OnnxBackend(artifact, options.threads)
+    return OnnxBackends(options.threads)
 
 
-def _reference(artifact: Artifact, options: Options) -> Backend[Any]:
+def _reference(options: Options) -> Open:
     from .reference.backend import ReferenceBackend
 
-    return ReferenceBackend(artifact)
+    return ReferenceBackend
 
 
-def _torch(artifact: Artifact, options: Options) -> Backend[Any]:
-    from .torch.backend import TorchBackend
+def _torch(options: Options) -> Open:
+    from .torch.backend import TorchBackends
 
-    return TorchBackend(artifact, options.threads, options.device, options.precision)
+    return TorchBackends(options.threads, options.device)
 
 
 RUNTIMES = {
-    "onnxruntime": Kind(_onnxruntime, install="onnxruntime"),
-    "torch": Kind(_torch, install="ttscompile[compile]", precisions=(FP32, BF16, FP16), devices=True),
-    "reference": Kind(_reference, install="ttscompile[compile]", precisions=(FP32,)),
+    "onnxruntime": Kind(_onnxruntime, install="onnxruntime", held=(INT8,), tokens=True),
+    "torch": Kind(_torch, install="ttscompile[compile]", made=(BF16, FP16), devices=True),
+    "reference": Kind(_reference, install="ttscompile[compile]"),
 }
+
+
+def require_able(runtime: str, artifact: Artifact, plan: Plan) -> None:
+    """Raise unless a runtime can compute what a plan asks for.
+
+    Raises:
+        RuntimeUnavailableError: it has no such precision, or cannot reuse tokens.
+        ArtifactError: it could, and the artifact holds no such models.
+    """
+    kind, remedy = kind_of(runtime), "Take plan='dense', or the plan without it: plan.exact"
+    for part, precision in plan.precision.items():
+        if precision in kind.made and part == BLOCKS:
+            continue
+        if precision not in kind.held:
+            able = [*kind.held, *(f"{name} in {BLOCKS}" for name in kind.made)]
+            can = f"fp32, and beside it {', '.join(able)}" if able else "fp32 alone"
+            raise RuntimeUnavailableError(
+                f"runtime {runtime!r} computes in {can}; the plan wants {part!r} in {precision!r}. {remedy}."
+            )
+    require_held(artifact, replace(plan, precision={p: n for p, n in plan.precision.items() if n in kind.held}))
+    if plan.tokens is not None and not kind.tokens:
+        able = ", ".join(repr(name) for name, each in RUNTIMES.items() if each.tokens)
+        raise RuntimeUnavailableError(
+            f"runtime {runtime!r} computes all tokens of a frame; the plan reuses some. Use runtime={able}. {remedy}."
+        )
 
 
 def kind_of(runtime: str) -> Kind:
@@ -94,8 +127,7 @@ def open_runtime(
     runtime: str = "onnxruntime",
     threads: int = 1,
     device: str | None = None,
-    precision: str = FP32,
-    plan: str | None = None,
+    plan: Plan | None = None,
 ) -> Runtime:
     """Make a runtime for an artifact.
 
@@ -104,13 +136,13 @@ def open_runtime(
         runtime: a name in ``RUNTIMES``.
         threads: see ``Options``.
         device: see ``Options``; None for the CPU.
-        precision: see ``Options``.
         plan: see ``Runtime``.
 
     Raises:
-        RuntimeUnavailableError: no runtime of this name, its packages are missing, or threads, device or precision
-            cannot be had.
+        RuntimeUnavailableError: no runtime of this name, its packages are missing, or threads, device or what the plan
+            asks for cannot be had.
         ArtifactError: the parts of the artifact do not fit each other.
+        IllegalPlanError: the plan names what the artifact lacks.
     """
     threads = integer(threads, "threads", RuntimeUnavailableError, 1, MOST_THREADS)
     kind = kind_of(runtime)
@@ -120,12 +152,15 @@ def open_runtime(
         able = ", ".join(repr(name) for name, each in RUNTIMES.items() if each.devices)
         problem = f"runtime {runtime!r} computes on the CPU alone; found device {device!r}"
         raise RuntimeUnavailableError(f"{problem}. Use runtime={able}.")
-    options = Options(threads, device or CPU, precision)
+    options, opener = Options(threads, device or CPU), list[Open]()
 
-    def backend(weights: Artifact) -> Backend[Any]:
+    def backend(view: View) -> Backend[Any]:
+        require_able(runtime, artifact, Plan(precision=view.precision, tokens=view.tokens))
         try:
-            with weights.reading(), fitting(weights):  # a backend reads arrays that are mapped from the files
-                return kind.make(weights, options)
+            with view.reading(), fitting(view):  # a backend reads arrays that are mapped from the files
+                if not opener:
+                    opener.append(kind.make(options))
+                return opener[0](view)
         except ModuleNotFoundError as error:
             problem = f"runtime {runtime!r} needs {error.name!r}, which is not installed"
             raise RuntimeUnavailableError(f"{problem}. Run: pip install '{kind.install}'.") from error

@@ -11,13 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ttscompile.artifact.load import Artifact
-from ttscompile.artifact.manifest import DENSE
-from ttscompile.core.spec import FloatArray, Noise
-from ttscompile.errors import (
-    IllegalPlanError,
-    NonFiniteActionsError,
-    TtscompileError,
-)
+from ttscompile.core.plan import Plan
+from ttscompile.core.spec import FP32, FloatArray, Noise
+from ttscompile.errors import NonFiniteActionsError, TtscompileError
 from ttscompile.measure.process import LONGEST_WAIT, Process
 
 from .arrays import Array, check_observation, check_seed, like, read_observation
@@ -27,8 +23,10 @@ from .inpainting import check_prefix, prefix_refusal
 from .instruct import Instruct
 from .liveness import rollout_needs
 from .queues import Queues, is_window
-from .report import CallReport
+from .report import GIVEN, CallReport
 from .runtime import Runtime
+
+NO_PREFIX = "its plan begins with the chunk of the call before, and so keeps to it already"
 
 
 class CompiledPolicy:
@@ -39,10 +37,9 @@ class CompiledPolicy:
 
     Args:
         artifact: loaded and checked.
-        runtime: opened on the same artifact.
+        runtime: opened on the same artifact, and for the same plan.
         seed: of the noise that is drawn when none is given.
         plan: see ``load``.
-        precision: see ``load``; None for the artifact's.
         origin: ``hf://org/name@commit`` of an artifact from the hub; None for another.
         instruct: puts tokens in the place of a task's text; None for none.
 
@@ -55,21 +52,16 @@ class CompiledPolicy:
         artifact: Artifact,
         runtime: Runtime,
         seed: int | None = None,
-        plan: str | None = None,
-        precision: str | None = None,
+        plan: str | Plan | None = None,
         origin: str | None = None,
         instruct: Instruct | None = None,
     ) -> None:
         self.origin = origin
         self._artifact, self._runtime, self._instruct = artifact, runtime, instruct
-        self._precision = precision or artifact.manifest.precision_name
-        self._manifest = artifact.manifest
-        self._default = artifact.manifest.default_plan if plan is None else plan
-        require_plan(artifact, self._default)
-        self._prefix_refusal = prefix_refusal(artifact.manifest.spec)
+        self._spec = artifact.manifest.spec  # of what all loops have in common
+        self._default = plan_of(artifact, plan)
         self._rng = np.random.default_rng(check_seed(seed))
         self._report: CallReport | None = None
-        self._sample: FloatArray | None = None  # of the last call, ``[B, T, D]``, normalised
         self._queues = Queues(artifact.manifest.spec.observations)
         self._lock, self._process = threading.Lock(), Process()
         self._exit = weakref.finalize(self, _end_calls, self._lock, self._process)
@@ -90,8 +82,9 @@ class CompiledPolicy:
 
     @property
     def info(self) -> PolicyInfo:
-        """What this policy is."""
-        manifest, blocks = self._manifest, []
+        """What this policy is: with the plan that it was loaded with."""
+        view, default = self._runtime.view(self._default), self._default
+        manifest, blocks = view.manifest, []
         for block in manifest.blocks:
             shape = tuple(n for i, n in enumerate(block.type.at(1)) if i != block.type.batch_axis)
             blocks.append(BlockInfo(block.kind, shape, block.flops))
@@ -106,14 +99,20 @@ class CompiledPolicy:
             stochastic=manifest.spec.sampler.stochastic,
             identity=manifest.identity,
             model_identity=manifest.model_identity,
-            plans=(DENSE, *manifest.plans),
-            default_plan=self._default,
-            precision=self._precision,
-            rollout=rollout_needs(self._artifact),
-            prefix_refusal=self._prefix_refusal,
+            plans=tuple(self._artifact.plans),
+            default_plan=self._artifact.name_of(default) or GIVEN,
+            precision=" and ".join(dict.fromkeys(default.precision.values())) or FP32,
+            rollout=rollout_needs(view),
+            prefix_refusal=self._prefix_refusal(default),
             frames=self._runtime.frame_pieces,
             reuses_tokens=self._runtime.reuses_tokens,
+            follows=default.otherwise is not None,
         )
+
+    @property
+    def plans(self) -> Mapping[str, Plan]:
+        """The plans of the artifact by name, ``dense`` among them. ``dataclasses.replace`` makes others of them."""
+        return self._artifact.plans
 
     @property
     def queued(self) -> int:
@@ -137,14 +136,13 @@ class CompiledPolicy:
                 self._rng = np.random.default_rng(seed)
 
     def _reset(self) -> None:
-        self._sample = None
         self._runtime.reset()
 
     def predict_action(
         self,
         obs_dict: Mapping[str, Any],
         noise: Noise | None = None,
-        plan: str | npt.ArrayLike | None = None,
+        plan: str | Plan | npt.ArrayLike | None = None,
         prefix: Any = None,
     ) -> dict[str, Any]:
         """One call of the policy.
@@ -153,9 +151,11 @@ class CompiledPolicy:
             obs_dict: by key ``[B, ...]``, numpy arrays or torch tensors, not normalised. ``info.observation`` has keys,
                 shapes and dtypes. B may only change after ``reset``.
             noise: the random numbers of the call; None has them drawn.
-            plan: None for the default of ``load``; ``dense`` or the name of a plan of the artifact, whose reads of what
-                was never computed are repaired and counted in the report; or int8 ``[K, blocks]`` or
-                ``[B, K, blocks]`` of ``ttscompile.Source``, which is executed as it is or refused.
+            plan: what to compute: None for the plan of ``load``; the name of a plan of the artifact, ``dense`` among
+                them, whose reads of what was never computed are repaired and counted in the report; a
+                ``ttscompile.Plan``; or int8 ``[K, blocks]`` or ``[B, K, blocks]`` of ``ttscompile.Source``, which are
+                the cells of a plan with the loop, precision and tokens of the plan of ``load``, without its correction
+                and with the original's weights, executed as they are or refused.
             prefix: experimental: the actions that are committed already, float32 ``[B, N, Da]``, not normalised, from
                 the first executed one on. They are kept, and the rest of the chunk is inpainted to them
                 (``runtimes.inpainting``). None or N = 0: none are.
@@ -171,7 +171,7 @@ class CompiledPolicy:
             NonFiniteActionsError: the arithmetic overflowed, and the episode has ended.
         """
         with self._turn():
-            spec = self._manifest.spec
+            spec = self._spec
             obs, example = self._read(obs_dict)
             predicted, chunk = self._predict(obs, noise, plan, prefix), spec.chunk
             executed = predicted[:, chunk.start : chunk.stop]
@@ -201,12 +201,20 @@ class CompiledPolicy:
         with self._turn():
             if not self._runtime.frame_pieces:
                 return FrameWork()
-            specs = self._manifest.spec.observations
+            specs = self._spec.observations
             one, whole = Queues(specs), self._read(frame, others=True)[0]
             obs = one.observation(one.after(whole))  # a window that holds nothing else
             self._runtime.require_streams(len(next(iter(obs.values()))))
             with np.errstate(all="ignore"):
                 return self._runtime.learn({key: specs[key].normalized(array) for key, array in obs.items()}, stop)
+
+    def forget_chunk(self) -> None:
+        """Have the next call begin with noise: it is not one chunk later than the one before.
+
+        For plans whose loop begins with the chunk of the call before; nothing changes for others.
+        """
+        with self._turn():
+            self._runtime.forget_chunk()
 
     def forget_frames(self) -> None:
         """Have the next call compute all of its frames, as if none had been seen: to measure what a call may take."""
@@ -214,7 +222,7 @@ class CompiledPolicy:
             self._runtime.forget_frames()
 
     def select_action(
-        self, batch: Mapping[str, Any], noise: Noise | None = None, plan: str | npt.ArrayLike | None = None
+        self, batch: Mapping[str, Any], noise: Noise | None = None, plan: str | Plan | npt.ArrayLike | None = None
     ) -> Any:
         """The next action, as LeRobot's policies give it: a chunk is computed when the one before it is used up.
 
@@ -244,7 +252,7 @@ class CompiledPolicy:
         self,
         batch: Mapping[str, Any],
         noise: Noise | None = None,
-        plan: str | npt.ArrayLike | None = None,
+        plan: str | Plan | npt.ArrayLike | None = None,
         prefix: Any = None,
     ) -> Any:
         """A chunk of actions ``[B, Ta, Da]``, as LeRobot's policies give it; the queue of ``select_action`` stays.
@@ -263,7 +271,7 @@ class CompiledPolicy:
             NonFiniteActionsError: as ``predict_action``.
         """
         with self._turn():
-            specs = self._manifest.spec.observations
+            specs = self._spec.observations
             obs, example = self._read(batch, others=True)
             if is_window(obs, specs):
                 chunk = self._chunk(obs, noise, plan, prefix)
@@ -276,35 +284,31 @@ class CompiledPolicy:
     def _read(self, given: Mapping[str, Any], others: bool = False) -> tuple[dict[str, Array], Any]:
         """The caller's observation, a text in it turned into tokens; see ``read_observation``."""
         given = given if self._instruct is None else self._instruct(given)
-        return read_observation(given, self._manifest.spec.observations, others)
+        return read_observation(given, self._spec.observations, others)
 
     def _chunk(
-        self, obs: Mapping[str, Array], noise: Noise | None, plan: str | npt.ArrayLike | None, prefix: Any = None
+        self, obs: Mapping[str, Array], noise: Noise | None, plan: str | Plan | npt.ArrayLike | None, prefix: Any = None
     ) -> FloatArray:
         """What is executed of a call, ``[B, Ta, Da]``."""
-        chunk = self._manifest.spec.chunk
+        chunk = self._spec.chunk
         return self._predict(obs, noise, plan, prefix)[:, chunk.start : chunk.stop]
 
     def _predict(
-        self, obs: Mapping[str, Array], noise: Noise | None, plan: str | npt.ArrayLike | None, prefix: Any = None
+        self, obs: Mapping[str, Array], noise: Noise | None, plan: str | Plan | npt.ArrayLike | None, prefix: Any = None
     ) -> FloatArray:
         """One call; the actions ``[B, T, Da]``, which are finite."""
-        self._report = self._sample = None
-        spec = self._manifest.spec
+        self._report, wanted = None, self._plan(plan)
+        spec = self._runtime.view(wanted).manifest.spec
         obs = check_observation(obs, spec.observations)
         streams = len(next(iter(obs.values())))
         self._runtime.require_streams(streams)
         if prefix is not None:
-            prefix = check_prefix(prefix, streams, spec, self._prefix_refusal)
+            prefix = check_prefix(prefix, streams, spec, self._prefix_refusal(wanted))
             prefix = prefix if spec.chunk.normalizer is None else spec.chunk.normalizer.normalize(prefix)
-        matrix, name, repair = self._plan(plan)
-        correction = None if name is None else self._artifact.corrections.get(name)
-        noise = self._draw(streams) if noise is None else noise
+        noise = self._draw(streams, wanted) if noise is None else noise
         with np.errstate(all="ignore"):  # onnxruntime and torch raise no flags either: a call is judged by its actions
             normalized = {key: spec.observations[key].normalized(array) for key, array in obs.items()}
-            sample, report = self._runtime.predict(
-                normalized, noise, matrix, plan_name=name, repair=repair, correction=correction, prefix=prefix
-            )
+            sample, report = self._runtime.predict(normalized, noise, wanted, prefix)
             actions = spec.chunk.unnormalized(sample)
         if not np.isfinite(actions).all():
             self._runtime.reset()  # what it kept may not be finite either
@@ -315,29 +319,31 @@ class CompiledPolicy:
                 " Look at the observation. If it is as in training, weights or plan are damaged: run 'ttscompile"
                 " verify', and try plan='dense'. The episode has ended, as by reset()."
             )
-        self._report, self._sample = report, sample
+        self._report = report
         return actions
 
-    def _draw(self, streams: int) -> Noise:
+    def _draw(self, streams: int, plan: Plan) -> Noise:
         """Noise of all steps of the original's horizon: a seed means the same however many are predicted."""
-        spec = self._manifest.spec.original
-        shape, predicted = (streams, *spec.sample), self._manifest.spec.sample[0]
+        spec = self._runtime.view(plan.otherwise or plan).manifest.spec  # of the whole loop
+        shape, predicted = (streams, *spec.original.sample), spec.sample[0]
         initial = self._rng.standard_normal(shape, dtype=np.float32)[:, :predicted]
         if not spec.sampler.stochastic:
             return Noise(initial)
         steps = self._rng.standard_normal((spec.sampler.steps, *shape), dtype=np.float32)
         return Noise(initial, steps[:, :, :predicted])
 
-    def _plan(self, plan: str | npt.ArrayLike | None) -> tuple[npt.ArrayLike | None, str | None, bool]:
-        """Matrix (None: the pruner's), name (None: the caller's matrix), and whether illegal reads are repaired."""
+    def _plan(self, plan: str | Plan | npt.ArrayLike | None) -> Plan:
+        """The plan that a caller means."""
         if plan is None:
-            plan = self._default
-        if not isinstance(plan, str):
-            return plan, None, False
-        if plan == DENSE:
-            return self._artifact.schedule(DENSE), DENSE, False
-        require_plan(self._artifact, plan)
-        return (None if self._manifest.plans[plan].pruned else self._artifact.schedule(plan)), plan, True
+            return self._default
+        if isinstance(plan, str | Plan):
+            return plan_of(self._artifact, plan)
+        own = self._default.otherwise or self._default
+        return Plan(own.loop, np.asarray(plan), precision=own.precision, tokens=own.tokens)
+
+    def _prefix_refusal(self, plan: Plan) -> str | None:
+        """Why a call with this plan takes no prefix; None if it does."""
+        return NO_PREFIX if plan.otherwise is not None else prefix_refusal(self._runtime.view(plan).manifest.spec)
 
     def _turn(self) -> threading.Lock:
         """The lock, to hold during a call. Not a manager of contexts of our own: an interrupt might keep it locked.
@@ -368,12 +374,12 @@ def _end_calls(lock: threading.Lock, process: Process) -> None:
         lock.acquire(timeout=LONGEST_WAIT)
 
 
-def require_plan(artifact: Artifact, name: str) -> None:
-    """Raise unless the artifact has a plan of this name."""
-    known = [DENSE, *artifact.manifest.plans]
-    if not isinstance(name, str):
-        found = f"found a {type(name).__name__}. A matrix is for predict_action(plan=...), call by call."
-        raise IllegalPlanError(f"expected the name of a plan, one of {known}; {found}")
-    if name not in known:
-        remedy = "Use one of these, or give predict_action a matrix [K, blocks] of ttscompile.Source."
-        raise IllegalPlanError(f"the artifact has no plan {name!r}; it has {known}. {remedy}")
+def plan_of(artifact: Artifact, plan: str | Plan | None) -> Plan:
+    """A plan, or the one of this name; None for the artifact's default.
+
+    Raises:
+        IllegalPlanError: the artifact has none of this name.
+    """
+    if plan is None:
+        return artifact.default
+    return plan if isinstance(plan, Plan) else artifact.plan(plan)

@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from ttscompile.core.lattice import PlanArray
+from ttscompile.core.plan import ORIGINAL
 
 from .frames import FrameWork
 
 GIVEN = "given"
-"""``CallReport.plan_name`` of a matrix that the caller gave no name."""
+"""``CallReport.plan_name`` of a plan that is none of the artifact's."""
 
 
 @dataclass(frozen=True)
@@ -39,12 +40,14 @@ class CallReport:
 
     Attributes:
         plan: int8 ``[B, K, blocks]`` of ``Source``, as executed. Read-only.
-        plan_name: ``dense``, the name of a plan of the artifact, or ``given`` for a matrix of the caller's.
+        plan_name: of a plan of the artifact, ``dense`` among them; or ``given`` for the caller's. Of a plan that begins
+            with the chunk of the call before, where there was none, the plan that took its place.
         computed: computed cells of each stream.
         legalised: cells of each stream that were replaced because their residual was never computed.
         flops: FLOPs of each stream, multiply and add counted as two, prologue and pruner included.
         timings: wall time in milliseconds.
         frames: how many frames were computed and how many were known, and what that took and saved.
+        loop: name of the loop that was executed.
     """
 
     plan: PlanArray
@@ -54,3 +57,4 @@ class CallReport:
     flops: tuple[float, ...]
     timings: Timings
     frames: FrameWork = field(default_factory=FrameWork)
+    loop: str = ORIGINAL

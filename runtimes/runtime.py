@@ -17,13 +17,12 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ttscompile.artifact.load import Artifact
-from ttscompile.artifact.manifest import DENSE, DISTILLED
-from ttscompile.core.correction import Correction
+from ttscompile.artifact.view import View, view_of
 from ttscompile.core.lattice import BoolArray, PlanArray, Source, check_plan, require_legal
-from ttscompile.core.spec import FloatArray, Noise
+from ttscompile.core.plan import DENSE, Plan, Variant
+from ttscompile.core.spec import FloatArray, Noise, PolicySpec
 from ttscompile.core.update import bounded
 from ttscompile.errors import IllegalPlanError, ObservationError
 from ttscompile.ir.pieces import PRUNER
@@ -33,8 +32,8 @@ from .backend import Backend, Call
 from .frames import NO_FRAMES, FramePieces, FrameWork
 from .helper import Helper
 from .inpainting import known_samples, with_prefix
+from .plans import LoweringCache, pruner_plan, repair_plan
 from .report import GIVEN, CallReport, Timings
-from .settle import LoweringCache, pruner_plan, repair_plan
 
 HELPER = "ttscompile-pruner"
 """Name of the helper's thread."""
@@ -51,12 +50,12 @@ class _Settled:
 
 
 class _Opened:
-    """A backend for the weights of some plans, and what it made of the plans that it was given."""
+    """A backend for the plans of one variant, and what it made of the plans that it was given."""
 
-    def __init__(self, artifact: Artifact, backend: Backend[Any]) -> None:
-        self.backend, self.lowering = backend, LoweringCache(backend.lower)
+    def __init__(self, view: View, backend: Backend[Any]) -> None:
+        self.view, self.backend, self.lowering = view, backend, LoweringCache(backend.lower)
         self.frames: FramePieces = getattr(backend, "frames", NO_FRAMES)
-        for schedule in artifact.schedules.values():
+        for schedule in view.schedules.values():
             self.lowering.lower(schedule)
 
 
@@ -66,31 +65,49 @@ class Runtime:
     Nothing here locks: a runtime belongs to one process and one thread (``CompiledPolicy`` sees to that).
 
     Which entries of the rollout cache are kept: of a call with a plan of the artifact, those that the backend says. A
-    dense call, and one whose plan is a matrix of the caller's, keeps all that it computes; and from the first such
-    matrix on every call does, since another may read any of it.
+    dense call, and one whose plan is the caller's, keeps all that it computes; and from the first such plan on every
+    call does, since another may read any of it.
 
-    A plan with weights of its own (``Artifact.with_weights_of``) has a backend of its own. The one that ``plan`` needs
-    is opened at once, another one by the first call that needs it. Between calls with different weights nothing is
-    reused.
+    Each variant of a plan (its loop, weights, precision and tokens) has a backend of its own, which shares with the
+    others what they have in common. The one that ``plan`` needs is opened at once, another one by the first call that
+    needs it. Between calls of different variants no residual is reused.
+
+    A plan whose loop begins with the chunk of the call before has that of the last call of the episode, moved by what
+    is executed of it. Where there is none, its ``otherwise`` is executed.
 
     Args:
         artifact: loaded and checked.
-        open_backend: on an artifact with the weights of some plan.
-        plan: name of the plan that most calls will have; None for the artifact's default.
+        open_backend: on a view of the artifact; refuses what it cannot do.
+        plan: that most calls will have; None for the artifact's default.
     """
 
     def __init__(
-        self, artifact: Artifact, open_backend: Callable[[Artifact], Backend[Any]], plan: str | None = None
+        self, artifact: Artifact, open_backend: Callable[[View], Backend[Any]], plan: Plan | None = None
     ) -> None:
         self._artifact, self._open_backend = artifact, open_backend
-        self._manifest, self._groups = artifact.manifest, artifact.manifest.groups
-        self._opened: dict[bool, _Opened] = {}
-        self._used = self._opened_for(self._manifest.default_plan if plan is None else plan)
-        pruned = any(plan.pruned for plan in self._manifest.plans.values())
-        self._helper = Helper(HELPER) if pruned else None  # its thread is there before the first call
-        self._matrices = False  # whether one was ever given
+        self._views: dict[Variant, View] = {}
+        self._opened: dict[Variant, _Opened] = {}
+        plan = artifact.default if plan is None else plan
+        if plan.otherwise is not None:
+            self._opened_for(plan.otherwise)
+        self._used = self._opened_for(plan)
+        # Its thread is there before the first call.
+        self._helper = Helper(HELPER) if any(one.pruned for one in artifact.plans.values()) else None
+        self._given = False  # whether a plan that is not the artifact's ever was
         self._written: BoolArray | None = None
         self._dropped: BoolArray | None = None  # computed in this episode, and not kept
+        self._streams: int | None = None
+        self._chunk: FloatArray | None = None  # denoised sample of the last call of the episode
+
+    def view(self, plan: Plan) -> View:
+        """The artifact as a plan sees it. Nothing is opened.
+
+        Raises:
+            IllegalPlanError: the plan names what the artifact lacks.
+        """
+        if plan.variant not in self._views:
+            self._views[plan.variant] = view_of(self._artifact, plan)
+        return self._views[plan.variant]
 
     @property
     def backend(self) -> Backend[Any]:
@@ -100,7 +117,7 @@ class Runtime:
     @property
     def streams(self) -> int | None:
         """B of the episode under way; None after ``reset`` and before the first call."""
-        return None if self._written is None else len(self._written)
+        return self._streams
 
     @property
     def frame_pieces(self) -> int:
@@ -131,17 +148,12 @@ class Runtime:
         """
         return self._used.frames.learn(obs, stop)
 
-    def of_last_steps(self, artifact: Artifact) -> Runtime:
-        """The runtime of the last steps of this loop, dense, and with these weights where the backend can share them.
-
-        Args:
-            artifact: ``artifact.rest.with_last_steps`` of this one's.
-        """
-        backend = self._opened_for(DENSE).backend
-        return Runtime(artifact, getattr(backend, "of_last_steps", self._open_backend))
+    def forget_chunk(self) -> None:
+        """Have the next call begin with noise, whatever its plan: it does not follow the call before by one chunk."""
+        self._chunk = None
 
     def _end_episode(self) -> None:
-        self._written = self._dropped = None
+        self._written = self._dropped = self._chunk = self._streams = None
 
     def require_streams(self, streams: int) -> None:
         """Raise unless a call of so many streams may be the next one.
@@ -154,57 +166,53 @@ class Runtime:
             raise ObservationError(f"{found}. Call reset() before changing the number of streams.")
 
     def predict(
-        self,
-        obs: Mapping[str, FloatArray],
-        noise: Noise,
-        plan: npt.ArrayLike | None = None,
-        *,
-        plan_name: str | None = None,
-        repair: bool = False,
-        correction: Correction | None = None,
-        prefix: FloatArray | None = None,
+        self, obs: Mapping[str, FloatArray], noise: Noise, plan: Plan, prefix: FloatArray | None = None
     ) -> tuple[FloatArray, CallReport]:
         """Denoise one chunk. A call that fails after its arguments were checked ends the episode, as ``reset`` does.
 
         Args:
             obs: normalised observation by key, ``[B, ...]`` each, of the dtype of its specification.
-            noise: see ``arrays.check_noise``.
-            plan: ``[K, blocks]`` or ``[B, K, blocks]`` of ``Source``; None asks the pruner.
-            plan_name: for the report; None for ``pruner`` or ``given``.
-            repair: legalise ``plan`` and count it, rather than refuse it when it is illegal.
-            correction: of the sampler's steps, which belongs to this plan; None for none.
+            noise: see ``arrays.check_noise``; of the whole loop, also where the call begins with the chunk before.
+            plan: what to compute.
             prefix: normalised actions that are committed already, ``[B, N, Da]``; see ``inpainting``. None for none.
 
         Returns:
             The denoised sample, float32 ``[B, T, D]``, and the report.
 
         Raises:
-            IllegalPlanError: ``plan`` has the wrong shape, or is illegal and not to be repaired; or no plan was given
-                and the artifact has no pruner.
+            IllegalPlanError: the plan names what the artifact lacks, its cells have the wrong shape, or are illegal and
+                not to be repaired.
             ObservationError: the number of streams differs from the episode's, or ``noise`` does not fit.
+            RuntimeUnavailableError: this runtime cannot do what the plan asks for.
         """
-        spec, streams = self._manifest.spec, len(next(iter(obs.values())))
+        streams = len(next(iter(obs.values())))
         self.require_streams(streams)
-        noise = check_noise(noise, streams, spec)
+        if plan.otherwise is not None and self._chunk is None:
+            plan = plan.otherwise
+        name = self._artifact.name_of(plan)
+        opened = self._opened_for(plan)
+        view, backend = opened.view, opened.backend
+        spec, manifest = view.manifest.spec, view.manifest
+        noise = check_noise(noise, streams, self._noise_spec(plan))
+        if view.start is not None and self._chunk is not None:
+            noise = view.start.noise_from(self._chunk, spec.chunk, noise)
         known = None if prefix is None else known_samples(spec, prefix, noise.initial)
-        cells = (streams, self._manifest.steps, len(self._groups))
-        opened = self._opened_for(plan_name)
-        same = opened is self._used  # else what earlier calls kept was computed with other weights
+        cells = (streams, manifest.steps, len(manifest.groups))
+        same = opened is self._used  # else what earlier calls kept is of another variant
         written = self._written if same and self._written is not None else np.zeros(cells, dtype=np.bool_)
         dropped = self._dropped if same and self._dropped is not None else np.zeros(cells, dtype=np.bool_)
-        if plan is None and PRUNER not in self._manifest.pieces:
-            remedy = "Give plan='dense', the name of a plan, or a matrix; or calibrate with strategy='tts'."
-            raise IllegalPlanError(f"no plan was given and the artifact has no pruner to make one. {remedy}")
-        settled = None if plan is None else self._settle(opened.lowering, plan, written, dropped, repair)
-        if plan_name not in (DENSE, *self._manifest.plans):
-            self._matrices = True
-        self._used, backend = opened, opened.backend
-        keep = np.ones_like(backend.keeps) if self._matrices or plan_name == DENSE else backend.keeps
+        if plan.cells is None and PRUNER not in manifest.pieces:
+            remedy = "Give a plan with cells: plan='dense', or the name of another one"
+            raise IllegalPlanError(f"a plan without cells needs a pruner, and loop {plan.loop!r} has none. {remedy}.")
+        settled = None if plan.cells is None else self._settle(opened, plan.cells, written, dropped, plan.repair)
+        self._given |= name is None
+        keep = np.ones_like(backend.keeps) if self._given or name == DENSE else backend.keeps
+        self._used = opened
         self._end_episode()  # a call that fails ends the episode: its residuals stand beside those of earlier ones
         backend.prepare(streams, None if settled is None else settled.lowered)
 
         start = time.perf_counter()
-        backend.start(Call(obs, noise, correction, known, keep, written))
+        backend.start(Call(obs, noise, plan.correction, known, keep, written))
         prologue = time.perf_counter()
         waited = 0.0
         if settled is None:
@@ -212,38 +220,43 @@ class Runtime:
         else:
             backend.first_step()
         sample = backend.other_steps(settled.lowered)
-        if correction is not None:
+        if plan.correction is not None:
             sample = with_prefix(bounded(spec.sampler, sample), known)
         stop = time.perf_counter()
         computed = settled.plans == Source.COMPUTE.value
         self._written, self._dropped = np.where(computed, keep, written), np.where(computed, ~keep, dropped)
+        self._streams, self._chunk = streams, sample
         executed = settled.plans.copy()  # the caller's plan is the caller's
         executed.flags.writeable = False
         report = CallReport(
             plan=executed,
-            plan_name=plan_name or (PRUNER if plan is None else GIVEN),
+            plan_name=name or GIVEN,
+            loop=plan.loop,
             computed=tuple(int(n) for n in np.count_nonzero(computed, axis=(1, 2))),
             legalised=settled.legalised,
-            flops=tuple(self._manifest.flops.call(one, plan is None, correction) for one in settled.plans),
-            frames=self._used.frames.work,
+            flops=tuple(manifest.flops.call(one, plan.pruned, plan.correction) for one in settled.plans),
+            frames=opened.frames.work,
             timings=Timings(
                 prologue=_milliseconds(start, prologue),
                 pruner=settled.pruner,
                 wait_pruner=waited,
                 decode=_milliseconds(prologue, stop) - waited,
                 total=_milliseconds(start, stop),
-                frames=self._used.frames.work.waited,
+                frames=opened.frames.work.waited,
             ),
         )
         return sample, report
 
-    def _opened_for(self, plan: str | None) -> _Opened:
-        """What computes the plan of this name, with its weights."""
-        own = plan == DISTILLED and self._manifest.distilled is not None
-        if own not in self._opened:
-            artifact = self._artifact.with_weights_of(plan)
-            self._opened[own] = _Opened(artifact, self._open_backend(artifact))
-        return self._opened[own]
+    def _noise_spec(self, plan: Plan) -> PolicySpec:
+        """What noise has to fit: of the loop whose last steps these are, where the plan begins with a chunk."""
+        return self.view(plan if plan.otherwise is None else plan.otherwise).manifest.spec
+
+    def _opened_for(self, plan: Plan) -> _Opened:
+        """What computes a plan."""
+        if plan.variant not in self._opened:
+            view = self.view(plan)
+            self._opened[plan.variant] = _Opened(view, self._open_backend(view))
+        return self._opened[plan.variant]
 
     def _prune_beside_first_step(self, written: BoolArray) -> tuple[_Settled, float]:
         """Step 0, and meanwhile the plan of the steps after it; ms that the loop stood still for it."""
@@ -258,13 +271,13 @@ class Runtime:
 
     def _settle(
         self,
-        lowering: LoweringCache[Any],
-        plan: npt.ArrayLike,
+        opened: _Opened,
+        plan: PlanArray,
         written: BoolArray,
         dropped: BoolArray,
         repair: bool,
     ) -> _Settled:
-        """The plan of a caller.
+        """Cells that were given.
 
         Whether a plan that was lowered before is legal depends on its ROLLOUT reads alone, which is quickly checked.
         """
@@ -281,10 +294,10 @@ class Runtime:
                 " computed with a plan of the artifact, and did not keep. Begin the episode with a matrix (one of zeros"
                 " computes all, as plan='dense' does): from a first matrix on every call keeps what it computes."
             )
-        check = partial(require_legal, plans, self._groups, written)
+        check = partial(require_legal, plans, opened.view.manifest.groups, written)
         if (rollout & ~written).any():
             check()
-        return _Settled(plans, tuple(lowering.lower(one, check) for one in plans), legalised)
+        return _Settled(plans, tuple(opened.lowering.lower(one, check) for one in plans), legalised)
 
 
 def _prune(backend: Backend[Any], lowering: LoweringCache[Any], written: BoolArray) -> _Settled:

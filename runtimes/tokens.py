@@ -15,7 +15,8 @@ import numpy.typing as npt
 
 from ttscompile.artifact.manifest import MANIFEST, Manifest
 from ttscompile.artifact.strict_json import REMEDY
-from ttscompile.artifact.tokens import ReuseRecord, TokensRecord
+from ttscompile.artifact.towers import TokensRecord
+from ttscompile.core.plan import TokenReuse
 from ttscompile.errors import ArtifactError
 from ttscompile.ir.pieces import INDEX, PIXELS, frame_pieces, pixels_name, tokens_name
 
@@ -66,9 +67,7 @@ class TokenTower:
         renew: the second.
     """
 
-    def __init__(
-        self, pixels: str, part: str, record: TokensRecord, reuse: ReuseRecord, run: Run, renew: Renew
-    ) -> None:
+    def __init__(self, pixels: str, part: str, record: TokensRecord, reuse: TokenReuse, run: Run, renew: Renew) -> None:
         self._pixels, self._part, self._run, self._renew = pixels, part, run, renew
         self._record, self._reuse = record, reuse
         self._lanes: dict[Lane, _Kept] = {}
@@ -158,12 +157,12 @@ class TokenTower:
         return cut.reshape(len(cut), rows, high, columns, wide).swapaxes(2, 3)
 
 
-def token_towers(manifest: Manifest, run: Run, renew: Renew) -> dict[str, TokenTower]:
-    """By frame piece, those that reuse tokens; none where the artifact does not."""
-    if manifest.reuse is None:
+def token_towers(manifest: Manifest, reuse: TokenReuse | None, run: Run, renew: Renew) -> dict[str, TokenTower]:
+    """By frame piece, those that reuse tokens; none where ``reuse`` is None."""
+    if reuse is None:
         return {}
     return {
-        name: TokenTower(pixels_name(i), tokens_name(i), manifest.tokens[name], manifest.reuse, run, renew)
+        name: TokenTower(pixels_name(i), tokens_name(i), manifest.tokens[name], reuse, run, renew)
         for i, name in enumerate(frame_pieces(manifest.pieces))
         if name in manifest.tokens
     }

@@ -9,7 +9,7 @@ import pytest
 import torch
 from diffusers import DDIMScheduler, DDPMScheduler, DPMSolverMultistepScheduler
 
-from ttscompile.core.rest import rest_of
+from ttscompile.core.start import rest_of
 from ttscompile.core.spec import SamplerTable
 from ttscompile.errors import SpecError
 from ttscompile.runtimes.reference.sampler import TorchSampler

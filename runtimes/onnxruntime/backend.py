@@ -7,35 +7,55 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
 
-from ttscompile.artifact.load import Artifact
+from ttscompile.artifact.view import View
 from ttscompile.core.lattice import PlanArray
 from ttscompile.core.spec import FloatArray, Noise
-from ttscompile.runtimes.backend import Call, fitting
+from ttscompile.runtimes.backend import Call
 from ttscompile.runtimes.frames import FramePieces
 from ttscompile.runtimes.instructions import Instructions, instructions_of
 from ttscompile.runtimes.liveness import readable_rollout
 from ttscompile.runtimes.tokens import token_towers
 
 from .decode import decode_first, decode_rest
-from .sessions import open_blocks, open_sessions, renew_piece, run_piece
+from .sessions import Sessions, renew_piece, run_piece
 from .workspace import Workspace
+
+
+class OnnxBackends:
+    """Opens backends on views of one artifact, which share sessions, and what they remember of frames.
+
+    Args:
+        threads: of arithmetic; one runs on the caller's thread.
+    """
+
+    def __init__(self, threads: int = 1) -> None:
+        self.sessions = Sessions(threads)
+        self._frames: dict[object, FramePieces] = {}
+
+    def __call__(self, view: View) -> OnnxBackend:
+        """The backend for a view, within its ``reading``.
+
+        Raises:
+            RuntimeUnavailableError: onnxruntime is missing, or other code has made its global thread pool.
+            ArtifactError: onnxruntime refuses a graph.
+        """
+        backend = OnnxBackend(view, self.sessions)
+        backend.frames = self._frames.setdefault(view.frames_key, backend.frames)
+        return backend
 
 
 class OnnxBackend:
     """A ``Backend`` on onnxruntime.
 
     Args:
-        artifact: loaded and checked.
-        threads: threads of arithmetic; one runs on the caller's thread.
-        whole: of the whole loop, where the artifact has its last steps: with its sessions and the frames that it
-            remembers. Its calls and these are made in turn. None: with its own.
+        view: of an artifact.
+        sessions: of its models.
 
     Attributes:
-        keeps: entries of the rollout cache that some plan of the artifact can read.
+        keeps: entries of the rollout cache that some plan of the view can read.
         frames: what depends on one frame alone.
         sessions: by piece; those of single blocks only once a plan needs them.
         workspace: of the batch size under way; None after one that found no memory.
@@ -45,21 +65,17 @@ class OnnxBackend:
         ArtifactError: onnxruntime refuses a graph.
     """
 
-    def __init__(self, artifact: Artifact, threads: int = 1, whole: OnnxBackend | None = None) -> None:
-        self._manifest = artifact.manifest
-        self._artifact, self._threads = artifact, threads
-        groups, plans = self._manifest.groups, artifact.schedules.values()
+    def __init__(self, view: View, sessions: Sessions) -> None:
+        self._manifest, self._view, self._pool = view.manifest, view, sessions
+        groups, plans = self._manifest.groups, view.schedules.values()
         self._lowered = {plan.tobytes(): instructions_of(plan, groups) for plan in plans}
         self._schedules = tuple(self._lowered.values())
-        self._pruned = any(plan.pruned for plan in self._manifest.plans.values())
-        self._blocks = self._pruned or any(one.partial for one in self._schedules)  # whether these have sessions
-        self.sessions: dict[str, Any] = (
-            open_sessions(artifact, threads, self._blocks) if whole is None else whole.sessions
-        )
+        self._blocks = view.pruned or any(one.partial for one in self._schedules)  # whether these have sessions
+        self.sessions = sessions.of(view, self._blocks)
         self._run = partial(run_piece, self.sessions, self._manifest.pieces)  # which does not keep the backend alive
         self._renew = partial(renew_piece, self.sessions, self._manifest.pieces)
-        self.frames: FramePieces = self._open_frames() if whole is None else whole.frames
-        self.keeps = readable_rollout(artifact)
+        self.frames: FramePieces = self._open_frames()
+        self.keeps = readable_rollout(view)
         self.workspace: Workspace | None = self._open_workspace(1)
 
     @property
@@ -82,7 +98,7 @@ class OnnxBackend:
             self.workspace = None  # give the old memory back first; there may be too little for the new
             self.workspace = self._open_workspace(streams)
         if not self._blocks and (plans is None or any(one.partial for one in plans)):
-            self.sessions |= open_blocks(self._artifact, self._threads)
+            self.sessions |= self._pool.of_blocks(self._view)
             self.workspace.bind_blocks()
             self._blocks = True
 
@@ -105,14 +121,10 @@ class OnnxBackend:
         decode_rest(self._work, plans, self._keep)
         return self._work.result()
 
-    def of_last_steps(self, artifact: Artifact) -> OnnxBackend:
-        """See ``Backend``."""
-        with artifact.reading(), fitting(artifact):
-            return OnnxBackend(artifact, self._threads, self)
-
     def _open_frames(self) -> FramePieces:
         """Frame pieces that remember nothing yet."""
-        return FramePieces(self._manifest.pieces, self._run, token_towers(self._manifest, self._run, self._renew))
+        towers = token_towers(self._manifest, self._view.tokens, self._run, self._renew)
+        return FramePieces(self._manifest.pieces, self._run, towers)
 
     @property
     def _work(self) -> Workspace:
@@ -124,10 +136,11 @@ class OnnxBackend:
 
         So the first call costs what the others do: sessions have their memory, and pages are committed.
         """
-        work = Workspace(self._manifest, self.sessions, self._artifact.tables, streams)
+        work = Workspace(self._view, self.sessions, streams)
         work.sums(max((one.slots for one in self._schedules), default=0))
-        for correction in self._artifact.corrections.values():
-            work.advances_with(correction)
+        for plan in self._view.plans.values():
+            if plan.correction is not None:
+                work.advances_with(plan.correction)
         for lowered in self._schedules:
             for k in np.flatnonzero(lowered.computed.all(axis=1)).tolist():
                 work.bind_dense(k)
@@ -141,6 +154,6 @@ class OnnxBackend:
             decode_first(work, np.zeros_like(self.keeps))
             for k in range(spec.sampler.steps):
                 work.advance(k)
-            if self._pruned:
+            if self._view.pruned:
                 work.logits()
         return work

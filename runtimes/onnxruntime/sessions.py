@@ -26,8 +26,8 @@ from weakref import WeakSet
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.artifact.load import Artifact
 from ttscompile.artifact.manifest import PieceRecord
+from ttscompile.artifact.view import View
 from ttscompile.core.spec import FP32
 from ttscompile.errors import ArtifactError, RuntimeUnavailableError
 from ttscompile.ir.graph import TensorType
@@ -43,8 +43,10 @@ from ttscompile.ir.pieces import (
     RESIDUAL,
     STEM,
     STREAM,
+    advance_name,
     block_name,
     of_tokens,
+    part_of,
     renewed_name,
 )
 from ttscompile.measure.machine import has_integer_dot_product
@@ -73,66 +75,88 @@ CONFIG_FROM_MODEL = "ORT_LOAD_CONFIG_FROM_MODEL"
 those of onnxruntime, with a thread a core. No argument turns it off."""
 
 
-def open_sessions(artifact: Artifact, threads: int, blocks: bool = True) -> dict[str, Any]:
-    """What runs each ONNX piece of the artifact, by name: an ``InferenceSession``, or a ``JointBlock``.
-
-    With one thread all run on the caller's thread and make none.
+class Sessions:
+    """The sessions of one artifact's models; views that compute with the same model share its session.
 
     Args:
-        artifact: loaded and checked; within its ``reading``.
-        threads: of arithmetic.
-        blocks: single blocks, too; else ``open_blocks`` may open them later.
-
-    Raises:
-        RuntimeUnavailableError: onnxruntime is missing, other code has made its global thread pool, or the environment
-            has it ignore options.
-        ArtifactError: onnxruntime refuses a graph.
+        threads: of arithmetic. With one thread all run on the caller's thread and make none.
     """
-    manifest = artifact.manifest
-    single = {block_name(b) for b in range(len(manifest.blocks))}
-    # A tower that reuses tokens computes all of them with the same session, so that its weights are there once.
-    unused = filter(of_tokens, manifest.pieces) if manifest.reuse is None else manifest.tokens
-    sessions = _open(artifact, set(manifest.pieces) - single - {JOINT, LAYERS} - set(unused), threads)
-    first = artifact.first_step
-    sessions[FIRST_STEP] = sessions[DENSE_STEP] if first is None else _open(first, [DENSE_STEP], threads)[DENSE_STEP]
-    return sessions | _open_blocks(artifact, threads) if blocks else sessions
+
+    def __init__(self, threads: int) -> None:
+        self.threads = threads
+        self._known: dict[tuple[str, int, bool], Any] = {}
+        self._careful: dict[str, bool] = {}
+
+    def of(self, view: View, blocks: bool = True) -> dict[str, Any]:
+        """What runs each ONNX piece of a view, by name: an ``InferenceSession``, or a ``JointBlock``.
+
+        Args:
+            view: within its ``reading``.
+            blocks: single blocks, too; else ``of_blocks`` may open them later.
+
+        Raises:
+            RuntimeUnavailableError: onnxruntime is missing, other code has made its global thread pool, or the
+                environment has it ignore options.
+            ArtifactError: onnxruntime refuses a graph.
+        """
+        manifest = view.manifest
+        single = {block_name(b) for b in range(len(manifest.blocks))}
+        # A tower that reuses tokens computes all of them with the same session, so that its weights are there once.
+        unused = filter(of_tokens, manifest.pieces) if view.tokens is None else manifest.tokens
+        others = {name for name in manifest.pieces if name.startswith(advance_name(""))}  # of other loops
+        sessions = self._open(view, set(manifest.pieces) - single - {JOINT, LAYERS} - set(unused) - others)
+        sessions[FIRST_STEP] = self._session(view, DENSE_STEP, first_step=True)
+        return sessions | self._of_blocks(view) if blocks else sessions
+
+    def of_blocks(self, view: View) -> dict[str, Any]:
+        """What runs single blocks, by name, some time after the artifact was loaded.
+
+        Raises:
+            ArtifactError: the artifact on disk is no longer the one that was loaded, or onnxruntime refuses a graph.
+        """
+        with view.reading():
+            return self._of_blocks(view)
+
+    def of_layers(self, view: View) -> dict[str, Any]:
+        """What runs the piece ``layers``, by its name, some time after the artifact was loaded; for ``verify``.
+
+        Raises:
+            ArtifactError: the artifact on disk is no longer the one that was loaded, or onnxruntime refuses the graph.
+        """
+        with view.reading():
+            return self._open(view, [LAYERS])
+
+    def _of_blocks(self, view: View) -> dict[str, Any]:
+        manifest = view.manifest
+        names = [block_name(b) for b in range(len(manifest.blocks))]
+        if self.threads == 1:
+            return self._open(view, names)
+        session, blanks = self._session(view, JOINT), dict[int, dict[str, Array]]()
+        pieces = [manifest.pieces[name] for name in names]
+        joint = join([tuple(manifest.contexts[name].type for name in piece.contexts) for piece in pieces])
+        return {
+            name: JointBlock(session, joint, b, piece, manifest.blocks[b].type, blanks)
+            for b, (name, piece) in enumerate(zip(names, pieces, strict=True))
+        }
+
+    def _open(self, view: View, pieces: Iterable[str]) -> dict[str, Any]:
+        return {piece: self._session(view, piece) for piece in sorted(pieces)}
+
+    def _session(self, view: View, piece: str, first_step: bool = False) -> Any:
+        """The session of a piece's model, opened once."""
+        file = view.onnx_file(piece, first_step)
+        threads = 1 if piece in SINGLE_THREADED else self.threads
+        spins = piece in OF_ALL_BLOCKS
+        if (file, threads, spins) not in self._known:
+            precision = view.precision.get(str(part_of(piece)), FP32)
+            if precision not in self._careful:
+                self._careful[precision] = needs_care(precision)
+            session = _open_file(view, file, threads, spins, self._careful[precision])
+            self._known[file, threads, spins] = session
+        return self._known[file, threads, spins]
 
 
-def open_blocks(artifact: Artifact, threads: int) -> dict[str, Any]:
-    """What runs single blocks, by name, some time after the artifact was loaded.
-
-    Raises:
-        ArtifactError: the artifact on disk is no longer the one that was loaded, or onnxruntime refuses a graph.
-    """
-    with artifact.reading():
-        return _open_blocks(artifact, threads)
-
-
-def open_layers(artifact: Artifact) -> dict[str, Any]:
-    """What runs the piece ``layers``, by its name, some time after the artifact was loaded; for ``verify``.
-
-    Raises:
-        ArtifactError: the artifact on disk is no longer the one that was loaded, or onnxruntime refuses the graph.
-    """
-    with artifact.reading():
-        return _open(artifact, [LAYERS], 1)
-
-
-def _open_blocks(artifact: Artifact, threads: int) -> dict[str, Any]:
-    manifest = artifact.manifest
-    names = [block_name(b) for b in range(len(manifest.blocks))]
-    if threads == 1:
-        return _open(artifact, names, threads)
-    session, blanks = _open(artifact, [JOINT], threads)[JOINT], dict[int, dict[str, Array]]()
-    pieces = [manifest.pieces[name] for name in names]
-    joint = join([tuple(manifest.contexts[name].type for name in piece.contexts) for piece in pieces])
-    return {
-        name: JointBlock(session, joint, b, piece, manifest.blocks[b].type, blanks)
-        for b, (name, piece) in enumerate(zip(names, pieces, strict=True))
-    }
-
-
-def _open(artifact: Artifact, pieces: Iterable[str], threads: int) -> dict[str, Any]:
+def _open_file(view: View, file: str, threads: int, spins: bool, careful: bool) -> Any:
     try:
         import onnxruntime as ort
     except ImportError as error:
@@ -141,26 +165,22 @@ def _open(artifact: Artifact, pieces: Iterable[str], threads: int) -> dict[str, 
     if os.environ.get(CONFIG_FROM_MODEL) not in (None, "", "0"):
         problem = f"the environment variable {CONFIG_FROM_MODEL} has onnxruntime ignore the threads and options that"
         raise RuntimeUnavailableError(f"{problem} a policy is loaded with. Unset it.")
-    sessions: dict[str, Any] = {}
-    careful = needs_care(artifact.manifest.precision_name)
-    for piece in sorted(pieces):
-        path = artifact.files / artifact.onnx_file(piece)
-        options = _options(ort, 1 if piece in SINGLE_THREADED else threads, piece in OF_ALL_BLOCKS, careful)
-        try:
-            sessions[piece] = ort.InferenceSession(str(path), options, ["CPUExecutionProvider"], enable_fallback=0)
-        except Exception as error:  # onnxruntime's own classes are derived from Exception
-            if "global thread pool" in str(error):
-                raise RuntimeUnavailableError(
-                    "other code of this process has made onnxruntime's global thread pool, and with it onnxruntime"
-                    " refuses sessions with threads of their own. Load the policy in another process."
-                ) from error
-            raise ArtifactError(
-                f"{path}: onnxruntime {ort.__version__} cannot load this graph: {error} Install the version that the"
-                f" artifact asks for (>= {artifact.manifest.requires.onnxruntime}), or convert the checkpoint again."
+    path, options = view.files / file, _options(ort, threads, spins, careful)
+    try:
+        session = ort.InferenceSession(str(path), options, ["CPUExecutionProvider"], enable_fallback=0)
+    except Exception as error:  # onnxruntime's own classes are derived from Exception
+        if "global thread pool" in str(error):
+            raise RuntimeUnavailableError(
+                "other code of this process has made onnxruntime's global thread pool, and with it onnxruntime"
+                " refuses sessions with threads of their own. Load the policy in another process."
             ) from error
-        if options.intra_op_num_threads > 1:
-            _threaded.add(sessions[piece])
-    return sessions
+        raise ArtifactError(
+            f"{path}: onnxruntime {ort.__version__} cannot load this graph: {error} Install the version that the"
+            f" artifact asks for (>= {view.manifest.requires.onnxruntime}), or convert the checkpoint again."
+        ) from error
+    if threads > 1:
+        _threaded.add(session)
+    return session
 
 
 def _options(ort: Any, threads: int, spin: bool, careful: bool) -> Any:
@@ -186,7 +206,7 @@ def needs_care(precision: str) -> bool:
     warnings.warn(
         f"precision {precision!r} is fast on a processor with integer dot products (on x86 avx512_vnni, avx_vnni or"
         f" amx_int8 among the flags in /proc/cpuinfo); found {what}. The actions are right, and take about as long as"
-        " in fp32. Load the policy with precision='fp32', or convert the checkpoint with --precision fp32.",
+        " in fp32. Take a plan without it (plan.exact), or convert the checkpoint with --precision fp32.",
         RuntimeWarning,
         stacklevel=2,
     )

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ttscompile.artifact.manifest import Manifest
+from ttscompile.artifact.view import View
 from ttscompile.core.correction import HISTORY, Correction, no_correction, remember
 from ttscompile.core.spec import FloatArray, Noise
 from ttscompile.core.update import matrices
@@ -36,9 +37,8 @@ class Workspace:
     sample has two buffers, taken in turn: step k reads that of ``k % 2``, and ``advance`` writes the other.
 
     Args:
-        manifest: of the artifact.
+        view: of an artifact.
         sessions: by piece.
-        tables: TABLE contexts ``[K, ...]``.
         streams: B.
 
     Attributes:
@@ -53,9 +53,8 @@ class Workspace:
         idle: for steps without a computed block; None if the network is of another form.
     """
 
-    def __init__(
-        self, manifest: Manifest, sessions: Mapping[str, Any], tables: Mapping[str, Array], streams: int
-    ) -> None:
+    def __init__(self, view: View, sessions: Mapping[str, Any], streams: int) -> None:
+        manifest = view.manifest
         kind = _stream_type(manifest, streams)
         shape = kind.at(streams)
         self.streams, self.axis = streams, kind.batch_axis or 0
@@ -71,7 +70,7 @@ class Workspace:
         self._sums = np.zeros((0, *shape), np.float32)
         self._sampler = manifest.spec.sampler
         self._offset = np.zeros((self._steps, dimensions, streams, horizon), np.float32)
-        self._contexts = ContextValues(manifest, sessions, tables, streams)
+        self._contexts = ContextValues(manifest, sessions, view.tables, streams)
         stem = manifest.pieces[STEM]
         assert stem.stream is not None
         at_first = {name: self._contexts.at(name, 0) for name in stem.contexts}
@@ -85,9 +84,7 @@ class Workspace:
         self.idle: IdleSteps | None = None
         if IDLE in manifest.pieces:
             self.idle = IdleSteps(sessions[IDLE], self._sampler, manifest.spec.sample, streams, shape)
-        # The last steps of a loop take an update in as many groups as all of its steps do.
-        (update,) = (one for one in sessions[ADVANCE].get_inputs() if one.name == pieces.UPDATE)
-        self._no_correction = no_correction(self._steps, manifest.spec.sample, update.shape[0])
+        self._no_correction = no_correction(self._steps, manifest.spec.sample, view.groups)
         # By the correction's identity, which the entry keeps from reuse, and whether there is a prefix.
         self._advances: dict[tuple[int, bool], _Advances] = {}
         self._advance = self.advances_with(self._no_correction)

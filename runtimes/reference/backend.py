@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ttscompile.artifact.load import Artifact
+from ttscompile.artifact.view import View
 from ttscompile.core.lattice import PlanArray
 from ttscompile.core.spec import FloatArray
 from ttscompile.runtimes.backend import Call, fitting
@@ -21,16 +21,16 @@ class ReferenceBackend:
     """A ``Backend`` on ``ReferenceModel``, without gradients; what fails is an error of the artifact.
 
     Args:
-        artifact: loaded and checked.
+        view: of an artifact.
 
     Attributes:
         keeps: all entries of the rollout cache.
         model: what it runs.
     """
 
-    def __init__(self, artifact: Artifact) -> None:
-        self._artifact = artifact
-        self.model = ReferenceModel.from_artifact(artifact)
+    def __init__(self, view: View) -> None:
+        self._view = view
+        self.model = ReferenceModel.from_view(view)
         self.keeps = np.ones((self.model.steps, self.model.blocks), dtype=np.bool_)
         self._residuals: Mapping[tuple[int, int], Tensor] = {}
 
@@ -44,12 +44,12 @@ class ReferenceBackend:
     def start(self, call: Call) -> None:
         """See ``Backend.start``."""
         self._call = call
-        with fitting(self._artifact), torch.no_grad():
+        with fitting(self._view), torch.no_grad():
             self._contexts = self.model.prologue({key: torch.from_numpy(np.array(a)) for key, a in call.obs.items()})
 
     def logits(self) -> FloatArray:
         """See ``Backend.logits``."""
-        with fitting(self._artifact), torch.no_grad():
+        with fitting(self._view), torch.no_grad():
             return np.asarray(self.model.logits(self._contexts).numpy(), dtype=np.float32)
 
     def first_step(self) -> None:
@@ -59,8 +59,8 @@ class ReferenceBackend:
         """See ``Backend.other_steps``."""
         call = self._call
         cache = RolloutCache(self._residuals if call.written.any() else {}, call.written)
-        noise = noise_tensors(call.noise, self._artifact.manifest.spec.sampler.stochastic)
-        with fitting(self._artifact), torch.no_grad():
+        noise = noise_tensors(call.noise, self._view.manifest.spec.sampler.stochastic)
+        with fitting(self._view), torch.no_grad():
             made = self.model.denoise(
                 self._contexts, *noise, np.stack(plans), cache, correction=call.correction, known=call.known
             )

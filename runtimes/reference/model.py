@@ -16,7 +16,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from ttscompile.artifact.load import Artifact
+from ttscompile.artifact.view import View
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import PlanArray, Source, check_plan, require_legal
 from ttscompile.core.spec import Noise, PolicySpec
@@ -127,16 +127,16 @@ class ReferenceModel:
         return cls(program.pieces, program.spec, types, groups, program.weights)
 
     @classmethod
-    def from_artifact(cls, artifact: Artifact, device: torch.device | None = None) -> ReferenceModel:
-        """The model of an artifact, on a device; None for the CPU.
+    def from_view(cls, view: View, device: torch.device | None = None) -> ReferenceModel:
+        """The model of a view of an artifact, in fp32, on a device; None for the CPU.
 
         Raises:
             ArtifactError: its graphs cannot be read.
         """
-        manifest = artifact.manifest
-        weights = {**artifact.weights, **artifact.pruner}
+        manifest = view.manifest
+        weights = {**view.weights, **view.pruner}
         types = [block.type for block in manifest.blocks]
-        return cls(artifact.pieces, manifest.spec, types, manifest.groups, weights, device, artifact.first_weights)
+        return cls(view.pieces, manifest.spec, types, manifest.groups, weights, device, view.first_weights)
 
     @property
     def pruner_weights(self) -> dict[str, Tensor]:

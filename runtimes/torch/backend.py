@@ -13,10 +13,11 @@ from functools import partial
 import numpy as np
 import torch
 
-from ttscompile.artifact.load import Artifact
+from ttscompile.artifact.view import View
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import BoolArray, PlanArray, dense_plan, without_illegal_reads
-from ttscompile.core.spec import FloatArray
+from ttscompile.core.spec import FP32, FloatArray
+from ttscompile.ir.pieces import BLOCKS
 from ttscompile.runtimes.backend import Call, fitting
 from ttscompile.runtimes.inpainting import MaskedUpdates
 from ttscompile.runtimes.instructions import Instructions, instructions_of
@@ -24,53 +25,70 @@ from ttscompile.runtimes.liveness import readable_rollout
 
 from .capture import Capture, Line, Lines, cuda_graphs
 from .devices import device_of, exact_arithmetic, narrow_type
-from .network import Parts
+from .network import Parts, Placed
 from .sampler import Advance
 from .workspace import Workspace
+
+
+class TorchBackends:
+    """Opens backends on views of one artifact, which share its constants on the device.
+
+    Args:
+        threads: of arithmetic on the CPU, during calls alone: torch's setting is as it was between them.
+        device: ``cpu``, ``cuda``, ``cuda:1``, ``mps``; as torch calls it.
+        capture: how lines are captured; None for CUDA graphs on CUDA, and not at all elsewhere.
+
+    Raises:
+        RuntimeUnavailableError: torch does not have the device.
+    """
+
+    def __init__(self, threads: int = 1, device: str = "cpu", capture: Capture | None = None) -> None:
+        self._threads, self._capture = threads, capture
+        self._placed = Placed(device_of(device))
+
+    def __call__(self, view: View) -> TorchBackend:
+        """The backend for a view, within its ``reading``.
+
+        Raises:
+            RuntimeUnavailableError: the device does not have the precision of its blocks.
+        """
+        return TorchBackend(view, self._placed, self._threads, self._capture)
 
 
 class TorchBackend:
     """A ``Backend`` on torch.
 
     Args:
-        artifact: loaded and checked.
-        threads: of arithmetic on the CPU, during calls alone: torch's setting is as it was between them.
-        device: ``cpu``, ``cuda``, ``cuda:1``, ``mps``; as torch calls it.
-        precision: of the products in residual blocks: ``fp32``, ``bf16``, ``fp16``.
-        capture: how lines are captured; None for CUDA graphs on CUDA, and not at all elsewhere.
+        view: of an artifact; its blocks have their products in fp32, bf16 or fp16.
+        placed: constants of the artifact, where to compute.
+        threads: see ``TorchBackends``.
+        capture: see ``TorchBackends``.
 
     Attributes:
-        keeps: entries of the rollout cache that some plan of the artifact can read.
+        keeps: entries of the rollout cache that some plan of the view can read.
         workspace: of the batch size under way.
 
     Raises:
-        RuntimeUnavailableError: torch does not have the device, or the device not the precision.
+        RuntimeUnavailableError: the device does not have the precision.
     """
 
-    def __init__(
-        self,
-        artifact: Artifact,
-        threads: int = 1,
-        device: str = "cpu",
-        precision: str = "fp32",
-        capture: Capture | None = None,
-    ) -> None:
-        self._artifact, self._manifest, self._threads = artifact, artifact.manifest, threads
-        self.device = device_of(device)
+    def __init__(self, view: View, placed: Placed, threads: int = 1, capture: Capture | None = None) -> None:
+        self._view, self._manifest, self._threads = view, view.manifest, threads
+        self.device = placed.device
         if capture is None and self.device.type == "cuda":
             capture = cuda_graphs(self.device)
         self._lines = Lines(capture)
         groups = self._manifest.groups
         dense = dense_plan(self._manifest.steps, len(groups))
         nothing = np.zeros(dense.shape, np.bool_)  # the first call of an episode is repaired
-        plans = (dense, *artifact.schedules.values())
+        plans = (dense, *view.schedules.values())
         known = {plan.tobytes(): plan for each in plans for plan in (each, without_illegal_reads(each, nothing))}
         self._own = {key: instructions_of(plan, groups) for key, plan in known.items()}
         self._named = set(self._own.values())
-        self.keeps = readable_rollout(artifact)
+        self.keeps = readable_rollout(view)
         self._advances: dict[tuple[Correction | None, bool], tuple[Advance, MaskedUpdates | None]] = {}
         with self._settings():
-            self._parts = Parts(artifact, self.device, narrow_type(precision, self.device))
+            self._parts = Parts(view, placed, narrow_type(view.precision.get(BLOCKS, FP32), self.device))
             self.workspace = Workspace(self._parts, 1)
         self._some: dict[int, Workspace] = {}  # for streams of a batch that follow a plan of their own
         self._whole = False
@@ -160,7 +178,7 @@ class TorchBackend:
         try:
             if before != self._threads:
                 torch.set_num_threads(self._threads)
-            with current, exact_arithmetic(self.device), fitting(self._artifact), torch.inference_mode():
+            with current, exact_arithmetic(self.device), fitting(self._view), torch.inference_mode():
                 yield
         finally:
             if before != self._threads:

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from ttscompile.artifact.load import Artifact, load_artifact
+from ttscompile.artifact.view import view_of
 from ttscompile.core.lattice import Source, check_plan, require_legal
 from ttscompile.core.spec import Affine, PolicySpec
 from ttscompile.errors import IllegalPlanError, ObservationError
@@ -49,9 +50,8 @@ def to_module(path: str | Path, plan: str | None = None) -> SparseCall:
     """
     artifact = load_artifact(path)
     name = artifact.manifest.default_plan if plan is None else plan
-    record = artifact.manifest.plans.get(name)
-    if record is not None and record.pruned:
-        known = ["dense", *artifact.schedules]
+    if artifact.plan(name).pruned:
+        known = [one for one, each in artifact.plans.items() if not each.pruned]
         problem = f"plan {name!r} is the pruner's, which decides for each observation; a module has one plan"
         raise IllegalPlanError(f"{problem}. Give a schedule, one of {known}, or use load(..., runtime='torch').")
     with artifact.reading():
@@ -74,11 +74,12 @@ class SparseCall(nn.Module):
 
     def __init__(self, artifact: Artifact, plan: str) -> None:
         super().__init__()
-        artifact = artifact.with_weights_of(plan)
-        manifest, pieces = artifact.manifest, artifact.pieces
+        own = artifact.plan(plan).exact
+        view = view_of(artifact, own)
+        manifest, pieces = view.manifest, view.pieces
         self._spec, self._pieces, self._features = manifest.spec, pieces, manifest.features
         groups = manifest.groups
-        schedule = check_plan(artifact.schedule(plan), manifest.steps, len(groups), 1)
+        schedule = check_plan(own.cells, manifest.steps, len(groups), 1)
         if (schedule == Source.ROLLOUT).any():
             problem = f"plan {plan!r} reads residuals of earlier calls, and a module keeps nothing between calls"
             raise IllegalPlanError(f"{problem}. Give another plan, or use load(..., runtime='torch').")
@@ -86,14 +87,14 @@ class SparseCall(nn.Module):
         self._plan: Instructions = instructions_of(schedule[0], groups)
         self._names: dict[str, str] = {}  # of buffers, by what they hold
         constants = {name for graph in pieces.graphs().values() for name in graph.constants}
-        self._keep("weight", {name: value for name, value in artifact.weights.items() if name in constants})
-        self._keep("first weight", artifact.first_weights)
+        self._keep("weight", {name: value for name, value in view.weights.items() if name in constants})
+        self._keep("first weight", view.first_weights)
         self._keep("table", pieces.tables)
-        correction = artifact.corrections.get(plan)
+        correction = own.correction
         self._advance = Advance(manifest.spec, correction, CPU)
         self._bound = None if correction is None else manifest.spec.sampler.bound
         self._keep("advance", self._advance.tensors())
-        form, _ = idle_form(pieces, artifact.weights)
+        form, _ = idle_form(pieces, view.weights)
         self._idle = None if form is None else IdleSteps(form, CPU)
         self._keep("idle", {} if self._idle is None else self._idle.tensors())
         bias = np.zeros((1, 1, 1, 1), np.float32) if correction is None else correction.bias

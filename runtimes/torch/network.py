@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from typing import TypeAlias
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from ttscompile.artifact.load import Artifact
+from ttscompile.artifact.view import View
 from ttscompile.errors import ArtifactError
 from ttscompile.ir.graph import Graph, TensorType
 from ttscompile.ir.idle_form import idle_form
@@ -19,25 +22,46 @@ from . import devices
 from .functions import Function, write_function
 from .idle_steps import IdleSteps
 
+Array: TypeAlias = npt.NDArray[np.generic]
+
+
+class Placed:
+    """Arrays of an artifact on a device, each once.
+
+    Args:
+        device: where they go.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        self._known: dict[int, tuple[Array, Tensor]] = {}  # by identity, which the entry keeps from reuse
+
+    def all(self, arrays: Mapping[str, Array]) -> dict[str, Tensor]:
+        """The tensors of these arrays, by name."""
+        for array in arrays.values():
+            if id(array) not in self._known:
+                self._known[id(array)] = array, devices.placed(array, self.device)
+        return {name: self._known[id(array)][1] for name, array in arrays.items()}
+
 
 class Parts:
     """What all numbers of streams share.
 
     Args:
-        artifact: loaded and checked.
-        device: where to compute.
+        view: of an artifact.
+        placed: its constants, where to compute.
         narrow: type of the products in residual blocks; None for float32.
     """
 
-    def __init__(self, artifact: Artifact, device: torch.device, narrow: torch.dtype | None) -> None:
-        self.manifest, self.pieces = artifact.manifest, artifact.pieces
-        self.device, self.narrow = device, narrow
-        values = {**artifact.weights, **artifact.pruner}
-        self.weights = {name: devices.placed(value, device) for name, value in values.items()}
-        first = {name: devices.placed(value, device) for name, value in artifact.first_weights.items()}
+    def __init__(self, view: View, placed: Placed, narrow: torch.dtype | None) -> None:
+        self.manifest, self.pieces = view.manifest, view.pieces
+        self.device, self.narrow = placed.device, narrow
+        values = {**view.weights, **view.pruner}
+        self.weights = placed.all(values)
+        first = placed.all(view.first_weights)
         self.first = self.weights | first if first else self.weights
         form, _ = idle_form(self.pieces, values)
-        self.idle = None if form is None else IdleSteps(form, device)
+        self.idle = None if form is None else IdleSteps(form, placed.device)
 
     def tensor(self, kind: TensorType, streams: int, *before: int) -> Tensor:
         """Zeros of a type, with other axes before its own."""

@@ -14,7 +14,7 @@ from ttscompile import Noise
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.rest import with_last_steps
 from ttscompile.core.correction import groups_of
-from ttscompile.core.rest import rest_of
+from ttscompile.core.start import rest_of
 from ttscompile.errors import (
     ArtifactError,
     ExecutorError,

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
+from ..core.plan import DENSE, ORIGINAL
 from ..errors import ArtifactError
 from ..ir.pieces import (
     ADVANCE,
@@ -28,8 +30,9 @@ from ..ir.pieces import (
     tokens_name,
 )
 from . import typed_json
-from .manifest import DENSE, DISTILLED, FORMAT, MANIFEST, SCHEMA_VERSION, DistilledRecord, Manifest, PrecisionRecord
+from .manifest import FORMAT, MANIFEST, SCHEMA_VERSION, Manifest, PlanRecord, PrecisionRecord, WeightsRecord
 from .strict_json import REMEDY, Value, dump, dump_compact, parse
+from .upgrade import upgraded
 
 MAX_MANIFEST_BYTES = 32 * 2**20
 
@@ -53,10 +56,10 @@ def decode(content: bytes, where: str = MANIFEST) -> Manifest:
             " Give the directory that 'ttscompile convert' wrote."
         )
     found, writer = document.get("schema_version"), document.get("ttscompile_version")
-    if found != SCHEMA_VERSION or type(found) is not int:
+    if found not in (SCHEMA_VERSION, SCHEMA_VERSION - 1) or type(found) is not int:
         install = f"ttscompile=={writer}, which wrote it" if isinstance(writer, str) else "the ttscompile that wrote it"
         raise ArtifactError(
-            f"{where}: schema_version: expected {SCHEMA_VERSION}, the only one that this ttscompile reads; found"
+            f"{where}: schema_version: expected {SCHEMA_VERSION} or the one before, which this ttscompile reads; found"
             f" {found!r}. Convert the checkpoint again with this version, or install {install}."
         )
     checksum = document.pop("checksum", None)
@@ -65,7 +68,11 @@ def decode(content: bytes, where: str = MANIFEST) -> Manifest:
             f"{where}: expected the checksum of its content; found {'none' if checksum is None else 'another'}."
             f" {REMEDY}"
         )
-    return from_json(Value(document, where))
+    if found == SCHEMA_VERSION:
+        return from_json(Value(document, where))
+    manifest = from_json(Value(upgraded(document, where), where))
+    identity, model_identity = identities(manifest)  # the new ones: what they cover is another
+    return replace(manifest, identity=identity, model_identity=model_identity)
 
 
 def to_json(manifest: Manifest) -> dict[str, Any]:
@@ -85,8 +92,9 @@ def from_json(root: Value) -> Manifest:
     manifest = typed_json.from_json(Manifest, Value(document, root.path))
     if manifest.precision is not None:
         _check_precision(manifest, manifest.precision, members["precision"])
-    if manifest.distilled is not None:
-        _check_distilled(manifest, manifest.distilled, members["distilled"])
+    for name, weights in manifest.weights.items():
+        _check_weights(manifest, weights, members["weights"].members()[name])
+    _check_plans(manifest, members)
     _check_parts(manifest, members)
     return manifest
 
@@ -94,10 +102,10 @@ def from_json(root: Value) -> Manifest:
 def identities(manifest: Manifest) -> tuple[str, str]:
     """Identity and model identity of what a manifest describes; its own two fields are not read.
 
-    The model identity covers weights, tables, graphs, sampler, normalisers, observations, chunk and block table. The
-    identity covers that, the pruner's weights, all plans, which of them is the default, how tokens are reused, and
-    weights of another precision: a calibration, which computes in fp32, belongs to the model with or without them.
-    Neither covers what people are told: source, FLOPs, reasons, sparsities, errors, calibration record, versions.
+    The model identity covers weights, tables, graphs, loops, normalisers, observations, chunk and block table. The
+    identity covers that, the pruner's weights, all fields of all plans by name, which of them is the default, and by
+    name the weights and models that plans may take: a calibration belongs to the model with or without them. Neither
+    covers what people are told: source, FLOPs, reasons, sparsities, errors, calibration record, versions.
 
     Returns:
         Two sha256 of 64 digits.
@@ -117,21 +125,67 @@ def identities(manifest: Manifest) -> tuple[str, str]:
         "weights": hashes[manifest.stores.weights],
     }
     model_identity = _checksum(model)
+    plans = {name: {k: v for k, v in plan.items() if k not in _TOLD} for name, plan in document["plans"].items()}
     whole: dict[str, Any] = {
         "model": model_identity,
         "pruner": [pruner, hashes.get(manifest.stores.pruner or "")],
-        "plans": [hashes.get(manifest.stores.plans or ""), {n: plan.kind for n, plan in manifest.plans.items()}],
+        "plans": [hashes.get(manifest.stores.plans or ""), plans],
         "default_plan": manifest.default_plan,
+        "starts": document["starts"],
+        "weights": {name: _hashed(record, hashes) for name, record in document["weights"].items()},
     }
     if manifest.precision is not None:
-        record = manifest.precision
-        models = {name: hashes[file] for name, file in record.models.items()}
-        whole["precision"] = {"name": record.name, "weights": hashes[record.weights], "models": models}
-    if manifest.distilled is not None:
-        whole["distilled"] = sorted(hashes[file] for file in manifest.distilled.files)
-    if manifest.reuse is not None:
-        whole["reuse"] = [manifest.reuse.threshold, manifest.reuse.refresh]
+        whole["precision"] = _hashed({k: document["precision"][k] for k in ("name", "weights", "models")}, hashes)
     return _checksum(whole), model_identity
+
+
+_TOLD = ("sparsity", "flops_sparsity")
+"""Of a plan what people are told and no action depends on."""
+
+
+def _hashed(record: Mapping[str, Any], hashes: Mapping[str, str]) -> dict[str, Any]:
+    """A record with the hash of every file in place of its name."""
+    return {
+        key: _hashed(value, hashes) if isinstance(value, Mapping) else hashes.get(value, value)
+        for key, value in record.items()
+    }
+
+
+def _check_plans(manifest: Manifest, fields: Mapping[str, Value]) -> None:
+    """Everything that plans and starts name is there."""
+    others = (ORIGINAL, *manifest.spec.loops)
+    for name, start in manifest.starts.items():
+        value = fields["starts"].members()[name]
+        if name in others or start.loop not in others:
+            value.fail(f"another name than the loops {list(others)}, and the last steps of one of these")
+        if start.steps >= manifest.sampler_of(start.loop).steps:
+            value.fail(f"fewer steps than the {manifest.sampler_of(start.loop).steps} of loop {start.loop!r}")
+    for name, plan in manifest.plans.items():
+        if fault := plan_fault(manifest, plan):
+            fields["plans"].members()[name].fail(fault)
+
+
+def plan_fault(manifest: Manifest, plan: PlanRecord) -> str | None:
+    """What was expected of the fields of a plan and is not so; None where all that it names is there."""
+    if plan.loop not in manifest.loops:
+        return f"a loop, one of {list(manifest.loops)}"
+    if plan.weights not in (ORIGINAL, *manifest.weights):
+        return f"weights, one of {[ORIGINAL, *manifest.weights]}"
+    record = manifest.precision
+    held = {} if record is None else dict.fromkeys(record.kept, record.name)
+    if not plan.precision.items() <= held.items():
+        return f"parts in the precision that the artifact has models in, {held or 'none'}"
+    if plan.tokens is not None and not manifest.tokens:
+        return "no reuse of tokens, because no frame piece has tokens"
+    if (plan.otherwise is not None) != (plan.loop in manifest.starts):
+        return "another plan for calls without a chunk exactly where the loop begins with one"
+    other = manifest.plans.get(plan.otherwise or DENSE)
+    if plan.otherwise not in (None, DENSE) and (other is None or other.loop in manifest.starts):
+        return "a plan for calls without a chunk whose loop begins with noise"
+    loop = manifest.starts[plan.loop].loop if plan.loop in manifest.starts else None
+    if loop is not None and loop != (ORIGINAL if other is None else other.loop):
+        return f"a plan for calls without a chunk in loop {loop!r}, whose last steps these are"
+    return None
 
 
 def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:
@@ -159,19 +213,14 @@ def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:
     files = {piece.file for piece in manifest.pieces.values()} | {n for n in vars(manifest.stores).values() if n}
     if manifest.precision is not None:
         files |= {manifest.precision.weights, *manifest.precision.models.values()}
-    if manifest.distilled is not None:
-        files |= manifest.distilled.files
+    for weights in manifest.weights.values():
+        files |= weights.files
     if files != set(manifest.files):
         fields["files"].fail(f"exactly the files {sorted(files)}")
     if DENSE in manifest.plans:
         fields["plans"].fail("no plan called 'dense', which every artifact has")
-    if (manifest.distilled is not None) != (DISTILLED in manifest.plans):
-        fields["distilled"].fail(f"weights exactly when there is a plan called {DISTILLED!r}")
     if manifest.default_plan not in {DENSE, *manifest.plans}:
         fields["default_plan"].fail(f"one of {[DENSE, *manifest.plans]}")
-    scheduled = any(not plan.pruned for plan in manifest.plans.values())
-    if scheduled != (manifest.stores.plans is not None):
-        fields["stores"].fail("a file of plans exactly when there are schedules")
 
 
 def _check_tokens(manifest: Manifest, fields: Mapping[str, Value]) -> None:
@@ -190,10 +239,6 @@ def _check_tokens(manifest: Manifest, fields: Mapping[str, Value]) -> None:
         renewed = tuple(map(renewed_name, record.kept))
         if not fits or part.outputs[len(frame.outputs) :] != renewed or set(rows) != {(record.tokens,)}:
             fields["tokens"].members()[name].fail("what the pieces of its tokens read and give")
-    if manifest.reuse is not None and not manifest.tokens:
-        fields["reuse"].fail("none, because no frame piece has tokens")
-    if manifest.warm is not None and manifest.warm.last_steps >= manifest.steps:
-        fields["warm"].fail(f"fewer than the {manifest.steps} steps of the loop")
 
 
 def _check_precision(manifest: Manifest, record: PrecisionRecord, value: Value) -> None:
@@ -214,7 +259,7 @@ def _check_precision(manifest: Manifest, record: PrecisionRecord, value: Value) 
         value.fail("a file for each model and one for the weights, which nothing else uses")
 
 
-def _check_distilled(manifest: Manifest, record: DistilledRecord, value: Value) -> None:
+def _check_weights(manifest: Manifest, record: WeightsRecord, value: Value) -> None:
     known = {*map(block_name, range(len(manifest.blocks))), *OF_ALL_BLOCKS}
     if set(record.models) != known:
         value.fail(f"a model of each of {', '.join(sorted(known))}")
@@ -223,6 +268,7 @@ def _check_distilled(manifest: Manifest, record: DistilledRecord, value: Value) 
     if set(record.precision_models) != lower or (record.precision_weights is None) is bool(lower):
         value.fail(f"models in another precision, and a file of their weights, for {sorted(lower) or 'nothing'}")
     others = {piece.file for piece in manifest.pieces.values()} | set(vars(manifest.stores).values())
+    others |= {file for one in manifest.weights.values() if one is not record for file in one.files}
     if other is not None:
         others |= {other.weights, *other.models.values()}
     count = 1 + len(record.models) + len(record.precision_models) + bool(lower)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.correction import Correction
+from ..core.correction import Correction, groups_of
 from ..errors import ArtifactError, IllegalPlanError
 from .manifest import Manifest
 from .strict_json import REMEDY
@@ -51,7 +51,19 @@ def read_corrections(stored: Mapping[str, npt.NDArray[Any]], manifest: Manifest,
     for name, of in wanted.items():
         try:
             found[name] = Correction(**{one: parts[f"{name}/{one}"] for one in of})
-            found[name].require_fit(manifest.steps, manifest.spec.sample, manifest.condition_numbers)
+            require_fit(found[name], manifest, manifest.plans[name].loop)
         except IllegalPlanError as error:
             raise ArtifactError(f"{where}: {name}: {error} {REMEDY}") from error
     return found
+
+
+def require_fit(correction: Correction, manifest: Manifest, loop: str) -> None:
+    """Raise unless it is a correction for this loop of a policy.
+
+    Raises:
+        IllegalPlanError: it is not.
+    """
+    start, sample = manifest.starts.get(loop), manifest.spec.sample
+    whole = manifest.sampler_of(loop if start is None else start.loop).steps
+    steps = whole if start is None else start.steps
+    correction.require_fit(steps, sample, manifest.condition_numbers, groups_of(whole, sample))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -17,10 +17,10 @@ import numpy.typing as npt
 from ..core.correction import Correction
 from ..core.lattice import PlanArray, Source, check_plan, dense_plan
 from ..core.paths import require_path
-from ..core.spec import FP32
+from ..core.plan import DENSE, ORIGINAL, Plan
 from ..errors import ArtifactError, IllegalPlanError
 from ..ir.graph import Graph
-from ..ir.pieces import CONDITION, FRAMES, PRUNER, STEM, STEP, TAIL, LoopPiece, block_name, frame_pieces, part_of
+from ..ir.pieces import CONDITION, FRAMES, PRUNER, STEM, STEP, TAIL, LoopPiece, block_name, frame_pieces
 from ..ir.program import Binding, Pieces
 from . import tensors
 from .archive import Unpacked, is_checkpoint, unpack
@@ -29,14 +29,15 @@ from .corrections import PREFIX, read_corrections
 from .files import check_file, read_file
 from .folder import Folder, Stamp
 from .graph_json import graph_from_json
-from .manifest import DENSE, DISTILLED, MANIFEST, Manifest, abbreviated
+from .manifest import MANIFEST, Manifest, PlanRecord, abbreviated
 from .onnx_files import check_model
 from .requires import check_runtime
 from .size import check_size
 from .strict_json import REMEDY, Value, parse
-from .tokens import ReuseRecord
 
 TABLE_PREFIX = "table/"
+LOOP_PREFIX = "loop/"
+"""Of the tables of loops beside the original's: ``loop/NAME/CONTEXT``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,29 +48,25 @@ class Artifact:
         path: the directory; of a zipped artifact a temporary one, which lives as long as this object.
         manifest: what is not array or graph.
         weights: constants of all pieces but the pruner's, read-only views of the file.
-        tables: TABLE contexts ``[K, ...]``, read-only views of the file.
+        tables: TABLE contexts ``[K, ...]`` of the original loop, read-only views of the file.
+        loop_tables: the same of the other loops that begin with noise, by their name.
         pruner: constants of the pruner (their names start with ``pruner.``); empty if there is none.
-        schedules: int8 ``[K, blocks]`` by name, without ``dense``.
-        corrections: of the sampler's steps, by the name of the plan that they belong to.
-        distilled: constants that the plan ``distilled`` has in place of those of ``weights``, read-only views of the
-            file; empty if there is no such plan.
-        first_step: the artifact whose blocks compute step 0, where those are not its own (``with_weights_of``).
-        later: names of the constants that blocks have after step 0 only.
+        plans: by name, ``dense`` the first of them.
+        block_weights: by the name of weights that plans may have, the constants that blocks have in place of those of
+            ``weights``; read-only views of the files.
     """
 
     path: Path
     manifest: Manifest
     weights: Mapping[str, npt.NDArray[Any]]
     tables: Mapping[str, npt.NDArray[Any]]
+    loop_tables: Mapping[str, Mapping[str, npt.NDArray[Any]]]
     pruner: Mapping[str, npt.NDArray[Any]]
-    schedules: Mapping[str, PlanArray]
-    corrections: Mapping[str, Correction]
-    distilled: Mapping[str, npt.NDArray[Any]]
+    plans: Mapping[str, Plan]
+    block_weights: Mapping[str, Mapping[str, npt.NDArray[Any]]]
     _folder: Folder = field(repr=False)
     _stamps: Mapping[str, Stamp] = field(repr=False)
     _unpacked: Unpacked | None = field(default=None, repr=False)
-    first_step: Artifact | None = field(default=None, repr=False)
-    later: tuple[str, ...] = ()
 
     @property
     def files(self) -> Path:
@@ -97,90 +94,27 @@ class Artifact:
                     raise self._folder.changed([name]) from error
             yield
 
-    def onnx_file(self, piece: str) -> str:
-        """Name of the ONNX file of a piece, whose weights are beside it; the one in its precision."""
-        record = self.manifest.precision
-        models = {} if record is None else record.models
-        return models.get(piece, self.manifest.pieces[piece].file)
-
-    def onnx_path(self, piece: str) -> Path:
-        """Where ``onnx_file`` is, for other programs; what is there by then was not checked."""
-        return self.path / self.onnx_file(piece)
-
-    def at_precision(self, name: str) -> Artifact:
-        """The same artifact in a precision: its own, or ``fp32``, which all artifacts hold.
-
-        Raises:
-            ArtifactError: it has no weights of this precision.
-        """
-        if name not in (FP32, own := self.manifest.precision_name):
-            known = list(dict.fromkeys((FP32, own)))
-            raise ArtifactError(
-                f"{self.path}: precision {name!r}: expected one that the artifact holds, {known}. Convert the"
-                f" checkpoint again with --precision {name}."
-            )
-        if name == own:
-            return self
-        first = None if self.first_step is None else self.first_step.at_precision(name)
-        return replace(self, manifest=replace(self.manifest, precision=None), first_step=first)
-
-    def with_parts(self, parts: Collection[str]) -> Artifact:
-        """The same artifact with only these parts (``ir.pieces.part_of``) in its precision."""
-        record = self.manifest.precision
-        models = {} if record is None else {n: file for n, file in record.models.items() if part_of(n) in parts}
-        own = replace(record, models=models) if record is not None and models else None
-        first = None if self.first_step is None else self.first_step.with_parts(parts)
-        return replace(self, manifest=replace(self.manifest, precision=own), first_step=first)
-
-    def with_reuse(self, reuse: ReuseRecord | None) -> Artifact:
-        """The same artifact, reusing tokens in another way; None for not at all."""
-        first = None if self.first_step is None else self.first_step.with_reuse(reuse)
-        return replace(self, manifest=replace(self.manifest, reuse=reuse), first_step=first)
-
-    def with_weights_of(self, plan: str | None) -> Artifact:
-        """The artifact whose blocks are those that a plan computes after step 0: itself, but for ``distilled``.
-
-        Step 0 has the original's weights in every plan.
-
-        Args:
-            plan: its name; None for one that has none.
-        """
-        record, manifest = self.manifest.distilled, self.manifest
-        if plan != DISTILLED or record is None:
-            return self
-        pieces = {n: replace(one, file=record.models.get(n, one.file)) for n, one in manifest.pieces.items()}
-        precision = manifest.precision
-        if precision is not None:
-            models = {name: record.precision_models.get(name, file) for name, file in precision.models.items()}
-            precision = replace(precision, models=models)
-        manifest = replace(manifest, pieces=pieces, precision=precision, distilled=None)
-        return replace(self.with_weights(self.distilled), manifest=manifest, distilled={})
-
     @property
-    def first_weights(self) -> Mapping[str, npt.NDArray[Any]]:
-        """Constants that blocks have at step 0, where those are others."""
-        return {} if self.first_step is None else {name: self.first_step.weights[name] for name in self.later}
+    def default(self) -> Plan:
+        """The plan that is taken when none is given."""
+        return self.plans[self.manifest.default_plan]
 
-    def with_weights(self, constants: Mapping[str, npt.NDArray[Any]]) -> Artifact:
-        """The artifact with other constants after step 0, for the reference runtime, which reads no models.
-
-        Args:
-            constants: of residual blocks, by name.
-        """
-        return replace(self, weights={**self.weights, **constants}, first_step=self, later=tuple(constants))
-
-    def schedule(self, name: str) -> PlanArray:
-        """A schedule by name, ``dense`` among them, int8 ``[K, blocks]``.
+    def plan(self, name: str) -> Plan:
+        """A plan by its name.
 
         Raises:
-            ArtifactError: there is none of this name.
+            IllegalPlanError: there is none of this name.
         """
-        if name == DENSE:
-            return dense_plan(self.manifest.steps, len(self.manifest.blocks))
-        if name not in self.schedules:
-            known = [DENSE, *self.schedules]
-            raise ArtifactError(f"{self.path}: has no schedule {name!r}; it has {known}. Use one of these.")
-        return self.schedules[name]
+        if not isinstance(name, str):
+            raise IllegalPlanError(f"expected a ttscompile.Plan, or the name of one; found a {type(name).__name__}.")
+        if name not in self.plans:
+            remedy = "Use one of these, or make one of them with dataclasses.replace"
+            raise IllegalPlanError(f"the artifact has no plan {name!r}; it has {list(self.plans)}. {remedy}.")
+        return self.plans[name]
+
+    def name_of(self, plan: Plan) -> str | None:
+        """The name of a plan of the artifact; None for any other."""
+        return next((name for name, one in self.plans.items() if one is plan), None)
 
     @cached_property
     def _document(self) -> Value:
@@ -326,23 +260,21 @@ def _open(path: Path, folder: Folder, stamps: Mapping[str, Stamp], manifest: Man
     for name in sorted(manifest.models):
         check_model(directory / name, manifest.files)
     stored = tensors.read(directory / manifest.stores.weights)
-    tables = {n.removeprefix(TABLE_PREFIX): a for n, a in stored.items() if n.startswith(TABLE_PREFIX)}
-    kinds = {n: c.type for n, c in manifest.contexts.items() if c.binding is Binding.TABLE}
-    wanted = {name: (kind.dtype, (manifest.steps, *kind.at(1))) for name, kind in kinds.items()}
-    tensors.check_arrays("table", tables, wanted, directory / manifest.stores.weights)
-    schedules, corrections = _plans(directory, manifest)
-    distilled = _optional(directory, None if manifest.distilled is None else manifest.distilled.weights)
-    of_weights = {name: (str(stored[name].dtype), stored[name].shape) for name in distilled if name in stored}
-    tensors.check_arrays("distilled weight", distilled, of_weights, directory)
+    tables = {loop: _tables(stored, manifest, loop, directory) for loop in (ORIGINAL, *manifest.spec.loops)}
+    block_weights = {}
+    for name, record in manifest.weights.items():
+        block_weights[name] = own = tensors.read(directory / record.weights)
+        of_weights = {n: (str(stored[n].dtype), stored[n].shape) for n in own if n in stored}
+        tensors.check_arrays(f"{name} weight", own, of_weights, directory)
     return Artifact(
         path=path,
         manifest=manifest,
-        weights=MappingProxyType({n: a for n, a in stored.items() if not n.startswith(TABLE_PREFIX)}),
-        tables=MappingProxyType(tables),
+        weights=MappingProxyType({n: a for n, a in stored.items() if not n.startswith((TABLE_PREFIX, LOOP_PREFIX))}),
+        tables=tables.pop(ORIGINAL),
+        loop_tables=MappingProxyType(tables),
         pruner=_optional(directory, manifest.stores.pruner),
-        schedules=schedules,
-        corrections=corrections,
-        distilled=distilled,
+        plans=_plans(directory, manifest),
+        block_weights=MappingProxyType(block_weights),
         _folder=folder,
         _stamps=stamps,
     )
@@ -352,30 +284,78 @@ def _optional(directory: Path, name: str | None) -> Mapping[str, npt.NDArray[Any
     return MappingProxyType({}) if name is None else tensors.read(directory / name)
 
 
-def _plans(directory: Path, manifest: Manifest) -> tuple[Mapping[str, PlanArray], Mapping[str, Correction]]:
-    """Schedules, and the corrections that belong to plans."""
+def table_prefix(loop: str) -> str:
+    """Before the name of a context it is the name of the array of its rows in a loop."""
+    return TABLE_PREFIX if loop == ORIGINAL else f"{LOOP_PREFIX}{loop}/"
+
+
+def _tables(
+    stored: Mapping[str, npt.NDArray[Any]], manifest: Manifest, loop: str, where: Path
+) -> Mapping[str, npt.NDArray[Any]]:
+    """The TABLE contexts of a loop that begins with noise."""
+    prefix, steps = table_prefix(loop), manifest.sampler_of(loop).steps
+    tables = {n.removeprefix(prefix): array for n, array in stored.items() if n.startswith(prefix)}
+    kinds = {n: c.type for n, c in manifest.contexts.items() if c.binding is Binding.TABLE}
+    wanted = {name: (kind.dtype, (steps, *kind.at(1))) for name, kind in kinds.items()}
+    tensors.check_arrays("table", tables, wanted, where / manifest.stores.weights)
+    return MappingProxyType(tables)
+
+
+def _plans(directory: Path, manifest: Manifest) -> Mapping[str, Plan]:
+    """All plans by name, with their cells and corrections."""
     stored = _optional(directory, manifest.stores.plans)
     where = directory / (manifest.stores.plans or MANIFEST)
     schedules = {name: array for name, array in stored.items() if not name.startswith(PREFIX)}
-    expected = sorted(name for name, plan in manifest.plans.items() if not plan.pruned)
+    expected = sorted(name for name, plan in manifest.plans.items() if plan.kind == "schedule")
     if expected != sorted(schedules):
         raise ArtifactError(f"{where}: expected schedules {expected}; found {sorted(schedules)}. {REMEDY}")
-    for name, plan in schedules.items():
+    for name, cells in schedules.items():
         try:
-            check_schedule(name, plan, manifest)
+            check_schedule(name, cells, steps_of(manifest, manifest.plans[name].loop), len(manifest.blocks))
         except IllegalPlanError as error:
             raise ArtifactError(f"{where}: {name}: {error} {REMEDY}") from error
     corrections = read_corrections(stored, manifest, str(where))
-    return MappingProxyType(schedules), MappingProxyType(corrections)
+    plans = {DENSE: Plan(cells=dense_plan(manifest.steps, len(manifest.blocks)), repair=True)}
+    # A plan may name another one that does not begin with a chunk: those come first.
+    for name, record in sorted(manifest.plans.items(), key=lambda item: item[1].otherwise is not None):
+        otherwise = None if record.otherwise is None else plans[record.otherwise]
+        plans[name] = plan_of(record, manifest, schedules.get(name), corrections.get(name), otherwise)
+    return MappingProxyType({name: plans[name] for name in (DENSE, *manifest.plans)})
 
 
-def check_schedule(name: str, plan: npt.NDArray[Any], manifest: Manifest) -> None:
-    """Raise unless this is a schedule of the policy: int8 ``[K, blocks]`` with a dense step 0.
+def plan_of(
+    record: PlanRecord,
+    manifest: Manifest,
+    schedule: PlanArray | None,
+    correction: Correction | None,
+    otherwise: Plan | None,
+) -> Plan:
+    """The plan of a record, with its cells."""
+    cells = dense_plan(steps_of(manifest, record.loop), len(manifest.blocks)) if record.kind == "all" else schedule
+    return Plan(
+        loop=record.loop,
+        cells=cells,
+        correction=correction,
+        weights=record.weights,
+        precision=record.precision,
+        tokens=record.tokens,
+        otherwise=otherwise,
+        repair=True,
+    )
+
+
+def steps_of(manifest: Manifest, loop: str) -> int:
+    """K of a loop, whatever it begins with."""
+    start = manifest.starts.get(loop)
+    return manifest.sampler_of(loop).steps if start is None else start.steps
+
+
+def check_schedule(name: str, plan: npt.NDArray[Any], steps: int, blocks: int) -> None:
+    """Raise unless this is a schedule of a loop: int8 ``[K, blocks]`` with a dense step 0.
 
     Raises:
         IllegalPlanError: it is not.
     """
-    steps, blocks = manifest.steps, len(manifest.blocks)
     if plan.dtype != np.int8 or plan.ndim != 2:
         raise IllegalPlanError(
             f"schedule {name!r}: expected int8[{steps}, {blocks}]; found {plan.dtype}{list(plan.shape)}."

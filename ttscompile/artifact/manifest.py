@@ -12,26 +12,17 @@ from typing import Annotated, Any, Literal
 
 from ..core.correction import Correction, numbers_of
 from ..core.lattice import PlanArray, plan_flops
+from ..core.plan import ORIGINAL, UNIFORM, TokenReuse
 from ..core.rules import NotNegative, Positive, Rule, Sha256, Share
-from ..core.spec import FP32, PolicySpec
+from ..core.spec import FP32, PolicySpec, SamplerTable
 from ..ir.graph import TensorType
 from ..ir.pieces import PRUNER, is_block, part_of
 from ..ir.program import Binding
-from .tokens import ReuseRecord, TokensRecord
-from .warm import WarmRecord
+from .towers import TokensRecord
 
 FORMAT = "ttscompile artifact"
-SCHEMA_VERSION = 10
+SCHEMA_VERSION = 11
 MANIFEST = "manifest.json"
-DENSE = "dense"
-"""The plan that computes every cell; every artifact has it without listing it."""
-UNIFORM = "uniform"
-"""The plan that calibration adds for comparisons alone: as many steps computed, evenly spaced. Not for a robot."""
-WARM = "warm"
-"""The plan of calls that begin with the chunk of the call before: the last steps, dense (``artifact.rest``)."""
-DISTILLED = "distilled"
-"""The plan whose residual blocks have weights of their own, which ``distill`` trained."""
-
 _SHOWN = 12
 
 FileName = Annotated[
@@ -138,23 +129,46 @@ class FlopsRecord:
 
 
 @dataclass(frozen=True)
-class PlanRecord:
-    """A plan that ``predict_action(plan=name)`` knows.
+class StartRecord:
+    """A loop that is the last steps of another, and begins with the chunk of the call before (``core.start``).
 
     Attributes:
-        kind: ``schedule`` (in ``Artifact.schedules``) or ``pruner`` (made for each observation; also the name of such a
-            plan where it is not called otherwise).
+        loop: name of the other, which begins with noise.
+        steps: how many of its steps are left.
+    """
+
+    loop: str
+    steps: Positive
+
+
+@dataclass(frozen=True)
+class PlanRecord:
+    """A plan of the artifact. ``core.plan.Plan`` says what its fields mean.
+
+    Attributes:
+        kind: where its cells are: ``schedule``, in the file of plans; ``pruner``, made for each observation; ``all``,
+            every cell is computed.
+        loop: see ``Plan``.
+        weights: see ``Plan``.
+        precision: see ``Plan``.
+        tokens: see ``Plan``.
+        otherwise: name of the plan of a call that has no chunk to begin with; None for loops that begin with noise.
         sparsity: share of reused cells; of a pruner the measured mean, None if it was not measured.
         flops_sparsity: the same with each cell weighed by its FLOPs.
     """
 
-    kind: Literal["schedule", "pruner"]
-    sparsity: Share | None
-    flops_sparsity: Share | None
+    kind: Literal["schedule", "pruner", "all"]
+    loop: str = ORIGINAL
+    weights: str = ORIGINAL
+    precision: Mapping[str, str] = field(default_factory=dict)
+    tokens: TokenReuse | None = None
+    otherwise: str | None = None
+    sparsity: Share | None = 0.0
+    flops_sparsity: Share | None = 0.0
 
     @property
     def pruned(self) -> bool:
-        """Whether the pruner makes it."""
+        """Whether the pruner makes its cells."""
         return self.kind == PRUNER
 
 
@@ -260,8 +274,8 @@ class PrecisionRecord:
 
 
 @dataclass(frozen=True)
-class DistilledRecord:
-    """Weights of residual blocks that the plan ``distilled`` has in place of the original's; both are in the artifact.
+class WeightsRecord:
+    """Weights of residual blocks that a plan may have in place of the original's; both are in the artifact.
 
     Attributes:
         weights: name of the file with the constants that differ.
@@ -306,11 +320,10 @@ class Manifest:
         stores: names of the files that are not ONNX.
         requires: what the ONNX graphs need.
         files: every file but the manifest.
-        precision: of blocks and prologue where it is not fp32. The reference runtime computes in fp32 always.
-        distilled: weights of the plan of this name; None where there is no such plan.
+        precision: models in another precision than fp32, which plans may take; None if there are none.
+        starts: by name, the loops that begin with the chunk of the call before. The others are in ``spec``.
+        weights: by name, the weights that plans may have in place of the original's.
         tokens: by frame piece, the tokens of those that are vision transformers.
-        reuse: how the onnxruntime runtime reuses them; None for not at all.
-        warm: of calls that begin with the chunk of the call before; None where that was not settled.
     """
 
     schema_version: int
@@ -330,15 +343,23 @@ class Manifest:
     requires: Requires
     files: Mapping[FileName, FileRecord]
     precision: PrecisionRecord | None = None
-    distilled: DistilledRecord | None = None
+    starts: Mapping[str, StartRecord] = field(default_factory=dict)
+    weights: Mapping[str, WeightsRecord] = field(default_factory=dict)
     tokens: Mapping[str, TokensRecord] = field(default_factory=dict)
-    reuse: ReuseRecord | None = None
-    warm: WarmRecord | None = None
+
+    @property
+    def loops(self) -> tuple[str, ...]:
+        """Names of all loops, the original's first."""
+        return (ORIGINAL, *self.spec.loops, *self.starts)
 
     @property
     def precision_name(self) -> str:
-        """``fp32`` or the name of the precision."""
+        """The precision that some parts have models of beside fp32; ``fp32`` where none has."""
         return FP32 if self.precision is None else self.precision.name
+
+    def sampler_of(self, loop: str) -> SamplerTable:
+        """The table of a loop that begins with noise."""
+        return self.spec.sampler if loop == ORIGINAL else self.spec.loops[loop]
 
     @property
     def models(self) -> set[str]:
@@ -346,13 +367,13 @@ class Manifest:
         own = {piece.file for piece in self.pieces.values()}
         if self.precision is not None:
             own |= set(self.precision.models.values())
-        if self.distilled is not None:
-            own |= {*self.distilled.models.values(), *self.distilled.precision_models.values()}
+        for weights in self.weights.values():
+            own |= {*weights.models.values(), *weights.precision_models.values()}
         return own
 
     @property
     def steps(self) -> int:
-        """K."""
+        """K of the original loop."""
         return self.spec.sampler.steps
 
     @property

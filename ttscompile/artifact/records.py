@@ -13,6 +13,8 @@ import numpy.typing as npt
 
 from ..core.correction import condition_flops, numbers_of
 from ..core.lattice import plan_flops, sparsity
+from ..core.plan import DENSE, ORIGINAL, Plan
+from ..core.spec import SamplerTable
 from ..core.update import update_flops
 from ..errors import ArtifactError
 from ..ir import pieces as names
@@ -23,10 +25,11 @@ from ..ir.layers import layers_graph
 from ..ir.program import Binding, Program
 from . import tensors
 from .bind import REPORT, interface
-from .load import check_schedule
-from .manifest import DENSE, BlockRecord, ContextRecord, FlopsRecord, Manifest, PieceRecord, PlanRecord, Requires
+from .codec import plan_fault
+from .load import check_schedule, steps_of
+from .manifest import BlockRecord, ContextRecord, FlopsRecord, Manifest, PieceRecord, PlanRecord, Requires
 from .strict_json import Value, dump_compact, parse
-from .tokens import TokensRecord
+from .towers import TokensRecord
 from .typed_json import from_json
 
 if TYPE_CHECKING:
@@ -130,8 +133,10 @@ def context_records(program: Program) -> dict[str, ContextRecord]:
                     f"{piece}: context {name!r} : {kind} has {shown}, and nothing computes it. {REPORT}"
                 )
             if binding is Binding.TABLE:
-                wanted = {name: (kind.dtype, (program.spec.sampler.steps, *kind.at(1)))}
-                tensors.check_arrays("table", {name: pieces.tables[name]}, wanted, piece, REPORT)
+                for loop, sampler in {ORIGINAL: program.spec.sampler, **program.spec.loops}.items():
+                    rows = (pieces.tables if loop == ORIGINAL else pieces.loop_tables[loop])[name]
+                    wanted = {name: (kind.dtype, (sampler.steps, *kind.at(1)))}
+                    tensors.check_arrays("table", {name: rows}, wanted, piece, REPORT)
             records[name] = ContextRecord(binding=binding, type=kind)
     return records
 
@@ -150,7 +155,8 @@ def piece_records(
     Raises:
         ArtifactError: models and pieces do not have the same names, inputs or outputs.
     """
-    expected = {name: one for name, one in _interfaces(program).items() if name != names.IDLE or names.IDLE in models}
+    optional = {names.IDLE, *map(names.advance_name, program.spec.loops)}
+    expected = {name: one for name, one in _interfaces(program).items() if name not in optional or name in models}
     if set(models) != set(expected):
         raise ArtifactError(f"expected the ONNX models {sorted(expected)}; found {sorted(models)}. {REPORT}")
     records = {}
@@ -181,40 +187,54 @@ def requirements(models: Mapping[str, ModelProto]) -> Requires:
     return Requires(onnxruntime=ONNXRUNTIME, opset=opset)
 
 
-def plan_records(
-    manifest: Manifest,
-    pruned: bool,
-    schedules: Mapping[str, npt.NDArray[np.int8]],
-    default_plan: str,
-    record: Mapping[str, Any],
-) -> dict[str, PlanRecord]:
-    """Records of schedules and, if it makes one (``pruned``), of the pruner's plan; see ``write.update_calibration``.
+def plan_records(manifest: Manifest, plans: Mapping[str, Plan], record: Mapping[str, Any]) -> dict[str, PlanRecord]:
+    """Records of plans by name, ``dense`` left out; see ``write.update_plans``.
+
+    Args:
+        manifest: with the loops and weights that the plans name.
+        plans: by name.
+        record: of the calibration: what the plans of the pruner come to on average is in it.
 
     Raises:
-        ArtifactError: names that cannot be, or sparsities that are no shares.
-        IllegalPlanError: a schedule that does not fit the policy.
+        ArtifactError: names that cannot be, fields that name what the artifact lacks, or sparsities that are no shares.
+        IllegalPlanError: cells that do not fit the policy.
     """
-    plans = {}
-    for name in sorted(schedules):
-        if _PLAN_NAME.fullmatch(name) is None or name == DENSE:
-            raise ArtifactError(f"schedule {name!r}: expected letters, digits and _ . % - and not 'dense'.")
-        plan = np.asarray(schedules[name])
-        check_schedule(name, plan, manifest)
-        total = manifest.steps * sum(manifest.flops.blocks)
-        weighed = 1 - plan_flops(plan, manifest.flops.blocks) / total if total else sparsity(plan)
-        plans[name] = PlanRecord(kind="schedule", sparsity=sparsity(plan), flops_sparsity=weighed)
-    if pruned:
-        if manifest.stores.pruner is None:
-            raise ArtifactError("the artifact has no pruner whose weights could be set. Convert the checkpoint again.")
-        name = names.PRUNER if default_plan in {DENSE, *plans} else default_plan
-        if name in plans or _PLAN_NAME.fullmatch(name) is None:
-            raise ArtifactError(f"the pruner's plan cannot be called {name!r}. Give the schedule another name.")
-        score = record.get("plans", {}).get(name, {})
-        shares = {key: score.get(key) for key in ("sparsity", "flops_sparsity")}
-        plans[name] = from_json(PlanRecord, Value({"kind": names.PRUNER, **shares}, "calibration record"))
-    if default_plan not in {DENSE, *plans}:
-        raise ArtifactError(f"default plan {default_plan!r}: expected one of {[DENSE, *plans]}.")
-    return plans
+    made, own = dict[str, PlanRecord](), {name: plan for name, plan in plans.items() if name != DENSE}
+    for name, plan in sorted(own.items()):
+        if _PLAN_NAME.fullmatch(name) is None:
+            raise ArtifactError(f"plan {name!r}: expected letters, digits and _ . % -.")
+        otherwise = None
+        if plan.otherwise is not None:
+            otherwise = next((other for other, one in plans.items() if one is plan.otherwise), None)
+            if otherwise is None:
+                raise ArtifactError(f"plan {name!r}: its plan for calls without a chunk is none of {sorted(plans)}.")
+        fields = {
+            "loop": plan.loop,
+            "weights": plan.weights,
+            "precision": dict(sorted(plan.precision.items())),
+            "tokens": None if plan.tokens is None else dict(vars(plan.tokens)),
+            "otherwise": otherwise,
+        }
+        if plan.cells is None:
+            if manifest.stores.pruner is None:
+                raise ArtifactError(
+                    f"plan {name!r}: the artifact has no pruner to make it. Convert the checkpoint again."
+                )
+            score = record.get("plans", {}).get(name, {})
+            told = {"kind": names.PRUNER, **{key: score.get(key) for key in ("sparsity", "flops_sparsity")}}
+        else:
+            cells = np.asarray(plan.cells)
+            steps = steps_of(manifest, plan.loop) if plan.loop in manifest.loops else len(cells)
+            check_schedule(name, cells, steps, len(manifest.blocks))
+            total = steps * sum(manifest.flops.blocks)
+            weighed = 1 - plan_flops(cells, manifest.flops.blocks) / total if total else sparsity(cells)
+            kind = "schedule" if cells.any() else "all"
+            told = {"kind": kind, "sparsity": sparsity(cells), "flops_sparsity": weighed}
+        made[name] = from_json(PlanRecord, Value({**told, **fields}, f"plan {name!r}"))
+    for name, one in made.items():
+        if fault := plan_fault(replace(manifest, plans=made), one):
+            raise ArtifactError(f"plan {name!r}: expected {fault}.")
+    return made
 
 
 def calibration_record(record: Mapping[str, Any]) -> dict[str, Any]:
@@ -249,10 +269,13 @@ def _interfaces(program: Program) -> dict[str, PieceRecord]:
         for name, piece in ((names.TAIL, tail), (names.STEM, stem))
         for n in piece.contexts
     ]
-    around = (*names.advance_inputs(sampler), *own)
-    found[names.ADVANCE] = record(
-        around, names.advance_outputs(sampler), names.STREAM, (*tail.contexts, *stem.contexts)
-    )
+
+    def advance(sampler: SamplerTable) -> PieceRecord:
+        around = (*names.advance_inputs(sampler), *own)
+        return record(around, names.advance_outputs(sampler), names.STREAM, (*tail.contexts, *stem.contexts))
+
+    found[names.ADVANCE] = advance(sampler)
+    found |= {names.advance_name(loop): advance(table) for loop, table in program.spec.loops.items()}
     joint = join([tuple(piece.contexts.values()) for piece in pieces.blocks])
     found[names.JOINT] = record(joint.inputs, (names.RESIDUAL,), names.STREAM)
     read = dict.fromkeys(name for piece in pieces.blocks for name in piece.contexts)

@@ -13,17 +13,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.correction import Correction
 from ..core.paths import require_free_or_path
+from ..core.plan import DENSE, FULL, ORIGINAL, Plan
 from ..errors import ArtifactError
-from ..ir.pieces import PRUNER
+from ..ir.pieces import ADVANCE, PRUNER, advance_name
 from ..ir.program import Binding, Program
 from ..measure.versions import VERSION
 from . import records, tensors
 from .bind import LoweredPieces, bind, places_of, store_pieces
+from .block_weights import BlockWeights, store_weights, without_weights
 from .codec import decode, encode, identities
-from .corrections import correction_arrays
-from .distilled import DistilledWeights, store_distilled
+from .corrections import correction_arrays, require_fit
 from .files import (
     PARTIAL,
     content_hash,
@@ -38,14 +38,8 @@ from .files import (
 )
 from .golden import Golden, GoldenPlan, plan_arrays
 from .graph_json import graph_to_json
-from .load import (
-    TABLE_PREFIX,
-    Artifact,
-    load_artifact,
-    read_manifest,
-    require_artifact_path,
-)
-from .manifest import DENSE, FORMAT, MANIFEST, SCHEMA_VERSION, Manifest, Stores, abbreviated
+from .load import Artifact, load_artifact, plan_of, read_manifest, require_artifact_path, table_prefix
+from .manifest import FORMAT, MANIFEST, SCHEMA_VERSION, Manifest, PlanRecord, StartRecord, Stores, abbreviated
 from .strict_json import dump_compact
 
 if TYPE_CHECKING:
@@ -57,7 +51,7 @@ GOLDEN = "golden.safetensors"
 
 _STALE = re.compile(
     rf"(pruner-[0-9a-f]+\.(onnx|safetensors)|(golden_)?plans-[0-9a-f]+\.safetensors"
-    rf"|distilled-[0-9a-f]+-[A-Za-z0-9_]+\.(onnx|safetensors)|\..+{re.escape(PARTIAL)})"
+    rf"|(blocks|distilled)-[0-9a-f]+-[A-Za-z0-9_]+\.(onnx|safetensors)|\..+{re.escape(PARTIAL)})"
 )
 BESIDE = ("config.json", "policy_preprocessor.json", "policy_postprocessor.json")
 """Files for LeRobot that may stand in an artifact. Nothing here reads them, the manifest does not list them, and no
@@ -74,8 +68,12 @@ def write_artifact(
     lowered: LoweredPieces | None = None,
     golden: Golden | None = None,
     beside: Mapping[str, bytes] | None = None,
+    loop: str = ORIGINAL,
 ) -> Manifest:
-    """Write a compiled program; its default plan is ``dense`` until it is calibrated.
+    """Write a compiled program.
+
+    Its default plan is ``dense``, or where another loop or precision is asked for ``full``, which computes every cell
+    of that loop in that precision; until it is calibrated.
 
     Everything is written to a folder beside ``directory``, which then takes its place.
 
@@ -83,9 +81,10 @@ def write_artifact(
         program: after all passes.
         models: from ``lower_program``.
         directory: where it goes; its parents are made. An artifact that is there is replaced.
-        lowered: pieces of another precision, which then is the artifact's; None for fp32.
+        lowered: pieces of another precision, which plan ``full`` takes; None for fp32 alone.
         golden: what the original network answered; None leaves the artifact without, which then cannot be verified.
         beside: files for other programs, by name, one of ``BESIDE``.
+        loop: of plan ``full``.
 
     Returns:
         The manifest.
@@ -100,7 +99,7 @@ def write_artifact(
         target.parent.mkdir(parents=True, exist_ok=True)
         recover(target)
         with locked(target) if target.is_dir() else nullcontext(), new_folder(target) as partial:
-            manifest = _fill(partial, program, models, lowered, golden)
+            manifest = _fill(partial, program, models, lowered, golden, loop)
             for name, content in (beside or {}).items():
                 assert name in BESIDE
                 write_synced(partial / name, content)
@@ -113,34 +112,33 @@ def write_artifact(
     return manifest
 
 
-def update_calibration(
+def update_plans(
     path: str | os.PathLike[str],
-    pruner_weights: Mapping[str, npt.NDArray[Any]] | None,
-    schedules: Mapping[str, npt.NDArray[np.int8]],
+    plans: Mapping[str, Plan],
     default_plan: str,
-    record: Mapping[str, Any],
+    record: Mapping[str, Any] | None = None,
     *,
-    corrections: Mapping[str, Correction] | None = None,
-    distilled: DistilledWeights | None = None,
+    pruner_weights: Mapping[str, npt.NDArray[Any]] | None = None,
+    weights: Mapping[str, BlockWeights] | None = None,
+    starts: Mapping[str, StartRecord] | None = None,
     model_identity: str | None = None,
     golden: Callable[[Artifact], Mapping[str, GoldenPlan]] | None = None,
     held: bool = False,
 ) -> Manifest:
-    """Replace the plans of an artifact, and its pruner's weights: at once, or not at all.
+    """Replace the plans of an artifact, and what they name: at once, or not at all.
 
-    Afterwards the artifact has exactly these schedules and, if ``pruner_weights`` are given, one plan of the pruner.
-    That plan has the name ``default_plan``, or ``pruner`` where ``default_plan`` is a schedule or ``dense``; its
-    ``sparsity`` and ``flops_sparsity`` are those of ``record["plans"]`` under this name, if the record has them. To
-    keep what is there, pass ``artifact.pruner`` and ``artifact.schedules``.
+    Afterwards the artifact has exactly these plans, beside ``dense``. Weights and starts that no plan names any more
+    are gone. To keep what is there, pass ``artifact.plans``.
 
     Args:
         path: the artifact's directory.
-        pruner_weights: all constants of the pruner, by name; None leaves them and drops the pruner's plan.
-        schedules: int8 ``[K, blocks]`` by name.
-        default_plan: what ``predict_action`` uses when it is given no plan.
-        record: what was done to get here; JSON.
-        corrections: of the sampler's steps, by the name of their plan; None for none.
-        distilled: weights of the plan ``distilled``, which then is one of the schedules; None drops those of before.
+        plans: by name; ``dense`` may be among them, and is as it was.
+        default_plan: what a call has that is given no plan.
+        record: what was done to get here, JSON; ``record["plans"]`` has ``sparsity`` and ``flops_sparsity`` of plans
+            that the pruner makes, by name. None keeps the record that is there.
+        pruner_weights: all constants of the pruner, by name; None leaves them.
+        weights: of blocks, which these plans name, by name; those that are there need not be given again.
+        starts: loops that begin with the chunk of the call before, by name; likewise.
         model_identity: of the artifact that was calibrated; refuses another one.
         golden: records what the reference runtime makes of the plans (``record_golden.record_plans``), given the
             artifact as it will be; None leaves the artifact without, and its plans cannot be verified.
@@ -151,7 +149,7 @@ def update_calibration(
 
     Raises:
         ArtifactError: no artifact, a zipped one, one that is being updated, or arguments that do not fit it.
-        IllegalPlanError: a schedule or a correction that does not fit the policy.
+        IllegalPlanError: a plan or a correction that does not fit the policy.
     """
     directory = require_unzipped(path)
     with nullcontext() if held else locked(directory):
@@ -162,24 +160,24 @@ def update_calibration(
                 f" {abbreviated(artifact.manifest.model_identity)}: the artifact was converted again. Calibrate it"
                 " again."
             )
-        manifest = replace(
-            artifact.manifest,
-            plans=records.plan_records(artifact.manifest, pruner_weights is not None, schedules, default_plan, record),
-            default_plan=default_plan,
-            calibration=records.calibration_record(record),
-        )
+        told = artifact.manifest.calibration if record is None else records.calibration_record(record)
         try:
-            arrays = _plan_arrays(manifest, schedules, corrections or {})
-            manifest = _store(directory, manifest, "plans", arrays)
-            manifest = store_distilled(artifact, manifest, distilled)
+            manifest = _store_named(artifact, plans, weights or {}, starts or {})
+            manifest = replace(manifest, plans=records.plan_records(manifest, plans, told or {}))
+            if default_plan not in {DENSE, *manifest.plans}:
+                raise ArtifactError(f"default plan {default_plan!r}: expected one of {[DENSE, *manifest.plans]}.")
+            manifest = replace(manifest, default_plan=default_plan, calibration=told)
+            manifest = _store(directory, manifest, "plans", _plan_arrays(manifest, plans))
             if pruner_weights is not None:
                 manifest = _store_pruner(artifact, manifest, pruner_weights)
             after = replace(
                 artifact,
-                distilled={} if distilled is None else distilled.weights,
+                block_weights={
+                    name: (weights or {})[name].weights if name in (weights or {}) else artifact.block_weights[name]
+                    for name in manifest.weights
+                },
                 manifest=manifest,
-                schedules=dict(schedules),
-                corrections=dict(corrections or {}),
+                plans=_named_plans(manifest, plans),
                 pruner=artifact.pruner if pruner_weights is None else pruner_weights,
             )
             manifest = _store(directory, manifest, "golden_plans", {} if golden is None else plan_arrays(golden(after)))
@@ -195,23 +193,47 @@ def update_calibration(
     return manifest
 
 
+def _store_named(
+    artifact: Artifact,
+    plans: Mapping[str, Plan],
+    weights: Mapping[str, BlockWeights],
+    starts: Mapping[str, StartRecord],
+) -> Manifest:
+    """The manifest with the weights and starts that plans name, and no others."""
+    manifest, loops = artifact.manifest, {plan.loop for plan in plans.values()}
+    named = {plan.weights for plan in plans.values()}
+    manifest = without_weights(manifest, named - set(weights))
+    for name, own in weights.items():
+        manifest = store_weights(artifact, manifest, name, own)
+    return replace(manifest, starts={n: one for n, one in {**manifest.starts, **starts}.items() if n in loops})
+
+
+def _named_plans(manifest: Manifest, plans: Mapping[str, Plan]) -> dict[str, Plan]:
+    """The plans of an artifact, as they will be when it is loaded again."""
+    dense = plan_of(PlanRecord("all"), manifest, None, None, None)
+    return {DENSE: dense, **{name: replace(plans[name], repair=True) for name in manifest.plans}}
+
+
 def _fill(
     folder: Path,
     program: Program,
     models: Mapping[str, ModelProto],
     lowered: LoweredPieces | None,
     golden: Golden | None,
+    loop: str,
 ) -> Manifest:
     """Write all files of a new artifact into an empty folder."""
     graphs = program.pieces.graphs()
     values = records.constants(program, graphs)
     contexts = records.context_records(program)
     requires = records.requirements(models)
-    files = {name: f"{name}.onnx" for name in models}
+    files = {name: f"{_file_name(name, program)}.onnx" for name in models}
 
     pruner = {name: value for name, value in values.items() if name.startswith(records.PRUNER_PREFIX)}
     stored = {name: value for name, value in values.items() if name not in pruner}
-    tables = {TABLE_PREFIX + n: program.pieces.tables[n] for n, c in contexts.items() if c.binding is Binding.TABLE}
+    read = [name for name, context in contexts.items() if context.binding is Binding.TABLE]
+    loops = {ORIGINAL: program.pieces.tables, **program.pieces.loop_tables}
+    tables = {table_prefix(of) + name: rows[name] for of, rows in loops.items() for name in read}
     tensors.write(folder / WEIGHTS, {**stored, **tables})
     places = places_of(folder / WEIGHTS, stored)
     pruner_file = None
@@ -225,6 +247,10 @@ def _fill(
     for name in pieces:
         write_synced(folder / files[name], bind(models[name], places, name))
     precision = None if lowered is None else store_pieces(folder, lowered, pieces, places)
+    plans = dict[str, PlanRecord]()
+    if precision is not None or loop != ORIGINAL:
+        held = {} if precision is None else dict.fromkeys(precision.kept, precision.name)
+        plans[FULL] = PlanRecord("all", loop=loop, precision=held)
     if golden is not None:
         write_synced(folder / GOLDEN, tensors.serialize(golden.arrays()))
     document = {
@@ -245,8 +271,8 @@ def _fill(
             contexts=contexts,
             features=program.pieces.features,
             flops=records.flops_record(program),
-            plans={},
-            default_plan=DENSE,
+            plans=plans,
+            default_plan=FULL if plans else DENSE,
             calibration=None,
             stores=Stores(PROGRAM, WEIGHTS, pruner_file, None, golden=None if golden is None else GOLDEN),
             requires=requires,
@@ -323,15 +349,22 @@ def locked(directory: Path) -> Iterator[None]:
         yield
 
 
-def _plan_arrays(
-    manifest: Manifest, schedules: Mapping[str, npt.NDArray[np.int8]], corrections: Mapping[str, Correction]
-) -> dict[str, npt.NDArray[Any]]:
-    arrays: dict[str, npt.NDArray[Any]] = dict(schedules)
-    for plan, correction in corrections.items():
-        if plan not in manifest.plans:
-            raise ArtifactError(f"correction of {plan!r}: expected a plan of the artifact, {sorted(manifest.plans)}.")
-        correction.require_fit(manifest.steps, manifest.spec.sample, manifest.condition_numbers)
-        arrays |= correction_arrays(plan, correction)
+def _file_name(piece: str, program: Program) -> str:
+    """Of a piece; the names of loops need not be names of files."""
+    own = {advance_name(loop): f"{ADVANCE}_{i:02d}" for i, loop in enumerate(program.spec.loops, start=1)}
+    return own.get(piece, piece)
+
+
+def _plan_arrays(manifest: Manifest, plans: Mapping[str, Plan]) -> dict[str, npt.NDArray[Any]]:
+    """Schedules and corrections of plans, by the names that they have in the file."""
+    arrays = dict[str, npt.NDArray[Any]]()
+    for name, record in manifest.plans.items():
+        if record.kind == "schedule":
+            arrays[name] = np.asarray(plans[name].cells)
+    for name in manifest.plans:
+        if (correction := plans[name].correction) is not None:
+            require_fit(correction, manifest, plans[name].loop)
+            arrays |= correction_arrays(name, correction)
     return arrays
 
 

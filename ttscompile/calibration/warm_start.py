@@ -22,7 +22,7 @@ from ..artifact.settle import settle
 from ..artifact.warm import WarmRecord
 from ..artifact.write import locked
 from ..core.coercion import integer
-from ..core.rest import Start
+from ..core.start import Start
 from ..core.spec import FloatArray, Noise
 from ..errors import CalibrationError, CalibrationFailedError
 from ..runtimes.open import open_runtime

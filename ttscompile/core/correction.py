@@ -153,13 +153,19 @@ class Correction:
         """F: how many numbers of the condition it reads; 0 if it does not read the observation."""
         return int(self.reading.shape[1])
 
-    def require_fit(self, steps: int, sample: tuple[int, int], numbers: int) -> None:
+    def require_fit(self, steps: int, sample: tuple[int, int], numbers: int, groups: int | None = None) -> None:
         """Raise unless it is a correction for a policy of K steps, samples ``(T, D)`` and a condition of N numbers.
+
+        Args:
+            steps: K.
+            sample: ``(T, D)``.
+            numbers: N.
+            groups: of action dimensions; None for as many as ``groups_of`` has.
 
         Raises:
             IllegalPlanError: it is not.
         """
-        expected = (steps, groups_of(steps, sample), FEATURES * sample[0], sample[0])
+        expected = (steps, groups or groups_of(steps, sample), FEATURES * sample[0], sample[0])
         if self.weights.shape != expected:
             raise IllegalPlanError(
                 f"the correction has weights {list(self.weights.shape)}; this policy needs {list(expected)}."

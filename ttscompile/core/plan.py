@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from types import MappingProxyType
 
 from ..errors import IllegalPlanError
@@ -95,7 +96,7 @@ class Plan:
         """Whether the pruner makes the cells."""
         return self.cells is None
 
-    @property
+    @cached_property
     def variant(self) -> Variant:
         """What has to be opened for it."""
         return Variant(self.loop, self.weights, tuple(sorted(self.precision.items())), self.tokens)

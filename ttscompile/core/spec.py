@@ -326,6 +326,7 @@ class PolicySpec:
         source: what this was compiled from, for people: format and variant, no path.
         left_out: steps that the original predicts after the last one of the sample (``ttscompile.capture.narrow``).
         instruction: of a policy that is told its task in words, which a text alone gives; None for all others.
+        loops: by name, other loops that the policy may be run in.
     """
 
     sample: tuple[Positive, Positive]
@@ -337,6 +338,7 @@ class PolicySpec:
     source: Mapping[str, str] = field(default_factory=dict)
     left_out: int = 0
     instruction: Instruction | None = None
+    loops: Mapping[str, SamplerTable] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         sizes = tuple(integer(n, "a size in the sample's shape", SpecError, 1) for n in self.sample)

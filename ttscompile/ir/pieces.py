@@ -35,6 +35,11 @@ TAIL = "tail"
 ADVANCE = "advance"
 """Tail, sampler update and the next step's stem in one (``lower.advance``)."""
 
+def advance_name(loop: str) -> str:
+    """``advance@NAME``: ``advance`` of another loop than the original's, where its sampler needs another graph."""
+    return f"{ADVANCE}@{loop}"
+
+
 JOINT = "blocks"
 """Any one of the blocks, chosen at each run (``ir.joint``)."""
 

@@ -1,0 +1,223 @@
+"""An artifact as the plans of one variant see it: one loop, one set of weights, one precision a part.
+
+A backend computes on a view. It has what an artifact with this loop alone would have, under the same names; arrays and
+files are the artifact's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy.typing as npt
+
+from ..core.correction import condition_flops, groups_of
+from ..core.lattice import PlanArray
+from ..core.plan import ORIGINAL, Plan, TokenReuse, Variant
+from ..core.start import Start, rest_of
+from ..core.update import update_flops
+from ..errors import ArtifactError, IllegalPlanError
+from ..ir.flops import graph_flops
+from ..ir.graph import Graph
+from ..ir.pieces import ADVANCE, STEP, advance_name, frame_pieces, part_of
+from ..ir.program import Pieces
+from .load import Artifact
+from .manifest import Manifest, WeightsRecord
+
+Arrays = Mapping[str, npt.NDArray[Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """See the module. ``view_of`` makes it.
+
+    Attributes:
+        artifact: loaded and checked.
+        variant: what it is a view for.
+        manifest: the artifact's, with the sampler, FLOPs and pieces of this loop, and the plans of this variant.
+        tables: TABLE contexts ``[K, ...]`` of this loop.
+        start: how a loop begins that goes on with the chunk of the call before; None where it begins with noise.
+        plans: by name, the artifact's plans of this variant.
+    """
+
+    artifact: Artifact
+    variant: Variant
+    manifest: Manifest
+    tables: Arrays
+    start: Start | None
+    plans: Mapping[str, Plan]
+
+    @property
+    def path(self) -> Path:
+        """Of the artifact."""
+        return self.artifact.path
+
+    @property
+    def files(self) -> Path:
+        """See ``Artifact``."""
+        return self.artifact.files
+
+    @contextmanager
+    def reading(self, *names: str) -> Iterator[None]:
+        """See ``Artifact``."""
+        with self.artifact.reading(*names):
+            yield
+
+    @property
+    def pruner(self) -> Arrays:
+        """See ``Artifact``."""
+        return self.artifact.pruner
+
+    @property
+    def groups(self) -> int:
+        """Into how many groups of action dimensions the models of this loop take the sampler's update."""
+        whole = self.manifest.steps + (0 if self.start is None else self.start.skipped)
+        return groups_of(whole, self.manifest.spec.sample)
+
+    @property
+    def tokens(self) -> TokenReuse | None:
+        """When a token of an image encoder is computed anew."""
+        return self.variant.tokens
+
+    @property
+    def precision(self) -> Mapping[str, str]:
+        """By part, where it is not fp32."""
+        return dict(self.variant.precision)
+
+    @property
+    def schedules(self) -> Mapping[str, PlanArray]:
+        """Cells of its plans, without those that the pruner makes, int8 ``[K, blocks]`` by name."""
+        return {name: plan.cells for name, plan in self.plans.items() if plan.cells is not None}
+
+    @property
+    def pruned(self) -> bool:
+        """Whether some of its plans is made by the pruner."""
+        return any(plan.pruned for plan in self.plans.values())
+
+    @property
+    def weights(self) -> Arrays:
+        """Constants of all pieces but the pruner's, as blocks have them from step 1 on."""
+        return {**self.artifact.weights, **self._trained} if self._trained else self.artifact.weights
+
+    @property
+    def first_weights(self) -> Arrays:
+        """Constants that blocks have at step 0, where those are others: step 0 has the original's in every plan."""
+        return {name: self.artifact.weights[name] for name in self._trained}
+
+    @property
+    def _trained(self) -> Arrays:
+        return {} if self.variant.weights == ORIGINAL else self.artifact.block_weights[self.variant.weights]
+
+    def onnx_file(self, piece: str, first_step: bool = False) -> str:
+        """Name of the ONNX file of a piece, in its precision and with its weights.
+
+        Args:
+            piece: its name.
+            first_step: of step 0, whose blocks have the original's weights.
+        """
+        manifest = self.artifact.manifest
+        own: WeightsRecord | None = None
+        if self.variant.weights != ORIGINAL and not first_step:
+            own = manifest.weights[self.variant.weights]
+        lower = manifest.precision
+        if lower is not None and self.precision.get(str(part_of(piece))) == lower.name and piece in lower.models:
+            return lower.models[piece] if own is None else own.precision_models.get(piece, lower.models[piece])
+        file = self.manifest.pieces[piece].file
+        return file if own is None else own.models.get(piece, file)
+
+    def onnx_path(self, piece: str) -> Path:
+        """Where ``onnx_file`` is, for other programs; what is there by then was not checked."""
+        return self.path / self.onnx_file(piece)
+
+    def graph(self, name: str) -> Graph:
+        """See ``Artifact``."""
+        return self.artifact.graph(name)
+
+    @cached_property
+    def pieces(self) -> Pieces:
+        """The pieces as the reference runtime executes them; see ``Artifact``."""
+        return replace(self.artifact.pieces, tables=self.tables)
+
+    @property
+    def frames_key(self) -> object:
+        """Equal for views whose frame pieces remember the same of the same frames."""
+        return self.tokens, tuple(self.onnx_file(piece) for piece in frame_pieces(self.manifest.pieces))
+
+
+def view_of(artifact: Artifact, plan: Plan | str | None = None) -> View:
+    """The view for a plan.
+
+    Args:
+        artifact: loaded and checked.
+        plan: a plan, or the name of one; None for the artifact's default.
+
+    Raises:
+        IllegalPlanError: the artifact has no such plan, loop, weights, or tokens to reuse.
+        SpecError: the plan's loop does not tell what it begins with (``core.start``).
+    """
+    if not isinstance(plan, Plan):
+        plan = artifact.default if plan is None else artifact.plan(plan)
+    manifest, variant = artifact.manifest, plan.variant
+    _require(manifest, variant, plan)
+    start, tables, loop = None, artifact.tables, variant.loop
+    record = manifest.starts.get(loop)
+    base = loop if record is None else record.loop
+    sampler = manifest.sampler_of(base)
+    if base != ORIGINAL:
+        tables = artifact.loop_tables[base]
+    if record is not None:
+        sampler, start = rest_of(sampler, record.steps)
+        tables = MappingProxyType({name: rows[start.skipped :] for name, rows in tables.items()})
+    spec, pieces = replace(manifest.spec, sampler=sampler, loops={}), dict(manifest.pieces)
+    pieces[ADVANCE] = pieces.get(advance_name(base), pieces[ADVANCE])
+    steps, numbers, sample = sampler.steps, manifest.condition_numbers, spec.sample
+    more = steps - manifest.steps
+    values = graph_flops(artifact.graph(STEP)) * more if more and STEP in pieces else 0
+    read = condition_flops(steps, sample, numbers) - condition_flops(manifest.steps, sample, numbers)
+    update = update_flops(sampler, sample) - update_flops(manifest.spec.sampler, sample)
+    flops = manifest.flops
+    flops = replace(flops, prologue=flops.prologue + values + read, tail=flops.tail + update)
+    plans = {name: one for name, one in artifact.plans.items() if one.variant == variant}
+    own = {name: manifest.plans[name] for name in plans if name in manifest.plans}
+    seen = replace(manifest, spec=spec, pieces=pieces, flops=flops, plans=own)
+    return View(artifact, variant, seen, tables, start, MappingProxyType(plans))
+
+
+def _require(manifest: Manifest, variant: Variant, plan: Plan) -> None:
+    """Raise unless the artifact has what a plan names; what a runtime can do is another question.
+
+    Raises:
+        IllegalPlanError: says what is missing.
+    """
+    if variant.loop not in manifest.loops:
+        raise IllegalPlanError(f"the artifact has no loop {variant.loop!r}; it has {list(manifest.loops)}.")
+    if variant.weights not in (known := [ORIGINAL, *manifest.weights]):
+        raise IllegalPlanError(f"the artifact has no weights {variant.weights!r}; it has {known}.")
+    if variant.tokens is not None and not manifest.tokens:
+        remedy = "Leave tokens out of the plan: dataclasses.replace(plan, tokens=None)."
+        raise IllegalPlanError(f"no image encoder of this policy has tokens that could be reused. {remedy}")
+    if (plan.otherwise is None) is (variant.loop in manifest.starts):
+        expected = "the plan of a call that has no chunk to begin with" if plan.otherwise is None else "none"
+        raise IllegalPlanError(f"a plan of loop {variant.loop!r}: expected {expected} as otherwise.")
+
+
+def require_held(artifact: Artifact, plan: Plan) -> None:
+    """Raise unless the artifact holds models for every precision of a plan.
+
+    Raises:
+        ArtifactError: it does not; says what it has.
+    """
+    record = artifact.manifest.precision
+    held = {} if record is None else dict.fromkeys(record.kept, record.name)
+    for part, precision in plan.precision.items():
+        if held.get(part) != precision:
+            known = ", ".join(f"{name} in {one}" for name, one in held.items()) or "fp32 alone"
+            remedy = f"Convert the checkpoint again with --precision {precision}, or take a plan without it"
+            raise ArtifactError(
+                f"{artifact.path}: a plan wants {part!r} in {precision!r}; the artifact has {known}. {remedy}."
+            )
