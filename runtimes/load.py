@@ -52,8 +52,8 @@ def load(
         ObservationError: the tokenizer cannot be had, or the policy has no use for it.
         ArtifactChangedError: the artifact was replaced while it was loaded, and again whenever it was tried again.
         ArtifactError: the artifact is missing, damaged, of another version, or without models of the plan's precision.
-        RuntimeUnavailableError: the runtime, or ``huggingface_hub``, cannot be had on this machine; or the runtime cannot
-            do what the plan asks for.
+        RuntimeUnavailableError: the runtime, or ``huggingface_hub``, cannot be had on this machine; or it cannot do
+            what the plan asks for.
         HubError: the repository cannot be had, or holds no artifact.
         TtscompileError: the seed is no whole number of at least 0.
     """
