@@ -95,7 +95,7 @@ class CompiledPolicy:
             observation=manifest.spec.observations,
             action=manifest.spec.chunk,
             sample=manifest.spec.sample,
-            original_sample=manifest.spec.original.sample,
+            original_sample=manifest.spec.whole_horizon.sample,
             stochastic=manifest.spec.sampler.stochastic,
             identity=manifest.identity,
             model_identity=manifest.model_identity,
@@ -325,7 +325,7 @@ class CompiledPolicy:
     def _draw(self, streams: int, plan: Plan) -> Noise:
         """Noise of all steps of the original's horizon: a seed means the same however many are predicted."""
         spec = self._runtime.view(plan.otherwise or plan).manifest.spec  # of the whole loop
-        shape, predicted = (streams, *spec.original.sample), spec.sample[0]
+        shape, predicted = (streams, *spec.whole_horizon.sample), spec.sample[0]
         initial = self._rng.standard_normal(shape, dtype=np.float32)[:, :predicted]
         if not spec.sampler.stochastic:
             return Noise(initial)

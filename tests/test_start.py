@@ -9,8 +9,8 @@ import pytest
 import torch
 from diffusers import DDIMScheduler, DDPMScheduler, DPMSolverMultistepScheduler
 
-from ttscompile.core.start import rest_of
 from ttscompile.core.spec import SamplerTable
+from ttscompile.core.start import rest_of
 from ttscompile.errors import SpecError
 from ttscompile.runtimes.reference.sampler import TorchSampler
 from ttscompile.samplers.flow import flow_matching_table

@@ -43,8 +43,8 @@ from ttscompile.ir.pieces import (
     RESIDUAL,
     STEM,
     STREAM,
-    advance_name,
     block_name,
+    is_of_loop,
     of_tokens,
     part_of,
     renewed_name,
@@ -103,7 +103,7 @@ class Sessions:
         single = {block_name(b) for b in range(len(manifest.blocks))}
         # A tower that reuses tokens computes all of them with the same session, so that its weights are there once.
         unused = filter(of_tokens, manifest.pieces) if view.tokens is None else manifest.tokens
-        others = {name for name in manifest.pieces if name.startswith(advance_name(""))}  # of other loops
+        others = set(filter(is_of_loop, manifest.pieces))
         sessions = self._open(view, set(manifest.pieces) - single - {JOINT, LAYERS} - set(unused) - others)
         sessions[FIRST_STEP] = self._session(view, DENSE_STEP, first_step=True)
         return sessions | self._of_blocks(view) if blocks else sessions

@@ -23,6 +23,7 @@ from ..ir.pieces import (
     STEM,
     block_name,
     frame_pieces,
+    of_loop,
     of_tokens,
     part_of,
     pixels_name,
@@ -113,7 +114,9 @@ def identities(manifest: Manifest) -> tuple[str, str]:
     document = to_json(manifest)
     hashes = {name: record.sha256 for name, record in manifest.files.items()}
     pieces = {name: {**piece, "file": hashes[piece["file"]]} for name, piece in document["pieces"].items()}
-    pruner = pieces.pop(PRUNER, None)
+    pruners = {
+        name: pieces.pop(name) for name in list(pieces) if name == PRUNER or name.startswith(of_loop(PRUNER, ""))
+    }
     model = {
         "spec": {key: value for key, value in document["spec"].items() if key != "source"},
         "blocks": [{key: block[key] for key in ("kind", "type", "group")} for block in document["blocks"]],
@@ -128,7 +131,7 @@ def identities(manifest: Manifest) -> tuple[str, str]:
     plans = {name: {k: v for k, v in plan.items() if k not in _TOLD} for name, plan in document["plans"].items()}
     whole: dict[str, Any] = {
         "model": model_identity,
-        "pruner": [pruner, hashes.get(manifest.stores.pruner or "")],
+        "pruner": [pruners, hashes.get(manifest.stores.pruner or ""), _hashed(manifest.loop_pruners, hashes)],
         "plans": [hashes.get(manifest.stores.plans or ""), plans],
         "default_plan": manifest.default_plan,
         "starts": document["starts"],
@@ -206,6 +209,9 @@ def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:
         fields["pieces"].fail(f"frame pieces that read {sorted(rows)}, each once")
     _check_tokens(manifest, fields)
     has_pruner = PRUNER in manifest.pieces
+    wanted = {of_loop(PRUNER, loop) for loop in manifest.loop_pruners}
+    if wanted != {name for name in manifest.pieces if name.startswith(of_loop(PRUNER, ""))}:
+        fields["loop_pruners"].fail("a file for each pruner of a further loop")
     if has_pruner != (manifest.stores.pruner is not None):
         fields["stores"].fail("a file of pruner weights exactly when there is a piece called pruner")
     if not has_pruner and any(plan.pruned for plan in manifest.plans.values()):
@@ -213,6 +219,7 @@ def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:
     files = {piece.file for piece in manifest.pieces.values()} | {n for n in vars(manifest.stores).values() if n}
     if manifest.precision is not None:
         files |= {manifest.precision.weights, *manifest.precision.models.values()}
+    files |= set(manifest.loop_pruners.values())
     for weights in manifest.weights.values():
         files |= weights.files
     if files != set(manifest.files):

@@ -20,7 +20,7 @@ from ..core.paths import require_path
 from ..core.plan import DENSE, ORIGINAL, Plan
 from ..errors import ArtifactError, IllegalPlanError
 from ..ir.graph import Graph
-from ..ir.pieces import CONDITION, FRAMES, PRUNER, STEM, STEP, TAIL, LoopPiece, block_name, frame_pieces
+from ..ir.pieces import CONDITION, FRAMES, PRUNER, STEM, STEP, TAIL, LoopPiece, block_name, frame_pieces, of_loop
 from ..ir.program import Binding, Pieces
 from . import tensors
 from .archive import Unpacked, is_checkpoint, unpack
@@ -51,6 +51,7 @@ class Artifact:
         tables: TABLE contexts ``[K, ...]`` of the original loop, read-only views of the file.
         loop_tables: the same of the other loops that begin with noise, by their name.
         pruner: constants of the pruner (their names start with ``pruner.``); empty if there is none.
+        loop_pruners: the same of loops that have a pruner of their own, by their name.
         plans: by name, ``dense`` the first of them.
         block_weights: by the name of weights that plans may have, the constants that blocks have in place of those of
             ``weights``; read-only views of the files.
@@ -62,6 +63,7 @@ class Artifact:
     tables: Mapping[str, npt.NDArray[Any]]
     loop_tables: Mapping[str, Mapping[str, npt.NDArray[Any]]]
     pruner: Mapping[str, npt.NDArray[Any]]
+    loop_pruners: Mapping[str, Mapping[str, npt.NDArray[Any]]]
     plans: Mapping[str, Plan]
     block_weights: Mapping[str, Mapping[str, npt.NDArray[Any]]]
     _folder: Folder = field(repr=False)
@@ -129,10 +131,10 @@ class Artifact:
         Raises:
             ArtifactError: ``program.json`` is not valid, or asks for a constant that the artifact lacks.
         """
-        graphs, stored = {}, {**self.pruner, **self.weights}
+        graphs, own = {}, {of_loop(PRUNER, loop): one for loop, one in self.loop_pruners.items()}
         for name, value in self._document.keys("graphs", "streams")["graphs"].members().items():
             graphs[name] = graph_from_json(value)
-            constants = graphs[name].constants
+            constants, stored = graphs[name].constants, own.get(name, {**self.pruner, **self.weights})
             kinds = {n: (kind.dtype, kind.at(1)) for n, kind in constants.items()}
             tensors.check_arrays("constant", {n: stored[n] for n in constants if n in stored}, kinds, value.path)
         return MappingProxyType(graphs)
@@ -273,6 +275,7 @@ def _open(path: Path, folder: Folder, stamps: Mapping[str, Stamp], manifest: Man
         tables=tables.pop(ORIGINAL),
         loop_tables=MappingProxyType(tables),
         pruner=_optional(directory, manifest.stores.pruner),
+        loop_pruners={loop: tensors.read(directory / file) for loop, file in manifest.loop_pruners.items()},
         plans=_plans(directory, manifest),
         block_weights=MappingProxyType(block_weights),
         _folder=folder,

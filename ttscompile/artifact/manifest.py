@@ -321,6 +321,7 @@ class Manifest:
         requires: what the ONNX graphs need.
         files: every file but the manifest.
         precision: models in another precision than fp32, which plans may take; None if there are none.
+        loop_pruners: by further loop with a pruner of its own, name of the file with its constants.
         starts: by name, the loops that begin with the chunk of the call before. The others are in ``spec``.
         weights: by name, the weights that plans may have in place of the original's.
         tokens: by frame piece, the tokens of those that are vision transformers.
@@ -343,6 +344,7 @@ class Manifest:
     requires: Requires
     files: Mapping[FileName, FileRecord]
     precision: PrecisionRecord | None = None
+    loop_pruners: Mapping[str, FileName] = field(default_factory=dict)
     starts: Mapping[str, StartRecord] = field(default_factory=dict)
     weights: Mapping[str, WeightsRecord] = field(default_factory=dict)
     tokens: Mapping[str, TokensRecord] = field(default_factory=dict)

@@ -155,7 +155,7 @@ def piece_records(
     Raises:
         ArtifactError: models and pieces do not have the same names, inputs or outputs.
     """
-    optional = {names.IDLE, *map(names.advance_name, program.spec.loops)}
+    optional = {names.IDLE, *(names.of_loop(names.ADVANCE, loop) for loop in program.spec.loops)}
     expected = {name: one for name, one in _interfaces(program).items() if name not in optional or name in models}
     if set(models) != set(expected):
         raise ArtifactError(f"expected the ONNX models {sorted(expected)}; found {sorted(models)}. {REPORT}")
@@ -261,6 +261,8 @@ def _interfaces(program: Program) -> dict[str, PieceRecord]:
         found[names.STEP] = record(step.inputs, step.outputs, contexts=step.inputs)
     if pruner is not None:
         found[names.PRUNER] = record(pruner.inputs, pruner.outputs)
+    for loop, graph in pieces.loop_pruners.items():
+        found[names.of_loop(names.PRUNER, loop)] = record(graph.inputs, graph.outputs)
     for name, piece in pieces.loop.items():
         if piece is not tail:
             found[name] = record(piece.graph.inputs, piece.graph.outputs, piece.stream, piece.contexts)
@@ -275,7 +277,7 @@ def _interfaces(program: Program) -> dict[str, PieceRecord]:
         return record(around, names.advance_outputs(sampler), names.STREAM, (*tail.contexts, *stem.contexts))
 
     found[names.ADVANCE] = advance(sampler)
-    found |= {names.advance_name(loop): advance(table) for loop, table in program.spec.loops.items()}
+    found |= {names.of_loop(names.ADVANCE, loop): advance(table) for loop, table in program.spec.loops.items()}
     joint = join([tuple(piece.contexts.values()) for piece in pieces.blocks])
     found[names.JOINT] = record(joint.inputs, (names.RESIDUAL,), names.STREAM)
     read = dict.fromkeys(name for piece in pieces.blocks for name in piece.contexts)

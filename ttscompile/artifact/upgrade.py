@@ -66,6 +66,7 @@ def _upgraded(document: Mapping[str, Any]) -> dict[str, Any]:
         "spec": {**document["spec"], "loops": {}},
         "plans": plans,
         "default_plan": default,
+        "loop_pruners": {},
         "starts": starts,
         "weights": {} if distilled is None else {_DISTILLED: distilled},
     }

@@ -24,7 +24,7 @@ from ..core.update import update_flops
 from ..errors import ArtifactError, IllegalPlanError
 from ..ir.flops import graph_flops
 from ..ir.graph import Graph
-from ..ir.pieces import ADVANCE, STEP, advance_name, frame_pieces, part_of
+from ..ir.pieces import ADVANCE, PRUNER, STEP, frame_pieces, of_loop, part_of
 from ..ir.program import Pieces
 from .load import Artifact
 from .manifest import Manifest, WeightsRecord
@@ -70,8 +70,8 @@ class View:
 
     @property
     def pruner(self) -> Arrays:
-        """See ``Artifact``."""
-        return self.artifact.pruner
+        """Constants of this loop's pruner."""
+        return self.artifact.loop_pruners.get(self.variant.loop, self.artifact.pruner)
 
     @property
     def groups(self) -> int:
@@ -141,7 +141,8 @@ class View:
     @cached_property
     def pieces(self) -> Pieces:
         """The pieces as the reference runtime executes them; see ``Artifact``."""
-        return replace(self.artifact.pieces, tables=self.tables)
+        own, graphs = self.artifact.pieces, self.artifact.graphs
+        return replace(own, tables=self.tables, pruner=graphs.get(of_loop(PRUNER, self.variant.loop), own.pruner))
 
     @property
     def frames_key(self) -> object:
@@ -174,7 +175,11 @@ def view_of(artifact: Artifact, plan: Plan | str | None = None) -> View:
         sampler, start = rest_of(sampler, record.steps)
         tables = MappingProxyType({name: rows[start.skipped :] for name, rows in tables.items()})
     spec, pieces = replace(manifest.spec, sampler=sampler, loops={}), dict(manifest.pieces)
-    pieces[ADVANCE] = pieces.get(advance_name(base), pieces[ADVANCE])
+    for piece in (ADVANCE, PRUNER):
+        if (own := of_loop(piece, base)) in pieces:
+            pieces[piece] = pieces[own]
+    if start is not None:  # a pruner decides about whole loops
+        pieces.pop(PRUNER, None)
     steps, numbers, sample = sampler.steps, manifest.condition_numbers, spec.sample
     more = steps - manifest.steps
     values = graph_flops(artifact.graph(STEP)) * more if more and STEP in pieces else 0
@@ -183,8 +188,8 @@ def view_of(artifact: Artifact, plan: Plan | str | None = None) -> View:
     flops = manifest.flops
     flops = replace(flops, prologue=flops.prologue + values + read, tail=flops.tail + update)
     plans = {name: one for name, one in artifact.plans.items() if one.variant == variant}
-    own = {name: manifest.plans[name] for name in plans if name in manifest.plans}
-    seen = replace(manifest, spec=spec, pieces=pieces, flops=flops, plans=own)
+    records = {name: manifest.plans[name] for name in plans if name in manifest.plans}
+    seen = replace(manifest, spec=spec, pieces=pieces, flops=flops, plans=records)
     return View(artifact, variant, seen, tables, start, MappingProxyType(plans))
 
 

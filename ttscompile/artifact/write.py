@@ -16,11 +16,11 @@ import numpy.typing as npt
 from ..core.paths import require_free_or_path
 from ..core.plan import DENSE, FULL, ORIGINAL, Plan
 from ..errors import ArtifactError
-from ..ir.pieces import ADVANCE, PRUNER, advance_name
+from ..ir.pieces import ADVANCE, PRUNER, of_loop
 from ..ir.program import Binding, Program
 from ..measure.versions import VERSION
 from . import records, tensors
-from .bind import LoweredPieces, bind, places_of, store_pieces
+from .bind import LoweredPieces, Place, bind, places_of, store_pieces
 from .block_weights import BlockWeights, store_weights, without_weights
 from .codec import decode, encode, identities
 from .corrections import correction_arrays, require_fit
@@ -119,6 +119,7 @@ def update_plans(
     record: Mapping[str, Any] | None = None,
     *,
     pruner_weights: Mapping[str, npt.NDArray[Any]] | None = None,
+    pruner_loop: str = ORIGINAL,
     weights: Mapping[str, BlockWeights] | None = None,
     starts: Mapping[str, StartRecord] | None = None,
     model_identity: str | None = None,
@@ -136,7 +137,8 @@ def update_plans(
         default_plan: what a call has that is given no plan.
         record: what was done to get here, JSON; ``record["plans"]`` has ``sparsity`` and ``flops_sparsity`` of plans
             that the pruner makes, by name. None keeps the record that is there.
-        pruner_weights: all constants of the pruner, by name; None leaves them.
+        pruner_weights: all constants of a pruner, by name; None leaves them.
+        pruner_loop: the loop whose pruner has these.
         weights: of blocks, which these plans name, by name; those that are there need not be given again.
         starts: loops that begin with the chunk of the call before, by name; likewise.
         model_identity: of the artifact that was calibrated; refuses another one.
@@ -168,8 +170,11 @@ def update_plans(
                 raise ArtifactError(f"default plan {default_plan!r}: expected one of {[DENSE, *manifest.plans]}.")
             manifest = replace(manifest, default_plan=default_plan, calibration=told)
             manifest = _store(directory, manifest, "plans", _plan_arrays(manifest, plans))
+            pruners = dict[str, Mapping[str, npt.NDArray[Any]]]()
             if pruner_weights is not None:
-                manifest = _store_pruner(artifact, manifest, pruner_weights)
+                own = pruner_loop if pruner_loop in manifest.loop_pruners else ORIGINAL
+                manifest = _store_pruner(artifact, manifest, pruner_weights, own)
+                pruners[own] = pruner_weights
             after = replace(
                 artifact,
                 block_weights={
@@ -178,7 +183,8 @@ def update_plans(
                 },
                 manifest=manifest,
                 plans=_named_plans(manifest, plans),
-                pruner=artifact.pruner if pruner_weights is None else pruner_weights,
+                pruner=pruners.pop(ORIGINAL, artifact.pruner),
+                loop_pruners={**artifact.loop_pruners, **pruners},
             )
             manifest = _store(directory, manifest, "golden_plans", {} if golden is None else plan_arrays(golden(after)))
             content = encode(identified(manifest))
@@ -236,16 +242,17 @@ def _fill(
     tables = {table_prefix(of) + name: rows[name] for of, rows in loops.items() for name in read}
     tensors.write(folder / WEIGHTS, {**stored, **tables})
     places = places_of(folder / WEIGHTS, stored)
-    pruner_file = None
-    if PRUNER in graphs:
-        content = tensors.serialize(pruner)
-        pruner_file, files[PRUNER] = (f"{PRUNER}-{content_hash(content)}{kind}" for kind in (".safetensors", ".onnx"))
-        write_synced(folder / pruner_file, content)
-        places.update(places_of(folder / pruner_file, pruner))
+    pruner_files, pruner_places = dict[str, str](), dict[str, dict[str, Place]]()
+    for piece, constants in ({PRUNER: pruner} if PRUNER in graphs else {}).items() | _loop_pruners(program).items():
+        content = tensors.serialize(constants)
+        name = f"{PRUNER}-{content_hash(content)}"
+        pruner_files[piece], files[piece] = f"{name}.safetensors", f"{name}.onnx"
+        write_synced(folder / pruner_files[piece], content)
+        pruner_places[piece] = places_of(folder / pruner_files[piece], constants)
 
     pieces = records.piece_records(program, models, files)
     for name in pieces:
-        write_synced(folder / files[name], bind(models[name], places, name))
+        write_synced(folder / files[name], bind(models[name], places | pruner_places.get(name, {}), name))
     precision = None if lowered is None else store_pieces(folder, lowered, pieces, places)
     plans = dict[str, PlanRecord]()
     if precision is not None or loop != ORIGINAL:
@@ -253,6 +260,7 @@ def _fill(
         plans[FULL] = PlanRecord("all", loop=loop, precision=held)
     if golden is not None:
         write_synced(folder / GOLDEN, tensors.serialize(golden.arrays()))
+    graphs |= {of_loop(PRUNER, loop): graph for loop, graph in program.pieces.loop_pruners.items()}
     document = {
         "graphs": {name: graph_to_json(graph) for name, graph in graphs.items()},
         "streams": {name: piece.stream for name, piece in program.pieces.loop.items()},
@@ -274,10 +282,13 @@ def _fill(
             plans=plans,
             default_plan=FULL if plans else DENSE,
             calibration=None,
-            stores=Stores(PROGRAM, WEIGHTS, pruner_file, None, golden=None if golden is None else GOLDEN),
+            stores=Stores(
+                PROGRAM, WEIGHTS, pruner_files.pop(PRUNER, None), None, golden=None if golden is None else GOLDEN
+            ),
             requires=requires,
             files={path.name: describe(path) for path in sorted(folder.iterdir())},
             precision=precision,
+            loop_pruners={loop: pruner_files[of_loop(PRUNER, loop)] for loop in program.pieces.loop_pruners},
             tokens=records.tokens_records(program),
         )
     )
@@ -349,10 +360,17 @@ def locked(directory: Path) -> Iterator[None]:
         yield
 
 
+def _loop_pruners(program: Program) -> dict[str, Mapping[str, npt.NDArray[Any]]]:
+    """Constants of the pruners of further loops, by piece."""
+    return {of_loop(PRUNER, loop): program.loop_weights[loop] for loop in program.pieces.loop_pruners}
+
+
 def _file_name(piece: str, program: Program) -> str:
     """Of a piece; the names of loops need not be names of files."""
-    own = {advance_name(loop): f"{ADVANCE}_{i:02d}" for i, loop in enumerate(program.spec.loops, start=1)}
-    return own.get(piece, piece)
+    for i, loop in enumerate(program.spec.loops, start=1):
+        if piece == of_loop(ADVANCE, loop):
+            return f"{ADVANCE}_{i:02d}"
+    return piece
 
 
 def _plan_arrays(manifest: Manifest, plans: Mapping[str, Plan]) -> dict[str, npt.NDArray[Any]]:
@@ -380,26 +398,31 @@ def _store(directory: Path, manifest: Manifest, store: str, arrays: Mapping[str,
     return replace(manifest, files=files, stores=replace(manifest.stores, **stores))
 
 
-def _store_pruner(artifact: Artifact, manifest: Manifest, weights: Mapping[str, npt.NDArray[Any]]) -> Manifest:
-    """Write the pruner's weights, and its model that refers to them, beside the old ones."""
+def _store_pruner(
+    artifact: Artifact, manifest: Manifest, weights: Mapping[str, npt.NDArray[Any]], loop: str
+) -> Manifest:
+    """Write the weights of a loop's pruner, and its model that refers to them, beside the old ones."""
     import onnx
 
+    own = artifact.pruner if loop == ORIGINAL else artifact.loop_pruners[loop]
+    piece = PRUNER if loop == ORIGINAL else of_loop(PRUNER, loop)
+    old = manifest.stores.pruner if loop == ORIGINAL else manifest.loop_pruners[loop]
+    record = manifest.pieces[piece]
     values = {name: np.asarray(value) for name, value in weights.items()}
-    expected = {name: (str(value.dtype), value.shape) for name, value in artifact.pruner.items()}
+    expected = {name: (str(value.dtype), value.shape) for name, value in own.items()}
     tensors.check_arrays("pruner's weight", values, expected, artifact.path, "Calibrate this artifact again.")
-    piece = manifest.pieces[PRUNER]
-    model = onnx.load(artifact.path / piece.file, load_external_data=False)
-    manifest = _store(artifact.path, manifest, PRUNER, values)
-    path = artifact.path / str(manifest.stores.pruner)
-    content = bind(model, places_of(path, values), PRUNER, again=True)
-    path = path.with_suffix(".onnx")
+    content = tensors.serialize(values)
+    path = artifact.path / f"{PRUNER}-{content_hash(content)}.safetensors"
     replace_file(path, content)
-    files = {name: record for name, record in manifest.files.items() if name != piece.file}
-    return replace(
-        manifest,
-        files={**files, path.name: describe(path)},
-        pieces={**manifest.pieces, PRUNER: replace(piece, file=path.name)},
-    )
+    model = onnx.load(artifact.path / record.file, load_external_data=False)
+    bound = bind(model, places_of(path, values), piece, again=True)
+    replace_file(path.with_suffix(".onnx"), bound)
+    files = {name: one for name, one in manifest.files.items() if name not in (old, record.file)}
+    files |= {each.name: describe(each) for each in (path, path.with_suffix(".onnx"))}
+    pieces = {**manifest.pieces, piece: replace(record, file=path.with_suffix(".onnx").name)}
+    if loop == ORIGINAL:
+        return replace(manifest, files=files, pieces=pieces, stores=replace(manifest.stores, pruner=path.name))
+    return replace(manifest, files=files, pieces=pieces, loop_pruners={**manifest.loop_pruners, loop: path.name})
 
 
 def _remove_stale(directory: Path) -> None:

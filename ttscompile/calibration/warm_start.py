@@ -22,8 +22,8 @@ from ..artifact.settle import settle
 from ..artifact.warm import WarmRecord
 from ..artifact.write import locked
 from ..core.coercion import integer
-from ..core.start import Start
 from ..core.spec import FloatArray, Noise
+from ..core.start import Start
 from ..errors import CalibrationError, CalibrationFailedError
 from ..runtimes.open import open_runtime
 from ..runtimes.random_calls import random_noise

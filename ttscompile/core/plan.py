@@ -15,9 +15,8 @@ from ..errors import IllegalPlanError
 from .correction import Correction
 from .lattice import PlanArray
 from .rules import NotNegative, Positive
+from .spec import ORIGINAL
 
-ORIGINAL = "original"
-"""The loop that the policy was trained to run in; and the weights that it was trained to have."""
 DENSE = "dense"
 """The plan that is the original policy: its loop, its weights, every cell computed. Every artifact has it."""
 FULL = "full"
