@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from ttscompile.artifact.load import Artifact
-from ttscompile.artifact.manifest import DENSE, PrecisionError
-from ttscompile.core.correction import Correction
-from ttscompile.core.spec import FP32, ChunkSpec, FloatArray, Noise
+from ttscompile.artifact.manifest import PrecisionError
+from ttscompile.core.plan import DENSE, Plan
+from ttscompile.core.spec import FP32, INT8, ChunkSpec, FloatArray, Noise
 from ttscompile.errors import ObservationError
 
 from .open import open_runtime
@@ -65,9 +65,10 @@ def measure_precision(artifact: Artifact, runtimes: Pair | None = None) -> Preci
         artifact: with parts of another precision.
         runtimes: one in the precision in question and one in fp32; None for the artifact's in onnxruntime.
     """
-    own, exact = runtimes or (open_runtime(artifact), open_runtime(artifact.at_precision(FP32)))
+    plans = [artifact.plan(f"{DENSE}@{name}") for name in (INT8, FP32)]
+    own, exact = runtimes or [open_runtime(artifact, plan=plan) for plan in plans]
     against = _Exact.of(artifact, exact)
-    return against.error(answers(own, artifact.schedule(DENSE), against.calls))
+    return against.error(answers(own, plans[0], against.calls))
 
 
 def measure_parts(artifact: Artifact, choose: bool = False) -> Measured:
@@ -81,11 +82,11 @@ def measure_parts(artifact: Artifact, choose: bool = False) -> Measured:
             of what other noise changes.
     """
     assert artifact.manifest.precision is not None
-    exact = _Exact.of(artifact, open_runtime(artifact.at_precision(FP32)))
+    exact = _Exact.of(artifact, open_runtime(artifact, plan=artifact.plans[DENSE]))
 
     def measured(parts: Collection[str], calls: int = CALLS) -> PrecisionError:
-        runtime = open_runtime(artifact.with_parts(parts))
-        return exact.error(answers(runtime, artifact.schedule(DENSE), exact.calls[:calls]))
+        plan = replace(artifact.plans[DENSE], precision=dict.fromkeys(parts, INT8))
+        return exact.error(answers(open_runtime(artifact, plan=plan), plan, exact.calls[:calls]))
 
     kept = artifact.manifest.precision.kept
     error: PrecisionError | None = measured(kept)
@@ -116,7 +117,7 @@ class _Exact:
 
     @classmethod
     def of(cls, artifact: Artifact, runtime: Runtime) -> _Exact:
-        spec, plan = artifact.manifest.spec, artifact.schedule(DENSE)
+        spec, plan = artifact.manifest.spec, artifact.plans[DENSE]
         calls: list[Call] = [(normalized(spec, obs), noise) for obs, noise in random_calls(spec, CALLS, SEED)]
         samples = answers(runtime, plan, calls)
         swapped = [(calls[i][0], calls[i + 1][1]) for i in range(FEW_CALLS)]
@@ -148,23 +149,20 @@ def _rounded(number: float) -> float:
     return float(f"{number:.4g}")
 
 
-def answers(
-    runtime: Runtime, plan: npt.NDArray[np.int8], calls: Iterable[Call], correction: Correction | None = None
-) -> list[FloatArray]:
+def answers(runtime: Runtime, plan: Plan, calls: Iterable[Call]) -> list[FloatArray]:
     """Denoised samples ``[T, D]`` of calls that are an episode of one stream each.
 
     One stream, because the scale of activations is that of the whole batch.
 
     Args:
         runtime: that makes the calls.
-        plan: ``[K, blocks]``, without reads of earlier calls.
+        plan: without reads of earlier calls.
         calls: normalised observation and noise of one stream each.
-        correction: of the plan.
     """
     samples = []
     for obs, noise in calls:
         runtime.reset()
-        samples.append(runtime.predict(obs, noise, plan, correction=correction)[0][0])
+        samples.append(runtime.predict(obs, noise, plan)[0][0])
     return samples
 
 

@@ -93,7 +93,7 @@ def require_able(runtime: str, artifact: Artifact, plan: Plan) -> None:
         RuntimeUnavailableError: it has no such precision, or cannot reuse tokens.
         ArtifactError: it could, and the artifact holds no such models.
     """
-    kind, remedy = kind_of(runtime), "Take plan='dense', or the plan without it: plan.exact"
+    kind, remedy = kind_of(runtime), "Take plan='dense', or a plan in fp32: plan='NAME@fp32', which is plan.exact"
     for part, precision in plan.precision.items():
         if precision in kind.made and part == BLOCKS:
             continue
@@ -105,9 +105,9 @@ def require_able(runtime: str, artifact: Artifact, plan: Plan) -> None:
             )
     require_held(artifact, replace(plan, precision={p: n for p, n in plan.precision.items() if n in kind.held}))
     if plan.tokens is not None and not kind.tokens:
-        able = ", ".join(repr(name) for name, each in RUNTIMES.items() if each.tokens)
+        others = ", ".join(repr(name) for name, each in RUNTIMES.items() if each.tokens)
         raise RuntimeUnavailableError(
-            f"runtime {runtime!r} computes all tokens of a frame; the plan reuses some. Use runtime={able}. {remedy}."
+            f"runtime {runtime!r} computes all tokens of a frame; the plan reuses some. Use runtime={others}. {remedy}."
         )
 
 

@@ -100,7 +100,7 @@ class CompiledPolicy:
             identity=manifest.identity,
             model_identity=manifest.model_identity,
             plans=tuple(self._artifact.plans),
-            default_plan=self._artifact.name_of(default) or GIVEN,
+            default_plan=self._artifact.told(default) or GIVEN,
             precision=" and ".join(dict.fromkeys(default.precision.values())) or FP32,
             rollout=rollout_needs(view),
             prefix_refusal=self._prefix_refusal(default),

@@ -230,7 +230,7 @@ class Runtime:
         executed.flags.writeable = False
         report = CallReport(
             plan=executed,
-            plan_name=name or GIVEN,
+            plan_name=self._artifact.told(plan) or GIVEN,
             loop=plan.loop,
             computed=tuple(int(n) for n in np.count_nonzero(computed, axis=(1, 2))),
             legalised=settled.legalised,

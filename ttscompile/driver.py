@@ -29,7 +29,7 @@ from .hub import fetch_checkpoint
 from .ir.dataflow import reachable_from
 from .ir.flops import graph_flops, node_flops
 from .ir.graph import Graph
-from .ir.pieces import is_block, is_of_loop, of_loop
+from .ir.pieces import is_block
 from .ir.program import Captured, Cut, Program
 from .ir.verify import verify
 from .lower.joint import lower_all_blocks
@@ -210,8 +210,7 @@ def _compile(
         return program
     models = lower_program(program)
     explain("lower", (f"{len(models)} ONNX models",))
-    written, own_models = _of_one_loop(program, models, loop)
-    lowered = None if precision == FP32 else _lower_pieces(written, own_models, precision, keep_fp32, explain)
+    lowered = None if precision == FP32 else _lower_pieces(program, models, precision, keep_fp32, explain)
     whole: bytes | None = None
     if single_file is not None:  # made before anything is written: without one there is no artifact either
         own, weights = ({}, {}) if lowered is None else (lowered.models, lowered.weights)
@@ -222,19 +221,12 @@ def _compile(
         told = f"{len(golden.steps)} of {spec.sampler.steps} steps, {golden.streams} streams"
         further = (f"{name}: {len(golden.loops[name].steps)} of {table.steps}" for name, table in spec.loops.items())
         explain("record_original", (told, *further))
-        manifest = write_artifact(written, own_models, directory, lowered, golden.in_loop(loop), beside)
+        manifest = write_artifact(program, models, directory, lowered, golden, beside, loop)
         explain("write", (f"identity {manifest.short_identity}",))
     if whole is not None and single_file is not None:
         _write(Path(single_file), whole)
         explain("write_single_file", (f"{len(whole) / 1e6:.1f} MB",))
     return program
-
-
-# To be removed, with all that calls it, when an artifact holds several loops.
-def _of_one_loop(program: Program, models: Models, loop: str) -> tuple[Program, Models]:
-    """Program and models that have this loop alone, in place of the original: what ``write_artifact`` takes so far."""
-    models = {**models, **{each: models[of_loop(each, loop)] for each in models if of_loop(each, loop) in models}}
-    return program.in_loop(loop), {name: model for name, model in models.items() if not is_of_loop(name)}
 
 
 def _require_apart(single_file: str | os.PathLike[str], directory: str | os.PathLike[str] | None) -> None:

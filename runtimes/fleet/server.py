@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ttscompile.artifact.load import Artifact
-from ttscompile.artifact.manifest import DENSE
+from ttscompile.artifact.view import view_of
 from ttscompile.errors import (
     DeadlineMissedError,
     IllegalPlanError,
@@ -56,8 +56,11 @@ class Plans(NamedTuple):
         Raises:
             IllegalPlanError: there is no such plan, or it reads the call before, which here is another robot's.
         """
-        reading = reading_earlier_calls(artifact)
-        names = tuple(name for name in dict.fromkeys((DENSE, *artifact.manifest.plans)) if name not in reading)
+        names = tuple(
+            name
+            for name, plan in artifact.plans.items()
+            if plan.otherwise is None and name not in reading_earlier_calls(view_of(artifact, plan))
+        )
         found = cls(names, artifact.manifest.default_plan if default is None else default)
         return found._replace(default=found.known(found.default))
 

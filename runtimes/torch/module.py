@@ -79,6 +79,7 @@ class SparseCall(nn.Module):
         manifest, pieces = view.manifest, view.pieces
         self._spec, self._pieces, self._features = manifest.spec, pieces, manifest.features
         groups = manifest.groups
+        assert own.cells is not None
         schedule = check_plan(own.cells, manifest.steps, len(groups), 1)
         if (schedule == Source.ROLLOUT).any():
             problem = f"plan {plan!r} reads residuals of earlier calls, and a module keeps nothing between calls"

@@ -64,6 +64,5 @@ def require_fit(correction: Correction, manifest: Manifest, loop: str) -> None:
         IllegalPlanError: it is not.
     """
     start, sample = manifest.starts.get(loop), manifest.spec.sample
-    whole = manifest.sampler_of(loop if start is None else start.loop).steps
-    steps = whole if start is None else start.steps
-    correction.require_fit(steps, sample, manifest.condition_numbers, groups_of(whole, sample))
+    whole = manifest.steps_of(loop if start is None else start.loop)
+    correction.require_fit(manifest.steps_of(loop), sample, manifest.condition_numbers, groups_of(whole, sample))

@@ -22,6 +22,7 @@ from ..errors import ArtifactError
 from ..ir.graph import TensorType
 from ..ir.pieces import LAYERS
 from . import tensors
+from .manifest import Manifest, PlanRecord
 from .strict_json import REMEDY
 
 if TYPE_CHECKING:
@@ -230,16 +231,23 @@ def load_golden_plans(artifact: Artifact, streams: int) -> dict[str, GoldenPlan]
         return {}
     with artifact.reading(manifest.stores.golden_plans):
         arrays = tensors.read(artifact.files / manifest.stores.golden_plans)
-    kinds: dict[str, tuple[str, tuple[int, ...]]] = {
-        "plan": ("int8", (2, streams, manifest.steps, len(manifest.blocks))),
-        "path": ("float32", (2, manifest.steps, streams, DIGITS)),
-        "sample": ("float32", (2, streams, *manifest.spec.sample)),
-    }
-    wanted = {f"{name}/{field}": kind for name in manifest.plans for field, kind in kinds.items()}
+    wanted, names = dict[str, tuple[str, tuple[int, ...]]](), set[str]()
+    for name, plan in manifest.plans.items():
+        if f"{name}/plan" not in arrays and not is_sparse(plan):
+            continue  # whose cells are all computed, as those of the original
+        names.add(name)
+        steps = manifest.steps_of(plan.loop)
+        wanted[f"{name}/plan"] = "int8", (2, streams, steps, len(manifest.blocks))
+        wanted[f"{name}/path"] = "float32", (2, steps, streams, DIGITS)
+        wanted[f"{name}/sample"] = "float32", (2, streams, *manifest.spec.sample)
     tensors.check_arrays("array", arrays, wanted, f"{artifact.path}: golden record of plans")
-    return {
-        name: GoldenPlan(**{field: arrays[f"{name}/{field}"] for field in kinds}) for name in sorted(manifest.plans)
-    }
+    fields = ("plan", "path", "sample")
+    return {name: GoldenPlan(**{field: arrays[f"{name}/{field}"] for field in fields}) for name in sorted(names)}
+
+
+def is_sparse(plan: PlanRecord) -> bool:
+    """Whether something of a plan is reused, or comes from the call before: then calibration records two calls."""
+    return plan.kind != "all" or plan.otherwise is not None
 
 
 def pattern_size(shape: tuple[int, ...]) -> int:

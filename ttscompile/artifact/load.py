@@ -18,9 +18,22 @@ from ..core.correction import Correction
 from ..core.lattice import PlanArray, Source, check_plan, dense_plan
 from ..core.paths import require_path
 from ..core.plan import DENSE, ORIGINAL, Plan
+from ..core.spec import BF16, FP16, FP32, INT8
 from ..errors import ArtifactError, IllegalPlanError
 from ..ir.graph import Graph
-from ..ir.pieces import CONDITION, FRAMES, PRUNER, STEM, STEP, TAIL, LoopPiece, block_name, frame_pieces, of_loop
+from ..ir.pieces import (
+    BLOCKS,
+    CONDITION,
+    FRAMES,
+    PRUNER,
+    STEM,
+    STEP,
+    TAIL,
+    LoopPiece,
+    block_name,
+    frame_pieces,
+    of_loop,
+)
 from ..ir.program import Binding, Pieces
 from . import tensors
 from .archive import Unpacked, is_checkpoint, unpack
@@ -36,6 +49,7 @@ from .size import check_size
 from .strict_json import REMEDY, Value, parse
 
 TABLE_PREFIX = "table/"
+PRECISIONS = (FP32, INT8, BF16, FP16)
 LOOP_PREFIX = "loop/"
 """Of the tables of loops beside the original's: ``loop/NAME/CONTEXT``."""
 
@@ -69,6 +83,7 @@ class Artifact:
     _folder: Folder = field(repr=False)
     _stamps: Mapping[str, Stamp] = field(repr=False)
     _unpacked: Unpacked | None = field(default=None, repr=False)
+    _derived: dict[str, Plan] = field(default_factory=dict, repr=False)
 
     @property
     def files(self) -> Path:
@@ -102,21 +117,36 @@ class Artifact:
         return self.plans[self.manifest.default_plan]
 
     def plan(self, name: str) -> Plan:
-        """A plan by its name.
+        """A plan by its name, or in another precision: ``NAME@fp32``, ``NAME@int8``, ``NAME@bf16``.
+
+        In fp32 all tokens are computed, too, which every runtime can do. int8 is of all parts that the artifact has
+        such models of; bf16 and fp16, which torch makes of the weights, are of the residual blocks.
 
         Raises:
             IllegalPlanError: there is none of this name.
         """
         if not isinstance(name, str):
             raise IllegalPlanError(f"expected a ttscompile.Plan, or the name of one; found a {type(name).__name__}.")
-        if name not in self.plans:
-            remedy = "Use one of these, or make one of them with dataclasses.replace"
+        own, _, precision = name.partition("@")
+        if own not in self.plans or precision not in ("", *PRECISIONS):
+            remedy = "Use one of these, NAME@PRECISION for one in another precision, or dataclasses.replace"
             raise IllegalPlanError(f"the artifact has no plan {name!r}; it has {list(self.plans)}. {remedy}.")
-        return self.plans[name]
+        if not precision:
+            return self.plans[own]
+        if name not in self._derived:
+            record, plan = self.manifest.precision, self.plans[own].exact
+            held = record.kept if precision == INT8 and record is not None else (BLOCKS,)
+            plan = plan if precision == FP32 else replace(plan, precision=dict.fromkeys(held, precision))
+            self._derived[name] = replace(plan)  # another object than the one in fp32 may be
+        return self._derived[name]
 
     def name_of(self, plan: Plan) -> str | None:
         """The name of a plan of the artifact; None for any other."""
         return next((name for name, one in self.plans.items() if one is plan), None)
+
+    def told(self, plan: Plan) -> str | None:
+        """What ``plan`` was given to have it; None for one that somebody else made."""
+        return self.name_of(plan) or next((name for name, one in self._derived.items() if one is plan), None)
 
     @cached_property
     def _document(self) -> Value:
@@ -314,7 +344,7 @@ def _plans(directory: Path, manifest: Manifest) -> Mapping[str, Plan]:
         raise ArtifactError(f"{where}: expected schedules {expected}; found {sorted(schedules)}. {REMEDY}")
     for name, cells in schedules.items():
         try:
-            check_schedule(name, cells, steps_of(manifest, manifest.plans[name].loop), len(manifest.blocks))
+            check_schedule(name, cells, manifest.steps_of(manifest.plans[name].loop), len(manifest.blocks))
         except IllegalPlanError as error:
             raise ArtifactError(f"{where}: {name}: {error} {REMEDY}") from error
     corrections = read_corrections(stored, manifest, str(where))
@@ -334,7 +364,7 @@ def plan_of(
     otherwise: Plan | None,
 ) -> Plan:
     """The plan of a record, with its cells."""
-    cells = dense_plan(steps_of(manifest, record.loop), len(manifest.blocks)) if record.kind == "all" else schedule
+    cells = dense_plan(manifest.steps_of(record.loop), len(manifest.blocks)) if record.kind == "all" else schedule
     return Plan(
         loop=record.loop,
         cells=cells,
@@ -345,12 +375,6 @@ def plan_of(
         otherwise=otherwise,
         repair=True,
     )
-
-
-def steps_of(manifest: Manifest, loop: str) -> int:
-    """K of a loop, whatever it begins with."""
-    start = manifest.starts.get(loop)
-    return manifest.sampler_of(loop).steps if start is None else start.steps
 
 
 def check_schedule(name: str, plan: npt.NDArray[Any], steps: int, blocks: int) -> None:

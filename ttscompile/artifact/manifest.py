@@ -359,6 +359,11 @@ class Manifest:
         """The precision that some parts have models of beside fp32; ``fp32`` where none has."""
         return FP32 if self.precision is None else self.precision.name
 
+    def steps_of(self, loop: str) -> int:
+        """K of a loop, whatever it begins with."""
+        start = self.starts.get(loop)
+        return self.sampler_of(loop).steps if start is None else start.steps
+
     def sampler_of(self, loop: str) -> SamplerTable:
         """The table of a loop that begins with noise."""
         return self.spec.sampler if loop == ORIGINAL else self.spec.loops[loop]

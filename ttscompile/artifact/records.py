@@ -26,7 +26,7 @@ from ..ir.program import Binding, Program
 from . import tensors
 from .bind import REPORT, interface
 from .codec import plan_fault
-from .load import check_schedule, steps_of
+from .load import check_schedule
 from .manifest import BlockRecord, ContextRecord, FlopsRecord, Manifest, PieceRecord, PlanRecord, Requires
 from .strict_json import Value, dump_compact, parse
 from .towers import TokensRecord
@@ -224,7 +224,7 @@ def plan_records(manifest: Manifest, plans: Mapping[str, Plan], record: Mapping[
             told = {"kind": names.PRUNER, **{key: score.get(key) for key in ("sparsity", "flops_sparsity")}}
         else:
             cells = np.asarray(plan.cells)
-            steps = steps_of(manifest, plan.loop) if plan.loop in manifest.loops else len(cells)
+            steps = manifest.steps_of(plan.loop) if plan.loop in manifest.loops else len(cells)
             check_schedule(name, cells, steps, len(manifest.blocks))
             total = steps * sum(manifest.flops.blocks)
             weighed = 1 - plan_flops(cells, manifest.flops.blocks) / total if total else sparsity(cells)

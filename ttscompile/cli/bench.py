@@ -25,7 +25,7 @@ from ttscompile.cli.types import FOLDER, PATH, TEXT
 from ttscompile.core.spec import FP32
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.units import ms, share
-from ttscompile.report.facts import precision as told_precision
+from ttscompile.report.facts import told_plan
 from ttscompile.runtimes.against_fp32 import measure_precision
 from ttscompile.runtimes.open import CPU, open_runtime
 
@@ -120,7 +120,8 @@ def bench(
     error = None
     if runtime == "torch" and precision not in (None, FP32):
         with console.status(f"comparing actions in {precision} and {FP32}"):
-            pair = (open_runtime(artifact, runtime, threads[0], device, each) for each in (precision, FP32))
+            plans = (artifact.plan(f"dense@{each}") for each in (precision, FP32))
+            pair = (open_runtime(artifact, runtime, threads[0], device, one) for one in plans)
             error = measure_precision(artifact, (next(pair), next(pair)))
     timed = dict(zip(threads, (m.median_ms for m in measured), strict=False))
     if as_json:
@@ -143,8 +144,7 @@ def bench(
     if len(threads) > 1:
         best = fewest_threads(timed)
         say(output, f"Load it with threads={best}: more of these save less than {WORTH:.0%} of a call.")
-    if runtime == "onnxruntime" and precision != FP32 and artifact.manifest.precision is not None:
-        say(output, f"The first row computes in {told_precision(artifact.manifest)}.")
+    say(output, f"The first row computes {told_plan(artifact.manifest, entered[0].plan.partition('@')[0])}.")
     if seeing:
         say(
             output,

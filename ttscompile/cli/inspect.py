@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 
 from ttscompile.artifact.load import Artifact, load_artifact
-from ttscompile.artifact.manifest import DENSE
 from ttscompile.cli.options import artifact_argument, json_option
 from ttscompile.cli.output import print_json, progress, results, say
 from ttscompile.cli.summary import print_summary
@@ -59,7 +58,7 @@ def _drawn_by_default(artifact: Artifact, observation: Path | None) -> str:
     """The default plan; without an observation the best schedule in place of plans that depend on one."""
     default = artifact.manifest.default_plan
     record = artifact.manifest.plans.get(default)
-    if record is None or record.kind == "schedule" or observation is not None or SCHEDULE not in artifact.schedules:
+    if record is None or record.kind != "pruner" or observation is not None or SCHEDULE not in artifact.plans:
         return default
     say(
         progress(),
@@ -71,13 +70,10 @@ def _drawn_by_default(artifact: Artifact, observation: Path | None) -> str:
 
 def _plan(artifact: Artifact, name: str, observation: Path | None) -> PlanArray:
     """The plan to draw, int8 ``[K, blocks]``."""
-    plans = artifact.manifest.plans
-    if name != DENSE and name not in plans:
-        raise ArtifactError(f"{artifact.path}: has no plan {name!r}; it has {[DENSE, *plans]}. Use one of these.")
-    if name == DENSE or plans[name].kind == "schedule":
-        return artifact.schedule(name)
+    if (cells := artifact.plan(name).cells) is not None:
+        return cells
     if observation is None:
-        others = [DENSE, *artifact.schedules]
+        others = [each for each, one in artifact.plans.items() if not one.pruned]
         raise ArtifactError(
             f"{artifact.path}: plan {name!r} is made for each observation, and none was given. Add --observation"
             f" FILE.npz, or draw a schedule with --plan: {', '.join(others)}."

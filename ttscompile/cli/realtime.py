@@ -10,10 +10,11 @@ import click
 import numpy as np
 
 import ttscompile
-from ttscompile.artifact.manifest import UNIFORM, marked
+from ttscompile.artifact.manifest import marked
 from ttscompile.cli.options import artifact_argument, json_option, loop_options, runs_option, runtime_options
 from ttscompile.cli.output import print_identity, print_json, progress, results, say, table
 from ttscompile.cli.types import SECONDS, TEXT
+from ttscompile.core.plan import UNIFORM
 from ttscompile.errors import DeadlineMissedError
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.timer import Times

@@ -50,7 +50,10 @@ def print_summary(artifact: Artifact, console: Console) -> None:
         ("precision", _told_precision(summary["precision"], len(summary["blocks"]))),
         *((f"piece {one['piece']}", _told_frames(one, captured)) for one in summary["frames"]),
         *facts.tokens(manifest),
-        *([] if manifest.warm is None else [("warm start", facts.told_warm(manifest.warm, manifest.steps))]),
+        *(
+            (f"loop {n!r}", f"the last {one.steps} steps of {one.loop!r}, from the chunk of the call before")
+            for n, one in manifest.starts.items()
+        ),
     )
     about = table("artifact", summary["path"], rows=rows)
     about.columns[1].justify = "left"

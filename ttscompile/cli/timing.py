@@ -137,7 +137,8 @@ def contestants(
     chosen = plan or manifest.default_plan
 
     def compiled(label: str, plan: str, how: Compiled) -> Contestant:
-        policy = open_policy(artifact, how.runtime, how.threads, precision=how.precision, plan=plan, device=how.device)
+        plan = plan if how.precision is None else f"{plan}@{how.precision}"
+        policy = open_policy(artifact, how.runtime, how.threads, plan=plan, device=how.device)
         policy.reset()
         found = policy.info.precision
         return plan_contestant(label + f", {found}" * (found != FP32), policy, plan, manifest.spec)

@@ -15,7 +15,7 @@ from ..errors import IllegalPlanError
 from .correction import Correction
 from .lattice import PlanArray
 from .rules import NotNegative, Positive
-from .spec import ORIGINAL
+from .spec import ORIGINAL as ORIGINAL
 
 DENSE = "dense"
 """The plan that is the original policy: its loop, its weights, every cell computed. Every artifact has it."""

@@ -41,6 +41,7 @@ def artifact_findings(directory: Path) -> list[Finding]:
 
 
 def _needs(artifact: Artifact) -> list[Finding]:
+    from ..artifact.view import view_of
     from ..measure.machine import has_integer_dot_product
     from ..runtimes.liveness import rollout_needs
 
@@ -50,10 +51,10 @@ def _needs(artifact: Artifact) -> list[Finding]:
     found = [Finding(PART, "identity", manifest.short_identity), Finding(PART, "format", told)]
     precision = manifest.precision_name
     slow = precision == "int8" and has_integer_dot_product() is False
-    remedy = "Its fast kernels saturate on this processor. Load it with precision='fp32', which it holds too."
+    remedy = "Its fast kernels saturate on this processor. Take plans in fp32, which it holds too: 'NAME@fp32'."
     found.append(Finding.judged(PART, "precision", precision + ", without VNNI or AMX" * slow, slow, remedy))
     weights = sum(record.bytes for record in manifest.files.values())
-    cache = rollout_needs(artifact)
+    cache = rollout_needs(view_of(artifact))
     told = (
         f"{weights / 2**20:.1f} MiB of files, and {cache.bytes_read / 2**20:.1f} MiB of rollout cache a stream for its"
         f" plans ({cache.bytes_most / 2**20:.1f} for plans that you give)"

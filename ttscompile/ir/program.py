@@ -120,7 +120,6 @@ class Pieces(Loop):
     step: Graph | None = None
     pruner: Graph | None = None
     tables: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
-    loop_tables: Mapping[str, Mapping[str, npt.NDArray[Any]]] = field(default_factory=dict)
     bindings: Mapping[str, Binding] = field(default_factory=dict)
     features: tuple[str, ...] = ()
     frames: Graph | None = None

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..artifact.load import Artifact
-from ..artifact.manifest import DENSE
+from ..core.plan import DENSE
 from ..measure.machine import fingerprint, one_line
 from ..measure.points import Point, efficient
 from ..measure.units import flops, ms, share
@@ -111,13 +111,15 @@ def _plans(artifact: Artifact, course: Course | None) -> Section:
     manifest = artifact.manifest
     kinds = [block.kind for block in manifest.blocks]
     drawn: list[Picture] = []
-    ordered = sorted(artifact.schedules, key=lambda name: name != manifest.default_plan)
+    own = {name: artifact.plans[name].cells for name, one in manifest.plans.items() if one.kind == "schedule"}
+    schedules = {name: cells for name, cells in own.items() if cells is not None}
+    ordered = sorted(schedules, key=lambda name: name != manifest.default_plan)
     for name in ordered[:MOST_PICTURES]:
         caption = f"Plan {name!r} of one call: steps across, blocks down."
-        drawn.append(pictures.plan_picture(artifact.schedule(name), kinds, f"plan {name!r}", caption))
+        drawn.append(pictures.plan_picture(schedules[name], kinds, f"plan {name!r}", caption))
     if course is not None:
         last, calls = course.plans[-1], len(course.plans)
-        if not any((last == schedule).all() for schedule in artifact.schedules.values()):
+        if not any(np.array_equal(last, schedule) for schedule in schedules.values()):
             caption = f"What the last of {calls} calls of the episode executed."
             drawn.append(pictures.plan_picture(last, kinds, f"executed in call {calls - 1}", caption))
         caption = f"Mean over {calls} calls of the episode {course.name}, a map for each source."

@@ -211,7 +211,7 @@ def _speed(latencies: Sequence[Latency], manifest: Manifest) -> Section:
 
 
 def _made(manifest: Manifest, base: HubName | None) -> Section:
-    sampler, record = manifest.spec.sampler, manifest.calibration
+    record, sampler = manifest.calibration, list(manifest.spec.all_loops.values())[-1]
     steps = sampler.steps // 4 if sampler.name == "rk4" else sampler.steps  # which evaluates four times a step
     checkpoint = "CHECKPOINT" if base is None else base.at(str(base.revision))
     precision = "" if manifest.precision is None else f" --precision {manifest.precision_name}"
@@ -230,7 +230,7 @@ def _made(manifest: Manifest, base: HubName | None) -> Section:
         asked = {k: budget[k] for k in goals if isinstance(budget, Mapping) and isinstance(budget.get(k), int | float)}
         words = " ".join(f"--{k.replace('_', '-')} {_word(v)}" for k, v in (asked | told).items())
         lines.append(f"ttscompile calibrate DIR --trajectories CALLS {words}")
-    if manifest.distilled is not None:
+    if manifest.weights:
         trained = facts.distillation(record)
         words = " ".join(f"--{key} {_word(trained[key])}" for key in ("plan", "rank", "updates") if key in trained)
         lines.append(f"ttscompile distill DIR --trajectories CALLS {words}".rstrip())

@@ -9,9 +9,11 @@ from typing import Any
 
 from ..artifact.ceiling import few_steps
 from ..artifact.load import Artifact
-from ..artifact.manifest import DENSE, DISTILLED, BlockRecord, Manifest, PlanRecord, marked
-from ..artifact.tokens import ReuseRecord
-from ..artifact.warm import WarmRecord
+from ..artifact.manifest import BlockRecord, Manifest, PlanRecord, marked
+from ..artifact.view import view_of
+from ..core.lattice import dense_plan
+from ..core.plan import DENSE, ORIGINAL
+from ..core.spec import SamplerTable
 from ..ir.flops import frames_flops, graph_flops
 from ..ir.program import Binding
 from ..measure.units import flops, plain, share
@@ -19,7 +21,8 @@ from ..runtimes.against_fp32 import SHARE
 from ..runtimes.liveness import rollout_needs
 from .page import Section, Table
 
-_NOT_TOLD = ("plans", "precision", "sparsity", "flops_sparsity", "skipped", "other_noise", DISTILLED)
+_DISTILLED = "distilled"
+_NOT_TOLD = ("plans", "precision", "sparsity", "flops_sparsity", "skipped", "other_noise", _DISTILLED)
 _ERRORS = ("error", "error_p90")
 
 
@@ -43,7 +46,7 @@ def provenance(artifact: Artifact) -> Section:
 def policy(manifest: Manifest) -> Section:
     """What goes in, what comes out, and the loop between."""
     spec = manifest.spec
-    sampler, chunk = spec.sampler, spec.chunk
+    chunk = spec.chunk
     horizon, channels = spec.sample
     rows = [
         (
@@ -55,9 +58,11 @@ def policy(manifest: Manifest) -> Section:
     rows += [
         ("action", f"{chunk.action_dim} numbers, {horizon} steps predicted, {chunk.start}..{chunk.stop - 1} executed"),
         ("sample", f"[{horizon}, {channels}]"),
-        ("sampler", f"{sampler.name}, {'draws noise in its steps' if sampler.stochastic else 'draws no noise'}"),
-        ("denoising steps K", f"{sampler.steps}, timesteps {sampler.timesteps[0]:g}..{sampler.timesteps[-1]:g}"),
-        ("clip of the denoised sample", "none" if sampler.clip is None else f"{sampler.clip:g}"),
+        *((f"loop {name!r}", told_sampler(table)) for name, table in spec.all_loops.items()),
+        *(
+            (f"loop {name!r}", f"the last {one.steps} steps of {one.loop!r}, from the chunk of the call before")
+            for name, one in manifest.starts.items()
+        ),
         ("precision", precision(manifest)),
         *tokens(manifest),
         ("default plan", manifest.default_plan),
@@ -65,29 +70,39 @@ def policy(manifest: Manifest) -> Section:
     return Section("Policy", (), (Table(("", ""), tuple(rows), prose=True),))
 
 
-def told_reuse(reuse: ReuseRecord) -> str:
-    """How tokens are reused, in words."""
-    return (
-        f"of new frames {reuse.computed:.0%} of the tokens were computed, actions off by {reuse.error:.4g} on"
-        f" {reuse.calls} held-out calls, other noise by {reuse.other_noise:.4g}; a patch has changed above"
-        f" {reuse.threshold:g}, one frame of {reuse.refresh} is whole"
-    )
-
-
-def told_warm(warm: WarmRecord, steps: int) -> str:
-    """What calls may begin with, in words."""
-    return (
-        f"load(DIR, warm=True): calls after the first of an episode begin with the chunk before, and compute the last"
-        f" {warm.last_steps} of {steps} steps; on {warm.calls} recorded calls {warm.same:.3g} times as far from a dense"
-        f" call as two dense calls are apart, {warm.changed:.3g} times where the world has changed"
-    )
+def told_sampler(table: SamplerTable) -> str:
+    """What a loop is, in words."""
+    clip = "no clip of the denoised sample" if table.clip is None else f"the denoised sample clipped at {table.clip:g}"
+    noise = "draws noise in its steps" if table.stochastic else "draws no noise"
+    steps = f"{table.steps} steps, timesteps {table.timesteps[0]:g}..{table.timesteps[-1]:g}"
+    return f"{table.name}, {steps}, {noise}, {clip}"
 
 
 def tokens(manifest: Manifest) -> list[tuple[str, str]]:
-    """Of each image encoder that has tokens, whether they are reused."""
-    settled = "all of them are computed ('ttscompile reuse-tokens' can change that)"
-    settled = settled if manifest.reuse is None else told_reuse(manifest.reuse)
-    return [(f"tokens of {name}", f"{one.tokens} a frame; {settled}") for name, one in manifest.tokens.items()]
+    """Of each image encoder that has tokens, which plans reuse them."""
+    reusing = [
+        f"{name} computes a token anew where its patch differs by more than {one.tokens.threshold:g}, and one frame of"
+        f" {one.tokens.refresh} whole"
+        for name, one in manifest.plans.items()
+        if one.tokens is not None
+    ]
+    told = "; ".join(reusing) or "every plan computes all of them"
+    return [(f"tokens of {name}", f"{one.tokens} a frame; {told}") for name, one in manifest.tokens.items()]
+
+
+def told_plan(manifest: Manifest, name: str) -> str:
+    """What a plan computes, in words: its loop, its precision, its weights, its tokens, what it begins with."""
+    plan, steps = plans_of(manifest)[name], manifest.steps_of(plans_of(manifest)[name].loop)
+    told = [f"{steps} steps of loop {plan.loop!r}"]
+    if plan.precision:
+        parts: dict[str, list[str]] = {}
+        for part, one in plan.precision.items():
+            parts.setdefault(one, []).append(part)
+        told += [f"{one} in {' and '.join(those)}" for one, those in parts.items()]
+    told += [f"weights {plan.weights!r}"] * (plan.weights != ORIGINAL)
+    told += ["some tokens of each new frame"] * (plan.tokens is not None)
+    told += [f"begins with the chunk of the call before, else {plan.otherwise!r}"] * (plan.otherwise is not None)
+    return "; ".join(told)
 
 
 def precision(manifest: Manifest) -> str:
@@ -159,31 +174,31 @@ def block_table(manifest: Manifest) -> Table:
 
 def plans_of(manifest: Manifest) -> dict[str, PlanRecord]:
     """All plans, the dense one first."""
-    return {DENSE: PlanRecord("schedule", 0.0, 0.0), **manifest.plans}
+    return {DENSE: PlanRecord("all"), **manifest.plans}
 
 
 def plan_flops(artifact: Artifact, name: str) -> float | None:
     """FLOPs of a call with a plan; a pruner's blocks cost what was measured on average, None if they were not."""
-    manifest = artifact.manifest
-    own = plans_of(manifest)[name]
+    own, plan = plans_of(artifact.manifest)[name], artifact.plans[name]
     if own.flops_sparsity is None:
         return None
-    correction = artifact.corrections.get(name)
-    dense = manifest.flops.call(artifact.schedule(DENSE), own.pruned, correction)
+    manifest = view_of(artifact, plan).manifest
+    whole = dense_plan(manifest.steps, len(manifest.blocks))
+    dense = manifest.flops.call(whole, own.pruned, plan.correction)
     return dense - own.flops_sparsity * manifest.steps * sum(manifest.flops.blocks)
 
 
 def plan_table(artifact: Artifact) -> Table:
-    """Every plan: its kind, its sparsity, its cost."""
+    """Every plan: what it computes, its sparsity, its cost."""
     manifest = artifact.manifest
     rows = []
     for name, own in plans_of(manifest).items():
         told = f"{name} (default)" if name == manifest.default_plan else marked(name)
-        saved = (own.kind, share(own.sparsity), share(own.flops_sparsity))
+        saved = (told_plan(manifest, name), own.kind, share(own.sparsity), share(own.flops_sparsity))
         cost = plan_flops(artifact, name)
         costs = ("", "") if cost is None else (flops(cost), share(cost / manifest.flops.dense))
         rows.append((told, *saved, *costs))
-    head = ("plan", "kind", "cells reused", "FLOPs reused", "FLOPs a call", "of the captured policy")
+    head = ("plan", "computes", "cells", "reused", "of their FLOPs", "FLOPs a call", "of the original")
     return Table(head, tuple(rows))
 
 
@@ -222,7 +237,7 @@ def own_weights(record: Mapping[str, Any]) -> tuple[str, ...]:
         return ()
     before, after = (_mapping(told.get(key)).get("error") for key in ("before", "after"))
     trained = (
-        f"Plan {DISTILLED!r} has the schedule of plan {plain(told.get('plan'))!r} and weights of its own:"
+        f"Plan {_DISTILLED!r} has the schedule of plan {plain(told.get('plan'))!r} and weights of its own:"
         f" {plain(told.get('matrices'))} matrices of blocks were trained, which took its error from {plain(before)} to"
         f" {plain(after)}. So its errors say less about it than those of other plans: evaluate it on your task."
     )
@@ -231,7 +246,7 @@ def own_weights(record: Mapping[str, Any]) -> tuple[str, ...]:
 
 def distillation(record: Mapping[str, Any] | None) -> Mapping[str, Any]:
     """What a distillation noted down; empty if there was none."""
-    return _mapping((record or {}).get(DISTILLED))
+    return _mapping((record or {}).get(_DISTILLED))
 
 
 def other_noise(record: Mapping[str, Any]) -> tuple[str, ...]:
@@ -312,13 +327,13 @@ def limits(artifact: Artifact) -> Section:
             f"The sampler ({sampler.name}) draws noise in every step: two calls on one observation differ, dense"
             " or not. Give reset a seed, or predict_action the noise, to repeat a call."
         )
-    if manifest.precision_name == "fp32":
+    if not plans_of(manifest)[manifest.default_plan].precision:
         points.append("Weights are in fp32. On processors with integer dot products, --precision int8 may be faster.")
     else:
         points.append(f"It computes in {precision(manifest)}: dense calls differ from those in fp32 as well.")
     if any(plan.pruned for plan in manifest.plans.values()):
         points.append("A plan that is made for each observation costs a different time each call.")
-    needs = rollout_needs(artifact)
+    needs = rollout_needs(view_of(artifact))
     if needs.read:
         points.append(
             f"Its plans read residuals of the call before: {needs.bytes_read / 1e6:.1f} MB a stream are kept, and the"

@@ -7,8 +7,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from ..artifact.load import load_artifact
-from ..artifact.manifest import DENSE, MANIFEST
+from ..artifact.manifest import MANIFEST
 from ..core.paths import HUB
+from ..core.plan import DENSE
 from ..hub import upload
 from ..hub.name import require_repository
 from ..runtimes.open import open_runtime

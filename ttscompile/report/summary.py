@@ -7,6 +7,7 @@ from typing import Any
 
 from ..artifact.load import Artifact
 from ..artifact.manifest import Manifest
+from ..artifact.view import view_of
 from ..ir.flops import graph_flops
 from ..ir.pieces import frame_name
 from ..runtimes.liveness import rollout_needs
@@ -39,14 +40,16 @@ def document(artifact: Artifact) -> dict[str, Any]:
             for i, (n, tower) in enumerate(zip(artifact.pieces.rows, artifact.pieces.towers, strict=True))
         ],
         "tokens": {name: {"tokens": one.tokens, "fixed": one.fixed} for name, one in manifest.tokens.items()},
-        "reuse": None if manifest.reuse is None else dict(vars(manifest.reuse)),
-        "warm": None if manifest.warm is None else dict(vars(manifest.warm)),
+        "loops": {
+            **{loop: {"sampler": table.name, "steps": table.steps} for loop, table in spec.all_loops.items()},
+            **{loop: {"last_steps_of": one.loop, "steps": one.steps} for loop, one in manifest.starts.items()},
+        },
         "flops": _flops(manifest),
         "ceiling": {"sparsity": 1 - 1 / manifest.steps, "flops": manifest.flops.ceiling(manifest.steps)},
         "plans": {
             name: asdict(plan) | {"flops": plan_flops(artifact, name)} for name, plan in plans_of(manifest).items()
         },
-        "rollout_cache": asdict(rollout_needs(artifact)),
+        "rollout_cache": asdict(rollout_needs(view_of(artifact))),
         "default_plan": manifest.default_plan,
         "calibration": None if manifest.calibration is None else dict(manifest.calibration),
     }

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -10,9 +12,9 @@ import numpy.typing as npt
 
 from ..artifact.golden import Golden, GoldenPlan, project
 from ..artifact.load import Artifact
-from ..artifact.manifest import DENSE
-from ..core.correction import Correction
-from ..core.lattice import PlanArray, Source
+from ..artifact.view import view_of
+from ..core.lattice import PlanArray, Source, dense_plan
+from ..core.plan import DENSE, ORIGINAL, Plan
 from ..core.spec import Noise
 from ..core.update import bounded
 from ..errors import RuntimeUnavailableError
@@ -44,42 +46,56 @@ ACTION, VALUE = "of the largest action", "of the largest value"
 """Of what errors are shares."""
 
 
-def check_dense(policy: CompiledPolicy, artifact: Artifact, golden: Golden, probe: Probe) -> Rung:
-    """A dense call against the original network in eager PyTorch with the same noise: the error of the export."""
-    spec = artifact.manifest.spec
-    policy.reset()
-    made = policy.predict_action(golden.raw_observations(spec), noise=golden.noise, plan=DENSE)
-    error = max(largest(made["action_pred"], golden.actions), largest(made["action"], golden.executed))
-    units = float(np.abs(made["action"].astype(np.float64) - golden.executed).max())
+def computed(artifact: Artifact, loop: str = ORIGINAL, precision: Mapping[str, str] = MappingProxyType({})) -> Plan:
+    """The plan that computes every cell of a loop that begins with noise."""
+    cells = dense_plan(artifact.manifest.sampler_of(loop).steps, len(artifact.manifest.blocks))
+    return Plan(loop, cells, precision=precision)
+
+
+def check_dense(policy: CompiledPolicy, artifact: Artifact, golden: Golden) -> Rung:
+    """A dense call in every loop against the original network in eager PyTorch with the same noise.
+
+    This is the error of the export.
+    """
+    spec, worst, found, step = artifact.manifest.spec, 0.0, dict[str, float](), None
+    for loop in spec.all_loops:
+        own = golden.in_loop(loop)
+        policy.reset()
+        made = policy.predict_action(own.raw_observations(spec), noise=own.noise, plan=computed(artifact, loop))
+        error = max(largest(made["action_pred"], own.actions), largest(made["action"], own.executed))
+        units = found[loop] = float(np.abs(made["action"].astype(np.float64) - own.executed).max())
+        if not error <= SAMPLE:
+            step, cause = _where(artifact, own, computed(artifact, loop), own.path)
+            told = f"the executed actions of a dense call in loop {loop!r} are up to {units:.2g} off: {cause}"
+            return judged(DENSE_CALL, error, SAMPLE, ACTION, told, CONVERT, step=step)
+        worst = max(worst, error)
+    units = max(found.values())
     told = f"a dense call of {golden.streams} streams: its executed actions are within {units:.2g} of the original's"
-    step = None
-    if not error <= SAMPLE:
-        dense = artifact.schedule(DENSE)
-        dense = np.broadcast_to(dense, (golden.streams, *dense.shape))
-        step, cause = _where(artifact, golden, probe, dense, None, golden.path)
-        told = f"the executed actions of a dense call are up to {units:.2g} off the original's: {cause}"
-    details = {"error_in_units": finite(units)}
-    return judged(DENSE_CALL, error, SAMPLE, ACTION, told, CONVERT, step=step, details=details)
+    told += f" in each of {len(found)} loops" * (len(found) > 1)
+    return judged(DENSE_CALL, worst, SAMPLE, ACTION, told, CONVERT, details={"error_in_units": finite(units)})
 
 
-def check_precision(artifact: Artifact, golden: Golden) -> Rung | None:
-    """Parts of another precision than fp32 against the original; None if there are none."""
+def check_precision(artifact: Artifact, golden: Golden, runtime: Runtime) -> Rung | None:
+    """Dense calls with parts of another precision than fp32 against the original; None if no plan has any."""
     record, spec = artifact.manifest.precision, artifact.manifest.spec
     if record is None:
         return None
-    tolerance = SAMPLE if record.error is None else record.error.tolerance
-    runtime, obs = open_runtime(artifact), golden.network_observations(spec)
-    runtime.reset()
-    sample, _ = runtime.predict(obs, golden.noise, artifact.schedule(DENSE), plan_name=DENSE)
+    tolerance, error = SAMPLE if record.error is None else record.error.tolerance, 0.0
+    obs, parts = golden.network_observations(spec), dict.fromkeys(record.kept, record.name)
+    for loop in spec.all_loops:
+        own, plan = golden.in_loop(loop), computed(artifact, loop, parts)
+        runtime.reset()
+        error = max(error, largest(runtime.predict(obs, own.noise, plan)[0], own.sample))
     told = f"a dense call with {record.told} against the original"
-    remedy = "Load with precision='fp32', or convert the checkpoint again."
-    return judged(PRECISION, largest(sample, golden.sample), tolerance, VALUE, told, remedy)
+    remedy = "Take plans in fp32 (plan.exact), or convert the checkpoint again."
+    return judged(PRECISION, error, tolerance, VALUE, told, remedy)
 
 
 def check_runtimes(artifact: Artifact, golden: Golden, runtime: Runtime) -> Rung:
     """A dense call in the runtimes on torch, and single blocks in the reference; skipped where there is no torch."""
+    dense = artifact.plans[DENSE]
     try:
-        reference, line = (open_runtime(artifact, name) for name in ("reference", "torch"))
+        reference, line = (open_runtime(artifact, name, plan=dense) for name in ("reference", "torch"))
     except RuntimeUnavailableError:
         remedy = "Install 'ttscompile[compile]' to have the runtimes compared."
         return Rung(RUNTIMES, SKIPPED, "the reference runtime was not run: it needs torch", remedy=remedy)
@@ -87,7 +103,7 @@ def check_runtimes(artifact: Artifact, golden: Golden, runtime: Runtime) -> Rung
     samples = []
     for one in (reference, runtime, line):
         one.reset()
-        samples.append(one.predict(obs, golden.noise, artifact.schedule(DENSE), plan_name=DENSE)[0])
+        samples.append(one.predict(obs, golden.noise, dense)[0])
     error, of_line = (largest(sample, samples[0]) for sample in samples[1:])
     if max(error, of_line) <= SAMPLE:
         told = "onnxruntime, torch and the reference runtime give the same denoised sample"
@@ -121,23 +137,24 @@ def _reference_blocks(reference: Any, obs: Mapping[str, npt.NDArray[Any]]) -> An
 
 
 def check_plans(
-    artifact: Artifact, golden: Golden, recorded: Mapping[str, GoldenPlan], runtime: Runtime, probe: Probe
+    artifact: Artifact, golden: Golden, recorded: Mapping[str, GoldenPlan], runtime: Runtime
 ) -> tuple[Rung, dict[str, npt.NDArray[np.bool_]]]:
-    """Episodes of two sparse calls with each plan against what calibration stored.
+    """Episodes of two sparse calls with each plan, in fp32, against what calibration stored.
 
     Returns:
         The rung; and by plan the cells ``[K, blocks]`` that differ, where some do.
     """
     plans = artifact.manifest.plans
-    if not plans:
-        return Rung(PLANS, SKIPPED, "the artifact is not calibrated: every call is dense"), {}
+    if all(plan.kind == "all" and plan.otherwise is None for plan in plans.values()):
+        return Rung(PLANS, SKIPPED, "the artifact is not calibrated: every call computes all cells"), {}
     if not recorded:
         told = f"no record of {', '.join(plans)}: they were written by other means than 'ttscompile calibrate'"
         return Rung(PLANS, SKIPPED, told, remedy="Calibrate the artifact to have its plans verified."), {}
     failures: list[tuple[str, int | None, tuple[int, ...]]] = []
     cells, worst = dict[str, npt.NDArray[np.bool_]](), 0.0
     for name, record in recorded.items():
-        made, differ, few, error = _replay(artifact, golden, runtime, name, record)
+        plan = artifact.plans[name].exact
+        made, differ, few, error = _replay(artifact, golden, runtime, plan, record)
         if not few:
             cells[name] = differ
             step, block = np.argwhere(differ)[0].tolist()
@@ -147,12 +164,12 @@ def check_plans(
             continue
         worst = max(worst, error)
         if not error <= SAMPLE:
-            correction = artifact.corrections.get(name)
-            own = ["a correction"] * (correction is not None)
-            if artifact.with_weights_of(name) is artifact:
-                step, cause = _where(artifact, golden, probe, record.plan[0], correction, record.path[0])
-            else:  # the probe has the original's
-                step, cause, own = None, "its samples differ", [*own, "weights of its own"]
+            own = ["a correction"] * (plan.correction is not None)
+            if plan.weights != ORIGINAL or plan.otherwise is not None:  # the probe has the original's, and noise
+                step, cause = None, "its samples differ"
+                own += ["weights of its own"] * (plan.weights != ORIGINAL)
+            else:
+                step, cause = _where(artifact, golden, replace(plan, cells=record.plan[0]), record.path[0])
             more = f"; it has {' and '.join(own)}: the likely culprit where dense calls hold" if own else ""
             failures.append((f"plan {name!r} is what calibration stored, but {cause}{more}", step, ()))
     if failures:
@@ -168,17 +185,19 @@ def check_plans(
 def check_plans_precision(
     artifact: Artifact, golden: Golden, recorded: Mapping[str, GoldenPlan], runtime: Runtime
 ) -> Rung | None:
-    """The same episodes with parts of another precision than fp32, as ``load`` runs them; None if there are none.
+    """The same episodes of plans with parts of another precision than fp32; None if there are none.
 
     The record is made in fp32, so that the samples differ by what the precision does to them.
     """
     precision = artifact.manifest.precision
-    if precision is None or not recorded:
+    own = {name: record for name, record in recorded.items() if artifact.plans[name].precision}
+    if precision is None or not own:
         return None
     tolerance = CARRIED * (SAMPLE if precision.error is None else precision.error.tolerance)
     errors, wrong = dict[str, float](), dict[str, str]()
-    for name, record in recorded.items():
-        _, differ, few, errors[name] = _replay(artifact, golden, runtime, name, record)
+    for name, record in own.items():
+        plan = replace(artifact.plans[name], tokens=None)  # what is recorded knows of no frames before
+        _, differ, few, errors[name] = _replay(artifact, golden, runtime, plan, record)
         if not few:
             wrong[name] = f"{name!r} in {np.count_nonzero(differ)} of {differ.size} cells"
         elif not errors[name] <= tolerance:
@@ -188,13 +207,13 @@ def check_plans_precision(
     if wrong:
         told = f"with {precision.told} plans are not what calibration stored of fp32: "
         told += ", ".join(wrong.values())
-        status, remedy = FAILED, "Load with precision='fp32', or convert the checkpoint again and calibrate."
+        status, remedy = FAILED, "Take plans in fp32 (plan.exact), or convert the checkpoint again and calibrate."
     details = {"errors": {name: finite(error) for name, error in errors.items()}}
     return Rung(PLANS_PRECISION, status, told, finite(max(errors.values())), tolerance, VALUE, remedy, details=details)
 
 
 def _replay(
-    artifact: Artifact, golden: Golden, runtime: Runtime, name: str, record: GoldenPlan
+    artifact: Artifact, golden: Golden, runtime: Runtime, plan: Plan, record: GoldenPlan
 ) -> tuple[PlanArray, npt.NDArray[np.bool_], bool, float]:
     """The episode that ``GoldenPlan`` describes.
 
@@ -202,42 +221,41 @@ def _replay(
         Executed plans ``[2, B, K, blocks]``; the cells ``[K, blocks]`` that are not those of the record; whether these
         may differ; and the error of the samples, with the stored plan where cells differ.
     """
-    obs, correction = golden.network_observations(artifact.manifest.spec), artifact.corrections.get(name)
+    spec, start = artifact.manifest.spec, artifact.manifest.starts.get(plan.loop)
+    loop = plan.loop if start is None else start.loop
+    own, obs = golden.in_loop(loop), golden.network_observations(spec)
 
-    def episode(plans: Iterable[Any], **named: Any) -> tuple[PlanArray, npt.NDArray[Any]]:
+    def episode(plans: Iterable[Plan]) -> tuple[PlanArray, npt.NDArray[Any]]:
         made, samples = [], []
         runtime.reset()
-        for order, plan in zip((1, -1), plans, strict=True):
-            draws = None if golden.draws is None else np.ascontiguousarray(golden.draws[:, ::order])
-            noise = Noise(np.ascontiguousarray(golden.initial[::order]), draws)
+        if start is not None:  # the chunk before the first call is that of the original
+            runtime.predict(obs, own.noise, computed(artifact, loop))
+        for order, one in zip((1, -1), plans, strict=True):
+            draws = None if own.draws is None else np.ascontiguousarray(own.draws[:, ::order])
+            noise = Noise(np.ascontiguousarray(own.initial[::order]), draws)
             turned = {key: np.ascontiguousarray(value[::order]) for key, value in obs.items()}
-            sample, report = runtime.predict(turned, noise, plan, correction=correction, **named)
+            sample, report = runtime.predict(turned, noise, one)
             made.append(report.plan)
             samples.append(sample)
         return np.stack(made), np.stack(samples)
 
-    pruned = artifact.manifest.plans[name].pruned
-    made, samples = episode([None if pruned else artifact.schedule(name)] * 2, plan_name=name, repair=True)
+    made, samples = episode([plan] * 2)
     differ = (made != record.plan).any((0, 1))
     if differ.any():  # a near tie, maybe: hold what the stored plan gives against the record
-        _, samples = episode(record.plan)
-    few = bool(np.count_nonzero(differ) <= (CELLS * differ.size if pruned else 0))
-    expected = bounded(artifact.manifest.spec.sampler, record.sample)  # records are older than what bounds a sample
+        _, samples = episode([replace(plan, cells=cells) for cells in record.plan])
+    few = bool(np.count_nonzero(differ) <= (CELLS * differ.size if plan.pruned else 0))
+    expected = bounded(artifact.manifest.sampler_of(loop), record.sample)  # records are older than what bounds a sample
     return made, differ, few, largest(samples, expected)
 
 
-def _where(
-    artifact: Artifact,
-    golden: Golden,
-    probe: Probe,
-    plan: PlanArray,
-    correction: Correction | None,
-    path: npt.NDArray[np.float32],
-) -> tuple[int | None, str]:
+def _where(artifact: Artifact, golden: Golden, plan: Plan, path: npt.NDArray[np.float32]) -> tuple[int | None, str]:
     """The first step after which the sample is another than recorded, and what that says."""
-    if (plan == Source.ROLLOUT).any():
+    cells = plan.cells
+    if cells is None or (cells == Source.ROLLOUT).any():
         return None, "its samples differ"
-    samples, predictions = probe.trace(golden.noise, plan, correction)
+    cells = np.broadcast_to(cells, (golden.streams, *cells.shape[-2:]))
+    probe = Probe(view_of(artifact, plan), golden.network_observations(artifact.manifest.spec))
+    samples, predictions = probe.trace(golden.in_loop(plan.loop).noise, cells, plan.correction)
     norms = np.linalg.norm(path.astype(np.float64), axis=(1, 2))
     found = np.stack([project(one, 0) for one in samples])
     errors = np.linalg.norm(found.astype(np.float64) - path, axis=(1, 2)) / np.maximum(norms, 1e-30)
@@ -245,8 +263,8 @@ def _where(
     if not len(above):
         return None, "the pieces, run one by one, give the recorded sample, so that the runtime is at fault"
     k = int(above[0])
-    if (plan == Source.COMPUTE).all():
-        predicted = largest(project(predictions[k], 0), golden.predictions[k])
+    if (cells == Source.COMPUTE).all():
+        predicted = largest(project(predictions[k], 0), golden.in_loop(plan.loop).predictions[k])
         if predicted <= SAMPLE:
             return k, f"the sampler goes another way from step {k} on, where the network's output is the original's"
         return k, f"the network's output is another from step {k} on"

@@ -9,8 +9,8 @@ from time import perf_counter
 
 from ..artifact.golden import Golden
 from ..artifact.load import Artifact
-from ..artifact.manifest import DENSE
 from ..core.lattice import sparsity
+from ..core.plan import DENSE
 from ..core.spec import Noise
 from ..measure.timer import Timer
 from ..runtimes.policy import CompiledPolicy
@@ -70,13 +70,18 @@ def check_engaged(
 ) -> Rung:
     """Planned against executed cells, FLOPs and time of every plan; one that saves nothing fails."""
     manifest = artifact.manifest
-    if not manifest.plans:
-        told = "the artifact is not calibrated: every call is dense, and nothing is saved"
+    if all(plan.kind == "all" for plan in manifest.plans.values()):
+        told = "the artifact is not calibrated: every call computes all cells, and nothing is saved"
         return Rung(ENGAGED, SKIPPED, told, remedy="Run 'ttscompile calibrate' to give it a plan.")
     found = _measure(artifact, golden, policy, clock)
     details = {name: asdict(one) for name, one in found.items()}
-    cells = manifest.steps * len(manifest.blocks)
-    judged = {name: _fault(manifest.plans[name].kind, one, cells) for name, one in found.items()}
+    own = manifest.plans
+    judged = {
+        name: _fault(
+            manifest.plans[name].kind, one, manifest.steps_of(manifest.plans[name].loop) * len(manifest.blocks)
+        )
+        for name, one in found.items()
+    }
     faults = [f"plan {name!r} {fault}" for name, fault in judged.items() if fault]
     name = manifest.default_plan if manifest.default_plan in found else next(iter(found))
     figure = (found[name].executed, None, "of the cells")
@@ -132,6 +137,7 @@ def _measure(
             time_saved=1 - medians[name] / medians[DENSE],
         )
         for name, plan in manifest.plans.items()
+        if plan.kind != "all"
     }
 
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from ..artifact.golden import Golden
 from ..artifact.load import Artifact
-from ..artifact.manifest import DENSE
+from ..core.plan import DENSE
 from ..core.spec import Noise, PolicySpec
 from ..runtimes.policy import CompiledPolicy
 from ..runtimes.random_calls import random_noise
@@ -60,8 +60,8 @@ def check_episodes(
     nothing is judged.
     """
     manifest = artifact.manifest
-    if not manifest.plans:
-        return Rung(SPARSITY, SKIPPED, "the artifact is not calibrated: every call is dense")
+    if all(plan.kind == "all" for plan in manifest.plans.values()):
+        return Rung(SPARSITY, SKIPPED, "the artifact is not calibrated: every call computes all cells")
     spec, draw = manifest.spec, np.random.default_rng(0)
     errors: Errors = {name: [] for name in (*manifest.plans, None)}
     for i, obs in enumerate([one.observations for one in episodes] or [golden.raw_observations(spec)]):

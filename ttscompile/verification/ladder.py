@@ -15,8 +15,9 @@ from ..artifact.files import check_file
 from ..artifact.golden import load_golden, load_golden_plans
 from ..artifact.load import Artifact, load_artifact, read_manifest, require_artifact_path
 from ..artifact.manifest import MANIFEST
+from ..artifact.view import view_of
 from ..core.coercion import integer
-from ..core.spec import FP32
+from ..core.plan import DENSE
 from ..errors import ArtifactChangedError, ArtifactError, RuntimeUnavailableError, TtscompileError
 from ..runtimes.open import MOST_THREADS, open_runtime
 from ..runtimes.policy import CompiledPolicy
@@ -145,17 +146,13 @@ def _climb(
 ) -> tuple[list[Rung], ErrorMap | None]:
     """All rungs above integrity."""
     golden = load_golden(artifact)
-    recorded, reusing = load_golden_plans(artifact, golden.streams), artifact
-    artifact = artifact.with_reuse(None)  # what is recorded knows of no frames before
-    plain = artifact.at_precision(FP32)
+    recorded, dense = load_golden_plans(artifact, golden.streams), artifact.plans[DENSE]
     try:
-        probe = Probe(plain, golden.network_observations(artifact.manifest.spec))
-        runtime = open_runtime(plain, threads=threads)
-        own_runtime = runtime if plain is artifact else open_runtime(artifact, threads=threads)
+        probe = Probe(view_of(artifact, dense), golden.network_observations(artifact.manifest.spec))
+        runtime = open_runtime(artifact, threads=threads, plan=dense)
     except ArtifactError as error:
         return [Rung(BLOCK, FAILED, str(error))], None
-    exact = CompiledPolicy(plain, runtime, seed=0)
-    own = exact if plain is artifact else CompiledPolicy(artifact, own_runtime, seed=0)
+    policy = CompiledPolicy(artifact, runtime, seed=0, plan=dense)
     rungs: list[Rung] = []
     errors: ErrorMap | None = None
 
@@ -170,26 +167,26 @@ def _climb(
 
     def blocks() -> Rung:
         nonlocal errors
-        rung, errors = check_blocks(plain, golden, probe)
+        rung, errors = check_blocks(artifact, golden, probe)
         return rung
 
     def plans() -> Rung:
         nonlocal errors
-        rung, differing = check_plans(plain, golden, recorded, runtime, probe)
+        rung, differing = check_plans(artifact, golden, recorded, runtime)
         if errors is not None and differing:
             name, cells = next(iter(differing.items()))
             errors = replace(errors, plan=name, cells=cells)
         return rung
 
-    climb(PREPROCESSING, lambda: check_preprocessing(plain, golden))
+    climb(PREPROCESSING, lambda: check_preprocessing(artifact, golden))
     climb(BLOCK, blocks)
-    climb(EVALUATION, lambda: check_evaluation(plain, golden, probe, rungs[-1]))
-    climb(DENSE_CALL, lambda: check_dense(exact, plain, golden, probe))
-    climb(PRECISION, lambda: check_precision(artifact, golden))
-    climb(TOKENS, lambda: check_tokens(reusing, golden))
-    climb(RUNTIMES, lambda: check_runtimes(plain, golden, runtime))
+    climb(EVALUATION, lambda: check_evaluation(artifact, golden, probe, rungs[-1]))
+    climb(DENSE_CALL, lambda: check_dense(policy, artifact, golden))
+    climb(PRECISION, lambda: check_precision(artifact, golden, runtime))
+    climb(TOKENS, lambda: check_tokens(artifact, golden, runtime))
+    climb(RUNTIMES, lambda: check_runtimes(artifact, golden, runtime))
     climb(PLANS, plans)
-    climb(PLANS_PRECISION, lambda: check_plans_precision(artifact, golden, recorded, own_runtime))
-    climb(SPARSITY, lambda: check_episodes(artifact, golden, own, episodes, progress))
-    climb(ENGAGED, lambda: check_engaged(artifact, golden, own))
+    climb(PLANS_PRECISION, lambda: check_plans_precision(artifact, golden, recorded, runtime))
+    climb(SPARSITY, lambda: check_episodes(artifact, golden, policy, episodes, progress))
+    climb(ENGAGED, lambda: check_engaged(artifact, golden, policy))
     return rungs, errors

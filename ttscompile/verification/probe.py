@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..artifact.load import Artifact
+from ..artifact.view import View
 from ..core.correction import HISTORY, Correction, no_correction
 from ..core.lattice import PlanArray, Source
 from ..core.spec import FloatArray, Noise
@@ -21,7 +21,7 @@ from ..core.update import bounded, clips, matrices
 from ..ir.pieces import ADVANCE, CONDITION, LAYERS, PREDICTION, STEM, STEP, STREAM, TAIL, advance_context, block_name
 from ..ir.program import Binding
 from ..runtimes.frames import FramePieces
-from ..runtimes.onnxruntime.sessions import open_layers, open_sessions, repeat_streams, run_named, run_piece
+from ..runtimes.onnxruntime.sessions import Sessions, repeat_streams, run_named, run_piece
 
 Array = npt.NDArray[Any]
 
@@ -30,17 +30,17 @@ class Probe:
     """The pieces on one observation.
 
     Args:
-        artifact: opened.
+        view: of an artifact.
         obs: normalised observations by key, ``[B, ...]``.
     """
 
-    def __init__(self, artifact: Artifact, obs: Mapping[str, Array]) -> None:
-        self._artifact, self._manifest = artifact, artifact.manifest
-        self._sessions = open_sessions(artifact, 1)
+    def __init__(self, view: View, obs: Mapping[str, Array]) -> None:
+        self._view, self._manifest, self._pool = view, view.manifest, Sessions(1)
+        self._sessions = self._pool.of(view)
         self.streams = len(next(iter(obs.values())))
         tables = {
-            name: repeat_streams(artifact.tables[name], None if axis is None else axis + 1, self.streams)
-            for name, context in artifact.manifest.contexts.items()
+            name: repeat_streams(view.tables[name], None if axis is None else axis + 1, self.streams)
+            for name, context in view.manifest.contexts.items()
             if context.binding is Binding.TABLE
             for axis in (context.type.batch_axis,)
         }
@@ -51,7 +51,7 @@ class Probe:
         named |= FramePieces(self._manifest.pieces, run).values(named)
         feed = {name: np.ascontiguousarray(named[name]) for name in piece.inputs}
         condition = run_named(self._sessions[CONDITION], piece.outputs, feed) if piece.outputs else {}
-        types = {name: artifact.manifest.contexts[name].type for name in artifact.manifest.features}
+        types = {name: view.manifest.contexts[name].type for name in view.manifest.features}
         rows = [np.moveaxis(condition[name], kind.batch_axis or 0, 0) for name, kind in types.items()]
         self._condition = [row.reshape(self.streams, -1) for row in rows]
         self._contexts = [self._step(k, tables, condition) for k in range(self._manifest.steps)]
@@ -84,7 +84,7 @@ class Probe:
         if record is None:
             return {}
         if LAYERS not in self._sessions:
-            self._sessions |= open_layers(self._artifact)
+            self._sessions |= self._pool.of_layers(self._view)
         feed = {name: stream if name == record.stream else self._contexts[k][name] for name in record.inputs}
         return run_named(self._sessions[LAYERS], record.outputs, feed)
 

@@ -14,9 +14,10 @@ import numpy.typing as npt
 import torch
 from torch import nn
 
-from ..artifact.golden import DIGITS, Golden, GoldenPlan, load_golden, pattern, probe_stream, project
+from ..artifact.golden import DIGITS, Golden, GoldenPlan, is_sparse, load_golden, pattern, probe_stream, project
 from ..artifact.load import Artifact
-from ..artifact.manifest import DISTILLED
+from ..artifact.view import View, view_of
+from ..core.plan import Plan
 from ..core.spec import ORIGINAL, FloatArray, Noise, PolicySpec
 from ..errors import CaptureError
 from ..frontends.copies import sharing_copy
@@ -28,8 +29,8 @@ from ..ir.graph import Graph, backward_slice
 from ..ir.layers import layers
 from ..ir.program import Block, Program
 from ..ir.rows import Rows
-from ..runtimes.reference.model import ReferenceModel
-from ..runtimes.settle import pruner_plan, repair_plan
+from ..runtimes.plans import pruner_plan, repair_plan
+from ..runtimes.reference.model import ReferenceModel, noise_tensors
 
 STREAMS = 2
 """Streams of the call, so that what mixes streams up shows; one where that would take long or much room."""
@@ -151,7 +152,7 @@ class _Recorder:
 
 
 def record_plans(artifact: Artifact) -> dict[str, GoldenPlan]:
-    """What the reference runtime makes of the plans of an artifact, with their corrections: two calls each.
+    """What the reference runtime makes of the plans of an artifact, with their corrections: two calls each, in fp32.
 
     Nothing of an artifact without a golden record of the original network.
     """
@@ -159,31 +160,35 @@ def record_plans(artifact: Artifact) -> dict[str, GoldenPlan]:
         return {}
     golden, found = load_golden(artifact), dict[str, GoldenPlan]()
     obs = golden.network_observations(artifact.manifest.spec)
-    for own in (False, True):
-        names = [name for name in artifact.manifest.plans if (name == DISTILLED) is own]
-        if names:  # one model at a time: each holds all weights
-            model = ReferenceModel.from_artifact(artifact.with_weights_of(names[0]))
-            with torch.no_grad():
-                found |= {name: _episode(artifact, model, name, golden, obs) for name in names}
-    return found
+    plans = {name: artifact.plans[name].exact for name, one in artifact.manifest.plans.items() if is_sparse(one)}
+    for variant in dict.fromkeys(plan.variant for plan in plans.values()):
+        own = {name: plan for name, plan in plans.items() if plan.variant == variant}
+        view = view_of(artifact, next(iter(own.values())))
+        model = ReferenceModel.from_view(view)  # one at a time: each holds all weights
+        start = artifact.manifest.starts.get(variant.loop)
+        record = golden.in_loop(variant.loop if start is None else start.loop)
+        with torch.no_grad():
+            found |= {name: _episode(view, model, plan, record, obs) for name, plan in own.items()}
+    return {name: found[name] for name in plans}
 
 
 def _episode(
-    artifact: Artifact, model: ReferenceModel, name: str, golden: Golden, obs: Mapping[str, npt.NDArray[Any]]
+    view: View, model: ReferenceModel, plan: Plan, golden: Golden, obs: Mapping[str, npt.NDArray[Any]]
 ) -> GoldenPlan:
     """Two calls with one plan; see ``GoldenPlan``."""
-    pruned = artifact.manifest.plans[name].pruned
-    cache, calls = model.empty_cache(golden.streams), []
+    cache, calls, chunk = model.empty_cache(golden.streams), [], golden.sample
     for order in (1, -1):
         contexts = model.prologue({key: torch.from_numpy(value[::order].copy()) for key, value in obs.items()})
-        wanted = pruner_plan(model.logits(contexts).numpy()) if pruned else artifact.schedule(name)
-        plan, _ = repair_plan(wanted, cache.written)
-        draws = None if golden.draws is None else torch.from_numpy(golden.draws[:, ::order].copy())
-        initial, correction = torch.from_numpy(golden.initial[::order].copy()), artifact.corrections.get(name)
-        result = model.denoise(contexts, initial, draws, plan, cache, correction=correction)
-        cache = result.cache
+        wanted = pruner_plan(model.logits(contexts).numpy()) if plan.cells is None else plan.cells
+        cells, _ = repair_plan(wanted, cache.written)
+        noise = Noise(golden.initial[::order], None if golden.draws is None else golden.draws[:, ::order])
+        if view.start is not None:
+            noise = view.start.noise_from(chunk, view.manifest.spec.chunk, noise)
+        inputs = noise_tensors(noise, view.manifest.spec.sampler.stochastic)
+        result = model.denoise(contexts, *inputs, cells, cache, correction=plan.correction)
+        cache, chunk = result.cache, result.sample.numpy()
         path = np.stack([project(sample.numpy(), 0) for sample in result.samples])
-        calls.append((plan, path, result.sample.numpy()))
+        calls.append((cells, path, chunk))
     return GoldenPlan(*(np.stack(each) for each in zip(*calls, strict=True)))
 
 

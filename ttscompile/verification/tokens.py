@@ -8,28 +8,29 @@ import numpy as np
 
 from ..artifact.golden import Golden
 from ..artifact.load import Artifact
-from ..artifact.manifest import DENSE
 from ..runtimes.frames import FrameWork
-from ..runtimes.open import open_runtime
-from .calls import SAMPLE, VALUE
+from ..runtimes.runtime import Runtime
+from .calls import SAMPLE, VALUE, computed
 from .network import largest
 from .rung import Rung, judged
 
 TOKENS = "tokens"
 
 
-def check_tokens(artifact: Artifact, golden: Golden) -> Rung | None:
+def check_tokens(artifact: Artifact, golden: Golden, runtime: Runtime) -> Rung | None:
     """A dense call in which all tokens are computed against one without their pieces, and one that reuses them.
 
-    None where the artifact reuses none.
+    None where no plan reuses any.
     """
-    reuse, obs = artifact.manifest.reuse, golden.network_observations(artifact.manifest.spec)
+    obs = golden.network_observations(artifact.manifest.spec)
+    reuse = next((plan.tokens for plan in artifact.plans.values() if plan.tokens is not None), None)
     if reuse is None:
         return None
     samples, works = [], list[FrameWork]()
     for settings in (None, replace(reuse, refresh=1), reuse):
-        runtime = open_runtime(artifact.with_reuse(settings))
-        sample, report = runtime.predict(obs, golden.noise, artifact.schedule(DENSE), plan_name=DENSE)
+        plan = replace(computed(artifact), tokens=settings)
+        runtime.reset()
+        sample, report = runtime.predict(obs, golden.noise, plan)
         samples.append(sample)
         if settings is reuse:  # the newest pictures again, with a bright spot
             shown = {key: value.copy() for key, value in obs.items()}
@@ -38,7 +39,7 @@ def check_tokens(artifact: Artifact, golden: Golden) -> Rung | None:
                     newest = shown[key][:, -1] if spec.frames else shown[key]
                     y, x = (slice(n // 2, n // 2 + n // 8 + 1) for n in newest.shape[-2:])
                     newest[..., y, x] += np.float32(10)
-            _, report = runtime.predict(shown, golden.noise, artifact.schedule(DENSE), plan_name=DENSE)
+            _, report = runtime.predict(shown, golden.noise, plan)
         works.append(report.frames)
     _, whole, some = works
     told = (
@@ -49,5 +50,5 @@ def check_tokens(artifact: Artifact, golden: Golden) -> Rung | None:
     if whole.tokens != whole.of or not 0 < some.tokens < some.of:
         error = np.inf
     details = {"spot": [some.tokens, some.of], **vars(reuse)}
-    remedy = "Run 'ttscompile reuse-tokens --off', or convert the checkpoint again."
+    remedy = "Take plans that compute all tokens (plan.exact), or convert the checkpoint again."
     return replace(judged(TOKENS, error, SAMPLE, VALUE, told, remedy), details=details)
