@@ -43,7 +43,7 @@ class PolicyInfo:
             where the runtime computes all of them in every call.
         reuses_tokens: whether of new frames only some tokens are computed, so that a call depends on the frames before.
         follows: whether that plan begins with the chunk of the call before, so that each call has to be one chunk later
-            than the one before (``CompiledPolicy.forget_chunk`` tells it of one that is not).
+            than the one before (``CompiledPolicy.follow`` tells it of one that is not).
     """
 
     K: int

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ttscompile.artifact.load import Artifact
+from ttscompile.core.coercion import integer
 from ttscompile.core.plan import Plan
 from ttscompile.core.spec import FP32, FloatArray, Noise
 from ttscompile.errors import NonFiniteActionsError, TtscompileError
@@ -208,13 +209,18 @@ class CompiledPolicy:
             with np.errstate(all="ignore"):
                 return self._runtime.learn({key: specs[key].normalized(array) for key, array in obs.items()}, stop)
 
-    def forget_chunk(self) -> None:
-        """Have the next call begin with noise: it is not one chunk later than the one before.
+    def follow(self, executed: int) -> None:
+        """Say how many steps of the last chunk are executed before the next call, where it is not all of ``action``.
 
-        For plans whose loop begins with the chunk of the call before; nothing changes for others.
+        It matters to plans that begin with the chunk of the call before: they move it by as many. A call that is late,
+        since more steps were due than ``action`` has, begins with noise.
+
+        Args:
+            executed: steps at the policy's rate.
         """
+        executed = integer(executed, "executed", TtscompileError)
         with self._turn():
-            self._runtime.forget_chunk()
+            self._runtime.follow(executed)
 
     def forget_frames(self) -> None:
         """Have the next call compute all of its frames, as if none had been seen: to measure what a call may take."""

@@ -98,6 +98,7 @@ class Runtime:
         self._dropped: BoolArray | None = None  # computed in this episode, and not kept
         self._streams: int | None = None
         self._chunk: FloatArray | None = None  # denoised sample of the last call of the episode
+        self._executed: int | None = None  # steps of it; None for all of ``action``
 
     def view(self, plan: Plan) -> View:
         """The artifact as a plan sees it. Nothing is opened.
@@ -148,12 +149,19 @@ class Runtime:
         """
         return self._used.frames.learn(obs, stop)
 
-    def forget_chunk(self) -> None:
-        """Have the next call begin with noise, whatever its plan: it does not follow the call before by one chunk."""
-        self._chunk = None
+    def follow(self, executed: int) -> None:
+        """Say how many steps of the last chunk are executed before the next call, where it is not all of ``action``.
+
+        A plan that begins with the chunk of the call before moves it by as many. Where more were due than ``action``
+        has, the call is late, and begins with noise: its plan's ``otherwise`` takes its place.
+        """
+        spec = self._artifact.manifest.spec.chunk
+        self._executed = executed
+        if not 0 <= executed <= spec.stop - spec.start:
+            self._chunk = None
 
     def _end_episode(self) -> None:
-        self._written = self._dropped = self._chunk = self._streams = None
+        self._written = self._dropped = self._chunk = self._streams = self._executed = None
 
     def require_streams(self, streams: int) -> None:
         """Raise unless a call of so many streams may be the next one.
@@ -195,7 +203,7 @@ class Runtime:
         spec, manifest = view.manifest.spec, view.manifest
         noise = check_noise(noise, streams, self._noise_spec(plan))
         if view.start is not None and self._chunk is not None:
-            noise = view.start.noise_from(self._chunk, spec.chunk, noise)
+            noise = view.start.noise_from(self._chunk, spec.chunk, noise, self._executed)
         known = None if prefix is None else known_samples(spec, prefix, noise.initial)
         cells = (streams, manifest.steps, len(manifest.groups))
         same = opened is self._used  # else what earlier calls kept is of another variant

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from .calibration.warm_start import warm_start as warm_start
     from .core.lattice import Source as Source
     from .core.lattice import legalize as legalize
+    from .core.plan import Plan as Plan
+    from .core.plan import TokenReuse as TokenReuse
     from .core.spec import Affine as Affine
     from .core.spec import ChunkSpec as ChunkSpec
     from .core.spec import Noise as Noise
@@ -53,6 +55,7 @@ _HOMES = {
         "calibration.tokens": ("TokenCalibration", "reuse_tokens"),
         "calibration.warm_start": ("WarmCalibration", "warm_start"),
         "core.lattice": ("Source", "legalize"),
+        "core.plan": ("Plan", "TokenReuse"),
         "core.spec": ("Affine", "ChunkSpec", "Noise", "ObservationSpec", "PolicySpec", "SamplerTable"),
         "driver": ("compile_denoiser", "convert"),
         "errors": ("TtscompileError",),

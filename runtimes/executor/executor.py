@@ -76,9 +76,6 @@ class AsyncExecutor:
         self._resolved = resolve(settings, info, control_hz)
         if settings.seam == "prefix":
             require_prefix(policy)
-        if getattr(info, "warm_steps", None) is not None:
-            found = "the policy was loaded with warm=, whose calls are one chunk apart; here a call may be late"
-            raise ExecutorError(f"{found}. Load it without warm=.")
         self._clock = clock or MonotonicClock()
         self._identity = str(getattr(info, "identity", ""))  # anything that predicts may be driven
         self.trace = Trace(settings.trace_events, self._identity)

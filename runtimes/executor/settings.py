@@ -41,7 +41,10 @@ class Policy(Protocol):
         """A new episode."""
 
     def predict_action(self, obs_dict: Mapping[str, Any], *, plan: str) -> Mapping[str, Any]:
-        """``{"action": [1, Ta, Da], "action_pred": [1, T, Da]}``."""
+        """``{"action": [1, Ta, Da], "action_pred": [1, T, Da]}``.
+
+        A policy that has ``follow``, too, is told how many steps of its last chunk are executed before the next call.
+        """
 
 
 class SeeingPolicy(Policy, Protocol):

@@ -64,6 +64,7 @@ class Worker:
         self._reset_seed: int | None = None
         self._ready = threading.Event()
         self._latencies: Mapping[str, float] | None = None  # as they were given
+        self._followed = -1, 0.0  # epoch and observation of the last call: how much of its chunk is executed by the next
         self._thread = threading.Thread(target=self._run, name="ttscompile-executor", daemon=True)
 
     # Everybody else's side
@@ -225,6 +226,9 @@ class Worker:
         obs = resolved.frames.observation(job.frames)
         prefix = {} if job.prefix is None else {"prefix": job.prefix[None]}
         last = resolved.first + resolved.horizon + resolved.reserve
+        if (follow := getattr(self._policy, "follow", None)) is not None and job.epoch == self._followed[0]:
+            follow(round((job.observed - self._followed[1]) * resolved.policy_hz))
+        self._followed = job.epoch, job.observed
         try:
             predicted = np.asarray(self._policy.predict_action(obs, plan=job.plan, **prefix)["action_pred"])
         except NonFiniteActionsError:  # the guard refuses them, as it does those of a policy that gives them out

@@ -15,10 +15,11 @@ from hypothesis import strategies as st
 
 from tests.artifact.folders import contents, flip
 from tests.artifact.tiny import tiny_models, tiny_program
+from tests.plans import store_schedules
 from ttscompile.artifact import codec, load_artifact, tensors
 from ttscompile.artifact.codec import identities
 from ttscompile.artifact.files import describe
-from ttscompile.artifact.write import update_calibration, write_artifact
+from ttscompile.artifact.write import write_artifact
 from ttscompile.errors import ArtifactError
 from ttscompile.ir.graph import TensorType
 
@@ -55,7 +56,7 @@ def named(directory: Path, role: str) -> Path:
 @pytest.fixture
 def calibrated(written: Path) -> Path:
     plan = np.array([[0, 0], [2, 1], [3, 0]], np.int8)
-    update_calibration(written, load_artifact(written).pruner, {"mine": plan}, "tts", {})
+    store_schedules(written, load_artifact(written).pruner, {"mine": plan}, "tts", {})
     return written
 
 
@@ -242,7 +243,7 @@ def test_unknown_names_are_errors(written: Path) -> None:
     with pytest.raises(ArtifactError, match=r"no graph 'advance'; it has \['condition'"):
         artifact.graph("advance")
     with pytest.raises(ArtifactError, match=r"no schedule 'fast'; it has \['dense'\]"):
-        artifact.schedule("fast")
+        artifact.plans["fast"].cells
 
 
 @pytest.mark.alone

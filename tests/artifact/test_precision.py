@@ -13,13 +13,14 @@ import pytest
 
 from tests.artifact.folders import contents, flip
 from tests.artifact.tiny import HORIZON, WIDTH, tiny_models, tiny_program
+from tests.plans import store_schedules
 from tests.rounding import assert_equal_but_for_rounding
 from ttscompile.artifact import codec
 from ttscompile.artifact.bind import LoweredPieces
 from ttscompile.artifact.load import load_artifact, read_manifest
 from ttscompile.artifact.manifest import Manifest, PrecisionError
 from ttscompile.artifact.strict_json import Value
-from ttscompile.artifact.write import update_calibration, write_artifact
+from ttscompile.artifact.write import write_artifact
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import ArtifactError
 from ttscompile.ir.pieces import DENSE_STEP, JOINT
@@ -107,7 +108,7 @@ def test_a_piece_of_the_prologue_has_a_model_of_its_own(tmp_path: Path) -> None:
 
 def test_a_calibration_keeps_the_precision(int8: Path) -> None:
     before = read_manifest(int8)
-    update_calibration(int8, None, {"uniform": uniform_plan(3, 2, 1)}, "uniform", {})
+    store_schedules(int8, None, {"uniform": uniform_plan(3, 2, 1)}, "uniform", {})
     after = load_artifact(int8).manifest
     assert after.precision == before.precision
     assert after.identity != before.identity

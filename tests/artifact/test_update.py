@@ -14,10 +14,11 @@ import pytest
 
 from tests.artifact.folders import contents, packed
 from tests.artifact.tiny import CHANNELS, HORIZON, STEPS, tiny_models, tiny_program
+from tests.plans import store_schedules
 from tests.rounding import assert_equal_but_for_rounding
 from ttscompile.artifact import load_artifact
 from ttscompile.artifact.manifest import Manifest, PlanRecord
-from ttscompile.artifact.write import update_calibration, write_artifact
+from ttscompile.artifact.write import write_artifact
 from ttscompile.core.correction import no_correction
 from ttscompile.errors import ArtifactError, IllegalPlanError
 
@@ -40,7 +41,7 @@ def update(path: Path, by: float = 1, **changes: Any) -> Manifest:
         "default_plan": "tts",
         "record": RECORD,
     }
-    return update_calibration(path, **{**arguments, **changes})
+    return store_schedules(path, **{**arguments, **changes})
 
 
 def logits(path: Path) -> np.ndarray:
@@ -65,7 +66,7 @@ def test_plans_weights_and_record_are_replaced(written: Path) -> None:
         "tts": PlanRecord("pruner", 0.75, None),
     }
     assert manifest.calibration == RECORD
-    np.testing.assert_array_equal(artifact.schedule("mine"), PLAN)
+    np.testing.assert_array_equal(artifact.plans["mine"].cells, PLAN)
     for name, value in pruner.items():
         assert artifact.pruner[name].tobytes() == value.tobytes()
     # All weights one larger, on 16 inputs of one; the bias is small enough to be in the model and has to follow too.

@@ -43,7 +43,7 @@ def test_round_trip(written: Path) -> None:
     assert manifest.condition_numbers > 0
     assert manifest.flops.prologue == 2 * 2 * 16 + STEPS * 2 * 16 * 16 + read
     assert {name: c.binding for name, c in manifest.contexts.items()} == pieces.bindings
-    assert artifact.schedule("dense").tolist() == [[0, 0]] * 3
+    assert artifact.plans["dense"].cells.tolist() == [[0, 0]] * 3
     for name, table in pieces.tables.items():
         assert artifact.tables[name].tobytes() == table.tobytes()
     stored = {**artifact.weights, **artifact.pruner}

@@ -11,9 +11,10 @@ import pytest
 
 import ttscompile
 from tests.artifact.folders import contents
+from tests.plans import store_schedules
 from ttscompile.artifact.files import exchange, lock_folder
 from ttscompile.artifact.load import load_artifact
-from ttscompile.artifact.write import locked, update_calibration
+from ttscompile.artifact.write import locked
 from ttscompile.calibration import pipeline
 from ttscompile.calibration.result import CalibrationResult
 from ttscompile.errors import ArtifactError
@@ -41,7 +42,7 @@ def test_a_calibration_refuses_all_others_from_its_beginning(
         with pytest.raises(ArtifactError, match=REFUSED):
             calibrate(artifact, recording)
         with pytest.raises(ArtifactError, match=REFUSED):
-            update_calibration(artifact, None, {}, "dense", {})
+            store_schedules(artifact, None, {}, "dense", {})
         with pytest.raises(ArtifactError, match=REFUSED):
             ttscompile.convert(artifact / "none.ckpt", artifact)
         with pytest.raises(ArtifactError, match=REFUSED):

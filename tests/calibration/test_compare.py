@@ -16,11 +16,11 @@ from PIL import Image
 import ttscompile
 from tests.families import cameras
 from tests.once import Once
+from tests.plans import store_schedules
 from ttscompile import SamplerTable
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.settle import settle
 from ttscompile.artifact.tokens import ReuseRecord
-from ttscompile.artifact.write import update_calibration
 from ttscompile.calibration.compare import _require_same_policy, compare
 from ttscompile.calibration.saved_searches import Searches
 from ttscompile.calibration.search import plan_of
@@ -42,7 +42,7 @@ def planned(compiled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("planned") / "compiled"
     shutil.copytree(compiled, directory)
     record = {"episodes": {"validation": [0, 1]}}
-    update_calibration(directory, None, {"half": uniform_plan(10, 6, 5)}, "half", record)
+    store_schedules(directory, None, {"half": uniform_plan(10, 6, 5)}, "half", record)
     return directory
 
 

@@ -15,11 +15,11 @@ from click.testing import CliRunner
 
 import ttscompile
 from tests.once import Once
+from tests.plans import store_schedules
 from ttscompile.artifact import codec, tensors
 from ttscompile.artifact.files import describe
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import DENSE, DISTILLED, MANIFEST
-from ttscompile.artifact.write import update_calibration
 from ttscompile.calibration import student
 from ttscompile.calibration.distill import SAVED, Distilled, distill
 from ttscompile.calibration.pipeline import calibrate
@@ -307,7 +307,7 @@ def test_a_plan_that_cannot_be_distilled(scheduled: Path, recording: Path, plan:
 def test_a_schedule_of_single_cells_is_refused(artifact: Path, recording: Path) -> None:
     plan = np.full((policies.STEPS, len(load_artifact(artifact).manifest.blocks)), 2, np.int8)
     plan[0] = plan[4, 1] = 0
-    update_calibration(artifact, None, {"schedule": plan}, "schedule", {})
+    store_schedules(artifact, None, {"schedule": plan}, "schedule", {})
     with pytest.raises(CalibrationError, match="expected whole steps, at least two of them computed"):
         train(artifact, recording)
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from ttscompile.artifact.write import update_calibration
+from tests.plans import store_schedules
 from ttscompile.cli import main
 from ttscompile.cli.bench import fewest_threads
 from ttscompile.core.lattice import uniform_plan
@@ -30,7 +30,7 @@ def scheduled(compiled_layer: Path, tmp_path_factory: pytest.TempPathFactory) ->
     """The artifact with a uniform schedule of 5 full steps as its default plan."""
     directory = tmp_path_factory.mktemp("scheduled") / "compiled"
     shutil.copytree(compiled_layer, directory)
-    update_calibration(directory, None, {"uniform": uniform_plan(100, 3, 5)}, "uniform", {"strategy": "uniform"})
+    store_schedules(directory, None, {"uniform": uniform_plan(100, 3, 5)}, "uniform", {"strategy": "uniform"})
     return directory
 
 
@@ -42,7 +42,7 @@ def pruned(compiled_layer: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     directory = tmp_path_factory.mktemp("pruned") / "compiled"
     shutil.copytree(compiled_layer, directory)
     weights = {name: np.array(array) for name, array in load_artifact(directory).pruner.items()}
-    update_calibration(directory, weights, {}, "tts", {"strategy": "tts"})
+    store_schedules(directory, weights, {}, "tts", {"strategy": "tts"})
     return directory
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from ttscompile.artifact.write import update_calibration
+from tests.plans import store_schedules
 from ttscompile.cli import main
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.doctor import diagnosis as doctor
@@ -26,7 +26,7 @@ def calibrated(toy_compiled: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     """The same with a schedule."""
     directory = tmp_path_factory.mktemp("doctor") / "calibrated"
     shutil.copytree(toy_compiled, directory)
-    update_calibration(directory, None, {"schedule": uniform_plan(5, 5, 2)}, "schedule", {"strategy": "interval"})
+    store_schedules(directory, None, {"schedule": uniform_plan(5, 5, 2)}, "schedule", {"strategy": "interval"})
     return directory
 
 

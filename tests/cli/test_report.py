@@ -17,8 +17,8 @@ from click.testing import CliRunner, Result
 from PIL import Image
 
 import ttscompile
+from tests.plans import store_schedules
 from ttscompile.artifact.load import load_artifact
-from ttscompile.artifact.write import update_calibration
 from ttscompile.cli import main
 from ttscompile.core.lattice import Source, uniform_plan
 from ttscompile.errors import ReportError
@@ -74,7 +74,7 @@ def calibrated(toy_compiled: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     rollout = np.full((5, 5), Source.ROLLOUT, np.int8)
     rollout[0] = Source.COMPUTE
     record = {"strategy": "tts", "plans": {"schedule": SCORE, "fast": {**SCORE, "error": 9.0}}, "steps": [0, 2]}
-    update_calibration(directory, None, {"schedule": uniform_plan(5, 5, 2), "fast": rollout}, "schedule", record)
+    store_schedules(directory, None, {"schedule": uniform_plan(5, 5, 2), "fast": rollout}, "schedule", record)
     return directory
 
 

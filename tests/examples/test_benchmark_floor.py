@@ -8,7 +8,7 @@ from rate import COLUMNS, ROWS, WIDTH, ProductRate
 from tests.families import cameras
 from tests.once import Once
 from ttscompile.artifact.load import load_artifact
-from ttscompile.artifact.tokens import ReuseRecord
+from ttscompile.artifact.towers import ReuseRecord
 from ttscompile.ir.flops import graph_flops
 from ttscompile.runtimes.load import open_policy
 from ttscompile.runtimes.policy import CompiledPolicy

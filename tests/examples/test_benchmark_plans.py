@@ -42,7 +42,7 @@ def test_a_sampler_may_have_more_steps_than_the_training() -> None:
 @pytest.fixture(scope="module")
 def tiny(tiny_artifact: Path) -> tuple[Path, dict[float, np.ndarray]]:
     artifact = load_artifact(tiny_artifact)
-    return tiny_artifact, {s: artifact.schedule(plan_name(s)) for s in (0.0, 0.5)}
+    return tiny_artifact, {s: artifact.plans[plan_name(s)].cells for s in (0.0, 0.5)}
 
 
 def test_an_artifact_has_the_plans_that_there_can_be(tiny: tuple[Path, dict[float, np.ndarray]]) -> None:

@@ -21,9 +21,9 @@ from environments import Environment, environment_class, environment_names
 from torch import nn
 
 import ttscompile
+from tests.plans import store_schedules
 from ttscompile import ChunkSpec, ObservationSpec, PolicySpec
 from ttscompile.artifact.load import load_artifact
-from ttscompile.artifact.write import update_calibration
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.samplers.flow import flow_matching_table
 
@@ -196,7 +196,7 @@ def test_a_policy_of_several_tasks_is_recorded_calibrated_and_evaluated(
         }
         assert file["task"].sum(0).min() > 0
     schedule = uniform_plan(4, len(load_artifact("arm").manifest.blocks), 2)
-    update_calibration(Path("arm"), None, {"schedule": schedule}, "schedule", {"strategy": "interval"})
+    store_schedules(Path("arm"), None, {"schedule": schedule}, "schedule", {"strategy": "interval"})
     document = json.loads(run(evaluate.main, "arm:dense", "arm", "--json", "--first-seed", "0"))
     assert document["environment"] == "fetch"
     dense, sparse = document["variants"]

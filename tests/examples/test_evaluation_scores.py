@@ -8,8 +8,8 @@ from jobs import Processes, fill_cache
 from score_plot import Timed, plot_scores, time_calls
 from variants import NoiseShape, Variant, open_variant
 
+from tests.plans import store_schedules
 from ttscompile.artifact.load import load_artifact
-from ttscompile.artifact.write import update_calibration
 from ttscompile.core.lattice import uniform_plan
 
 
@@ -74,7 +74,7 @@ def test_processes_fill_the_cache_with_the_episodes_of_one(compiled_pusht, tmp_p
     shutil.copytree(compiled_pusht, artifact)
     manifest = load_artifact(artifact).manifest
     plan = uniform_plan(manifest.steps, len(manifest.blocks), 1)
-    update_calibration(artifact, None, {"one": plan}, "one", {"strategy": "interval"})
+    store_schedules(artifact, None, {"one": plan}, "one", {"strategy": "interval"})
     text, told = f"{artifact}:one", []
 
     def fill():

@@ -16,8 +16,8 @@ from rich.console import Console
 from rollout import Episode, Rollout
 from variants import open_variant
 
+from tests.plans import store_schedules
 from ttscompile.artifact.load import load_artifact
-from ttscompile.artifact.write import update_calibration
 from ttscompile.calibration.result import CalibrationResult, PlanScore
 from ttscompile.core.lattice import uniform_plan
 
@@ -95,7 +95,7 @@ def test_episodes_that_were_run_before_are_compared(compiled_pusht, tmp_path):
     original, artifact = (shutil.copytree(compiled_pusht, tmp_path / name) for name in ("original", "compiled"))
     manifest = load_artifact(artifact).manifest
     plan = uniform_plan(manifest.steps, len(manifest.blocks), 1)
-    update_calibration(artifact, None, {"one": plan}, "one", {"strategy": "interval"})
+    store_schedules(artifact, None, {"one": plan}, "one", {"strategy": "interval"})
     for text, coverage in ((f"{original}:dense", 0.8), (str(artifact), 0.7)):  # both compute all with the same weights
         cache = Episodes(tmp_path / "episodes", "pusht", open_variant(text, "onnxruntime", 1), "onnxruntime")
         for seed in (7, 8):

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 import ttscompile
+from tests.plans import store_schedules
 from tests.runtimes.toys import toy_program, written_artifact
 from ttscompile import AsyncExecutor, ExecutorSettings, Source
-from ttscompile.artifact.write import update_calibration
 from ttscompile.errors import DeadlineMissedError
 from ttscompile.runtimes.policy import CompiledPolicy
 
@@ -29,7 +29,7 @@ PLAN = "tts"
 def pruned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A toy whose default plan is its pruner's, which reads earlier calls; eight actions a chunk."""
     artifact = written_artifact(toy_program(horizon=9), tmp_path_factory.mktemp("pruned") / "artifact")
-    update_calibration(artifact.path, dict(artifact.pruner), {}, PLAN, {"strategy": "tts"})
+    store_schedules(artifact.path, dict(artifact.pruner), {}, PLAN, {"strategy": "tts"})
     return artifact.path
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from ttscompile.artifact.write import update_calibration
+from tests.plans import store_schedules
 from ttscompile.cli import main
 from ttscompile.core.lattice import dense_plan, uniform_plan
 
@@ -53,7 +53,7 @@ def test_jitter_is_measured_and_printed(toy_compiled: Path) -> None:
 def test_jitter_is_measured_beside_the_plan_that_a_robot_runs(toy_compiled: Path, tmp_path: Path) -> None:
     calibrated = shutil.copytree(toy_compiled, tmp_path / "compiled")
     plans = {"uniform": uniform_plan(5, 5, 1), "schedule": dense_plan(5, 5)}  # the baseline is the faster one
-    update_calibration(calibrated, None, plans, "schedule", {"strategy": "tts"})
+    store_schedules(calibrated, None, plans, "schedule", {"strategy": "tts"})
     loop = ("--control-hz", 10, "--margin-ticks", 0, "--runs", 3, "--jitter", 0.1)
     assert "beside plan 'schedule'" in run(calibrated, *loop)[1]
     told = run(calibrated, *loop, "--plan", "uniform")[1]

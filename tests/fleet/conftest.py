@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.plans import store_schedules
 from tests.runtimes.toys import toy_program, written_artifact
 from ttscompile import Source
 from ttscompile.artifact.load import load_artifact
-from ttscompile.artifact.write import update_calibration
 from ttscompile.core.lattice import uniform_plan
 
 
@@ -18,6 +18,6 @@ def planned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     artifact = written_artifact(toy_program(pruner=False), tmp_path_factory.mktemp("fleet") / "artifact")
     evenly = uniform_plan(artifact.manifest.steps, len(artifact.manifest.groups), 2)
     memory = np.where(evenly == Source.TIMESTEP, Source.ROLLOUT.value, evenly).astype(np.int8)
-    update_calibration(artifact.path, None, {"evenly": evenly, "memory": memory}, "evenly", {})
+    store_schedules(artifact.path, None, {"evenly": evenly, "memory": memory}, "evenly", {})
     assert (load_artifact(artifact.path).schedules["memory"] == Source.ROLLOUT).any()
     return artifact.path

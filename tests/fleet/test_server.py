@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.plans import store_schedules
 from tests.runtimes.toys import toy_program, written_artifact
 from tests.server.serving import LIMITS, Client, ServerError, connected, listening, vanish
 from tests.server.watching import figures, get
 from ttscompile.artifact.load import load_artifact
-from ttscompile.artifact.write import update_calibration
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import ClusterError, IllegalPlanError, NonFiniteActionsError
 from ttscompile.runtimes.executor.window import Array
@@ -183,7 +183,7 @@ def test_a_plan_that_cannot_run_is_refused_before_it_starts(planned: Path, plan:
 def test_a_pruner_that_may_read_the_call_before_is_left_out(tmp_path: Path) -> None:
     """Each request begins an episode: such a plan would quietly be another one than was calibrated."""
     made = written_artifact(toy_program(), tmp_path / "artifact")
-    update_calibration(made.path, dict(made.pruner), {"evenly": uniform_plan(5, 5, 2)}, "tts", {})
+    store_schedules(made.path, dict(made.pruner), {"evenly": uniform_plan(5, 5, 2)}, "tts", {})
     artifact = load_artifact(made.path)
     assert Plans.of(artifact, "evenly").names == ("dense", "evenly")
     with pytest.raises(IllegalPlanError, match="another robot's"):

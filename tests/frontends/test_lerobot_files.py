@@ -10,8 +10,9 @@ from typing import Any
 import pytest
 
 import ttscompile
+from tests.plans import store_schedules
 from ttscompile.artifact.load import load_artifact
-from ttscompile.artifact.write import BESIDE, update_calibration
+from ttscompile.artifact.write import BESIDE
 from ttscompile.core.lattice import dense_plan
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends import files_beside, load_checkpoint_policy
@@ -77,7 +78,7 @@ def test_the_artifact_is_the_same_without_them(folder: Path, tmp_path: Path) -> 
     zipped = load_artifact(Path(shutil.make_archive(str(tmp_path / "zipped"), "zip", whole)))
     assert zipped.manifest.identity == manifest.identity and not (zipped.path / "config.json").exists()
     plan = dense_plan(manifest.steps, len(manifest.blocks))
-    update_calibration(whole, None, {"all": plan}, "all", {})
+    store_schedules(whole, None, {"all": plan}, "all", {})
     assert read(whole, "config.json")["threads"] == 2
 
 

@@ -19,8 +19,8 @@ def make(folder: Path) -> None:
     """Write the corpus: artifacts, checkpoints, trajectories, a calibration's state. Takes torch and some seconds."""
     import torch
 
+    from tests.plans import store_schedules
     from tests.runtimes.toys import pencil_program, toy_program, written_artifact
-    from ttscompile.artifact.write import update_calibration
     from ttscompile.calibration.state import StateFile
     from ttscompile.core.correction import no_correction
     from ttscompile.core.lattice import dense_plan
@@ -32,7 +32,7 @@ def make(folder: Path) -> None:
         artifact = written_artifact(program, path)
         sparse = dense_plan(artifact.manifest.steps, len(artifact.manifest.blocks))
         sparse[1:, ::2] = 2
-        update_calibration(
+        store_schedules(
             path,
             artifact.pruner or None,
             {"schedule": sparse, "uniform": sparse},

@@ -19,9 +19,10 @@ def main() -> None:
     """Print a JSON line for each scenario."""
     import torch
 
+    from tests.plans import store_schedules
     from tests.runtimes.toys import toy_program
     from ttscompile.artifact.load import load_artifact
-    from ttscompile.artifact.write import update_calibration, write_artifact
+    from ttscompile.artifact.write import write_artifact
     from ttscompile.calibration.state import StateFile
     from ttscompile.lower.program import lower_program
 
@@ -41,7 +42,7 @@ def main() -> None:
         pruner = {name: value + 1 for name, value in load_artifact(new).pruner.items()}
 
         def update(path: Path) -> None:
-            update_calibration(path, pruner, {"schedule": plan}, "schedule", {"seed": 1})
+            store_schedules(path, pruner, {"schedule": plan}, "schedule", {"seed": 1})
 
         def save(path: Path) -> None:
             state = StateFile(path, {"a": 1})

@@ -28,6 +28,7 @@ from ttscompile.artifact.bind import LoweredPieces
 from ttscompile.artifact.write import write_artifact
 from ttscompile.core.correction import INNER, JUMPS, MIDDLE, OBSERVED, OUTER, READING, Correction, no_correction
 from ttscompile.core.lattice import Source
+from ttscompile.core.plan import Plan
 from ttscompile.driver import compile_denoiser
 from ttscompile.errors import ArtifactError, LoweringError
 from ttscompile.ir.graph import Batch
@@ -106,7 +107,7 @@ def test_a_schedule_with_a_correction(tmp_path: Path, noise: float, read: int) -
         assert normalizer is not None
         assert actions is not None
         normalized = {"obs": normalizer.normalize(obs["obs"])}
-        sample, _ = reference.predict(normalized, drawn, plan, correction=correction)
+        sample, _ = reference.predict(normalized, drawn, Plan(cells=plan, correction=correction))
         found = Episode(model, streams).call(obs, drawn, plan, **feeds)["action_pred"]
         assert_equal_but_for_rounding(found, actions.unnormalize(sample), terms)
         without = Episode(model, streams).call(obs, drawn, plan)["action_pred"]

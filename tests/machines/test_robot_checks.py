@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.plans import store_schedules
 from tests.runtimes.toys import toy_program, written_artifact
-from ttscompile.artifact.write import update_calibration
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.measure.machine import cpuinfo
 
@@ -25,7 +25,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What ``made.py`` leaves for one policy, without blocks of eight bits: the toy has none."""
     folder = tmp_path_factory.mktemp("made") / "toy"
     artifact = written_artifact(toy_program(noise=0.0, pruner=False), folder / "artifact").path
-    update_calibration(artifact, None, {"uniform": uniform_plan(5, 5, 3)}, "uniform", {"strategy": "by hand"})
+    store_schedules(artifact, None, {"uniform": uniform_plan(5, 5, 3)}, "uniform", {"strategy": "by hand"})
     np.savez(folder / "actions.npz", **dict(made.answers(artifact, ("fp32",))))
     return folder
 

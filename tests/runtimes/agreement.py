@@ -8,6 +8,7 @@ from tests.rounding import Counted
 from ttscompile import Noise
 from ttscompile.artifact import Artifact
 from ttscompile.core.lattice import Source
+from ttscompile.core.plan import Plan
 from ttscompile.runtimes import Runtime, open_runtime
 
 from .plans import random_plan
@@ -35,7 +36,7 @@ def call_terms(artifact: Artifact) -> int:
     obs, noise = random_inputs(artifact, np.random.default_rng(0), 1)
     runtime = open_runtime(artifact, "reference")
     with Counted() as counted:
-        runtime.predict(obs, noise, np.zeros((spec.sampler.steps, len(manifest.groups)), np.int8))
+        runtime.predict(obs, noise, Plan(cells=np.zeros((spec.sampler.steps, len(manifest.groups)), np.int8)))
     return counted.terms
 
 
@@ -52,7 +53,7 @@ def largest_difference(
         computed = rng.uniform(0.02, 0.3)
         plans = np.stack([random_plan(rng, manifest.steps, manifest.groups, cells, computed) for cells in written])
         obs, noise = random_inputs(artifact, rng, streams)
-        samples = [runtime.predict(obs, noise, plans)[0] for runtime in (left, right)]
+        samples = [runtime.predict(obs, noise, Plan(cells=plans))[0] for runtime in (left, right)]
         worst = max(worst, float(np.abs(samples[0] - samples[1]).max() / np.abs(samples[1]).max()))
         written |= plans == Source.COMPUTE
     return worst

@@ -26,9 +26,9 @@ from pathlib import Path
 import numpy as np
 
 import ttscompile
+from tests.plans import store_schedules
 from ttscompile.artifact.files import beside, exchange, replace_folder
 from ttscompile.artifact.load import read_manifest
-from ttscompile.artifact.write import update_calibration
 from ttscompile.core.spec import PolicySpec
 from ttscompile.errors import ArtifactError
 from ttscompile.runtimes.policy import CompiledPolicy
@@ -85,7 +85,7 @@ def reuse(target: Path, source: int) -> None:
     manifest = read_manifest(target)
     plan = np.full((manifest.steps, len(manifest.blocks)), source, np.int8)
     plan[0] = 0
-    update_calibration(target, None, {"schedule": plan}, "schedule", {})
+    store_schedules(target, None, {"schedule": plan}, "schedule", {})
 
 
 def keep_changing(target: Path, others: Sequence[Path], ways: Sequence[str], longest: float) -> None:

@@ -17,13 +17,15 @@ from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultist
 
 import ttscompile
 from tests.lower.whole_call import Episode
+from tests.plans import store_schedules
 from tests.rounding import assert_equal_but_for_rounding
 from ttscompile import Noise, SamplerTable
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.golden import GoldenPlan
-from ttscompile.artifact.write import update_calibration, write_artifact
+from ttscompile.artifact.write import write_artifact
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import uniform_plan
+from ttscompile.core.plan import Plan
 from ttscompile.lower.program import lower_program
 from ttscompile.lower.single_file import lower_single_file
 from ttscompile.runtimes import open_runtime
@@ -85,7 +87,7 @@ def corrected(tmp_path_factory: pytest.TempPathFactory) -> Corrected:
     bias[-1, :, :, 0] = 0
     correction = replace(correction, bias=bias)
     plan = uniform_plan(STEPS, BLOCKS, 2)
-    update_calibration(folder, None, {"fast": plan, "bare": plan}, "fast", {}, corrections={"fast": correction})
+    store_schedules(folder, None, {"fast": plan, "bare": plan}, "fast", {}, corrections={"fast": correction})
     file = lower_single_file(program, models, program.weights).SerializeToString()
     return Corrected(load_artifact(folder), correction, plan, file)
 
@@ -127,7 +129,7 @@ def test_committed_actions_stay_what_they_are(corrected: Corrected, runtime: str
     start, channels = artifact.manifest.spec.chunk.start, artifact.manifest.spec.chunk.action_dim
     prefix = np.full((STREAMS, 1, channels), 1.5, np.float32)
     opened = open_runtime(artifact, runtime)
-    sample, _ = opened.predict(obs, noise, plan, correction=correction, prefix=prefix)
+    sample, _ = opened.predict(obs, noise, Plan(cells=plan, correction=correction), prefix=prefix)
     np.testing.assert_array_equal(sample[:, start : start + 1, :channels], prefix)
     rest = np.delete(sample, start, axis=1)
     assert np.abs(rest).max() == 1
@@ -148,7 +150,7 @@ def test_a_record_of_before_is_held_against_what_it_is_bounded_to(corrected: Cor
     artifact, correction, plan, _ = corrected
     obs, noise = random_inputs(artifact, np.random.default_rng(4), STREAMS)
     opened = open_runtime(artifact)
-    sample, _ = opened.predict(obs, noise, plan, correction=correction)
+    sample, _ = opened.predict(obs, noise, Plan(cells=plan, correction=correction))
     golden: Any = SimpleNamespace(initial=noise.initial, draws=noise.steps, network_observations=lambda spec: obs)
     plans = np.broadcast_to(plan, (2, STREAMS, *plan.shape))
     for beyond, expected in ((5.0, True), (0.5, False)):

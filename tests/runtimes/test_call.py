@@ -10,17 +10,17 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
 import pytest
 
+from tests.plans import store_schedules
 from tests.rounding import assert_equal_but_for_rounding
 from ttscompile import Noise, Source
 from ttscompile.artifact import Artifact, load_artifact
-from ttscompile.artifact.write import update_calibration
+from ttscompile.artifact.manifest import WeightsRecord
 from ttscompile.core.lattice import dense_plan, uniform_plan
+from ttscompile.core.plan import Plan
 from ttscompile.errors import ArtifactError, IllegalPlanError
 from ttscompile.runtimes import Runtime, open_runtime
 from ttscompile.runtimes.onnxruntime.backend import OnnxBackend
@@ -42,12 +42,12 @@ def helpers() -> list[threading.Thread]:
 @pytest.fixture
 def pruned(own_artifact: Artifact) -> Artifact:
     """A toy whose default plan is its pruner's."""
-    update_calibration(own_artifact.path, dict(own_artifact.pruner), {}, "tts", {"strategy": "tts"})
+    store_schedules(own_artifact.path, dict(own_artifact.pruner), {}, "tts", {"strategy": "tts"})
     return load_artifact(own_artifact.path)
 
 
 def call(runtime: Runtime, artifact: Artifact, seed: int, plan: np.ndarray | None = None) -> np.ndarray:
-    return runtime.predict(*random_inputs(artifact, np.random.default_rng(seed), 2), plan)[0]
+    return runtime.predict(*random_inputs(artifact, np.random.default_rng(seed), 2), Plan(cells=plan))[0]
 
 
 def test_the_pruners_thread_is_made_at_load_and_lives_as_long_as_the_runtime(pruned: Artifact) -> None:
@@ -90,7 +90,7 @@ def test_step_0_does_not_wait_for_the_pruner(pruned: Artifact, monkeypatch: pyte
     with monkeypatch.context() as patched:
         patched.setattr(Workspace, "logits", late)
         patched.setattr(Workspace, "run_dense", run)
-        sample, report = runtime.predict(*random_inputs(pruned, np.random.default_rng(0), 2))
+        sample, report = runtime.predict(*random_inputs(pruned, np.random.default_rng(0), 2), Plan(repair=True))
     assert np.array_equal(sample, expected)
     timings = report.timings
     assert min(timings.wait_pruner, timings.pruner) > 0
@@ -159,12 +159,14 @@ def test_weights_that_find_no_memory_read_nothing_of_others(
     toy_artifact: Artifact, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A plan with weights of its own has a backend of its own, which never computed what the other's calls have."""
-    manifest: Any = replace(toy_artifact.manifest, distilled=cast("Any", object()))
-    given: Any = SimpleNamespace(manifest=manifest, schedules={}, with_weights_of=lambda plan: toy_artifact)
-    runtime, (obs, noise) = Runtime(given, OnnxBackend), random_inputs(toy_artifact, np.random.default_rng(0), 1)
+    weights = dict.fromkeys(["distilled"], WeightsRecord("none", {}, None, {}))
+    given = replace(
+        toy_artifact, manifest=replace(toy_artifact.manifest, weights=weights), block_weights={"distilled": {}}
+    )
+    runtime, (obs, noise) = open_runtime(given), random_inputs(toy_artifact, np.random.default_rng(0), 1)
     reuse = dense_plan(5, 5)
     reuse[1:] = Source.ROLLOUT
-    runtime.predict(obs, noise, dense_plan(5, 5), plan_name="dense")
+    runtime.predict(obs, noise, given.plans["dense"])
 
     def full(*_: object) -> None:
         raise MemoryError
@@ -172,9 +174,9 @@ def test_weights_that_find_no_memory_read_nothing_of_others(
     with monkeypatch.context() as patched:
         patched.setattr(OnnxBackend, "prepare", full)
         with pytest.raises(MemoryError):
-            runtime.predict(obs, noise, reuse * 0, plan_name="distilled")
+            runtime.predict(obs, noise, Plan(cells=reuse * 0, weights="distilled"))
     with pytest.raises(IllegalPlanError, match="never computed"):
-        runtime.predict(obs, noise, reuse, plan_name="distilled")
+        runtime.predict(obs, noise, Plan(cells=reuse, weights="distilled"))
 
 
 def test_the_interpreter_ends_with_a_runtime_open(pruned: Artifact) -> None:
@@ -213,7 +215,7 @@ def test_a_first_call_with_a_schedule_binds_nothing(
     if not whole_steps:
         schedule[3, 1] = Source.COMPUTE
     path = make_artifact(toy_program(pruner=False, normed=True)).path
-    update_calibration(path, None, {"mine": schedule}, "mine", {"strategy": "tts"})
+    store_schedules(path, None, {"mine": schedule}, "mine", {"strategy": "tts"})
     artifact = load_artifact(path)
     runtime = open_runtime(artifact)
     assert isinstance(runtime.backend, OnnxBackend)
@@ -226,7 +228,7 @@ def test_a_first_call_with_a_schedule_binds_nothing(
     for module, name in ((workspace, "Bound"), (workspace, "BoundBlock"), (contexts, "BoundBlock")):
         monkeypatch.setattr(module, name, bind)
     for _ in range(2):
-        runtime.predict(obs, noise, schedule, plan_name="mine")
+        runtime.predict(obs, noise, artifact.plans["mine"])
         runtime.reset()
 
 
@@ -234,12 +236,12 @@ def test_single_blocks_are_opened_by_the_first_plan_that_needs_them(toy_artifact
     runtime, other = open_runtime(toy_artifact), open_runtime(toy_artifact, "reference")
     assert isinstance(runtime.backend, OnnxBackend)
     obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), 1)
-    runtime.predict(obs, noise, uniform_plan(5, 5, 3))
+    runtime.predict(obs, noise, Plan(cells=uniform_plan(5, 5, 3)))
     assert "block_00" not in runtime.backend.sessions
     runtime.reset()
     partial = uniform_plan(5, 5, 3)
     partial[4, 2] = Source.COMPUTE
-    found, expected = (each.predict(obs, noise, partial)[0] for each in (runtime, other))
+    found, expected = (each.predict(obs, noise, Plan(cells=partial))[0] for each in (runtime, other))
     assert_equal_but_for_rounding(found, expected, call_terms(toy_artifact))
     assert "block_00" in runtime.backend.sessions
 
@@ -249,7 +251,7 @@ def test_streams_that_compute_whole_steps_need_no_single_blocks(toy_artifact: Ar
     assert isinstance(runtime.backend, OnnxBackend)
     obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), 3)
     plans = np.stack([uniform_plan(5, 5, n) for n in (1, 2, 3)])
-    found, expected = (each.predict(obs, noise, plans)[0] for each in (runtime, other))
+    found, expected = (each.predict(obs, noise, Plan(cells=plans))[0] for each in (runtime, other))
     assert_equal_but_for_rounding(found, expected, call_terms(toy_artifact))
     assert "block_00" not in runtime.backend.sessions
 
@@ -262,8 +264,8 @@ def test_single_blocks_of_an_artifact_that_has_changed_since_are_refused(own_art
     path = own_artifact.onnx_path("block_02")
     path.write_bytes(path.read_bytes()[:-1] + b"?")
     with pytest.raises(ArtifactError, match=r"since it was loaded \(block_02\.onnx\)"):
-        runtime.predict(obs, noise, partial)
-    assert runtime.predict(obs, noise, uniform_plan(5, 5, 3))[1].computed == (15,)
+        runtime.predict(obs, noise, Plan(cells=partial))
+    assert runtime.predict(obs, noise, Plan(cells=uniform_plan(5, 5, 3)))[1].computed == (15,)
 
 
 def test_a_batch_that_finds_no_memory_leaves_a_runtime_that_works(
@@ -278,10 +280,10 @@ def test_a_batch_that_finds_no_memory_leaves_a_runtime_that_works(
     with monkeypatch.context() as patched:
         patched.setattr("ttscompile.runtimes.onnxruntime.backend.Workspace", full)
         with pytest.raises(MemoryError):
-            runtime.predict(obs, noise, dense_plan(5, 5))
+            runtime.predict(obs, noise, Plan(cells=dense_plan(5, 5)))
     assert isinstance(runtime.backend, OnnxBackend)
     assert runtime.backend.nbytes == runtime.backend.rollout_nbytes == 0
-    assert runtime.predict(obs, noise, dense_plan(5, 5))[1].computed == (25, 25)
+    assert runtime.predict(obs, noise, Plan(cells=dense_plan(5, 5)))[1].computed == (25, 25)
 
 
 def test_a_workspace_is_given_back_when_the_batch_changes(toy_artifact: Artifact) -> None:
@@ -291,7 +293,7 @@ def test_a_workspace_is_given_back_when_the_batch_changes(toy_artifact: Artifact
     sizes = []
     for streams in (1, 4, 2):
         obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), streams)
-        runtime.predict(obs, Noise(noise.initial, noise.steps), dense_plan(5, 5))
+        runtime.predict(obs, Noise(noise.initial, noise.steps), Plan(cells=dense_plan(5, 5)))
         assert runtime.backend.rollout_nbytes == 25 * streams * 3 * 4 * 4
         sizes.append(runtime.backend.nbytes)
         runtime.reset()

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 import ttscompile
+from tests.plans import store_schedules
 from tests.rounding import assert_equal_but_for_rounding
 from tests.runtimes.plans import random_correction
 from ttscompile import Noise, Source
 from ttscompile.artifact import Artifact, load_artifact
-from ttscompile.artifact.write import update_calibration
 from ttscompile.core.correction import Correction, no_correction
 from ttscompile.core.lattice import uniform_plan
+from ttscompile.core.plan import Plan
 from ttscompile.errors import ArtifactError, IllegalPlanError
 from ttscompile.runtimes import open_runtime
 
@@ -36,7 +37,7 @@ def test_runtimes_agree_on_random_corrections(toy_artifact: Artifact, streams: i
         plans = np.stack([random_plan(rng, manifest.steps, manifest.groups, cells) for cells in written])
         obs, noise = random_inputs(toy_artifact, rng, streams)
         correction = random_correction(toy_artifact, rng)
-        *ours, theirs = (r.predict(obs, noise, plans, correction=correction)[0] for r in runtimes)
+        *ours, theirs = (r.predict(obs, noise, Plan(cells=plans, correction=correction))[0] for r in runtimes)
         for each in ours:
             assert_equal_but_for_rounding(each, theirs, terms)
         written |= plans == Source.COMPUTE
@@ -55,7 +56,7 @@ def test_what_it_reads_of_the_observation_is_each_streams_own(toy_artifact: Arti
 
     def call(given: dict[str, np.ndarray], one: Correction) -> np.ndarray:
         made.reset()
-        return made.predict(given, noise, plan, correction=one)[0]
+        return made.predict(given, noise, Plan(cells=plan, correction=one))[0]
 
     blind = replace(correction, observed=np.zeros_like(correction.observed))
     assert (np.abs(call(obs, correction) - call(obs, blind)).max(axis=(1, 2)) > 1e-2).all()
@@ -70,9 +71,9 @@ def test_a_correction_of_one_call_is_gone_in_the_next(toy_artifact: Artifact) ->
     runtime = open_runtime(toy_artifact)
     obs, noise = random_inputs(toy_artifact, rng, 1)
     plan = uniform_plan(toy_artifact.manifest.steps, len(toy_artifact.manifest.groups), 2)
-    before, _ = runtime.predict(obs, noise, plan)
-    corrected, _ = runtime.predict(obs, noise, plan, correction=random_correction(toy_artifact, rng))
-    after, _ = runtime.predict(obs, noise, plan)
+    before, _ = runtime.predict(obs, noise, Plan(cells=plan))
+    corrected, _ = runtime.predict(obs, noise, Plan(cells=plan, correction=random_correction(toy_artifact, rng)))
+    after, _ = runtime.predict(obs, noise, Plan(cells=plan))
     assert np.abs(corrected - before).max() > 1e-2
     np.testing.assert_array_equal(before, after)
 
@@ -82,9 +83,7 @@ def corrected(own_artifact: Artifact) -> tuple[Path, Correction, np.ndarray]:
     manifest = own_artifact.manifest
     correction = random_correction(own_artifact, np.random.default_rng(0))
     plan = uniform_plan(manifest.steps, len(manifest.groups), 2)
-    update_calibration(
-        own_artifact.path, None, {"fast": plan, "bare": plan}, "fast", {}, corrections={"fast": correction}
-    )
+    store_schedules(own_artifact.path, None, {"fast": plan, "bare": plan}, "fast", {}, corrections={"fast": correction})
     return own_artifact.path, correction, plan
 
 
@@ -92,8 +91,9 @@ def corrected(own_artifact: Artifact) -> tuple[Path, Correction, np.ndarray]:
 def test_it_belongs_to_the_plan_of_its_name(corrected: tuple[Path, Correction, np.ndarray], runtime: str) -> None:
     path, correction, plan = corrected
     artifact = load_artifact(path)
-    assert set(artifact.corrections) == {"fast"}
-    np.testing.assert_array_equal(artifact.corrections["fast"].weights, correction.weights)
+    corrections = {name: plan.correction for name, plan in artifact.plans.items() if plan.correction is not None}
+    assert set(corrections) == {"fast"}
+    np.testing.assert_array_equal(corrections["fast"].weights, correction.weights)
     obs, noise = random_inputs(artifact, np.random.default_rng(1), 1)
     policy = ttscompile.load(path, runtime=runtime)
 
@@ -111,7 +111,7 @@ def test_it_belongs_to_the_plan_of_its_name(corrected: tuple[Path, Correction, n
 
 def test_a_matrix_has_none_whatever_plans_are_called(corrected: tuple[Path, Correction, np.ndarray]) -> None:
     path, correction, plan = corrected
-    update_calibration(path, None, {"given": plan, "bare": plan}, "given", {}, corrections={"given": correction})
+    store_schedules(path, None, {"given": plan, "bare": plan}, "given", {}, corrections={"given": correction})
     policy = ttscompile.load(path)
     obs, noise = random_inputs(load_artifact(path), np.random.default_rng(1), 1)
     named, bare, matrix = (policy.predict_action(obs, noise, each)["action"] for each in ("given", "bare", plan))
@@ -127,19 +127,20 @@ def test_the_first_call_binds_nothing(
     obs, noise = random_inputs(artifact, np.random.default_rng(1), 1)
     made: list[object] = []
     monkeypatch.setattr("ttscompile.runtimes.onnxruntime.workspace.Bound", lambda *arguments: made.append(arguments))
-    plans, correction = artifact.schedule("fast")[None], artifact.corrections["fast"]
-    runtime.predict(obs, noise, plans, plan_name="fast", correction=correction)
+    fast = artifact.plans["fast"]
+    runtime.predict(obs, noise, fast)
     assert made == []
-    another = replace(correction)
+    assert fast.correction is not None
+    another = replace(fast.correction)
     with pytest.raises(AttributeError):  # what stands in for a binding cannot run
-        runtime.predict(obs, noise, plans, plan_name="fast", correction=another)
+        runtime.predict(obs, noise, replace(fast, correction=another))
     assert len(made) == artifact.manifest.steps
 
 
 def test_it_is_part_of_the_identity(corrected: tuple[Path, Correction, np.ndarray]) -> None:
     path, _, plan = corrected
     before = load_artifact(path).manifest
-    update_calibration(path, None, {"fast": plan, "bare": plan}, "fast", {})
+    store_schedules(path, None, {"fast": plan, "bare": plan}, "fast", {})
     after = load_artifact(path).manifest
     assert before.identity != after.identity
     assert before.model_identity == after.model_identity
@@ -149,9 +150,9 @@ def test_one_that_does_not_fit_is_not_written(corrected: tuple[Path, Correction,
     path, _, plan = corrected
     before = {file.name: file.read_bytes() for file in path.iterdir()}
     with pytest.raises(IllegalPlanError, match="this policy needs"):
-        update_calibration(path, None, {"fast": plan}, "fast", {}, corrections={"fast": no_correction(3, (2, 2))})
+        store_schedules(path, None, {"fast": plan}, "fast", {}, corrections={"fast": no_correction(3, (2, 2))})
     manifest = load_artifact(path).manifest
     fitting = no_correction(manifest.steps, manifest.spec.sample)
     with pytest.raises(ArtifactError, match="expected a plan of the artifact"):
-        update_calibration(path, None, {"fast": plan}, "fast", {}, corrections={"slow": fitting})
+        store_schedules(path, None, {"fast": plan}, "fast", {}, corrections={"slow": fitting})
     assert {file.name: file.read_bytes() for file in path.iterdir()} == before

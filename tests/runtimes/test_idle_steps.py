@@ -12,6 +12,7 @@ from ttscompile import SamplerTable, Source
 from ttscompile.artifact import Artifact
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import legalize, uniform_plan
+from ttscompile.core.plan import Plan
 from ttscompile.ir.graph import Node, Ref
 from ttscompile.ir.pieces import IDLE
 from ttscompile.runtimes import open_runtime
@@ -75,7 +76,9 @@ def test_idle_steps_agree_with_the_reference(
             plans = random_plans(rng, artifact, streams, written)
             obs, noise = random_inputs(artifact, rng, streams)
             correction = random_correction(artifact, rng) if rng.random() < 0.7 else None
-            ours, theirs = (r.predict(obs, noise, plans, correction=correction)[0] for r in (runtime, reference))
+            ours, theirs = (
+                r.predict(obs, noise, Plan(cells=plans, correction=correction))[0] for r in (runtime, reference)
+            )
             assert_equal_but_for_rounding(ours, theirs, terms)
             written |= plans == Source.COMPUTE
         runtime.reset()
@@ -103,7 +106,9 @@ def test_runs_of_idle_steps_go_through_numpy_and_prepare_once(
     obs, noise = random_inputs(artifact, np.random.default_rng(0), 1)
     correction = random_correction(artifact, np.random.default_rng(1))
     without = dict.fromkeys(("inner", "middle", "outer"), np.zeros((0, 0, 0), np.float32))
-    runtime.predict(obs, noise, plan, correction=replace(correction, anchors=np.ones(STEPS, np.bool_), **without))
+    runtime.predict(
+        obs, noise, Plan(cells=plan, correction=replace(correction, anchors=np.ones(STEPS, np.bool_), **without))
+    )
     assert (runs, len(prepared)) == ([(1, 4), (8, 12)], 2)
 
 
@@ -122,8 +127,8 @@ def test_a_network_of_another_form_has_no_such_steps(make_artifact: MakeArtifact
     assert runtime.backend.workspace is not None
     assert runtime.backend.workspace.idle is None
     obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), 1)
-    theirs = open_runtime(toy_artifact, "reference").predict(obs, noise, uniform_plan(5, 5, 1))[0]
-    ours = runtime.predict(obs, noise, uniform_plan(5, 5, 1))[0]
+    theirs = open_runtime(toy_artifact, "reference").predict(obs, noise, Plan(cells=uniform_plan(5, 5, 1)))[0]
+    ours = runtime.predict(obs, noise, Plan(cells=uniform_plan(5, 5, 1)))[0]
     assert_equal_but_for_rounding(ours, theirs, call_terms(toy_artifact))
 
 
@@ -133,6 +138,6 @@ def test_a_call_does_not_see_the_history_of_the_one_before(make_artifact: MakeAr
     plan, rng = uniform_plan(STEPS, BLOCKS, 2), np.random.default_rng(0)
     obs, noise = random_inputs(artifact, rng, 1)
     correction: Correction = random_correction(artifact, rng)
-    first, _ = runtime.predict(obs, noise, plan, correction=correction)
-    again, _ = runtime.predict(obs, noise, plan, correction=correction)
+    first, _ = runtime.predict(obs, noise, Plan(cells=plan, correction=correction))
+    again, _ = runtime.predict(obs, noise, Plan(cells=plan, correction=correction))
     np.testing.assert_array_equal(first, again)

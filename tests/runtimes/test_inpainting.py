@@ -18,8 +18,10 @@ import ttscompile
 from tests.rounding import assert_equal_but_for_rounding
 from ttscompile import Affine, ChunkSpec, SamplerTable, Source
 from ttscompile.artifact import Artifact, load_artifact
+from ttscompile.artifact.view import view_of
 from ttscompile.artifact.write import write_artifact
 from ttscompile.core.lattice import dense_plan, uniform_plan
+from ttscompile.core.plan import Plan
 from ttscompile.errors import ObservationError
 from ttscompile.ir.program import Program
 from ttscompile.lower.program import lower_program
@@ -145,7 +147,9 @@ def test_runtimes_agree_on_prefixes(artifacts: dict[str, Artifact], name: str, s
         obs, noise = random_inputs(artifact, rng, streams)
         prefix = None if length is None else rng.uniform(-1, 1, (streams, length, 2)).astype(np.float32)
         correction = corrections[call % 3]
-        *ours, theirs = (r.predict(obs, noise, plans, correction=correction, prefix=prefix)[0] for r in runtimes)
+        *ours, theirs = (
+            r.predict(obs, noise, Plan(cells=plans, correction=correction), prefix=prefix)[0] for r in runtimes
+        )
         for each in ours:
             assert_equal_but_for_rounding(each, theirs, terms)
             if prefix is not None:
@@ -155,7 +159,7 @@ def test_runtimes_agree_on_prefixes(artifacts: dict[str, Artifact], name: str, s
 
 def test_between_steps_the_committed_actions_have_the_noise_of_the_step(artifact: Artifact) -> None:
     table, made = diffusion(DDPMScheduler)
-    model = ReferenceModel.from_artifact(artifact)
+    model = ReferenceModel.from_view(view_of(artifact))
     obs, noise = random_inputs(artifact, np.random.default_rng(0), 2)
     prefix = np.random.default_rng(1).uniform(-1, 1, (2, 3, 2)).astype(np.float32)
     known = known_samples(artifact.manifest.spec, prefix, noise.initial)
@@ -184,7 +188,7 @@ def test_a_network_inpaints_as_the_loop_of_its_scheduler(make_artifact: MakeArti
     program = toy(table)
     program = replace(program, spec=replace(program.spec, chunk=ChunkSpec(1, START, HORIZON - 1, normalizer)))
     artifact = make_artifact(program)
-    model = ReferenceModel.from_artifact(artifact)
+    model = ReferenceModel.from_view(view_of(artifact))
     rng = np.random.default_rng(0)
     obs, noise = random_inputs(artifact, rng, 2)
     committed = rng.uniform(-1, 1, (2, 3, 1)).astype(np.float32)
@@ -207,9 +211,9 @@ def test_a_network_inpaints_as_the_loop_of_its_scheduler(make_artifact: MakeArti
     terms = call_terms(artifact)
     for name in ("reference", "onnxruntime"):
         runtime = open_runtime(artifact, name)
-        found, _ = runtime.predict(obs, noise, dense_plan(STEPS, BLOCKS), prefix=prefix)
+        found, _ = runtime.predict(obs, noise, Plan(cells=dense_plan(STEPS, BLOCKS)), prefix=prefix)
         assert_equal_but_for_rounding(found, sample, terms)
-        plain, _ = runtime.predict(obs, noise, dense_plan(STEPS, BLOCKS))
+        plain, _ = runtime.predict(obs, noise, Plan(cells=dense_plan(STEPS, BLOCKS)))
         assert np.abs(found - plain)[:, START : START + 3, 1].max() > 1e-2  # the other channel saw it
         policy = ttscompile.load(artifact.path, runtime=name)
         assert policy.info.prefix_refusal is None
@@ -238,13 +242,13 @@ def test_no_action_committed_is_no_prefix_and_a_prefix_leaves_nothing_behind(art
     obs, noise = random_inputs(artifact, rng, 2)
     correction = random_correction(artifact, rng)
     plan = uniform_plan(STEPS, BLOCKS, 3)
-    before = runtime.predict(obs, noise, plan, correction=correction)[0]
+    before = runtime.predict(obs, noise, Plan(cells=plan, correction=correction))[0]
     for length in (0, 4, 0, 2, 0):
         prefix = np.zeros((2, length, 2), np.float32)
         assert (known_samples(artifact.manifest.spec, prefix, noise.initial) is None) == (length == 0)
-        sample = runtime.predict(obs, noise, plan, correction=correction, prefix=prefix)[0]
+        sample = runtime.predict(obs, noise, Plan(cells=plan, correction=correction), prefix=prefix)[0]
         assert np.array_equal(sample, before) == (length == 0)
-    np.testing.assert_array_equal(runtime.predict(obs, noise, plan, correction=correction)[0], before)
+    np.testing.assert_array_equal(runtime.predict(obs, noise, Plan(cells=plan, correction=correction))[0], before)
 
 
 def test_a_prefix_that_does_not_fit_is_refused_and_nothing_is_executed(artifact: Artifact) -> None:

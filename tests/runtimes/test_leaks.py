@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.plans import store_schedules
 from ttscompile import Source
 from ttscompile.artifact import Artifact
 from ttscompile.artifact.load import load_artifact
-from ttscompile.artifact.write import update_calibration
 from ttscompile.core.lattice import dense_plan
+from ttscompile.core.plan import Plan
 from ttscompile.errors import ArtifactError, IllegalPlanError
 from ttscompile.runtimes import Runtime, open_runtime
 from ttscompile.runtimes.onnxruntime.workspace import Workspace
@@ -28,14 +29,14 @@ class Failure(Exception):
 @pytest.fixture
 def pruned(own_artifact: Artifact) -> Artifact:
     """A toy whose default plan is its pruner's, which reads earlier calls."""
-    update_calibration(own_artifact.path, dict(own_artifact.pruner), {}, "tts", {"strategy": "tts"})
+    store_schedules(own_artifact.path, dict(own_artifact.pruner), {}, "tts", {"strategy": "tts"})
     return load_artifact(own_artifact.path)
 
 
 def episode(artifact: Artifact, name: str, inputs: list[tuple[dict[str, np.ndarray], object]]) -> list[np.ndarray]:
     """The same calls on a runtime that has done nothing else."""
     runtime = open_runtime(artifact, name)
-    return [runtime.predict(obs, noise)[0] for obs, noise in inputs]  # type: ignore[arg-type]
+    return [runtime.predict(obs, noise, Plan(repair=True))[0] for obs, noise in inputs]  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("name", RUNTIMES)
@@ -54,12 +55,12 @@ def test_any_sequence_of_calls_resets_failures_and_refusals(
         obs, noise = random_inputs(pruned, draw, streams)
         if what == "call":
             since.append((obs, noise))
-            found, report = runtime.predict(obs, noise)
+            found, report = runtime.predict(obs, noise, Plan(repair=True))
             read += int((report.plan == Source.ROLLOUT).sum())
             assert np.array_equal(found, episode(pruned, name, since)[-1])
         elif what == "refused":  # before anything was done: the episode goes on
             with pytest.raises(IllegalPlanError):
-                runtime.predict(obs, noise, dense_plan(5, 5)[:, :4])
+                runtime.predict(obs, noise, Plan(cells=dense_plan(5, 5)[:, :4]))
         elif what == "reset":
             runtime.reset()
             streams, since = int(draw.integers(1, 4)), []
@@ -69,7 +70,7 @@ def test_any_sequence_of_calls_resets_failures_and_refusals(
                 patched.setattr(ReferenceModel, "prologue", fail)
                 patched.setattr(StreamsNetwork, "prologue", fail)
                 with pytest.raises((Failure, ArtifactError)):
-                    runtime.predict(obs, noise)
+                    runtime.predict(obs, noise, Plan(repair=True))
             since = []
     assert read >= 10  # else nothing could have leaked
 
@@ -87,8 +88,8 @@ def test_a_stream_is_the_same_beside_any_others(pruned: Artifact, name: str) -> 
         assert others.steps is not None
         steps = np.concatenate([others.steps[:, :1], noise.steps[:, 1:2], others.steps[:, 2:]], axis=1)
         (one, report), (two, _) = (
-            batches[0].predict(obs, noise),
-            batches[1].predict(mixed, type(noise)(initial, steps)),
+            batches[0].predict(obs, noise, Plan(repair=True)),
+            batches[1].predict(mixed, type(noise)(initial, steps), Plan(repair=True)),
         )
         np.testing.assert_allclose(one[1], two[1], rtol=1e-4, atol=1e-5)
         assert np.abs(one[0] - two[0]).max() > 1e-3

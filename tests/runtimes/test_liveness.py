@@ -7,11 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.plans import store_schedules
 from tests.rounding import assert_equal_but_for_rounding
 from ttscompile import Source
 from ttscompile.artifact import Artifact, load_artifact
-from ttscompile.artifact.write import update_calibration
+from ttscompile.artifact.view import view_of
 from ttscompile.core.lattice import uniform_plan
+from ttscompile.core.plan import Plan
 from ttscompile.errors import IllegalPlanError
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.liveness import readable_rollout, reading_earlier_calls, rollout_needs
@@ -29,16 +31,16 @@ def scheduled(own_artifact: Artifact) -> Artifact:
     reads = uniform_plan(5, 5, 2)
     reads[2, 1] = reads[3, 4] = R
     schedules = {"plain": uniform_plan(5, 5, 2), "reads": reads}
-    update_calibration(own_artifact.path, None, schedules, "plain", {})
+    store_schedules(own_artifact.path, None, schedules, "plain", {})
     return load_artifact(own_artifact.path)
 
 
 def test_schedules_say_exactly_what_they_read(scheduled: Artifact, toy_artifact: Artifact) -> None:
-    assert np.argwhere(readable_rollout(scheduled)).tolist() == [[2, 1], [3, 4]]
-    assert reading_earlier_calls(scheduled) == {"reads"}
+    assert np.argwhere(readable_rollout(view_of(scheduled))).tolist() == [[2, 1], [3, 4]]
+    assert reading_earlier_calls(view_of(scheduled)) == {"reads"}
     needs = load(scheduled.path).info.rollout
     assert (needs.read, needs.bytes_read, needs.cells, needs.bytes_most) == (2, 2 * ENTRY, 25, 25 * ENTRY)
-    assert rollout_needs(toy_artifact).read == 0  # its pruner is no plan of it
+    assert rollout_needs(view_of(toy_artifact)).read == 0  # its pruner is no plan of it
 
 
 def head(**changes: float) -> dict[str, np.ndarray]:
@@ -65,12 +67,12 @@ def head(**changes: float) -> dict[str, np.ndarray]:
 def test_a_pruner_is_known_by_the_bounds_of_its_logits(
     own_artifact: Artifact, changes: dict[str, float], cells: list[list[int]]
 ) -> None:
-    update_calibration(own_artifact.path, dict(own_artifact.pruner), {}, "tts", {})
+    store_schedules(own_artifact.path, dict(own_artifact.pruner), {}, "tts", {})
     artifact = load_artifact(own_artifact.path)
-    assert readable_rollout(artifact).all()  # the toy's own pruner is of another form
+    assert readable_rollout(view_of(artifact)).all()  # the toy's own pruner is of another form
     changed = replace(artifact, pruner=head(**changes))
-    assert np.argwhere(readable_rollout(changed)).tolist() == cells
-    assert reading_earlier_calls(changed) == ({"tts"} if cells else set())
+    assert np.argwhere(readable_rollout(view_of(changed))).tolist() == cells
+    assert reading_earlier_calls(view_of(changed)) == ({"tts"} if cells else set())
 
 
 def test_calls_with_the_artifacts_plans_keep_what_these_read(scheduled: Artifact) -> None:
@@ -79,9 +81,8 @@ def test_calls_with_the_artifacts_plans_keep_what_these_read(scheduled: Artifact
     assert runtime.backend.rollout_nbytes == 2 * ENTRY
     for name in ("plain", "reads", "dense", "plain", "reads"):
         obs, noise = random_inputs(scheduled, rng, 1)
-        plan = scheduled.schedule(name)
-        found, report = runtime.predict(obs, noise, plan, plan_name=name, repair=True)
-        expected, wanted = reference.predict(obs, noise, plan, plan_name=name, repair=True)
+        found, report = runtime.predict(obs, noise, scheduled.plans[name])
+        expected, wanted = reference.predict(obs, noise, scheduled.plans[name])
         assert_equal_but_for_rounding(found, expected, call_terms(scheduled))
         assert report.legalised == wanted.legalised
         if name == "plain":
@@ -96,44 +97,44 @@ def test_a_matrix_may_read_what_dense_calls_and_matrices_computed(scheduled: Art
     obs, noise = random_inputs(scheduled, np.random.default_rng(0), 1)
     reads = uniform_plan(5, 5, 2)
     reads[1] = R
-    runtime.predict(obs, noise, scheduled.schedule("dense"), plan_name="dense")
-    runtime.predict(obs, noise, reads)
+    runtime.predict(obs, noise, scheduled.plans["dense"])
+    runtime.predict(obs, noise, Plan(cells=reads))
     runtime.reset()
     with pytest.raises(IllegalPlanError, match="step 1, block 0 .*never computed"):
-        runtime.predict(obs, noise, reads)
+        runtime.predict(obs, noise, Plan(cells=reads))
 
 
 def test_a_matrix_reads_no_older_residual_than_the_last_computed(scheduled: Artifact) -> None:
     """A dense call keeps all; a plan of the artifact then computes cells anew, and does not keep them."""
     runtime, reference = open_runtime(scheduled), open_runtime(scheduled, "reference")
     rng = np.random.default_rng(0)
-    plain = scheduled.schedule("plain")
+    plain = scheduled.plans["plain"].cells
     for name in ("dense", "plain"):
         obs, noise = random_inputs(scheduled, rng, 1)
         for each in (runtime, reference):
-            each.predict(obs, noise, scheduled.schedule(name), plan_name=name, repair=name != "dense")
+            each.predict(obs, noise, scheduled.plans[name])
     (k,) = np.flatnonzero((plain == C).all(axis=1))[1:]
     row = np.arange(5)[:, None] == k
     gone, there = np.where(row, R, plain), np.where(row, T, np.where(plain == T, R, plain))
     with pytest.raises(IllegalPlanError, match=rf"step {k}, block 0, .* did not keep"):
-        runtime.predict(obs, noise, gone)
-    found, expected = (each.predict(obs, noise, there)[0] for each in (runtime, reference))
+        runtime.predict(obs, noise, Plan(cells=gone))
+    found, expected = (each.predict(obs, noise, Plan(cells=there))[0] for each in (runtime, reference))
     assert_equal_but_for_rounding(found, expected, call_terms(scheduled))
     with pytest.raises(IllegalPlanError, match=rf"step {k}, block 0, .* did not keep"):  # that call computed none of it
-        runtime.predict(obs, noise, gone)
+        runtime.predict(obs, noise, Plan(cells=gone))
 
 
 def test_a_first_matrix_after_a_plan_of_the_artifact_is_told_what_was_not_kept(scheduled: Artifact) -> None:
     runtime = open_runtime(scheduled)
     obs, noise = random_inputs(scheduled, np.random.default_rng(0), 1)
-    plain = scheduled.schedule("plain")
+    plain = scheduled.plans["plain"].cells
     (k,) = np.flatnonzero((plain == C).all(axis=1))[1:]
     reads = plain.copy()
     reads[k] = R
-    runtime.predict(obs, noise, plain, plan_name="plain", repair=True)
+    runtime.predict(obs, noise, scheduled.plans["plain"])
     with pytest.raises(IllegalPlanError, match=rf"step {k}, block 0, .* did not keep.*Begin the episode with"):
-        runtime.predict(obs, noise, reads)
-    runtime.predict(obs, noise, plain)  # a matrix: from here on all is kept, whatever the plan
+        runtime.predict(obs, noise, Plan(cells=reads))
+    runtime.predict(obs, noise, Plan(cells=plain))  # a matrix: from here on all is kept, whatever the plan
     runtime.reset()
-    runtime.predict(obs, noise, plain, plan_name="plain", repair=True)
-    assert runtime.predict(obs, noise, reads)[1].legalised == (0,)
+    runtime.predict(obs, noise, scheduled.plans["plain"])
+    assert runtime.predict(obs, noise, Plan(cells=reads))[1].legalised == (0,)

@@ -16,7 +16,7 @@ from ttscompile.errors import IllegalPlanError
 from ttscompile.runtimes.instructions import Instructions, instructions_of
 from ttscompile.runtimes.onnxruntime.decode import decode_first, decode_rest
 from ttscompile.runtimes.onnxruntime.workspace import RolloutStore
-from ttscompile.runtimes.settle import LoweringCache
+from ttscompile.runtimes.plans import LoweringCache
 
 from .literal import Episode, Toy
 from .plans import random_plan

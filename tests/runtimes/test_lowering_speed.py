@@ -10,7 +10,7 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 from ttscompile.core.lattice import Source, uniform_plan
 from ttscompile.runtimes.instructions import instructions_of
-from ttscompile.runtimes.settle import LoweringCache
+from ttscompile.runtimes.plans import LoweringCache
 
 from .plans import random_plan
 

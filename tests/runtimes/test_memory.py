@@ -19,6 +19,7 @@ from ttscompile.calibration.calls import Calls
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.fit_correction import fit_correction
 from ttscompile.core.correction import correction_flops
+from ttscompile.core.plan import Plan
 from ttscompile.core.update import update_flops
 from ttscompile.ir.program import Program
 from ttscompile.runtimes import open_runtime
@@ -119,11 +120,11 @@ def test_both_runtimes_agree_under_corrections_and_forget_between_calls(made: Ma
         samples = []
         for runtime in runtimes:
             runtime.reset()
-            samples += [runtime.predict(obs, noise, plan, correction=correction)[0] for _ in range(2)]
+            samples += [runtime.predict(obs, noise, Plan(cells=plan, correction=correction))[0] for _ in range(2)]
         assert_equal_but_for_rounding(samples[0], samples[2], terms)
         np.testing.assert_array_equal(samples[0], samples[1])
         np.testing.assert_array_equal(samples[2], samples[3])
-        plain, _ = runtimes[0].predict(obs, noise, plan)
+        plain, _ = runtimes[0].predict(obs, noise, Plan(cells=plan))
         assert np.abs(plain - samples[0]).max() > 1e-2
 
 
@@ -166,8 +167,8 @@ def test_noise_of_a_deterministic_sampler_is_not_read(made: Made) -> None:
     runtime = open_runtime(artifact)
     plan = np.zeros((artifact.manifest.steps, len(artifact.manifest.blocks)), np.int8)
     assert noise.steps is not None
-    one, _ = runtime.predict(obs, noise, plan)
-    other, _ = runtime.predict(obs, Noise(noise.initial, 2 * noise.steps), plan)
+    one, _ = runtime.predict(obs, noise, Plan(cells=plan))
+    other, _ = runtime.predict(obs, Noise(noise.initial, 2 * noise.steps), Plan(cells=plan))
     assert np.array_equal(one, other) != artifact.manifest.spec.sampler.stochastic
 
 

@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.plans import store_schedules
 from tests.rounding import assert_equal_but_for_rounding, bound
 from tests.verification.broken import edit_manifest
 from ttscompile import Noise, Source
 from ttscompile.artifact import Artifact, load_artifact
-from ttscompile.artifact.write import update_calibration
 from ttscompile.core.lattice import PlanArray, dense_plan, legalize, uniform_plan
+from ttscompile.core.plan import Plan
 from ttscompile.errors import ArtifactError, IllegalPlanError, ObservationError, RuntimeUnavailableError
 from ttscompile.ir.program import Binding
 from ttscompile.runtimes import Runtime, open_runtime
@@ -42,7 +43,7 @@ def test_reuse_gives_41_and_compute_gives_44(pencil_artifact: Artifact, name: st
 
     def call(x: float, plan: list[Source]) -> float:
         obs = {"obs": np.array([[-32]], np.float32)}
-        sample, _ = runtime.predict(obs, Noise(np.full((1, 1, 1), x, np.float32)), np.array(plan)[:, None])
+        sample, _ = runtime.predict(obs, Noise(np.full((1, 1, 1), x, np.float32)), Plan(cells=np.array(plan)[:, None]))
         return float(sample[0, 0, 0])
 
     assert call(35, [C, T]) == 41
@@ -59,7 +60,7 @@ def test_a_schedule_is_lowered_once_at_load_and_never_in_a_call(
     own_artifact: Artifact, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     schedules = {"half": uniform_plan(5, 5, 2), "most": uniform_plan(5, 5, 4)}
-    update_calibration(own_artifact.path, None, schedules, "half", {"strategy": "uniform"})
+    store_schedules(own_artifact.path, None, schedules, "half", {"strategy": "uniform"})
     lowered: list[bytes] = []
 
     def counted(plan: PlanArray, groups: tuple[int, ...]) -> Instructions:
@@ -68,7 +69,7 @@ def test_a_schedule_is_lowered_once_at_load_and_never_in_a_call(
 
     monkeypatch.setattr("ttscompile.runtimes.onnxruntime.backend.instructions_of", counted)
     policy = load(own_artifact.path)
-    assert sorted(lowered) == sorted(plan.tobytes() for plan in load_artifact(own_artifact.path).schedules.values())
+    assert sorted(lowered) == sorted(plan.tobytes() for plan in schedules.values())
     for name in policy.info.plans:
         policy.predict_action({"obs": np.zeros((1, 2), np.float32)}, plan=name)
     assert len(lowered) == len(set(lowered)) >= 2
@@ -89,7 +90,7 @@ def test_a_value_of_the_step_may_be_one_number(make_artifact: MakeArtifact) -> N
     for name in ("onnxruntime", "torch", "reference"):
         noise = Noise(np.array([[[35]], [[33]]], np.float32))
         obs = {"obs": np.zeros((2, 1), np.float32)}
-        sample, _ = open_runtime(artifact, name).predict(obs, noise, np.array([[C], [C]]))
+        sample, _ = open_runtime(artifact, name).predict(obs, noise, Plan(cells=np.array([[C], [C]])))
         assert sample.ravel().tolist() == [35 + 3 + 7, 33 + 1 + 3]
 
 
@@ -116,10 +117,10 @@ def test_a_batch_of_streams_is_its_streams_one_by_one(toy_artifact: Artifact) ->
         plans = np.stack([random_plan(rng, manifest.steps, manifest.groups, cells) for cells in written])
         obs, noise = random_inputs(toy_artifact, rng, 3)
         assert noise.steps is not None
-        sample, report = together.predict(obs, noise, plans)
+        sample, report = together.predict(obs, noise, Plan(cells=plans))
         for s, runtime in enumerate(apart):
             own = Noise(noise.initial[s : s + 1], noise.steps[:, s : s + 1])
-            alone, single = runtime.predict({"obs": obs["obs"][s : s + 1]}, own, plans[s])
+            alone, single = runtime.predict({"obs": obs["obs"][s : s + 1]}, own, Plan(cells=plans[s]))
             assert_equal_but_for_rounding(sample[s], alone[0], terms)
             assert single.flops[0] == report.flops[s]
         written |= plans == C
@@ -129,10 +130,10 @@ def test_the_report_says_what_was_done(runtime: Runtime, toy_artifact: Artifact)
     manifest = toy_artifact.manifest
     plans = np.stack([dense_plan(5, 5), uniform_plan(5, 5, 2)])
     obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), 2)
-    _, report = runtime.predict(obs, noise, plans, plan_name="mine")
+    _, report = runtime.predict(obs, noise, Plan(cells=plans))
     assert np.array_equal(report.plan, plans)
     assert not report.plan.flags.writeable
-    assert (report.plan_name, report.computed, report.legalised) == ("mine", (25, 10), (0, 0))
+    assert (report.plan_name, report.computed, report.legalised) == ("given", (25, 10), (0, 0))
     loop = 5 * (manifest.flops.stem + manifest.flops.tail)
     dense, sparse = report.flops
     assert dense == manifest.flops.prologue + loop + 5 * sum(manifest.flops.blocks)
@@ -151,8 +152,8 @@ def test_the_pruners_plan_is_legalised_and_counted(runtime: Runtime, toy_artifac
     repaired = []
     for _ in range(3):
         obs, noise = random_inputs(toy_artifact, rng, 2)
-        _, report = runtime.predict(obs, noise)
-        reference.predict(obs, noise, report.plan)  # refuses an illegal plan
+        _, report = runtime.predict(obs, noise, Plan(repair=True))
+        reference.predict(obs, noise, Plan(cells=report.plan))  # refuses an illegal plan
         model = reference.backend.model
         import torch
 
@@ -160,7 +161,7 @@ def test_the_pruners_plan_is_legalised_and_counted(runtime: Runtime, toy_artifac
         expected, _ = legalize(wanted, manifest.groups, written)
         assert np.array_equal(report.plan, expected)
         assert report.legalised == tuple((wanted != expected).sum(axis=(1, 2)))
-        assert report.plan_name == "pruner"
+        assert report.plan_name == "given"
         assert report.flops == tuple(manifest.flops.call(plan, True) for plan in expected)
         assert 0 < report.timings.pruner <= report.timings.total
         repaired.append(sum(report.legalised))
@@ -173,58 +174,58 @@ def test_a_plan_is_repaired_only_if_asked(runtime: Runtime, toy_artifact: Artifa
     plan = np.full((5, 5), R, np.int8)
     obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), 2)
     with pytest.raises(IllegalPlanError, match="stream 0 is illegal at step 0"):
-        runtime.predict(obs, noise, plan)
-    _, report = runtime.predict(obs, noise, plan, repair=True)
+        runtime.predict(obs, noise, Plan(cells=plan))
+    _, report = runtime.predict(obs, noise, Plan(cells=plan, repair=True))
     assert report.legalised == (25, 25)
     assert report.computed == (5, 5)
 
 
 def test_an_illegal_plan_names_its_stream_and_changes_nothing(runtime: Runtime, toy_artifact: Artifact) -> None:
     obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), 2)
-    first, _ = runtime.predict(obs, noise, dense_plan(5, 5))
+    first, _ = runtime.predict(obs, noise, Plan(cells=dense_plan(5, 5)))
     bad = np.stack([dense_plan(5, 5), np.full((5, 5), T, np.int8)])
     with pytest.raises(IllegalPlanError, match="stream 1 is illegal at step 0"):
-        runtime.predict(obs, noise, bad)
+        runtime.predict(obs, noise, Plan(cells=bad))
     for plan, message in [
         (np.zeros((5, 4), np.int8), r"\(5, 4\); expected"),
         (np.zeros((5, 5)), "dtype float64"),
         (np.full((5, 5), 4), r"0\.\.3|4\.\.4"),
     ]:
         with pytest.raises(IllegalPlanError, match=message):
-            runtime.predict(obs, noise, plan)
+            runtime.predict(obs, noise, Plan(cells=plan))
     reuse = dense_plan(5, 5)
     reuse[1:] = R
-    again, _ = runtime.predict(obs, noise, reuse)  # the first call's residuals are still there
+    again, _ = runtime.predict(obs, noise, Plan(cells=reuse))  # the first call's residuals are still there
     assert_equal_but_for_rounding(again, first, call_terms(toy_artifact))
 
 
 def test_streams_may_change_after_reset_only(runtime: Runtime, toy_artifact: Artifact) -> None:
     rng = np.random.default_rng(0)
     assert runtime.streams is None
-    runtime.predict(*random_inputs(toy_artifact, rng, 2), dense_plan(5, 5))
+    runtime.predict(*random_inputs(toy_artifact, rng, 2), Plan(cells=dense_plan(5, 5)))
     assert runtime.streams == 2
     with pytest.raises(ObservationError, match=r"3 streams.*under way 2.*reset"):
-        runtime.predict(*random_inputs(toy_artifact, rng, 3), dense_plan(5, 5))
+        runtime.predict(*random_inputs(toy_artifact, rng, 3), Plan(cells=dense_plan(5, 5)))
     runtime.reset()
     assert runtime.streams is None
-    sample, _ = runtime.predict(*random_inputs(toy_artifact, rng, 3), dense_plan(5, 5))
+    sample, _ = runtime.predict(*random_inputs(toy_artifact, rng, 3), Plan(cells=dense_plan(5, 5)))
     assert len(sample) == 3
 
 
 def test_noise_of_the_wrong_shape_is_refused(runtime: Runtime, toy_artifact: Artifact) -> None:
     obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), 2)
     with pytest.raises(ObservationError, match=r"noise\.initial must be float32 .*; found float32 \[2, 3, 1\]"):
-        runtime.predict(obs, Noise(noise.initial[..., :1], noise.steps), dense_plan(5, 5))
+        runtime.predict(obs, Noise(noise.initial[..., :1], noise.steps), Plan(cells=dense_plan(5, 5)))
     assert noise.steps is not None
     with pytest.raises(ObservationError, match=r"noise\.steps must be float32 .*; found float32 \[4, 2, 3, 2\]"):
-        runtime.predict(obs, Noise(noise.initial, noise.steps[1:]), dense_plan(5, 5))
+        runtime.predict(obs, Noise(noise.initial, noise.steps[1:]), Plan(cells=dense_plan(5, 5)))
 
 
 def test_what_a_call_gave_stays_as_it_was(runtime: Runtime, toy_artifact: Artifact) -> None:
     rng = np.random.default_rng(0)
-    sample, report = runtime.predict(*random_inputs(toy_artifact, rng, 2))
+    sample, report = runtime.predict(*random_inputs(toy_artifact, rng, 2), Plan(repair=True))
     kept, plan = sample.copy(), report.plan.copy()
-    runtime.predict(*random_inputs(toy_artifact, rng, 2))
+    runtime.predict(*random_inputs(toy_artifact, rng, 2), Plan(repair=True))
     assert np.array_equal(sample, kept)
     assert np.array_equal(report.plan, plan)
 
@@ -234,15 +235,15 @@ def test_a_sample_of_one_dimension_stays_as_it_was(pencil_artifact: Artifact, na
     """Its transposition moves nothing in memory."""
     runtime = open_runtime(pencil_artifact, name)
     obs = {"obs": np.array([[-32]], np.float32)}
-    sample, _ = runtime.predict(obs, Noise(np.full((1, 1, 1), 35, np.float32)), dense_plan(2, 1))
-    runtime.predict(obs, Noise(np.full((1, 1, 1), 40, np.float32)), dense_plan(2, 1))
+    sample, _ = runtime.predict(obs, Noise(np.full((1, 1, 1), 35, np.float32)), Plan(cells=dense_plan(2, 1)))
+    runtime.predict(obs, Noise(np.full((1, 1, 1), 40, np.float32)), Plan(cells=dense_plan(2, 1)))
     assert sample.item() == 44
 
 
 def test_a_call_that_fails_half_way_ends_the_episode(toy_artifact: Artifact, monkeypatch: pytest.MonkeyPatch) -> None:
     runtime = open_runtime(toy_artifact)
     obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), 2)
-    first, _ = runtime.predict(obs, noise, dense_plan(5, 5))
+    first, _ = runtime.predict(obs, noise, Plan(cells=dense_plan(5, 5)))
 
     def interrupted(self: Workspace) -> None:
         raise KeyboardInterrupt
@@ -250,21 +251,21 @@ def test_a_call_that_fails_half_way_ends_the_episode(toy_artifact: Artifact, mon
     with monkeypatch.context() as patched:
         patched.setattr(Workspace, "begin", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            runtime.predict(obs, noise, dense_plan(5, 5))
+            runtime.predict(obs, noise, Plan(cells=dense_plan(5, 5)))
     assert runtime.streams is None
     rollout = dense_plan(5, 5)
     rollout[1:] = R
     with pytest.raises(IllegalPlanError, match="never computed"):
-        runtime.predict(obs, noise, rollout)
-    assert np.array_equal(runtime.predict(obs, noise, dense_plan(5, 5))[0], first)
+        runtime.predict(obs, noise, Plan(cells=rollout))
+    assert np.array_equal(runtime.predict(obs, noise, Plan(cells=dense_plan(5, 5)))[0], first)
 
 
 def test_without_a_pruner_a_plan_is_needed(make_artifact: MakeArtifact) -> None:
     artifact = make_artifact(toy_program(pruner=False))
     for name in ("onnxruntime", "torch", "reference"):
         runtime = open_runtime(artifact, name)
-        with pytest.raises(IllegalPlanError, match="no pruner"):
-            runtime.predict(*random_inputs(artifact, np.random.default_rng(0), 1))
+        with pytest.raises(IllegalPlanError, match="needs a pruner"):
+            runtime.predict(*random_inputs(artifact, np.random.default_rng(0), 1), Plan(repair=True))
 
 
 def test_a_pruner_that_gives_nan_is_refused(make_artifact: MakeArtifact) -> None:
@@ -273,7 +274,9 @@ def test_a_pruner_that_gives_nan_is_refused(make_artifact: MakeArtifact) -> None
     artifact = make_artifact(program)
     for name in ("onnxruntime", "torch", "reference"):
         with pytest.raises(IllegalPlanError, match="NaN"):
-            open_runtime(artifact, name).predict(*random_inputs(artifact, np.random.default_rng(0), 1))
+            open_runtime(artifact, name).predict(
+                *random_inputs(artifact, np.random.default_rng(0), 1), Plan(repair=True)
+            )
 
 
 @pytest.mark.parametrize(
@@ -306,7 +309,7 @@ except RuntimeUnavailableError as error:
 def test_a_graph_that_onnxruntime_refuses_is_an_artifact_error(
     own_artifact: Artifact, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    path = own_artifact.onnx_path("dense_step")
+    path = own_artifact.path / "dense_step.onnx"
     path.write_bytes(b"")
     edit_manifest(path.parent)
     with pytest.raises(ArtifactError, match=rf"^{path}: onnxruntime .* cannot load"):
@@ -370,12 +373,12 @@ for threads in (1, 2):
 def test_two_threads_give_the_same_answer(toy_artifact: Artifact, tmp_path: Path) -> None:
     body = """
 import numpy as np
-from ttscompile import Noise
+from ttscompile import Noise, Plan
 rng = np.random.default_rng(0)
 shape = (2, 3, 2)
 noise = Noise(rng.standard_normal(shape, dtype=np.float32), rng.standard_normal((5, *shape), dtype=np.float32))
 obs = {"obs": rng.standard_normal((2, 2), dtype=np.float32)}
-samples = [open_runtime(artifact, threads=n).predict(obs, noise, np.zeros((5, 5), np.int8))[0] for n in (1, 2)]
+samples = [open_runtime(artifact, threads=n).predict(obs, noise, Plan(cells=np.zeros((5, 5), np.int8)))[0] for n in (1, 2)]
 np.save(OUT, samples)
 """
     body = body.replace("OUT", repr(str(tmp_path / "samples.npy")))

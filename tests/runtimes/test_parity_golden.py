@@ -14,6 +14,7 @@ from tests.rounding import PROMISED
 from ttscompile import Noise
 from ttscompile.artifact import load_artifact
 from ttscompile.core.lattice import Source
+from ttscompile.core.plan import Plan
 from ttscompile.ir.program import Program
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.info import PolicyInfo
@@ -123,9 +124,11 @@ def test_a_batch_of_streams_is_its_streams_one_by_one(compiled: Compiled, name: 
         plans = np.stack([random_plan(rng, artifact.manifest.steps, artifact.manifest.groups, one) for one in written])
         obs, noise = random_inputs(artifact, rng, 2)
         assert noise.steps is not None
-        batch, _ = together.predict(obs, noise, plans)
+        batch, _ = together.predict(obs, noise, Plan(cells=plans))
         for s, runtime in enumerate(alone):
             own = Noise(noise.initial[s : s + 1], noise.steps[:, s : s + 1])
-            single, _ = runtime.predict({key: value[s : s + 1] for key, value in obs.items()}, own, plans[s])
+            single, _ = runtime.predict(
+                {key: value[s : s + 1] for key, value in obs.items()}, own, Plan(cells=plans[s])
+            )
             assert np.abs(batch[s] - single[0]).max() < PROMISED * np.abs(single).max()
         written |= plans == Source.COMPUTE

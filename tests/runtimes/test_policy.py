@@ -13,11 +13,12 @@ import pytest
 import torch
 
 import ttscompile
+from tests.plans import store_schedules
 from tests.rounding import assert_equal_but_for_rounding
 from ttscompile import Noise, Source
 from ttscompile.artifact import Artifact
-from ttscompile.artifact.write import update_calibration
 from ttscompile.core.lattice import dense_plan, uniform_plan
+from ttscompile.core.plan import Plan
 from ttscompile.core.spec import Affine
 from ttscompile.errors import IllegalPlanError, ObservationError, TtscompileError
 from ttscompile.runtimes import open_runtime
@@ -56,7 +57,7 @@ def test_actions_are_normalised_in_and_out_and_cut(policy: CompiledPolicy, toy_a
     out = policy.predict_action({"obs": OBS}, noise=some_noise(), plan="dense")
     runtime = open_runtime(toy_artifact)
     normalized = OBS * np.array([2, 0.5], np.float32) + np.array([0.1, -0.2], np.float32)
-    sample, _ = runtime.predict({"obs": normalized}, some_noise(), dense_plan(5, 5))
+    sample, _ = runtime.predict({"obs": normalized}, some_noise(), Plan(cells=dense_plan(5, 5)))
     expected = (sample - np.array([1, -1])) / np.array([0.5, 4])
     assert set(out) == {"action", "action_pred"}
     assert_equal_but_for_rounding(out["action_pred"], expected, call_terms(toy_artifact))
@@ -90,7 +91,7 @@ def test_the_default_plan_is_dense_until_calibration(quick: CompiledPolicy) -> N
 def test_plans_of_the_artifact_by_name(own_artifact: Artifact) -> None:
     mixed = uniform_plan(5, 5, 2)
     mixed[1] = R
-    update_calibration(own_artifact.path, dict(own_artifact.pruner), {"mixed": mixed}, "tts", {"strategy": "tts"})
+    store_schedules(own_artifact.path, dict(own_artifact.pruner), {"mixed": mixed}, "tts", {"strategy": "tts"})
     for runtime in ("onnxruntime", "torch", "reference"):
         policy = load(own_artifact.path, runtime)
         assert set(policy.info.plans) == {"dense", "mixed", "tts"}
@@ -144,7 +145,9 @@ def test_plans_that_are_no_matrix_are_refused(policy: CompiledPolicy) -> None:
 @pytest.mark.parametrize("runtime", ["onnxruntime", "torch", "reference"])
 def test_a_stochastic_sampler_needs_its_draws(toy_artifact: Artifact, runtime: str) -> None:
     with pytest.raises(ObservationError, match=r"noise.steps is missing.*\[K, B, T, D\] = \(5, 2, 3, 2\)"):
-        open_runtime(toy_artifact, runtime).predict({"obs": OBS}, Noise(some_noise().initial), dense_plan(5, 5))
+        open_runtime(toy_artifact, runtime).predict(
+            {"obs": OBS}, Noise(some_noise().initial), Plan(cells=dense_plan(5, 5))
+        )
 
 
 def test_a_refused_call_leaves_no_report_of_the_one_before(policy: CompiledPolicy) -> None:

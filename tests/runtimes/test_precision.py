@@ -13,6 +13,7 @@ from tests.calibration import policies
 from tests.once import Once
 from ttscompile import Noise, TtscompileError
 from ttscompile.artifact import load_artifact
+from ttscompile.core.plan import Plan
 from ttscompile.errors import ArtifactError, RuntimeUnavailableError
 from ttscompile.runtimes import against_fp32, open_runtime
 from ttscompile.runtimes.onnxruntime import sessions
@@ -65,10 +66,10 @@ def test_the_measured_error_is_what_the_public_interface_gives(int8: Path) -> No
 def test_fp32_of_an_int8_artifact_is_the_fp32_artifact(int8: Path, fp32: Path) -> None:
     with_both, plain = load_artifact(int8).at_precision("fp32"), load_artifact(fp32)
     obs, noise = random_inputs(plain, np.random.default_rng(0), 2)
-    plan = plain.schedule("dense")
-    samples = [open_runtime(one).predict(obs, noise, plan)[0] for one in (with_both, plain)]
+    plan = plain.plans["dense"].cells
+    samples = [open_runtime(one).predict(obs, noise, Plan(cells=plan))[0] for one in (with_both, plain)]
     np.testing.assert_array_equal(*samples)
-    assert not np.array_equal(open_runtime(load_artifact(int8)).predict(obs, noise, plan)[0], samples[0])
+    assert not np.array_equal(open_runtime(load_artifact(int8)).predict(obs, noise, Plan(cells=plan))[0], samples[0])
 
 
 def test_the_reference_runtime_computes_in_fp32(int8: Path) -> None:
@@ -87,7 +88,7 @@ def test_calls_repeat_to_the_bit(int8: Path) -> None:
         obs, noise = random_inputs(artifact, np.random.default_rng(3), 2)
         for _ in range(2):
             runtime.reset()
-            sample = runtime.predict(obs, noise, artifact.schedule("dense"))[0]
+            sample = runtime.predict(obs, noise, Plan(cells=artifact.plans["dense")].cells)[0]
             digests.add(hashlib.sha256(sample.tobytes()).hexdigest())
     assert len(digests) == 1
 
@@ -99,11 +100,13 @@ def test_where_sums_saturate_they_are_made_exact_and_a_warning_says_that_it_is_s
 ) -> None:
     artifact = load_artifact(int8)
     obs, noise = random_inputs(artifact, np.random.default_rng(3), 1)
-    expected = open_runtime(artifact).predict(obs, noise, artifact.schedule("dense"))[0]
+    expected = open_runtime(artifact).predict(obs, noise, Plan(cells=artifact.plans["dense")].cells)[0]
     monkeypatch.setattr(sessions, "has_integer_dot_product", lambda: found)
     with pytest.warns(RuntimeWarning, match=rf"avx512_vnni.*{told}.*precision='fp32'"):
         careful = open_runtime(artifact, threads=threads)
-    np.testing.assert_allclose(careful.predict(obs, noise, artifact.schedule("dense"))[0], expected, rtol=1e-5)
+    np.testing.assert_allclose(
+        careful.predict(obs, noise, Plan(cells=artifact.plans["dense")].cells)[0], expected, rtol=1e-5
+    )
     open_runtime(artifact.at_precision("fp32"))  # no warning, which would be an error here
 
 
@@ -112,7 +115,7 @@ def test_a_policy_that_gives_no_numbers_is_not_measured(int8: Path, monkeypatch:
     broken = {"obs": np.full((1, 2, 3), np.nan, np.float32)}
     noise = Noise(np.zeros((1, 8, 2), np.float32), np.zeros((10, 1, 8, 2), np.float32))
     runtimes = [open_runtime(one) for one in (artifact, artifact.at_precision("fp32"))]
-    own, exact = (against_fp32.answers(one, artifact.schedule("dense"), [(broken, noise)]) for one in runtimes)
+    own, exact = (against_fp32.answers(one, artifact.plans["dense"].cells, [(broken, noise)]) for one in runtimes)
     with pytest.raises(TtscompileError, match="not a number"):
         against_fp32.mean_errors(policies.spec().chunk, own, exact)
 

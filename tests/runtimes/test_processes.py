@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.plans import store_schedules
 from ttscompile.artifact import Artifact, load_artifact
-from ttscompile.artifact.write import update_calibration
 from ttscompile.errors import RuntimeUnavailableError, TtscompileError
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.load import load
@@ -27,7 +27,7 @@ forks = pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork her
 @pytest.fixture
 def pruned(own_artifact: Artifact) -> Path:
     """A toy whose default plan is its pruner's, which has a thread."""
-    update_calibration(own_artifact.path, dict(own_artifact.pruner), {}, "tts", {"strategy": "tts"})
+    store_schedules(own_artifact.path, dict(own_artifact.pruner), {}, "tts", {"strategy": "tts"})
     return own_artifact.path
 
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile import Noise, Source
 from ttscompile.artifact import Artifact
+from ttscompile.artifact.view import view_of
 from ttscompile.core.lattice import PlanArray
 from ttscompile.errors import IllegalPlanError
 from ttscompile.ir.program import Program
@@ -202,7 +203,7 @@ def test_an_artifact_gives_the_model_of_its_program(toy_artifact: Artifact) -> N
     obs, noise = inputs(np.random.default_rng(0), 2)
     plan = np.full((MODEL.steps, MODEL.blocks), T, np.int8)
     plan[0] = C
-    stored = ReferenceModel.from_artifact(toy_artifact)
+    stored = ReferenceModel.from_view(view_of(toy_artifact))
     samples = [m.denoise(m.prologue(obs), torch.from_numpy(noise.initial), None, plan).sample for m in (stored, MODEL)]
     assert torch.equal(*samples)
     assert torch.equal(stored.logits(stored.prologue(obs)), MODEL.logits(MODEL.prologue(obs)))

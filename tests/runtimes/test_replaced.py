@@ -14,11 +14,11 @@ import onnxruntime
 import pytest
 
 import ttscompile
+from tests.plans import store_schedules
 from ttscompile.artifact import folder, load_artifact
 from ttscompile.artifact.files import beside, exchange, replace_folder
 from ttscompile.artifact.golden import load_golden_plans
 from ttscompile.artifact.load import read_manifest
-from ttscompile.artifact.write import update_calibration
 from ttscompile.core.lattice import Source, uniform_plan
 from ttscompile.errors import ArtifactChangedError, ArtifactError
 from ttscompile.runtimes import load as loading
@@ -199,7 +199,7 @@ def test_a_calibration_while_the_artifact_is_loaded(places: tuple[Path, Path], m
     def calibrate() -> None:
         if "second" not in read_manifest(places[0]).plans:
             plan = uniform_plan(5, 5, 2)
-            update_calibration(places[0], None, {"second": plan}, "second", {})
+            store_schedules(places[0], None, {"second": plan}, "second", {})
 
     with around_sessions(monkeypatch, calibrate):
         assert ttscompile.load(places[0]).info.default_plan == "second"

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.plans import store_schedules
 from ttscompile.artifact import Artifact
-from ttscompile.artifact.write import update_calibration
 
 from .soak import EPISODE, median_slope
 
@@ -20,7 +20,7 @@ SOAK = Path(__file__).with_name("soak.py")
 
 
 def test_calls_are_repeatable_and_leave_nothing_behind(own_artifact: Artifact) -> None:
-    update_calibration(own_artifact.path, dict(own_artifact.pruner), {}, "tts", {"strategy": "tts"})
+    store_schedules(own_artifact.path, dict(own_artifact.pruner), {}, "tts", {"strategy": "tts"})
     # A process of its own: this one has the memory of a thousand other tests to give back or to keep.
     command = [sys.executable, str(SOAK), str(own_artifact.path), "--calls", str(60 * EPISODE)]
     result = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)

@@ -10,10 +10,11 @@ import pytest
 
 from tests.rounding import bound
 from ttscompile.artifact import Artifact
+from ttscompile.artifact.view import view_of
 from ttscompile.ir.pieces import DENSE_STEP, JOINT
 from ttscompile.ir.program import Program
 from ttscompile.runtimes import open_runtime
-from ttscompile.runtimes.onnxruntime.sessions import FIRST_STEP, SINGLE_THREADED, JointBlock, open_sessions
+from ttscompile.runtimes.onnxruntime.sessions import FIRST_STEP, SINGLE_THREADED, JointBlock, Sessions
 
 from .agreement import call_terms, largest_difference
 from .toys import toy_program
@@ -32,7 +33,7 @@ def test_threads_give_the_same_as_the_reference(make_artifact: MakeArtifact, seq
 
 def test_one_thread_has_a_session_a_block_and_more_have_one_for_all(toy_artifact: Artifact) -> None:
     blocks = [f"block_{b:02d}" for b in range(len(toy_artifact.manifest.blocks))]
-    alone, together = open_sessions(toy_artifact, 1), open_sessions(toy_artifact, 2)
+    alone, together = (Sessions(threads).of(view_of(toy_artifact)) for threads in (1, 2))
     assert alone.keys() == together.keys() == {*toy_artifact.manifest.pieces, FIRST_STEP} - {JOINT}
     assert all(sessions[FIRST_STEP] is sessions[DENSE_STEP] for sessions in (alone, together))
     assert not any(isinstance(session, JointBlock) for session in alone.values())

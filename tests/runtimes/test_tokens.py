@@ -20,7 +20,7 @@ from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import PieceRecord
 from ttscompile.artifact.settle import settle
 from ttscompile.artifact.size import check_size
-from ttscompile.artifact.tokens import ReuseRecord
+from ttscompile.artifact.towers import ReuseRecord
 from ttscompile.errors import ArtifactError
 from ttscompile.ir.pieces import FRAMES, INDEX
 from ttscompile.runtimes.frames import FramePieces

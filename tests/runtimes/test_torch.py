@@ -11,18 +11,18 @@ import torch
 from torch.fx.experimental.proxy_tensor import make_fx
 
 import ttscompile
+from tests.plans import store_schedules
 from tests.rounding import assert_equal_but_for_rounding, bound
 from ttscompile import Source
 from ttscompile.artifact import Artifact, load_artifact
-from ttscompile.artifact.manifest import DENSE
-from ttscompile.artifact.write import update_calibration
 from ttscompile.core.lattice import uniform_plan
+from ttscompile.core.plan import DENSE, Plan
 from ttscompile.errors import CaptureError, RuntimeUnavailableError
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Enum, Graph, Ref
 from ttscompile.runtimes import Runtime, open_runtime
 from ttscompile.runtimes.instructions import instructions_of
-from ttscompile.runtimes.torch.backend import TorchBackend
+from ttscompile.runtimes.torch.backend import TorchBackend, TorchBackends
 from ttscompile.runtimes.torch.capture import Line, Lines
 from ttscompile.runtimes.torch.functions import write_function
 from ttscompile.runtimes.torch.loop import denoise
@@ -93,7 +93,7 @@ def test_streams_with_one_plan_are_a_batch(make_artifact: MakeArtifact) -> None:
         one, other = (random_plan(rng, manifest.steps, manifest.groups, written.all(axis=0)) for _ in range(2))
         plans = np.stack([one, other, one])
         obs, noise = random_inputs(artifact, rng, 3)
-        ours, theirs = (runtime.predict(obs, noise, plans)[0] for runtime in runtimes)
+        ours, theirs = (runtime.predict(obs, noise, Plan(cells=plans))[0] for runtime in runtimes)
         assert_equal_but_for_rounding(ours, theirs, call_terms(artifact))
         written |= plans == Source.COMPUTE
     assert isinstance(runtimes[0].backend, TorchBackend)
@@ -110,13 +110,12 @@ def calibrated(make_artifact: MakeArtifact) -> Artifact:
     assert (mixed == Source.ROLLOUT).any()
     corrections = {"mixed": random_correction(artifact, rng)}
     plans = {"evenly": evenly, "mixed": mixed}
-    update_calibration(artifact.path, dict(artifact.pruner), plans, "evenly", {}, corrections=corrections)
+    store_schedules(artifact.path, dict(artifact.pruner), plans, "evenly", {}, corrections=corrections)
     return load_artifact(artifact.path)
 
 
 def both(artifact: Artifact, lines: list[Line]) -> list[Runtime]:
-    captured = TorchBackend(artifact, capture=replaying(lines))
-    return [Runtime(artifact, lambda opened: captured), open_runtime(artifact, "reference")]
+    return [Runtime(artifact, TorchBackends(capture=replaying(lines))), open_runtime(artifact, "reference")]
 
 
 @pytest.mark.parametrize("name", ["evenly", "mixed", DENSE])
@@ -125,10 +124,8 @@ def test_a_call_is_captured_once_and_replayed_on_other_inputs(calibrated: Artifa
     lines: list[Line] = []
     runtimes, rng = both(calibrated, lines), np.random.default_rng(0)
     for called in (DENSE, name, name, name):
-        plan, correction = calibrated.schedule(called), calibrated.corrections.get(called)
         obs, noise = random_inputs(calibrated, rng, streams)
-        given = {"plan_name": called, "repair": True, "correction": correction}
-        ours, theirs = (runtime.predict(obs, noise, plan, **given)[0] for runtime in runtimes)
+        ours, theirs = (runtime.predict(obs, noise, calibrated.plans[called])[0] for runtime in runtimes)
         assert_equal_but_for_rounding(ours, theirs, 2 * call_terms(calibrated))
     assert len(lines) == (1 if name == DENSE else 2)
 
@@ -137,13 +134,12 @@ def test_the_first_call_of_an_episode_is_captured_too(calibrated: Artifact) -> N
     """Its plan is the one that was repaired, since nothing was computed before."""
     lines: list[Line] = []
     runtimes, rng = both(calibrated, lines), np.random.default_rng(0)
-    plan = calibrated.schedule("mixed")
     for _ in range(2):
         obs, noise = random_inputs(calibrated, rng, 1)
         samples = []
         for runtime in runtimes:
             runtime.reset()
-            samples.append(runtime.predict(obs, noise, plan, plan_name="mixed", repair=True)[0])
+            samples.append(runtime.predict(obs, noise, calibrated.plans["mixed"])[0])
         assert_equal_but_for_rounding(*samples, call_terms(calibrated))
     assert len(lines) == 1
 
@@ -154,14 +150,14 @@ def test_what_a_pruner_decides_selects_among_captured_calls_and_a_matrix_runs_as
     seen = set()
     for _ in range(3):
         obs, noise = random_inputs(calibrated, rng, 1)
-        ours, report = runtimes[0].predict(obs, noise)
-        theirs, _ = runtimes[1].predict(obs, noise, report.plan)
+        ours, report = runtimes[0].predict(obs, noise, Plan(repair=True))
+        theirs, _ = runtimes[1].predict(obs, noise, Plan(cells=report.plan))
         assert_equal_but_for_rounding(ours, theirs, call_terms(calibrated))
         seen.add(report.plan.tobytes())
     assert len(lines) == 1 + len(seen)  # the prologue is a line of its own, since the pruner reads it
     matrix = random_plan(rng, 5, calibrated.manifest.groups, np.zeros((5, 5), np.bool_))
     obs, noise = random_inputs(calibrated, rng, 1)
-    ours, theirs = (runtime.predict(obs, noise, matrix)[0] for runtime in runtimes)
+    ours, theirs = (runtime.predict(obs, noise, Plan(cells=matrix))[0] for runtime in runtimes)
     assert_equal_but_for_rounding(ours, theirs, call_terms(calibrated))
     assert len(lines) == 1 + len(seen)
 
@@ -169,10 +165,9 @@ def test_what_a_pruner_decides_selects_among_captured_calls_and_a_matrix_runs_as
 def test_another_batch_size_is_captured_anew(calibrated: Artifact) -> None:
     lines: list[Line] = []
     runtimes, rng = both(calibrated, lines), np.random.default_rng(1)
-    plan = calibrated.schedule("evenly")
     for streams in (1, 1, 2, 2, 1):
         obs, noise = random_inputs(calibrated, rng, streams)
-        ours, theirs = (runtime.predict(obs, noise, plan, plan_name="evenly")[0] for runtime in runtimes)
+        ours, theirs = (runtime.predict(obs, noise, calibrated.plans["evenly"])[0] for runtime in runtimes)
         assert_equal_but_for_rounding(ours, theirs, call_terms(calibrated))
         for runtime in runtimes:
             runtime.reset()
@@ -208,8 +203,9 @@ def test_products_in_fewer_bits_are_near_those_in_fp32(make_artifact: MakeArtifa
     rng = np.random.default_rng(0)
     obs, noise = random_inputs(artifact, rng, 2)
     plan = uniform_plan(5, 5, 3)
-    exact = open_runtime(artifact, "torch").predict(obs, noise, plan)[0]
-    narrow = open_runtime(artifact, "torch", precision=precision).predict(obs, noise, plan)[0]
+    exact = open_runtime(artifact, "torch").predict(obs, noise, Plan(cells=plan))[0]
+    runtime, narrowed = open_runtime(artifact, "torch"), Plan(cells=plan, precision={"blocks": precision})
+    narrow = runtime.predict(obs, noise, narrowed)[0]
     unit = {"bf16": 2.0**-8, "fp16": 2.0**-11}[precision]
     difference = np.abs(narrow - exact).max() / np.abs(exact).max()
     assert bound(1) < difference < bound(call_terms(artifact), unit=unit)
@@ -231,12 +227,22 @@ def test_weights_of_products_are_kept_in_fewer_bits(toy_artifact: Artifact) -> N
         ({"device": "abacus"}, "device 'abacus' cannot be had"),
         ({"device": "cuda:97"}, "device 'cuda:97' cannot be had"),
         ({"device": 3}, "expected the name of a device"),
-        ({"precision": "int8"}, "runtime 'torch' computes in 'fp32', 'bf16', 'fp16' alone"),
+        (
+            {"plan": "dense@int8"},
+            "runtime 'torch' computes in fp32, and beside it bf16 in blocks, fp16 in blocks; the plan wants",
+        ),
         (
             {"runtime": "onnxruntime", "device": "cuda"},
             "on the CPU alone; found device 'cuda'. Use runtime='torch'",
         ),
-        ({"runtime": "reference", "precision": "bf16"}, "computes in 'fp32' alone"),
+        (
+            {"runtime": "reference", "plan": "dense@bf16"},
+            "'reference' computes in fp32 alone; the plan wants 'blocks' in 'bf16'",
+        ),
+        (
+            {"runtime": "onnxruntime", "plan": "dense@fp16"},
+            "computes in fp32, and beside it int8; the plan wants 'blocks'",
+        ),
     ],
 )
 def test_what_cannot_be_had_is_refused(toy_artifact: Artifact, options: dict[str, object], message: str) -> None:
@@ -245,8 +251,8 @@ def test_what_cannot_be_had_is_refused(toy_artifact: Artifact, options: dict[str
 
 
 def test_the_precision_is_told(toy_artifact: Artifact) -> None:
-    precisions = [ttscompile.load(toy_artifact.path, "torch", precision=p).info.precision for p in (None, "bf16")]
-    assert precisions == ["fp32", "bf16"]
+    told = [ttscompile.load(toy_artifact.path, "torch", plan=name).info for name in ("dense", "dense@bf16")]
+    assert [(one.precision, one.default_plan) for one in told] == [("fp32", "dense"), ("bf16", "dense@bf16")]
 
 
 def test_settings_of_torch_are_as_they_were_after_a_call(toy_artifact: Artifact) -> None:

@@ -11,6 +11,7 @@ import torch
 
 from ttscompile.artifact import Artifact
 from ttscompile.core.lattice import uniform_plan
+from ttscompile.core.plan import Plan
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.torch.backend import TorchBackend
 from ttscompile.runtimes.torch.capture import cuda_graphs
@@ -29,7 +30,9 @@ def test_what_a_caller_told_torch_about_precision_changes_no_action(
     obs, noise = random_inputs(artifact, np.random.default_rng(0), 2)
 
     def actions() -> np.ndarray:
-        return open_runtime(artifact, "torch", precision=precision).predict(obs, noise, uniform_plan(5, 5, 3))[0]
+        return open_runtime(artifact, "torch", precision=precision).predict(
+            obs, noise, Plan(cells=uniform_plan(5, 5, 3))
+        )[0]
 
     expected = actions()
     with torch.autocast("cpu", torch.bfloat16):

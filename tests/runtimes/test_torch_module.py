@@ -10,10 +10,10 @@ import pytest
 import torch
 
 import ttscompile
+from tests.plans import store_schedules
 from tests.rounding import assert_equal_but_for_rounding
 from ttscompile import Noise, Source
 from ttscompile.artifact import Artifact, load_artifact
-from ttscompile.artifact.write import update_calibration
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import ArtifactError, IllegalPlanError, ObservationError, RuntimeUnavailableError
 
@@ -36,7 +36,7 @@ def calibrated(artifact: Artifact) -> Artifact:
     }
     schedules = {name: plan.astype(np.int8) for name, plan in plans.items()}
     corrections = {"mixed": random_correction(artifact, rng)}
-    update_calibration(artifact.path, dict(artifact.pruner), schedules, "evenly", {}, corrections=corrections)
+    store_schedules(artifact.path, dict(artifact.pruner), schedules, "evenly", {}, corrections=corrections)
     return load_artifact(artifact.path)
 
 

@@ -11,9 +11,9 @@ import pytest
 
 import ttscompile
 from tests.calibration import policies
+from tests.plans import store_schedules
 from tests.runtimes.plans import random_reading
 from ttscompile.artifact.load import load_artifact
-from ttscompile.artifact.write import update_calibration
 from ttscompile.core.correction import no_correction
 from ttscompile.core.lattice import Source
 from ttscompile.ir.program import Program
@@ -60,7 +60,7 @@ def sound(compiled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     pruner["pruner.base"][...] = np.eye(4)[policy.sparse()] - 0.5 * np.eye(4)[Source.ROLLOUT]
     pruner["pruner.step"] *= 10
     pruner["pruner.block"] *= 3  # so that plans depend on the observation
-    update_calibration(
+    store_schedules(
         directory,
         pruner,
         {"schedule": policy.sparse(), "other": policy.other()},
@@ -77,7 +77,7 @@ def quick(compiled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same with one plan, which saves so much that it is the faster one beside any other work."""
     directory = Path(shutil.copytree(compiled, tmp_path_factory.mktemp("quick") / "compiled"))
     plan = policy.sparsest()
-    update_calibration(directory, None, {"schedule": plan}, "schedule", {"strategy": "by hand"}, golden=record_plans)
+    store_schedules(directory, None, {"schedule": plan}, "schedule", {"strategy": "by hand"}, golden=record_plans)
     return directory
 
 

@@ -15,13 +15,13 @@ import pytest
 import torch
 
 import ttscompile
+from tests.plans import store_schedules
 from tests.rounding import PROMISED
 from tests.runtimes.plans import random_correction
 from ttscompile import Affine
 from ttscompile.artifact import tensors
 from ttscompile.artifact.golden import DIGITS, load_golden, load_golden_plans
 from ttscompile.artifact.load import load_artifact, read_manifest
-from ttscompile.artifact.write import update_calibration
 from ttscompile.core.correction import Correction, no_correction
 from ttscompile.core.lattice import Source
 from ttscompile.errors import ArtifactError
@@ -208,7 +208,7 @@ def test_the_pruners_weights(artifact: Path) -> None:
 
 def _with(artifact: Path, plan: np.ndarray, correction: Correction | None = None) -> Path:
     corrections = {} if correction is None else {"mine": correction}
-    update_calibration(artifact, None, {"mine": plan}, "mine", {}, corrections=corrections, golden=record_plans)
+    store_schedules(artifact, None, {"mine": plan}, "mine", {}, corrections=corrections, golden=record_plans)
     return artifact
 
 
@@ -239,7 +239,7 @@ def test_a_plan_that_reuses_less_than_it_says_is_inert(artifact: Path) -> None:
 
 
 def test_plans_of_other_means_are_not_verified_and_that_is_said(artifact: Path) -> None:
-    update_calibration(artifact, None, {"mine": policy.sparse()}, "mine", {})
+    store_schedules(artifact, None, {"mine": policy.sparse()}, "mine", {})
     assert read_manifest(artifact).stores.golden_plans is None
     rung = ttscompile.verify(artifact).rung("plans")
     assert rung.status == SKIPPED

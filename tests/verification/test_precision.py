@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 import ttscompile
+from tests.plans import store_schedules
 from tests.rounding import PROMISED
 from ttscompile.artifact.golden import GoldenPlan, load_golden, load_golden_plans
 from ttscompile.artifact.load import load_artifact
-from ttscompile.artifact.write import update_calibration
 from ttscompile.core.lattice import Source
 from ttscompile.runtimes import open_runtime
 from ttscompile.verification.calls import check_plans_precision
@@ -29,7 +29,7 @@ def int8(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("int8") / "compiled"
     ttscompile.compile_denoiser(policy.Network().eval(), policy.spec(), directory, precision="int8")
     plans = {"schedule": policy.sparse(), "other": policy.other()}
-    update_calibration(directory, None, plans, "schedule", {}, golden=record_plans)
+    store_schedules(directory, None, plans, "schedule", {}, golden=record_plans)
     return directory
 
 

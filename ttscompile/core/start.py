@@ -31,17 +31,19 @@ class Start:
     action: float
     noise: float
 
-    def noise_from(self, before: FloatArray, chunk: ChunkSpec, fresh: Noise) -> Noise:
+    def noise_from(self, before: FloatArray, chunk: ChunkSpec, fresh: Noise, executed: int | None = None) -> Noise:
         """The noise of the rest, whose initial sample goes on with a chunk.
 
         The chunk is moved by what was executed of it, and its last step is repeated where none is left.
 
         Args:
             before: the denoised sample of the call before, float32 ``[B, T, D]``.
-            chunk: which steps of it were executed.
+            chunk: which steps of it are to be executed.
             fresh: noise of the whole loop, of as many streams.
+            executed: how many steps of it were executed; None for all that are to be.
         """
-        moved = np.minimum(np.arange(before.shape[1]) + chunk.stop - chunk.start, before.shape[1] - 1)
+        executed = chunk.stop - chunk.start if executed is None else executed
+        moved = np.minimum(np.arange(before.shape[1]) + executed, before.shape[1] - 1)
         initial = np.float32(self.action) * before[:, moved] + np.float32(self.noise) * fresh.initial
         return Noise(initial, None if fresh.steps is None else fresh.steps[self.skipped :])
 
@@ -88,5 +90,5 @@ def _shares(table: SamplerTable, step: int) -> tuple[float, float]:
             return sample, -out
     raise SpecError(
         f"a loop of {table.name!r} does not tell what part of its sample is noise in the middle; expected ddpm, ddim,"
-        " dpmsolver++ or euler, and a network that predicts noise or velocity. Load it without warm=."
+        " dpmsolver++ or euler, and a network that predicts noise or velocity. It begins with noise."
     )

@@ -75,7 +75,6 @@ def check_engaged(
         return Rung(ENGAGED, SKIPPED, told, remedy="Run 'ttscompile calibrate' to give it a plan.")
     found = _measure(artifact, golden, policy, clock)
     details = {name: asdict(one) for name, one in found.items()}
-    own = manifest.plans
     judged = {
         name: _fault(
             manifest.plans[name].kind, one, manifest.steps_of(manifest.plans[name].loop) * len(manifest.blocks)
