@@ -108,7 +108,11 @@ class Runtime:
         """
         if plan.variant not in self._views:
             self._views[plan.variant] = view_of(self._artifact, plan)
-        return self._views[plan.variant]
+        view = self._views[plan.variant]
+        if (plan.otherwise is None) is (view.start is not None):
+            expected = "none" if view.start is None else "the plan of a call that has no chunk to begin with"
+            raise IllegalPlanError(f"a plan of loop {plan.loop!r}: expected {expected} as otherwise.")
+        return view
 
     @property
     def backend(self) -> Backend[Any]:

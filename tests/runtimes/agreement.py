@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from tests.rounding import Counted
@@ -41,9 +43,19 @@ def call_terms(artifact: Artifact) -> int:
 
 
 def largest_difference(
-    artifact: Artifact, left: Runtime, right: Runtime, rng: np.random.Generator, streams: int, calls: int
+    artifact: Artifact,
+    left: Runtime,
+    right: Runtime,
+    rng: np.random.Generator,
+    streams: int,
+    calls: int,
+    base: Plan | None = None,
 ) -> float:
-    """One episode of random legal plans, one for each stream; differences relative to the sample's largest value."""
+    """One episode of random legal plans, one for each stream; differences relative to the sample's largest value.
+
+    ``left`` has them with the other fields of ``base``, and ``right`` with those in fp32.
+    """
+    base = base or Plan()
     manifest = artifact.manifest
     written = np.zeros((streams, manifest.steps, len(manifest.groups)), np.bool_)
     left.reset()
@@ -53,7 +65,8 @@ def largest_difference(
         computed = rng.uniform(0.02, 0.3)
         plans = np.stack([random_plan(rng, manifest.steps, manifest.groups, cells, computed) for cells in written])
         obs, noise = random_inputs(artifact, rng, streams)
-        samples = [runtime.predict(obs, noise, Plan(cells=plans))[0] for runtime in (left, right)]
+        both = ((left, replace(base, cells=plans)), (right, replace(base, cells=plans).exact))
+        samples = [runtime.predict(obs, noise, plan)[0] for runtime, plan in both]
         worst = max(worst, float(np.abs(samples[0] - samples[1]).max() / np.abs(samples[1]).max()))
         written |= plans == Source.COMPUTE
     return worst

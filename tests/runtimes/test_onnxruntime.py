@@ -309,7 +309,7 @@ except RuntimeUnavailableError as error:
 def test_a_graph_that_onnxruntime_refuses_is_an_artifact_error(
     own_artifact: Artifact, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    path = own_artifact.path / "dense_step.onnx"
+    path = own_artifact.onnx_path("dense_step")
     path.write_bytes(b"")
     edit_manifest(path.parent)
     with pytest.raises(ArtifactError, match=rf"^{path}: onnxruntime .* cannot load"):
@@ -378,7 +378,8 @@ rng = np.random.default_rng(0)
 shape = (2, 3, 2)
 noise = Noise(rng.standard_normal(shape, dtype=np.float32), rng.standard_normal((5, *shape), dtype=np.float32))
 obs = {"obs": rng.standard_normal((2, 2), dtype=np.float32)}
-samples = [open_runtime(artifact, threads=n).predict(obs, noise, Plan(cells=np.zeros((5, 5), np.int8)))[0] for n in (1, 2)]
+plan = Plan(cells=np.zeros((5, 5), np.int8))
+samples = [open_runtime(artifact, threads=n).predict(obs, noise, plan)[0] for n in (1, 2)]
 np.save(OUT, samples)
 """
     body = body.replace("OUT", repr(str(tmp_path / "samples.npy")))

@@ -13,7 +13,6 @@ from tests.calibration import policies
 from tests.once import Once
 from ttscompile import Noise, TtscompileError
 from ttscompile.artifact import load_artifact
-from ttscompile.core.plan import Plan
 from ttscompile.errors import ArtifactError, RuntimeUnavailableError
 from ttscompile.runtimes import against_fp32, open_runtime
 from ttscompile.runtimes.onnxruntime import sessions
@@ -41,43 +40,51 @@ def test_it_is_the_reference_within_its_own_tolerance_on_random_plans(int8: Path
     assert record is not None and record.error is not None
     assert 0 < record.error.tolerance < 0.2
     assert 0 < record.error.mean <= record.error.p90 <= record.error.largest
-    compiled, reference = open_runtime(artifact), open_runtime(artifact, "reference")
+    own = artifact.plan("dense@int8")
+    compiled, reference = open_runtime(artifact), open_runtime(artifact, "reference", plan=own.exact)
     for seed in range(6):
-        found = largest_difference(artifact, compiled, reference, np.random.default_rng(seed), 1 + seed % 3, calls=3)
+        rng = np.random.default_rng(seed)
+        found = largest_difference(artifact, compiled, reference, rng, 1 + seed % 3, calls=3, base=own)
         assert 1e-5 < found < record.error.tolerance, "not in eight bits, or further off than the artifact says"
 
 
 def test_the_measured_error_is_what_the_public_interface_gives(int8: Path) -> None:
     record = load_artifact(int8).manifest.precision
     assert record is not None and record.error is not None
-    policies_ = [ttscompile.load(int8), ttscompile.load(int8, precision="fp32")]
+    policies_ = [ttscompile.load(int8), ttscompile.load(int8, plan="full@fp32")]
     assert [one.info.precision for one in policies_] == ["int8", "fp32"]
     errors = []
     for obs, noise in random_calls(policies.spec(), record.error.calls, against_fp32.SEED):
         actions = []
         for policy in policies_:
             policy.reset()
-            actions.append(policy.predict_action(obs, noise=noise, plan="dense")["action"])
+            actions.append(policy.predict_action(obs, noise=noise)["action"])
         errors.append(np.abs(actions[0] - actions[1]))
     assert record.error.mean == pytest.approx(np.mean(errors), rel=0.05)
     assert record.error.largest == pytest.approx(np.max(errors), rel=0.05)
 
 
 def test_fp32_of_an_int8_artifact_is_the_fp32_artifact(int8: Path, fp32: Path) -> None:
-    with_both, plain = load_artifact(int8).at_precision("fp32"), load_artifact(fp32)
+    with_both, plain = load_artifact(int8), load_artifact(fp32)
     obs, noise = random_inputs(plain, np.random.default_rng(0), 2)
-    plan = plain.plans["dense"].cells
-    samples = [open_runtime(one).predict(obs, noise, Plan(cells=plan))[0] for one in (with_both, plain)]
+    samples = [open_runtime(one).predict(obs, noise, one.plans["dense"])[0] for one in (with_both, plain)]
     np.testing.assert_array_equal(*samples)
-    assert not np.array_equal(open_runtime(load_artifact(int8)).predict(obs, noise, Plan(cells=plan))[0], samples[0])
+    assert not np.array_equal(open_runtime(with_both).predict(obs, noise, with_both.plans["full"])[0], samples[0])
 
 
 def test_the_reference_runtime_computes_in_fp32(int8: Path) -> None:
-    assert ttscompile.load(int8, "reference").info.precision == "fp32"
-    with pytest.raises(RuntimeUnavailableError, match="'reference' computes in 'fp32' alone; found precision 'int8'"):
-        ttscompile.load(int8, "reference", precision="int8")
-    with pytest.raises(ArtifactError, match="'bf16': expected one that the artifact holds"):
-        ttscompile.load(int8, precision="bf16")
+    assert ttscompile.load(int8, "reference", plan="full@fp32").info.precision == "fp32"
+    with pytest.raises(
+        RuntimeUnavailableError, match="'reference' computes in fp32 alone; the plan wants 'blocks' in 'int8'"
+    ):
+        ttscompile.load(int8, "reference")
+    with pytest.raises(RuntimeUnavailableError, match="'onnxruntime' computes in fp32, and beside it int8"):
+        ttscompile.load(int8, plan="full@bf16")
+
+
+def test_a_precision_that_the_artifact_does_not_hold_is_refused_by_its_name(fp32: Path) -> None:
+    with pytest.raises(ArtifactError, match="a plan wants 'blocks' in 'int8'; the artifact has fp32 alone"):
+        ttscompile.load(fp32, plan="dense@int8")
 
 
 def test_calls_repeat_to_the_bit(int8: Path) -> None:
@@ -88,7 +95,7 @@ def test_calls_repeat_to_the_bit(int8: Path) -> None:
         obs, noise = random_inputs(artifact, np.random.default_rng(3), 2)
         for _ in range(2):
             runtime.reset()
-            sample = runtime.predict(obs, noise, Plan(cells=artifact.plans["dense")].cells)[0]
+            sample = runtime.predict(obs, noise, artifact.plans["full"])[0]
             digests.add(hashlib.sha256(sample.tobytes()).hexdigest())
     assert len(digests) == 1
 
@@ -100,22 +107,20 @@ def test_where_sums_saturate_they_are_made_exact_and_a_warning_says_that_it_is_s
 ) -> None:
     artifact = load_artifact(int8)
     obs, noise = random_inputs(artifact, np.random.default_rng(3), 1)
-    expected = open_runtime(artifact).predict(obs, noise, Plan(cells=artifact.plans["dense")].cells)[0]
+    expected = open_runtime(artifact).predict(obs, noise, artifact.plans["full"])[0]
     monkeypatch.setattr(sessions, "has_integer_dot_product", lambda: found)
-    with pytest.warns(RuntimeWarning, match=rf"avx512_vnni.*{told}.*precision='fp32'"):
+    with pytest.warns(RuntimeWarning, match=rf"avx512_vnni.*{told}.*plan.exact"):
         careful = open_runtime(artifact, threads=threads)
-    np.testing.assert_allclose(
-        careful.predict(obs, noise, Plan(cells=artifact.plans["dense")].cells)[0], expected, rtol=1e-5
-    )
-    open_runtime(artifact.at_precision("fp32"))  # no warning, which would be an error here
+    np.testing.assert_allclose(careful.predict(obs, noise, artifact.plans["full"])[0], expected, rtol=1e-5)
+    open_runtime(artifact, plan=artifact.plans["dense"])  # no warning, which would be an error here
 
 
 def test_a_policy_that_gives_no_numbers_is_not_measured(int8: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     artifact = load_artifact(int8)
     broken = {"obs": np.full((1, 2, 3), np.nan, np.float32)}
     noise = Noise(np.zeros((1, 8, 2), np.float32), np.zeros((10, 1, 8, 2), np.float32))
-    runtimes = [open_runtime(one) for one in (artifact, artifact.at_precision("fp32"))]
-    own, exact = (against_fp32.answers(one, artifact.plans["dense"].cells, [(broken, noise)]) for one in runtimes)
+    plans, runtime = (artifact.plans[name] for name in ("full", "dense")), open_runtime(artifact)
+    own, exact = (against_fp32.answers(runtime, one, [(broken, noise)]) for one in plans)
     with pytest.raises(TtscompileError, match="not a number"):
         against_fp32.mean_errors(policies.spec().chunk, own, exact)
 

@@ -85,7 +85,7 @@ def test_each_part_is_measured_alone(int8: Path) -> None:
         differences = []
         for number in range(FEW_CALLS):
             obs, noise = random_call(spec, number, 8)
-            samples = [one.predict(obs, noise, Plan(cells=artifact.plans["dense")].cells)[0] for one in (own, exact)]
+            samples = [one.predict(obs, noise, Plan(cells=artifact.plans["dense"].cells))[0] for one in (own, exact)]
             differences.append(np.abs(samples[0] - samples[1]).mean())
         assert mean == pytest.approx(np.mean(differences), rel=0.05)
         assert 0 < np.mean(differences) < record.error.other_noise
@@ -103,7 +103,7 @@ def test_it_is_the_reference_within_its_own_tolerance_whatever_the_threads(int8:
         assert 1e-5 < found < record.error.tolerance, "not in eight bits, or further off than the artifact says"
         obs, noise = random_inputs(artifact, np.random.default_rng(1), 2)
         runtime.reset()
-        samples.append(runtime.predict(obs, noise, Plan(cells=artifact.plans["dense")].cells)[0])
+        samples.append(runtime.predict(obs, noise, Plan(cells=artifact.plans["dense"].cells))[0])
     np.testing.assert_array_equal(*samples)
     statuses = {rung.name: rung.status for rung in ttscompile.verify(int8).rungs}
     assert "failed" not in statuses.values() and statuses["precision"] == "passed"
@@ -122,7 +122,7 @@ def test_the_single_file_computes_the_same(int8: Path) -> None:
 def test_calibration_measures_the_parts_on_recorded_calls(int8: Path) -> None:
     artifact, draw = load_artifact(int8), np.random.default_rng(0)
     episodes = [Recorded("seen", {"image": draw.standard_normal((9, 3, 16, 16), dtype=np.float32)})]
-    record = precision_record(artifact, episodes, [0], Found(artifact.plans["dense")].cells, seed=0)["precision"]
+    record = precision_record(artifact, episodes, [0], Found(artifact.plans["dense"].cells), seed=0)["precision"]
     assert list(record["parts"]) == ["condition", "blocks"]
     assert all(0 < error < record["plans"]["dense"]["error_p90"] * 2 for error in record["parts"].values())
     alone, much = [f"dense, {part} alone: int8 against fp32" for part in record["parts"]], record["parts"]["condition"]

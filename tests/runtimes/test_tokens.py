@@ -18,20 +18,21 @@ from tests.literal_tokens import LiteralTokens
 from tests.once import Once
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import PieceRecord
-from ttscompile.artifact.settle import settle
 from ttscompile.artifact.size import check_size
-from ttscompile.artifact.towers import ReuseRecord
-from ttscompile.errors import ArtifactError
+from ttscompile.artifact.view import view_of
+from ttscompile.artifact.write import update_plans
+from ttscompile.core.plan import DENSE, Plan, TokenReuse
+from ttscompile.errors import ArtifactError, RuntimeUnavailableError
 from ttscompile.ir.pieces import FRAMES, INDEX
 from ttscompile.runtimes.frames import FramePieces
 from ttscompile.runtimes.load import open_policy
-from ttscompile.runtimes.onnxruntime.backend import OnnxBackend
+from ttscompile.runtimes.onnxruntime.backend import OnnxBackends
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.runtimes.tokens import TokenTower, sizes_of, token_towers
 
 Array = npt.NDArray[Any]
 SIDE, PATCH, TOKENS = cameras.SIDE, 4, 37
-REUSE = ReuseRecord(threshold=0.0, refresh=1000, computed=0.3, error=0.0, other_noise=1.0, calls=1)
+REUSE = TokenReuse(threshold=0.0, refresh=1000)
 
 
 @pytest.fixture(scope="module")
@@ -41,12 +42,16 @@ def compiled(once: Once) -> Path:
 
 @pytest.fixture
 def artifact(compiled: Path) -> Artifact:
-    return load_artifact(compiled / "artifact").with_reuse(REUSE).at_precision("fp32")
+    return load_artifact(compiled / "artifact")
+
+
+def reusing(artifact: Artifact, reuse: TokenReuse = REUSE, **fields: Any) -> Plan:
+    return replace(artifact.plans[DENSE], tokens=reuse, **fields)
 
 
 @pytest.fixture
 def policy(artifact: Artifact) -> CompiledPolicy:
-    return open_policy(artifact, seed=0)
+    return open_policy(artifact, seed=0, plan=reusing(artifact))
 
 
 def picture(number: int) -> Array:
@@ -79,9 +84,11 @@ def counted(policy: CompiledPolicy) -> tuple[int, int]:
 
 
 def tower_of(artifact: Artifact, threshold: float = 0.0, refresh: int = 1000) -> TokenTower:
-    reuse = replace(REUSE, threshold=threshold, refresh=refresh)
-    backend = OnnxBackend(artifact.with_reuse(reuse))
-    (tower,) = token_towers(backend._manifest, backend._run, backend._renew).values()
+    reuse = TokenReuse(threshold, refresh)
+    view = view_of(artifact, reusing(artifact, reuse))
+    with view.reading():
+        backend = OnnxBackends()(view)
+    (tower,) = token_towers(backend._manifest, reuse, backend._run, backend._renew).values()
     return tower
 
 
@@ -110,7 +117,7 @@ def test_what_it_gives_is_what_the_tokens_literally_give(artifact: Artifact) -> 
     assert sizes_of(37) == (5, 10, 19, 37)
 
 
-def test_it_is_off_until_it_was_settled(compiled: Path, tmp_path: Path) -> None:
+def test_a_plan_says_whether_tokens_are_reused(compiled: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(compiled / "artifact", tmp_path / "own")
     first, other = frame((picture(0), picture(1))), frame((moved(picture(0), 7), picture(1)))
 
@@ -120,13 +127,22 @@ def test_it_is_off_until_it_was_settled(compiled: Path, tmp_path: Path) -> None:
         act(policy, first, other)
         return counted(policy)
 
-    identity = load_artifact(folder).manifest.identity
+    artifact = load_artifact(folder)
     assert tokens() == (0, 0)
-    assert settle(folder, "reuse", REUSE).identity != identity
-    assert tokens() == (5, 37)
-    assert tokens(reuse_tokens=False) == tokens(runtime="reference") == (0, 0)
-    assert settle(folder, "reuse", None).identity == identity
-    assert tokens() == (0, 0)
+    manifest = update_plans(folder, {**artifact.plans, "some": reusing(artifact)}, "some")
+    assert manifest.identity != artifact.manifest.identity
+    assert manifest.model_identity == artifact.manifest.model_identity
+    assert tokens() == tokens(plan="some") == (5, 37)
+    assert tokens(plan="some@fp32") == tokens(plan="dense") == (0, 0)
+    for runtime in ("torch", "reference"):
+        with pytest.raises(
+            RuntimeUnavailableError, match=rf"{runtime}' computes all tokens .*Use runtime='onnxruntime'"
+        ):
+            ttscompile.load(folder, runtime)
+        assert tokens(runtime=runtime, plan="some@fp32") == (0, 0)
+    whole = open_policy(load_artifact(folder), "reference", plan="dense")
+    with pytest.raises(RuntimeUnavailableError, match="the plan reuses some"):
+        act(whole, first, other, plan="some")
 
 
 def test_cameras_and_streams_share_nothing(policy: CompiledPolicy) -> None:
@@ -146,7 +162,7 @@ def test_cameras_and_streams_share_nothing(policy: CompiledPolicy) -> None:
 def test_a_frame_that_was_prepared_is_computed_the_same_way(policy: CompiledPolicy, artifact: Artifact) -> None:
     frames = [frame((moved(picture(0), i), picture(1))) for i in range(3)]
     found = [act(policy, frames[max(i - 1, 0)], frames[i]) for i in range(3)]
-    other = open_policy(artifact, seed=0)
+    other = open_policy(artifact, seed=0, plan=reusing(artifact))
     for i in range(3):
         work = other.prepare_frame(frames[i])
         assert (work.tokens, work.of) == ((74, 74) if i == 0 else (5, 37))
@@ -156,7 +172,7 @@ def test_a_frame_that_was_prepared_is_computed_the_same_way(policy: CompiledPoli
 
 def test_actions_depend_on_the_frames_before_and_on_nothing_else(artifact: Artifact) -> None:
     """Those that were prepared count; after ``reset`` there are none."""
-    policy = open_policy(artifact, seed=0)
+    policy = open_policy(artifact, seed=0, plan=reusing(artifact))
     first, between, newest = (frame((moved(picture(0), i), picture(1))) for i in (0, 30, 2))
     made = []
     for prepared in ([], [between], [between], []):
@@ -196,7 +212,7 @@ def test_after_a_failure_nothing_stale_is_read(policy: CompiledPolicy, artifact:
     tower._renew = plain
     found = act(policy, first, other)
     assert counted(policy) == (37, 37), "what was kept of this camera is gone; the other one is known"
-    exact = open_policy(artifact.with_reuse(None))
+    exact = open_policy(artifact, plan=DENSE)
     np.testing.assert_allclose(found, act(exact, first, other), rtol=0, atol=1e-5)
 
 
@@ -206,7 +222,7 @@ def test_other_patches_than_there_are_tokens_are_refused(artifact: Artifact, wro
     manifest = artifact.manifest
     tokens = {name: replace(record, **wrong) for name, record in manifest.tokens.items()}
     with pytest.raises(ArtifactError, match=r"tokens: expected a patch for each of \d+ tokens; found \d+ by \d+"):
-        open_policy(replace(artifact, manifest=replace(manifest, tokens=tokens)))
+        open_policy(replace(artifact, manifest=replace(manifest, tokens=tokens)), plan=reusing(artifact))
 
 
 def test_what_is_kept_counts_as_memory(artifact: Artifact) -> None:
@@ -219,7 +235,7 @@ def test_what_is_kept_counts_as_memory(artifact: Artifact) -> None:
 
 @pytest.mark.parametrize("change", ["camera motion", "noise", "light"])
 def test_where_everything_changes_nothing_is_reused(policy: CompiledPolicy, artifact: Artifact, change: str) -> None:
-    exact, rng, image = open_policy(artifact.with_reuse(None), seed=0), np.random.default_rng(0), picture(0)
+    exact, rng, image = open_policy(artifact, seed=0, plan=DENSE), np.random.default_rng(0), picture(0)
     act(policy, frame((image, image)), frame((image, image)))
     for _ in range(3):
         before = frame((image, image))
@@ -252,7 +268,8 @@ def test_what_is_kept_is_written_where_it_is_and_nothing_else_is_moved(artifact:
         assert array is before[key]
         assert 0 < (array != old[key]).reshape(TOKENS, -1).any(1).sum() <= 5
     nodes = {
-        piece: onnx.load(artifact.files / artifact.onnx_file(piece)).graph.node for piece in ("frame_00", "tokens_00")
+        piece: onnx.load(artifact.files / artifact.manifest.pieces[piece].file).graph.node
+        for piece in ("frame_00", "tokens_00")
     }
     moves = {piece: sum(node.op_type == "Transpose" for node in own) for piece, own in nodes.items()}
     assert moves["tokens_00"] == moves["frame_00"]
@@ -263,7 +280,8 @@ def test_in_eight_bits(compiled: Path) -> None:
     record = artifact.manifest.precision
     assert record is not None
     assert {"frame_00", "tokens_00"} <= set(record.models)
-    whole, some = open_policy(artifact, seed=0), open_policy(artifact.with_reuse(REUSE), seed=0)
+    int8 = artifact.plan("dense@int8")
+    whole, some = (open_policy(artifact, seed=0, plan=plan) for plan in (int8, replace(int8, tokens=REUSE)))
     first, other = frame((picture(0), picture(1))), frame((moved(picture(0), 7), picture(1)))
     np.testing.assert_allclose(act(some, first, first), act(whole, first, first), rtol=0, atol=1e-4)
     near, far = act(whole, first, other), act(whole, other, frame((picture(8), picture(9))))

@@ -15,6 +15,7 @@ from tests.plans import store_schedules
 from tests.rounding import assert_equal_but_for_rounding, bound
 from ttscompile import Source
 from ttscompile.artifact import Artifact, load_artifact
+from ttscompile.artifact.view import view_of
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.core.plan import DENSE, Plan
 from ttscompile.errors import CaptureError, RuntimeUnavailableError
@@ -26,7 +27,7 @@ from ttscompile.runtimes.torch.backend import TorchBackend, TorchBackends
 from ttscompile.runtimes.torch.capture import Line, Lines
 from ttscompile.runtimes.torch.functions import write_function
 from ttscompile.runtimes.torch.loop import denoise
-from ttscompile.runtimes.torch.network import Parts, StreamsNetwork
+from ttscompile.runtimes.torch.network import Parts, Placed, StreamsNetwork
 from ttscompile.runtimes.torch.packed import HALF_LINEAR
 from ttscompile.runtimes.torch.sampler import Advance
 
@@ -369,7 +370,7 @@ def test_everything_of_a_call_is_on_its_device(make_artifact: MakeArtifact, vari
     plan = random_plan(rng, manifest.steps, groups, np.ones((5, 5), np.bool_), computed=0.4)
     lowered = instructions_of(plan, groups)
     assert lowered.rollout.any()
-    parts = Parts(artifact, device, None)
+    parts = Parts(view_of(artifact), Placed(device), None)
     network = StreamsNetwork(parts, {"obs": torch.zeros((2, 2), device=device)}, 2)
     advance = Advance(manifest.spec, random_correction(artifact, rng), device)
     network.prologue()

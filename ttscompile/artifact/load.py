@@ -111,6 +111,10 @@ class Artifact:
                     raise self._folder.changed([name]) from error
             yield
 
+    def onnx_path(self, piece: str) -> Path:
+        """Where the model of a piece in fp32 is, for other programs; what is there by then was not checked."""
+        return self.path / self.manifest.pieces[piece].file
+
     @property
     def default(self) -> Plan:
         """The plan that is taken when none is given."""

@@ -42,7 +42,7 @@ class View:
         manifest: the artifact's, with the sampler, FLOPs and pieces of this loop, and the plans of this variant.
         tables: TABLE contexts ``[K, ...]`` of this loop.
         start: how a loop begins that goes on with the chunk of the call before; None where it begins with noise.
-        plans: by name, the artifact's plans of this variant.
+        plans: by name, the artifact's plans of this variant, but for ``dense``.
     """
 
     artifact: Artifact
@@ -130,10 +130,6 @@ class View:
         file = self.manifest.pieces[piece].file
         return file if own is None else own.models.get(piece, file)
 
-    def onnx_path(self, piece: str) -> Path:
-        """Where ``onnx_file`` is, for other programs; what is there by then was not checked."""
-        return self.path / self.onnx_file(piece)
-
     def graph(self, name: str) -> Graph:
         """See ``Artifact``."""
         return self.artifact.graph(name)
@@ -164,7 +160,7 @@ def view_of(artifact: Artifact, plan: Plan | str | None = None) -> View:
     if not isinstance(plan, Plan):
         plan = artifact.default if plan is None else artifact.plan(plan)
     manifest, variant = artifact.manifest, plan.variant
-    _require(manifest, variant, plan)
+    _require(manifest, variant)
     start, tables, loop = None, artifact.tables, variant.loop
     record = manifest.starts.get(loop)
     base = loop if record is None else record.loop
@@ -180,20 +176,20 @@ def view_of(artifact: Artifact, plan: Plan | str | None = None) -> View:
             pieces[piece] = pieces[own]
     if start is not None:  # a pruner decides about whole loops
         pieces.pop(PRUNER, None)
-    steps, numbers, sample = sampler.steps, manifest.condition_numbers, spec.sample
-    more = steps - manifest.steps
-    values = graph_flops(artifact.graph(STEP)) * more if more and STEP in pieces else 0
-    read = condition_flops(steps, sample, numbers) - condition_flops(manifest.steps, sample, numbers)
+    flops, sample, more = manifest.flops, spec.sample, sampler.steps - manifest.steps
+    if more:
+        values = graph_flops(artifact.graph(STEP)) * more if STEP in pieces else 0
+        read = [condition_flops(k, sample, manifest.condition_numbers) for k in (sampler.steps, manifest.steps)]
+        flops = replace(flops, prologue=flops.prologue + values + read[0] - read[1])
     update = update_flops(sampler, sample) - update_flops(manifest.spec.sampler, sample)
-    flops = manifest.flops
-    flops = replace(flops, prologue=flops.prologue + values + read, tail=flops.tail + update)
-    plans = {name: one for name, one in artifact.plans.items() if one.variant == variant}
-    records = {name: manifest.plans[name] for name in plans if name in manifest.plans}
+    flops = replace(flops, tail=flops.tail + update)
+    plans = {name: artifact.plans[name] for name in manifest.plans if artifact.plans[name].variant == variant}
+    records = {name: manifest.plans[name] for name in plans}
     seen = replace(manifest, spec=spec, pieces=pieces, flops=flops, plans=records)
     return View(artifact, variant, seen, tables, start, MappingProxyType(plans))
 
 
-def _require(manifest: Manifest, variant: Variant, plan: Plan) -> None:
+def _require(manifest: Manifest, variant: Variant) -> None:
     """Raise unless the artifact has what a plan names; what a runtime can do is another question.
 
     Raises:
@@ -206,9 +202,6 @@ def _require(manifest: Manifest, variant: Variant, plan: Plan) -> None:
     if variant.tokens is not None and not manifest.tokens:
         remedy = "Leave tokens out of the plan: dataclasses.replace(plan, tokens=None)."
         raise IllegalPlanError(f"no image encoder of this policy has tokens that could be reused. {remedy}")
-    if (plan.otherwise is None) is (variant.loop in manifest.starts):
-        expected = "the plan of a call that has no chunk to begin with" if plan.otherwise is None else "none"
-        raise IllegalPlanError(f"a plan of loop {variant.loop!r}: expected {expected} as otherwise.")
 
 
 def require_held(artifact: Artifact, plan: Plan) -> None:
