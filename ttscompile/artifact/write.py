@@ -243,7 +243,8 @@ def _fill(
     tensors.write(folder / WEIGHTS, {**stored, **tables})
     places = places_of(folder / WEIGHTS, stored)
     pruner_files, pruner_places = dict[str, str](), dict[str, dict[str, Place]]()
-    for piece, constants in ({PRUNER: pruner} if PRUNER in graphs else {}).items() | _loop_pruners(program).items():
+    own = {PRUNER: pruner} if PRUNER in graphs else {}
+    for piece, constants in {**own, **_loop_pruners(program)}.items():
         content = tensors.serialize(constants)
         name = f"{PRUNER}-{content_hash(content)}"
         pruner_files[piece], files[piece] = f"{name}.safetensors", f"{name}.onnx"

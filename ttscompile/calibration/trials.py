@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -48,7 +47,7 @@ EPISODES = 16
 """That these are of, at most."""
 
 STRETCH = 32
-"""Consecutive calls of an episode that they are among, at most. A plan that goes on from call to call makes them all."""
+"""Consecutive calls of an episode that they are among, at most: a plan that goes on from call to call makes all."""
 
 LEARNED, HELD_OUT = "learned", "held out"
 """The two parts of the episodes: what is learned from, and what is judged on."""
@@ -183,19 +182,22 @@ class Trials:
 
     def holding(self, proposal: Proposal) -> Trials:
         """The same, of an artifact that holds in memory what a proposal brings."""
-        manifest, weights = self.artifact.manifest, dict(self.artifact.block_weights)
-        weights |= {name: own.weights for name, own in proposal.weights.items()}
-        known = {**manifest.weights, **{name: WeightsRecord(name, {}, None, {}) for name in proposal.weights}}
-        return replace(
-            self,
-            artifact=replace(
-                self.artifact,
-                manifest=replace(manifest, starts={**manifest.starts, **proposal.starts}, weights=known),
-                block_weights=MappingProxyType(weights),
-                pruner=self.artifact.pruner if proposal.pruner is None else proposal.pruner,
-            ),
-            fresh=self.fresh or bool(proposal.weights) or proposal.pruner is not None,
+        artifact, manifest, loop = self.artifact, self.artifact.manifest, proposal.plan.loop
+        added = {name: own.weights for name, own in proposal.weights.items()}
+        known = {**manifest.weights, **{name: WeightsRecord(name, {}, None, {}) for name in added}}
+        pruner, pruners = artifact.pruner, dict(artifact.loop_pruners)
+        if proposal.pruner is not None and loop in pruners:
+            pruners[loop] = proposal.pruner
+        elif proposal.pruner is not None:
+            pruner = proposal.pruner
+        held = replace(
+            artifact,
+            manifest=replace(manifest, starts={**manifest.starts, **proposal.starts}, weights=known),
+            block_weights={**artifact.block_weights, **added},
+            pruner=pruner,
+            loop_pruners=pruners,
         )
+        return replace(self, artifact=held, fresh=self.fresh or bool(added) or proposal.pruner is not None)
 
     def view(self, plan: Plan) -> View:
         """The artifact as a plan sees it."""
@@ -253,7 +255,7 @@ class Trials:
 
 def _draw(spec: PolicySpec, seed: tuple[int, ...]) -> tuple[FloatArray, FloatArray | None]:
     """Initial sample ``[T, D]``, and draws ``[K, T, D]`` where the sampler takes any, of one call."""
-    rng, shape, predicted = np.random.default_rng(seed), spec.original.sample, spec.sample[0]
+    rng, shape, predicted = np.random.default_rng(seed), spec.whole_horizon.sample, spec.sample[0]
     initial = rng.standard_normal(shape, dtype=np.float32)[:predicted]
     if not spec.sampler.stochastic:
         return initial, None
