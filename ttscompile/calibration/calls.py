@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..core.spec import PolicySpec
 from ..errors import CalibrationError
-from ..runtimes.random_calls import normalized
+from ..runtimes.random_calls import Observation, normalized
 from ..runtimes.reference.model import Contexts, ReferenceModel
 from ..trajectories.episodes import Episode, load_trajectories
 
@@ -176,7 +176,7 @@ def prepare_calls(
 
     Args:
         model: of the policy.
-        spec: of the policy.
+        spec: of the policy, with the loop of the model.
         episodes: all recorded episodes.
         chosen: the number of the episode, and the row in it, of each call; those of a window one after the other.
         seed: the seed of the noise.
@@ -187,16 +187,32 @@ def prepare_calls(
     if pinned:
         first = torch.arange(len(chosen)) // window * window
         initial, noise = initial[first], None if noise is None else noise[:, first]
+    return calls_at(model, spec, episodes, chosen, (initial, noise), window)
+
+
+def calls_at(
+    model: ReferenceModel,
+    spec: PolicySpec,
+    episodes: Sequence[Episode],
+    chosen: Sequence[tuple[int, int]],
+    noise: tuple[Tensor, Tensor | None],
+    window: int = 1,
+) -> Calls:
+    """The same with given noise: initial samples ``[N, T, D]``, and draws ``[K, N, T, D]`` or None."""
 
     def parts() -> Iterator[Contexts]:
         for begin in range(0, len(chosen), OBSERVED_AT_ONCE):
-            some = chosen[begin : begin + OBSERVED_AT_ONCE]
-            seen = {key: np.stack([episodes[n].observations[key][row] for n, row in some]) for key in spec.observations}
-            yield model.prologue({key: torch.from_numpy(one) for key, one in normalized(spec, seen).items()})
+            seen = normalized(spec, observed(spec, episodes, chosen[begin : begin + OBSERVED_AT_ONCE]))
+            yield model.prologue({key: torch.from_numpy(one) for key, one in seen.items()})
 
     with torch.no_grad():
         contexts = model.joined(parts(), len(chosen))
-    return Calls(contexts, initial, noise, np.array([n for n, _ in chosen], np.int64), window=window)
+    return Calls(contexts, *noise, np.array([n for n, _ in chosen], np.int64), window=window)
+
+
+def observed(spec: PolicySpec, episodes: Sequence[Episode], chosen: Sequence[tuple[int, int]]) -> Observation:
+    """What was observed at some calls, by key ``[n, ...]``, as it was recorded."""
+    return {key: np.stack([episodes[n].observations[key][row] for n, row in chosen]) for key in spec.observations}
 
 
 def draw_noise(spec: PolicySpec, count: int, seed: tuple[int, ...]) -> tuple[Tensor, Tensor | None]:

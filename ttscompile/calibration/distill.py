@@ -37,7 +37,7 @@ from .result import PlanScore
 from .state import DISTILLATION, StateFile
 from .student import Student, trainable
 from .targets import draw_calls, with_targets
-from .task import Clock
+from .clock import Clock
 
 UPDATES = 600
 """Of the weights, if there is time. On Push-T with 2 of 16 steps and 3,072 calls the held-out error has stopped falling

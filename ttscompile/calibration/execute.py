@@ -20,7 +20,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from ..artifact.load import Artifact
+from ..artifact.view import View
 from ..core.correction import Correction
 from ..core.lattice import BoolArray, PlanArray, Source, dense_plan
 from ..errors import IllegalPlanError
@@ -35,12 +35,12 @@ class Executor:
     """Runs plans without gradients.
 
     Args:
-        artifact: the policy.
+        view: of the policy; its precision and tokens are left alone: all is in fp32.
         device: where the network computes; None for the CPU. Samples are on the CPU, and so is all that is returned but
             streams and residuals.
 
     Attributes:
-        artifact: the policy.
+        view: the same.
         correction: of the sampler's steps, for all that is run but ``run_dense``; None for none.
         model: of the policy.
         types: of each block's residual.
@@ -49,11 +49,10 @@ class Executor:
         pruner_graph: the pruner; None if the artifact has none.
     """
 
-    def __init__(self, artifact: Artifact, device: torch.device | None = None) -> None:
-        blocks = artifact.manifest.blocks
-        self.artifact = artifact
-        self.model = ReferenceModel.from_artifact(artifact, device)
-        pieces = artifact.pieces
+    def __init__(self, view: View, device: torch.device | None = None) -> None:
+        blocks, pieces = view.manifest.blocks, view.pieces
+        self.view = view
+        self.model = ReferenceModel.from_view(view, device)
         read = [graph for graph in (pieces.condition, pieces.step) if graph is not None]
         types = {name: graph.types()[name] for graph in read for name in graph.outputs}
         self._axes = {name: one.batch_axis for name, one in types.items() if one.batch_axis is not None}

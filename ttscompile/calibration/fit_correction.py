@@ -28,5 +28,5 @@ def fit_correction(executor: Executor, plan: PlanArray, calls: Calls, reads: boo
         reads: whether it may read the observation.
     """
     loop = SparseLoop(executor, calls, None, reads=reads, whole=is_whole(plan))
-    ends = loop.ends(plan) if may_jump(executor.artifact.manifest.spec.sample) else (loop.end(plan),)
+    ends = loop.ends(plan) if may_jump(executor.view.manifest.spec.sample) else (loop.end(plan),)
     return loop.correction(min(ends, key=lambda place: float((place.fitted_samples - calls.targets).abs().mean())))

@@ -1,182 +1,337 @@
-"""How good plans are on calls that they were not learned from, and whether that is good enough."""
+"""How far what a plan answers is from what the original answers: the one yardstick for plans of every kind.
+
+The energy distance (Szekely and Rizzo, 2013) of the executed actions, normalised. For draws i < j of noise of one
+observation, with x the plan's answers and y the original's,
+
+    h = |x_i - y_j| + |x_j - y_i| - |x_i - x_j| - |y_i - y_j|
+
+has the energy distance of the two distributions of answers as its mean, whether or not draw i of the plan has the noise
+of draw i of the original; where it has, x_i is near y_i, the terms nearly cancel, and h varies little. ``distance`` is
+the root of the mean of h over the mean of |y_i - y_j|: 0 if nothing can be told apart, and 1 where answers are as far
+off as ones that have a shift of about their own spread (``docs/decisions.md`` says why the root).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from itertools import combinations
 from typing import Any
 
 import numpy as np
-import torch
+import numpy.typing as npt
 
-from ..artifact.load import Artifact
-from ..artifact.manifest import DENSE, UNIFORM, Manifest
-from ..core.correction import Correction
-from ..core.lattice import PlanArray, uniform_plan
-from ..core.spec import FP32
-from ..errors import CalibrationFailedError
-from ..ir.pieces import PRUNER
-from ..runtimes.against_fp32 import FEW_CALLS, answers, mean_errors
+from ..core.lattice import Source, plan_flops, sparsity
+from ..core.plan import Plan
+from ..core.spec import FloatArray, SamplerTable
+from ..errors import CalibrationError
+from ..measure.timer import Timer, Times
 from ..runtimes.open import open_runtime
-from ..runtimes.random_calls import normalized, random_noise
-from ..runtimes.settle import pruner_plan
-from ..trajectories.episodes import Episode
-from .budget import ERROR, FLOPS, Goal
-from .calls import LARGEST, Actions, Calls, FloatArray, draw_noise, sample_calls
-from .execute import Executor
-from .result import CalibrationResult, PlanScore
-from .strategies import FITTED, strategy_of
-from .targets import dense_rounds
-from .task import Found
+from ..runtimes.report import CallReport
+from ..runtimes.runtime import Runtime
+from .calls import LARGEST
+from .trials import DRAWS, HELD_OUT, Sample, Trials
 
-SCHEDULE = "schedule"
-"""Name in the artifact of the best plan that does not depend on the observation."""
+Numbers = npt.NDArray[np.float64]
 
-BETTER = 0.9
-"""A plan has to bring the error below this share of the uniform schedule's."""
+STREAMS = 32
+"""Calls that are computed together, at most."""
 
-WITH_OTHER_NOISE = 32
-"""Held-out calls at most that the dense policy answers a second time."""
+RESAMPLED = 1000
+"""Samples of the bootstrap over episodes."""
 
-IN_PRECISION = 8
-"""Calls in the artifact's precision; on Push-T at K = 100 about one second each, the dense ones for the most part."""
+WARM_UP, TIMED = 2, 16
+"""Rounds of timed calls that are not counted, and that are."""
 
 
-def uniform_of(manifest: Manifest, budget: int) -> Found:
-    """The baseline: whole steps, evenly spaced; the last cells of the budget are rounded up to one, in its favour."""
-    blocks = len(manifest.blocks)
-    return Found(uniform_plan(manifest.steps, blocks, -(-budget // blocks)))
+@dataclass(frozen=True)
+class Score:
+    """How good a plan is on calls of one part of the episodes.
 
-
-def judge(artifact: Artifact, executor: Executor, plans: Mapping[str, Found], calls: Calls) -> dict[str, PlanScore]:
-    """Scores of plans, and of those of the pruner that belongs to the one that is called ``schedule``, by name.
-
-    ``calls`` are of episodes that nothing was learned from, with targets; windows of consecutive ones if a plan may
-    read what an earlier call computed.
+    Attributes:
+        distance: between what it answers and what the original answers to the same observation, in units of what other
+            noise changes; 0 is the same. See the module.
+        interval: 95 % interval of the distance, over episodes.
+        error: mean absolute difference between its executed actions and those of the original with the same noise, in
+            the units of the actions; None for plans of another sampler or start, which take other noise.
+        error_p90: 90th percentile of that over calls.
+        sparsity: share of the cells that are reused, mean over the calls.
+        flops_sparsity: the same with each cell weighed by its FLOPs.
+        flops_saved: share of the FLOPs of a dense call of the original that are saved; all that is computed is counted.
+        plans: how many different matrices of cells the calls had.
+        tokens: share of the tokens of new frames that were computed; 1 where no tokens are reused.
+        milliseconds: median of a call of one stream on this machine, with onnxruntime; None where it was not timed.
+        gaps: mean h of each episode, and the mean over all episodes of |y_i - y_j|, that the others are of: what
+            ``further`` compares.
     """
-    flops, actions = artifact.manifest.flops, Actions(artifact.manifest.spec)
 
-    def errors(correction: Correction | None, plan: PlanArray) -> FloatArray:
-        return actions.errors(executor.corrected(correction).run(plan, calls), calls.targets, units=True)
+    distance: float
+    interval: tuple[float, float]
+    error: float | None
+    error_p90: float | None
+    sparsity: float
+    flops_sparsity: float
+    flops_saved: float
+    plans: int
+    tokens: float = 1.0
+    milliseconds: float | None = None
+    gaps: tuple[tuple[float, ...], float] = ((), 0.0)
 
-    scores = dict[str, PlanScore]()
-    for name, one in plans.items():
-        off, own = errors(one.correction, one.schedule), one.schedule[None]
-        scores[name] = PlanScore.of(off, own, flops, pruned=False, correction=one.correction)
-    found = plans[SCHEDULE]
-    if found.pruner is not None:
-        made = pruner_plan(executor.logits(calls, found.pruner))
-        shared = found.pruner_correction
-        scores[PRUNER] = PlanScore.of(errors(shared, made), made, flops, pruned=True, correction=shared)
-    return scores
+    def record(self) -> dict[str, Any]:
+        """As JSON, for the record of a calibration; the same on every machine."""
+        known = {name: one for name, one in asdict(self).items() if one is not None}
+        return {name: one for name, one in known.items() if name not in ("gaps", "milliseconds")}
 
 
-def dense_with_other_noise(artifact: Artifact, executor: Executor, calls: Calls, seed: int) -> float:
-    """How far two answers of the dense policy to one observation are apart, in the units of the actions.
+def judge(trials: Trials, plan: Plan, part: str = HELD_OUT, threads: int | None = None) -> Score:
+    """Score a plan.
 
-    The yardstick for the errors of plans: what is far below it changes less than the policy's own noise does.
+    A plan that begins with the chunk of the call before is judged along each stretch of an episode, and once more with
+    the chunk of another episode, as if the world had changed between two calls; the worse of the two counts.
 
     Args:
-        artifact: the artifact of the policy.
-        executor: of the artifact.
-        calls: with targets; some of them get another noise.
-        seed: of that noise.
-    """
-    spec = artifact.manifest.spec
-    some = executor.select(calls, np.arange(min(WITH_OTHER_NOISE, calls.count)))
-    initial, noise = draw_noise(spec, some.count, (seed, 5))
-    paths = torch.cat(list(dense_rounds(executor, replace(some, initial=initial, noise=noise, path=None))))
-    return float(Actions(spec).errors(paths[:, -1], some.targets, units=True).mean())
-
-
-def default_of(scores: Mapping[str, PlanScore], goal: Goal, cells: int, manifest: Manifest) -> str:
-    """The pruner's plans if they are no worse than the schedule on held-out calls, and keep the budget as it does.
-
-    ``cells`` is how many computed cells the goal comes to.
-    """
-    pruned = scores.get(PRUNER)
-    if pruned is None or pruned.sparsity < goal.sparsity(cells, manifest) - 1e-9:
-        return SCHEDULE
-    saves = goal.kind != FLOPS or pruned.flops_saved >= goal.value - 1e-9
-    return PRUNER if saves and pruned.error <= scores[SCHEDULE].error else SCHEDULE
-
-
-def precision_record(
-    artifact: Artifact, episodes: Sequence[Episode], numbers: Sequence[int], schedule: Found, seed: int
-) -> dict[str, Any]:
-    """Actions in the artifact's precision against those in fp32 with the same plan and noise.
-
-    So this is the error of the precision alone; that of the plan is measured in fp32, and has its own figures.
-
-    Args:
-        artifact: the artifact of the policy.
-        episodes: all recorded episodes.
-        numbers: the numbers of the held-out episodes.
-        schedule: what is measured beside ``dense``; it reads nothing of earlier calls, which these calls do not have.
-        seed: the seed of the choice of calls and of their noise.
-
-    Returns:
-        ``{"precision": {"name": .., "calls": .., "plans": {plan: {"error": .., "error_p90": ..}}, "parts": {part:
-        error}}}`` for the calibration record, in the units of the actions; empty for an artifact in fp32. ``parts`` has
-        the mean error of dense calls with each part alone in the precision, on some of the calls where there are more.
-    """
-    precision, spec = artifact.manifest.precision, artifact.manifest.spec
-    if precision is None:
-        return {}
-    draw, calls = np.random.default_rng((seed, 3)), []
-    for number, row in sample_calls(episodes, numbers, IN_PRECISION, seed):
-        obs = {key: episodes[number].observations[key][row : row + 1] for key in spec.observations}
-        calls.append((normalized(spec, obs), random_noise(spec, draw)))
-    plain, exact, scores = open_runtime(artifact.at_precision(FP32)), dict[str, list[FloatArray]](), {}
-    plans = {DENSE: Found(artifact.schedule(DENSE)), SCHEDULE: schedule}
-    for name, one in plans.items():
-        exact[name] = answers(plain, one.schedule, calls, one.correction)
-    own = open_runtime(artifact)
-    for name, one in plans.items():
-        errors = mean_errors(spec.chunk, answers(own, one.schedule, calls, one.correction), exact[name])
-        scores[name] = {"error": float(errors.mean()), "error_p90": float(np.quantile(errors, 0.9))}
-    parts = dict.fromkeys(precision.kept, scores[DENSE]["error"])
-    for part in parts if len(parts) > 1 else ():
-        alone = answers(open_runtime(artifact.with_parts([part])), plans[DENSE].schedule, calls[:FEW_CALLS])
-        parts[part] = float(mean_errors(spec.chunk, alone, exact[DENSE][:FEW_CALLS]).mean())
-    return {"precision": {"name": precision.name, "calls": len(calls), "plans": scores, "parts": parts}}
-
-
-def require_success(result: CalibrationResult, goal: Goal) -> None:
-    """Raise unless the default plan is what was asked for.
+        trials: holding all that the plan names.
+        plan: any that a runtime can execute.
+        part: of the episodes.
+        threads: with which its calls are timed; None leaves that out.
 
     Raises:
-        CalibrationFailedError: says which of its promises it breaks.
+        IllegalPlanError: the plan names what the artifact lacks.
+        CalibrationError: a plan that begins with the chunk of the call before, and no recorded call has one before it.
     """
-    chosen, baseline = result.plans[result.default_plan], result.plans[UNIFORM]
+    plan, sample = replace(plan, repair=True), trials.sample(part)
+    answered = _Answers(trials, plan, sample)
+    scores = [_scored(trials, plan, sample, made, answered.reports) for made in answered.all()]
+    score = max(scores, key=lambda one: one.distance)
+    return score if threads is None else replace(score, milliseconds=timed(trials, [plan], threads)[0].median)
 
-    def require(kept: bool, what: str, otherwise: str = "") -> None:
-        if not kept:
-            plan = f"plan {result.default_plan!r} of strategy {result.strategy!r}"
-            raise CalibrationFailedError(f"{plan} {what}. The artifact is as it was.{otherwise}")
 
-    # The mean of some calls, one of which is that far off.
-    require(chosen.error <= LARGEST / 1e6, "gives actions that are not numbers")
-    require(
-        chosen.sparsity >= result.target_sparsity - 1e-9,
-        f"reaches a sparsity of {chosen.sparsity:.4f} on validation calls; the target is {result.target_sparsity:g}",
-        " Calibrate with more episodes or more time.",
+def further(score: Score, other: Score) -> tuple[float, float]:
+    """By how much a score is further from the original than another of the same calls, and 95 % limits of that.
+
+    Returns:
+        The difference of the distances, and its upper limit, over episodes.
+    """
+    difference = score.distance - other.distance
+    own, theirs = (_resampled(np.array(one.gaps[0]), one.gaps[1]) for one in (score, other))
+    return difference, float(np.quantile(own - theirs, 0.975))
+
+
+def timed(trials: Trials, plans: Sequence[Plan], threads: int, rounds: int = TIMED) -> list[Times]:
+    """What calls of plans take with onnxruntime, of one stream, in turn: whatever else the machine does hits all.
+
+    Every call computes all of its frames. Weights that are in memory alone are timed as the original's.
+    """
+    opened = [open_runtime(trials.artifact, "onnxruntime", threads, plan=_filed(trials, plan)) for plan in plans]
+    timer, sample = Timer(len(plans), WARM_UP), trials.held_out
+    for number in range(WARM_UP + rounds):
+        stretch, row = sample.calls[number % len(sample.calls)].tolist()
+        obs = trials.observation([(int(sample.stretches[stretch, 0]), row)])
+        for i in timer.round():
+            runtime, plan = opened[i], _filed(trials, plans[i])
+            noise = trials.noise(_loop_spec(trials, plan), [trials.key(sample.part, stretch, row, 0)])
+            if plan.otherwise is not None:
+                runtime.predict(obs, noise, plan)  # so that there is a chunk to begin with
+            runtime.forget_frames()
+            timer.time(i, partial(runtime.predict, obs, noise, plan))
+            runtime.reset()
+    return timer.times
+
+
+def _filed(trials: Trials, plan: Plan) -> Plan:
+    """The plan with weights that the artifact has in files."""
+    if not trials.fresh:
+        return plan
+    otherwise = None if plan.otherwise is None else _filed(trials, plan.otherwise)
+    return replace(plan, weights="original", otherwise=otherwise)
+
+
+def _loop_spec(trials: Trials, plan: Plan) -> Any:
+    """The specification with the whole loop that the noise of a plan's calls is for."""
+    return trials.view(plan.otherwise or plan).manifest.spec
+
+
+class _Answers:
+    """What a plan answers to the calls of a sample.
+
+    Attributes:
+        reports: of the calls that are scored, with the number of their stream each.
+    """
+
+    def __init__(self, trials: Trials, plan: Plan, sample: Sample) -> None:
+        self._trials, self._sample = trials, sample
+        self._plan = plan.exact if trials.fresh else plan
+        self._spec = _loop_spec(trials, self._plan)
+        name, device = "onnxruntime", None
+        if trials.fresh:
+            name = "reference"
+        elif trials.device is not None and self._plan is self._plan.exact:
+            name, device = "torch", str(trials.device)
+        threads = 1 if name == "reference" else trials.threads
+        self._runtime: Runtime = open_runtime(trials.artifact, name, threads, device, self._plan)
+        # The scale of int8 activations is that of the whole batch, and a robot has one stream.
+        self._streams = 1 if self._plan.precision else STREAMS
+        self.reports: list[tuple[CallReport, int]] = []
+
+    def all(self) -> Iterator[FloatArray]:
+        """Denoised samples ``[N, R, T, D]``; twice for a plan that begins with the chunk of the call before."""
+        if self._plan.otherwise is not None:
+            if any(first == last for _, first, last in self._sample.stretches):
+                told = (
+                    "a plan that begins with the chunk of the call before is judged on episodes of two calls at least"
+                )
+                raise CalibrationError(f"{told}; one that was recorded has one call. Record longer ones.")
+            yield self._in_order()
+            yield self._after_another()
+        elif _goes_on(self._plan):
+            yield self._in_order()
+        else:
+            yield self._apart()
+
+    def _apart(self) -> FloatArray:
+        """Every call the first of an episode."""
+        sample, made = self._sample, np.empty_like(self._sample.answers)
+        asked = [(n, draw) for n in range(len(sample.calls)) for draw in range(DRAWS)]
+        for some in _batches(asked, self._streams):
+            self._runtime.reset()
+            found = self._call([(*sample.calls[n].tolist(), draw) for n, draw in some], scored=range(len(some)))
+            made[tuple(np.array(some).T)] = found
+        return made
+
+    def _in_order(self) -> FloatArray:
+        """All calls of each stretch, one after the other; those of several stretches together."""
+        sample, made = self._sample, np.empty_like(self._sample.answers)
+        numbers = {(stretch, row): n for n, (stretch, row) in enumerate(sample.calls.tolist())}
+        asked = [(stretch, draw) for stretch in range(len(sample.stretches)) for draw in range(DRAWS)]
+        for some in _batches(asked, self._streams):
+            self._runtime.reset()
+            ends = sample.stretches[[stretch for stretch, _ in some], 1:].tolist()
+            for step in range(max(last - first for first, last in ends) + 1):
+                # A stretch that is over goes on with its last call, for nobody.
+                rows = [min(first + step, last) for first, last in ends]
+                going = [i for i, (first, last) in enumerate(ends) if first + step <= last]
+                wanted = [i for i in going if (some[i][0], rows[i]) in numbers]
+                calls = [(stretch, row, draw) for (stretch, draw), row in zip(some, rows, strict=True)]
+                found = self._call(calls, wanted)
+                for i in wanted:
+                    made[numbers[some[i][0], rows[i]], some[i][1]] = found[i]
+        return made
+
+    def _after_another(self) -> FloatArray:
+        """Every call after one of another episode, drawn at random: as if the world had changed between the two."""
+        sample, made, trials = self._sample, np.empty_like(self._sample.answers), self._trials
+        draw = np.random.default_rng((trials.seed, 6))
+        asked = [(n, r) for n in range(len(sample.calls)) for r in range(DRAWS)]
+        for some in _batches(asked, self._streams):
+            self._runtime.reset()
+            others = []
+            for n, _ in some:
+                known = [i for i in range(len(trials.episodes)) if i != int(sample.episodes[n])]
+                other = int(draw.choice(known))
+                others.append((other, min(int(sample.calls[n, 1]) - 1, trials.episodes[other].calls - 1)))
+            keys = [(2, n, row, r) for (n, r), (_, row) in zip(some, others, strict=True)]
+            self._runtime.predict(trials.observation(others), trials.noise(self._spec, keys), self._plan)
+            found = self._call([(*sample.calls[n].tolist(), r) for n, r in some], scored=range(len(some)))
+            made[tuple(np.array(some).T)] = found
+        return made
+
+    def _call(self, calls: Sequence[tuple[int, int, int]], scored: Sequence[int]) -> FloatArray:
+        """The next call of streams: the stretch, row and draw of each. Reports are kept of those that are scored."""
+        trials, sample = self._trials, self._sample
+        obs = trials.observation([(int(sample.stretches[stretch, 0]), row) for stretch, row, _ in calls])
+        noise = trials.noise(self._spec, [trials.key(sample.part, *call) for call in calls])
+        found, report = self._runtime.predict(obs, noise, self._plan)
+        self.reports += [(report, i) for i in scored]
+        return found
+
+
+def _batches(asked: Sequence[tuple[int, int]], size: int) -> Iterator[Sequence[tuple[int, int]]]:
+    return (asked[i : i + size] for i in range(0, len(asked), size))
+
+
+def _goes_on(plan: Plan) -> bool:
+    """Whether what a call of it answers depends on the calls before."""
+    reads = plan.cells is None or bool((plan.cells == Source.ROLLOUT).any())
+    return reads or plan.tokens is not None
+
+
+def _scored(
+    trials: Trials, plan: Plan, sample: Sample, made: FloatArray, reports: Sequence[tuple[CallReport, int]]
+) -> Score:
+    spec, flops, answers = trials.artifact.manifest.spec, trials.artifact.manifest.flops, sample.answers
+    part = (..., slice(spec.chunk.start, spec.chunk.stop), slice(spec.chunk.action_dim))
+    x, y = (samples[part].astype(np.float64).reshape(*samples.shape[:2], -1) for samples in (made, answers))
+    x = np.nan_to_num(x, nan=LARGEST, posinf=LARGEST, neginf=-LARGEST).clip(-LARGEST, LARGEST)
+    h, apart = pairs(x, y)
+    numbers = np.unique(sample.episodes)
+    gaps = np.array([h[sample.episodes == one].mean() for one in numbers])
+    low, high = np.quantile(_resampled(gaps, float(apart.mean())), (0.025, 0.975))
+    error = error_p90 = None
+    if _paired(trials, plan):
+        scale = 1.0 if spec.chunk.normalizer is None else np.abs(spec.chunk.normalizer.scale)
+        wrong = np.abs(x - y).reshape(*x.shape[:2], -1, spec.chunk.action_dim) / scale
+        each = wrong.mean((2, 3)).clip(max=LARGEST)
+        error, error_p90 = float(each.mean()), float(np.quantile(each, 0.9))
+    cells = np.stack([report.plan[i] for report, i in reports])
+    frames = [report.frames for report, _ in reports]
+    of = sum(one.of for one in frames)
+    block_flops = cells.shape[1] * sum(flops.blocks)
+    return Score(
+        distance=rooted(float(gaps.mean()), float(apart.mean())),
+        interval=(float(low), float(high)),
+        error=error,
+        error_p90=error_p90,
+        sparsity=sparsity(cells),
+        flops_sparsity=1 - float(np.mean([plan_flops(one, flops.blocks) for one in cells])) / block_flops,
+        flops_saved=1 - float(np.mean([report.flops[i] for report, i in reports])) / flops.dense,
+        plans=len(np.unique(cells, axis=0)),
+        tokens=sum(one.tokens for one in frames) / of if of else 1.0,
+        gaps=(tuple(gaps.tolist()), float(apart.mean())),
     )
-    require(
-        goal.kind != FLOPS or chosen.flops_saved >= goal.value - 1e-9,
-        f"saves {chosen.flops_saved:.4f} of the FLOPs of a dense call; the target is {goal.value:g}: its blocks cost"
-        " more than the average",
-        f" Raise the target a little, or take strategy {' or '.join(map(repr, FITTED))}, which computes whole steps.",
-    )
-    require(
-        goal.kind != ERROR or chosen.error <= goal.value,
-        f"computes {result.budget['cells']} cells, and is {chosen.error:.4g} off on average on the validation calls; at"
-        f" most {goal.value:g} was asked for",
-        " Allow a larger error, more time, or calibrate with more episodes.",
-    )
-    require(
-        strategy_of(result.strategy).baseline or chosen.error < BETTER * baseline.error,
-        f"is no better than the uniform schedule: on the validation calls its actions are {chosen.error:.4g} off on"
-        f" average, the uniform schedule's {baseline.error:.4g} (expected below {BETTER:.0%} of that)",
-        " Calibrate with more episodes or more time, or lower the target.",
-    )
+
+
+def pairs(x: Numbers, y: Numbers) -> tuple[Numbers, Numbers]:
+    """h, and how far two answers of the original are apart, mean over the pairs of draws of each call.
+
+    Args:
+        x: what a plan answers, ``[N, R, A]``.
+        y: what the original answers.
+
+    Returns:
+        ``[N]`` twice.
+    """
+    found = []
+    for i, j in combinations(range(x.shape[1]), 2):
+        crossed = _far(x[:, i], y[:, j]) + _far(x[:, j], y[:, i])
+        apart = _far(y[:, i], y[:, j])
+        found.append((crossed - _far(x[:, i], x[:, j]) - apart, apart))
+    h, far = np.mean(found, axis=0)
+    return h, far
+
+
+def _far(one: Numbers, other: Numbers) -> Numbers:
+    return np.asarray(np.abs(one - other).mean(-1))
+
+
+def rooted(gap: float, apart: float) -> float:
+    """The root of a mean h in units of how far answers of the original are apart; of less than 0 that of its size."""
+    share = gap / max(apart, 1e-12)
+    return float(np.sign(share) * np.sqrt(abs(share)))
+
+
+def _resampled(gaps: Numbers, apart: float) -> Numbers:
+    """The distance with episodes drawn anew, of the mean h of each; the same draws for equally many episodes."""
+    drawn = np.random.default_rng(0).integers(0, len(gaps), (RESAMPLED, len(gaps)))
+    share = gaps[drawn].mean(1) / max(apart, 1e-12)
+    return np.asarray(np.sign(share) * np.sqrt(np.abs(share)))
+
+
+def _paired(trials: Trials, plan: Plan) -> bool:
+    """Whether the noise of the plan's calls means the same as in the original."""
+
+    def kind(table: SamplerTable) -> tuple[str, int, bool]:
+        return table.name, table.steps, table.stochastic
+
+    manifest = trials.artifact.manifest
+    return plan.otherwise is None and kind(manifest.sampler_of(plan.loop)) == kind(manifest.spec.sampler)

@@ -41,7 +41,8 @@ from .state import StateFile
 from .step_counts import SAFE, SHARE, CrowdedSchedules, budget_of_error, named_plans
 from .strategies import DEFAULT, FITTED, Strategy, strategy_of
 from .targets import draw_calls, with_targets
-from .task import Clock, Found, Search, Task
+from .clock import Clock
+from .task import Found, Search, Task
 
 
 def calibrate(

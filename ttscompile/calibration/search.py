@@ -7,7 +7,8 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from .strategies import strategy_of
-from .task import Clock, Found, Search, Task
+from .clock import Clock
+from .task import Found, Search, Task
 
 CLOSING_SHARE = 0.3
 """What a search does at the end is left out where it would take more than this share of the time: on Push-T an interval

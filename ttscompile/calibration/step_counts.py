@@ -17,7 +17,8 @@ from .budget import Budget, Goal
 from .progress import Bar
 from .state import StateFile
 from .strategies import Strategy
-from .task import Clock, Found, Task
+from .clock import Clock
+from .task import Found, Task
 from .whole_steps import Errors, WholeSteps
 
 CROWDING = (2.0, 3.0, 1.5, 4.0, 1.0, 2.5, 3.5, 5.0, 0.6, 0.4)

@@ -8,14 +8,16 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from ..artifact.view import view_of
+from ..core.plan import Plan
 from ..core.spec import PolicySpec
 from ..pool import Here, Pool, Work, artifact_elsewhere, place_of
 from ..trajectories.episodes import Episode
 from .calls import Calls, Split, prepare_calls, sample_calls, sample_windows
+from .clock import Clock
 from .execute import Executor, workers
 from .progress import Bar
 from .state import StateFile
-from .task import Clock
 
 REPEATS = 8
 """How often an observation may be learned from, each time with another noise."""
@@ -72,7 +74,7 @@ def dense_rounds(executor: Executor, calls: Calls, begin: int = 0, pool: Pool | 
     """
     pool = pool or Here()
     at_once = max(pool.count, torch.get_num_threads()) * TARGETS_AT_ONCE
-    work = Work(executor.run_dense, _dense_elsewhere, place_of(executor.artifact), threads=True)
+    work = Work(executor.run_dense, _dense_elsewhere, where(executor), threads=True)
     while begin < calls.count:
         end = min(begin + at_once, calls.count)
         parts = [np.arange(i, min(i + TARGETS_AT_ONCE, end)) for i in range(begin, end, TARGETS_AT_ONCE)]
@@ -81,8 +83,22 @@ def dense_rounds(executor: Executor, calls: Calls, begin: int = 0, pool: Pool | 
         yield torch.cat(found)
 
 
-def _dense_elsewhere(path: str, identity: str) -> Callable[[Calls], torch.Tensor]:
-    executor = Executor(artifact_elsewhere(path, identity))
+def where(executor: Executor) -> tuple[str, str, str]:
+    """What ``executor_elsewhere`` takes."""
+    return *place_of(executor.view.artifact), executor.view.variant.loop
+
+
+def executor_elsewhere(path: str, identity: str, loop: str) -> Executor:
+    """The same executor in another process, which may be on another machine.
+
+    Raises:
+        CalibrationError: there is another artifact, or none.
+    """
+    return Executor(view_of(artifact_elsewhere(path, identity), Plan(loop)))
+
+
+def _dense_elsewhere(path: str, identity: str, loop: str) -> Callable[[Calls], torch.Tensor]:
+    executor = executor_elsewhere(path, identity, loop)
 
     def answer(calls: Calls) -> torch.Tensor:
         with workers() as threads:  # one thread does a part, as here
@@ -97,26 +113,15 @@ def draw_calls(
     episodes: Sequence[Episode],
     split: Split,
     limit: int,
-    judged: int,
     seed: int,
     window: int = 1,
-) -> dict[str, Calls]:
-    """The calls to learn from, ``calibration``, and those that plans are judged on, ``validation``, without targets.
+) -> Calls:
+    """The calls to learn from, without targets: at most ``limit`` of them, in windows of so many.
 
-    There are at most ``limit`` and ``judged`` of them, in windows of so many; the seed is that of their choice and of
-    their noise.
+    The seed is that of their choice and of their noise.
     """
-
-    def chosen_of(numbers: Sequence[int], most: int, repeats: int = 1) -> list[tuple[int, int]]:
-        if window == 1:
-            return sample_calls(episodes, numbers, most, seed, repeats)
-        return sample_windows(episodes, numbers, most, window, seed, repeats)
-
-    drawn = {
-        "calibration": chosen_of(split.calibration, limit, REPEATS),
-        "validation": chosen_of(split.validation, judged),
-    }
-    return {
-        name: prepare_calls(executor.model, spec, episodes, chosen, (seed, 2, number), window)
-        for number, (name, chosen) in enumerate(drawn.items())
-    }
+    if window == 1:
+        chosen = sample_calls(episodes, split.calibration, limit, seed, REPEATS)
+    else:
+        chosen = sample_windows(episodes, split.calibration, limit, window, seed, REPEATS)
+    return prepare_calls(executor.model, spec, episodes, chosen, (seed, 2, 0), window)

@@ -1,13 +1,11 @@
-"""What a strategy is given (``Task``, ``Clock``), how it is interrupted (``Search``), and what it gives (``Found``)."""
+"""What a strategy is given (``Task``), how it is interrupted (``Search``), and what it gives (``Found``)."""
 
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from copy import copy
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -17,61 +15,13 @@ from ..core.correction import Correction
 from ..core.lattice import PlanArray, Source
 from ..errors import CalibrationError
 from ..pool import Pool
-from ..runtimes.settle import pruner_plan
+from ..runtimes.plans import pruner_plan
 from .calls import Actions, Calls
+from .clock import Clock
 from .execute import Executor
 from .whole_steps import WholeSteps
 
 Array = npt.NDArray[Any]
-Part = TypeVar("Part")
-
-
-class Clock:
-    """Seconds of work, those before an interruption included, and what there is still time for.
-
-    Args:
-        limit: seconds after which nothing more is begun.
-        before: seconds of the parts of the work before this one.
-        begun: reading of ``time.monotonic`` when this part began; None for now.
-
-    Attributes:
-        limit: the argument of this name.
-        cut: whether anything was left out for want of time.
-    """
-
-    def __init__(self, limit: float = math.inf, before: float = 0.0, begun: float | None = None) -> None:
-        self.limit, self.cut = limit, False
-        self._zero = (time.monotonic() if begun is None else begun) - before
-
-    def elapsed(self) -> float:
-        """Seconds of work so far."""
-        return time.monotonic() - self._zero
-
-    def left(self) -> float:
-        """Seconds until the limit; negative after it."""
-        return self.limit - self.elapsed()
-
-    def until(self, share: float) -> Clock:
-        """The same clock with a share of the limit."""
-        other = copy(self)
-        other.limit *= share
-        return other
-
-    def has(self, seconds: float) -> bool:
-        """Whether so much is left; where it is not, something is left out, and ``cut`` says so."""
-        enough = seconds <= self.left()
-        self.cut |= not enough
-        return enough
-
-    def in_time(self, parts: Iterable[Part]) -> Iterator[Part]:
-        """The first part of some work, and others as long as they end in time, taking no more than those before."""
-        longest = 0.0
-        for number, part in enumerate(parts):
-            begun = self.elapsed()
-            if number and not self.has(longest):
-                return
-            yield part
-            longest = max(longest, self.elapsed() - begun)
 
 
 @dataclass(frozen=True)

@@ -12,12 +12,13 @@ from torch import Tensor
 
 from ..core.correction import Correction
 from ..core.lattice import BoolArray, PlanArray, whole_steps_plan
-from ..pool import Here, Pool, Work, artifact_elsewhere, place_of
+from ..pool import Here, Pool, Work
 from .calls import Actions, Calls, IntArray
 from .execute import Executor
 from .fit_correction import fit_correction
 from .schedule_runs import Trails
 from .sparse_loop import SparseLoop, anchors_of
+from .targets import executor_elsewhere, where
 
 FITTED, COMPARED = 384, 128
 """Calls on which a candidate's correction is fitted, and others on which its error is measured; fewer if there are
@@ -66,7 +67,7 @@ class WholeSteps:
         self._known: dict[tuple[int, ...], Errors] = {}
         self._trails: dict[bool | None, Trails] = {}
         self._pool = pool or Here()
-        self._work = Work(self.measured, _measured_elsewhere, (*place_of(executor.artifact), calls, seed))
+        self._work = Work(self.measured, _measured_elsewhere, (*where(executor), calls, seed))
         order = np.random.default_rng((seed, 3, 0)).permutation(calls.count // calls.window)
         apart = _set_apart(calls.episodes[:: calls.window][order])
 
@@ -178,10 +179,10 @@ class WholeSteps:
 
 
 def _measured_elsewhere(
-    path: str, identity: str, calls: Calls, seed: int
+    path: str, identity: str, loop: str, calls: Calls, seed: int
 ) -> Callable[[Sequence[int]], tuple[Errors, float]]:
-    artifact = artifact_elsewhere(path, identity)
-    return WholeSteps(Executor(artifact), Actions(artifact.manifest.spec), calls, seed).measured
+    executor = executor_elsewhere(path, identity, loop)
+    return WholeSteps(executor, Actions(executor.view.manifest.spec), calls, seed).measured
 
 
 def _plans(plan: PlanArray | MakePlans, calls: Calls) -> PlanArray:

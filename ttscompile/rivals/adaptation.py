@@ -8,7 +8,7 @@ import numpy as np
 
 from ..calibration.task import Array, Task
 from ..core.lattice import PlanArray, Source
-from ..runtimes.settle import pruner_plan
+from ..runtimes.plans import pruner_plan
 from .linear import Matrix, linearise
 from .switches import capacity, fit_switches, has_head, head_features, head_weights
 

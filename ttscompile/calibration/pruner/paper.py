@@ -35,7 +35,7 @@ from torch import Tensor
 from ...core.lattice import PlanArray, Source, whole_steps_plan
 from ...ir.plan_head import first_numbers
 from ...rivals.switches import has_head
-from ...runtimes.settle import pruner_plan
+from ...runtimes.plans import pruner_plan
 from ..calls import Calls, IntArray
 from ..step_counts import crowded_family
 from ..task import Array, Found, NothingAfter, Task

@@ -1,0 +1,164 @@
+"""What proposes plans to the judge: three members each, and a row in ``PROPOSERS``.
+
+The command line reads names and what they tell here; so this module imports neither torch nor those of the proposers.
+Members as those of the algorithms of NNCF: whether it applies, what it does, and what it tells.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy.typing as npt
+
+from ..errors import CalibrationError
+
+if TYPE_CHECKING:
+    from ..artifact.block_weights import BlockWeights
+    from ..artifact.load import Artifact
+    from ..artifact.manifest import StartRecord
+    from ..core.plan import Plan
+    from .budget import Goal
+    from .clock import Clock
+    from .trials import Trials
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """A plan, and what has to be written for it.
+
+    Attributes:
+        name: that it gets in the artifact, if it is kept.
+        plan: what is judged. It may name what the artifact has not, and the fields below bring.
+        notes: what is worth keeping about how it was found; JSON. They go into the record under the proposer's name.
+        pruner: all constants of the pruner, by name; None leaves them.
+        weights: of blocks, by the name that the plan has for them.
+        starts: loops that begin with the chunk of the call before, by the name that the plan has for them.
+        margin: by how much further from the original than the plan that it was made from it may be: the upper limit of
+            the difference over episodes counts (``judge.further``). For plans that cost less. None: it has to be
+            nearer.
+        beside: kept under its name whatever its score, and not a candidate for the default.
+        shared: fields that the other plans of this calibration get too, if it is kept: of ``Plan``, by name.
+    """
+
+    name: str
+    plan: Plan
+    notes: Mapping[str, Any] = field(default_factory=dict)
+    pruner: Mapping[str, npt.NDArray[Any]] | None = None
+    weights: Mapping[str, BlockWeights] = field(default_factory=dict)
+    starts: Mapping[str, StartRecord] = field(default_factory=dict)
+    margin: float | None = None
+    beside: bool = False
+    shared: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Request:
+    """What was asked for, as far as proposers read it.
+
+    Attributes:
+        goal: the budget.
+        strategy: how schedules are found; a name of ``strategies``.
+        correct: whether a correction is fitted to what a strategy finds that fits none itself.
+        intervals: of a search, at most; None for its own number.
+        rank: of the low-rank update to each weight matrix.
+        updates: of the weights.
+        margin: in place of ``Proposal.margin`` wherever that is a number; None leaves it.
+    """
+
+    goal: Goal
+    strategy: str = "tts"
+    correct: bool = False
+    intervals: int | None = None
+    rank: int = 16
+    updates: int = 600
+    margin: float | None = None
+
+
+class Proposer(Protocol):
+    """Something that learns. Made of a ``Request``.
+
+    Attributes:
+        told: one sentence on what became of it, for people; read after ``propose`` is exhausted or left.
+    """
+
+    told: str
+
+    def applies(self, artifact: Artifact) -> str | None:
+        """Why it can do nothing for this policy; None if it can. Asked before any work."""
+
+    def propose(self, trials: Trials, plan: Plan, clock: Clock) -> Iterator[Proposal]:
+        """Propose plans made from a plan, the best so far, the most wished for first.
+
+        The first of a name that is kept ends the wish: others of this name are not judged. Proposals of other names,
+        and those ``beside``, are.
+
+        Args:
+            trials: to learn from (``calls``) and to choose on (``learned``); never ``held_out``.
+            plan: the best so far.
+            clock: nothing is begun that would end after its limit, but for what has to be done at least.
+
+        Raises:
+            CalibrationFailedError: it found nothing to propose; says why. The calibration ends with that where nobody
+                else has found anything.
+        """
+
+
+@dataclass(frozen=True)
+class Row:
+    """A proposer, as is known before it runs.
+
+    Attributes:
+        name: as ``--learn`` has it.
+        what: what it learns: the end of a sentence.
+        maker: where the class or function is that makes a ``Proposer`` of a ``Request``, as ``module:name`` below
+            ``ttscompile``.
+        corrects: whether it fits corrections, which need many calls to learn from.
+        trains: whether it trains a network on the calls, for which more of them are better.
+        consecutive: whether it learns from consecutive calls too (``Trials.windows``).
+    """
+
+    name: str
+    what: str
+    maker: str
+    corrects: bool = False
+    trains: bool = False
+    consecutive: bool = False
+
+    def make(self, request: Request) -> Proposer:
+        """The proposer.
+
+        Raises:
+            ImportError: there is no such module, or it needs a package that is not installed.
+        """
+        module, _, name = self.maker.partition(":")
+        made: Proposer = getattr(importlib.import_module(f"ttscompile.{module}"), name)(request)
+        return made
+
+
+PROPOSERS = (
+    Row("schedule", "which steps are computed, with corrections and jumps", "calibration.schedule:Schedule", True),
+    Row("pruner", "gates for each observation", "calibration.pruner.proposer:Pruner", consecutive=True),
+    Row("weights", "low-rank updates of the weights of later steps", "calibration.weights:Weights", True, True),
+    Row("precision", "which parts compute in the artifact's other precision", "calibration.precision:Precision"),
+    Row("tokens", "when a token of an image encoder is computed anew", "calibration.tokens:Tokens"),
+    Row("start", "how many steps a call needs that begins with the chunk before", "calibration.start:Start"),
+)
+"""In the order in which they propose, whatever the order in which they are asked for."""
+
+NAMES = tuple(row.name for row in PROPOSERS)
+
+
+def rows_of(learn: tuple[str, ...]) -> tuple[Row, ...]:
+    """The rows of these names, in the order of ``PROPOSERS``.
+
+    Raises:
+        CalibrationError: none is of a name, or there is no name.
+    """
+    unknown = [name for name in learn if name not in NAMES]
+    if unknown or not learn:
+        found = repr(unknown[0]) if unknown else "none"
+        raise CalibrationError(f"learn: expected some of {', '.join(NAMES)}; found {found}.")
+    return tuple(row for row in PROPOSERS if row.name in learn)

@@ -1,0 +1,277 @@
+"""What everything that learns is given, and what every plan is judged on: the same for all.
+
+One division of the recorded episodes, one source of noise, and what the original answers to the same observations.
+Nobody else divides episodes, draws noise, or asks the original: so what was learned from is never judged on, and two
+scores are of the same calls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from ..artifact.load import Artifact
+from ..artifact.manifest import WeightsRecord
+from ..artifact.view import View, view_of
+from ..core.plan import DENSE, FULL, Plan
+from ..core.spec import FloatArray, Noise, PolicySpec
+from ..pool import Here, Pool
+from ..runtimes.random_calls import Observation, normalized
+from ..runtimes.reference.model import noise_tensors
+from ..trajectories.episodes import Episode
+from .arguments import FEWEST_CALLS
+from .calls import Calls, IntArray, Split, calls_at, observed, split_episodes, window_of
+from .clock import Clock
+from .execute import Executor
+from .progress import Bar
+from .state import StateFile
+from .targets import dense_rounds, draw_calls, with_targets
+
+if TYPE_CHECKING:
+    from .proposer import Proposal
+
+FRACTION = 0.25
+"""Share of the episodes that are held out, if nothing else is said."""
+
+DRAWS = 2
+"""Of noise for each observation."""
+
+OBSERVATIONS = 64
+"""That the original answers, at most, of either part."""
+
+EPISODES = 16
+"""That these are of, at most."""
+
+STRETCH = 32
+"""Consecutive calls of an episode that they are among, at most: a plan that goes on from call to call makes all."""
+
+LEARNED, HELD_OUT = "learned", "held out"
+"""The two parts of the episodes: what is learned from, and what is judged on."""
+
+_NUMBERS = {LEARNED: 0, HELD_OUT: 1}
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """Calls of one part that the original has answered, each several times, with other noise.
+
+    Attributes:
+        part: ``LEARNED`` or ``HELD_OUT``.
+        stretches: number of the episode, first row and last row of each stretch of consecutive calls, ``[S, 3]``.
+        calls: number of the stretch and row of each answered call, ``[N, 2]``; where its stretch is longer than one
+            call there is one before it in the stretch.
+        answers: denoised samples of the original, float32 ``[N, R, T, D]``; R draws of noise of each call.
+    """
+
+    part: str
+    stretches: IntArray
+    calls: IntArray
+    answers: FloatArray
+
+    @property
+    def episodes(self) -> IntArray:
+        """The number of the episode of each answered call, ``[N]``."""
+        return np.asarray(self.stretches[self.calls[:, 0], 0])
+
+
+@dataclass(frozen=True, eq=False)
+class Trials:
+    """See the module. ``Trials.of`` makes them.
+
+    Attributes:
+        artifact: as it would be with what is judged; ``holding`` adds to it, in memory.
+        episodes: the recorded ones.
+        split: numbers of those that are learned from, and of those that are held out.
+        seed: of the split, the noise, and everything else that is random.
+        base: what a calibration begins with: every cell of its loop, in its precision and with its tokens.
+        executor: runs plans of the base's loop on many calls at once, in fp32.
+        limits: of the calls to learn from: how many there are whatever the time, and if there is enough.
+        fresh: whether the artifact holds in memory what it has not in its files.
+        state: of the calibration; what the original answers is kept there.
+        clock: of all work.
+        bar: told how far it is.
+        pool: where the original answers.
+        device: where the network computes; None for the CPU.
+    """
+
+    artifact: Artifact
+    episodes: Sequence[Episode]
+    split: Split
+    seed: int
+    base: Plan
+    executor: Executor
+    state: StateFile
+    clock: Clock
+    bar: Bar
+    pool: Pool = field(default_factory=Here)
+    device: torch.device | None = None
+    fresh: bool = False
+    limits: tuple[int, int] = (FEWEST_CALLS, FEWEST_CALLS)
+    _calls: dict[int, Calls] = field(default_factory=dict)
+    _samples: dict[str, Sample] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        artifact: Artifact,
+        episodes: Sequence[Episode],
+        state: StateFile,
+        *,
+        seed: int = 0,
+        fraction: float = FRACTION,
+        clock: Clock | None = None,
+        bar: Bar | None = None,
+        pool: Pool | None = None,
+        device: torch.device | None = None,
+        limits: tuple[int, int] = (FEWEST_CALLS, FEWEST_CALLS),
+    ) -> Trials:
+        """Divide the episodes, and open the policy."""
+        base = artifact.plans.get(FULL, artifact.plans[DENSE])
+        executor = Executor(view_of(artifact, base.exact), device)
+        split = split_episodes(len(episodes), fraction, seed)
+        clock, bar, pool = clock or Clock(), bar or Bar(shown=False), pool or Here()
+        opened = executor, state, clock, bar, pool, device
+        return cls(artifact, episodes, split, seed, base, *opened, limits=limits)
+
+    @property
+    def calls(self) -> Calls:
+        """Calls of the episodes that are learned from, and the base's way to its answer with the same noise."""
+        return self._to_learn_from(1)
+
+    @property
+    def windows(self) -> Calls:
+        """The same in windows of consecutive calls, for what reads what an earlier call computed."""
+        return self._to_learn_from(window_of(self.episodes, self.split))
+
+    def _to_learn_from(self, window: int) -> Calls:
+        if window not in self._calls:
+            spec, (fewest, most) = self.executor.view.manifest.spec, self.limits
+            calls = draw_calls(self.executor, spec, self.episodes, self.split, most, self.seed, window)
+            name = "calibration" if window == 1 else "windows"
+            self._calls[window] = with_targets(
+                self.executor, name, calls, fewest, self.state, self.clock, self.bar, self.pool
+            )
+        return self._calls[window]
+
+    @property
+    def threads(self) -> int:
+        """Of arithmetic."""
+        return torch.get_num_threads()
+
+    @property
+    def learned(self) -> Sample:
+        """Answered calls of the episodes that are learned from: for proposers to choose on."""
+        return self.sample(LEARNED)
+
+    @property
+    def held_out(self) -> Sample:
+        """Answered calls of the other episodes: no proposer reads them."""
+        return self.sample(HELD_OUT)
+
+    def sample(self, part: str) -> Sample:
+        """The answered calls of a part; answered when they are first asked for."""
+        if part not in self._samples:
+            numbers = self.split.calibration if part == LEARNED else self.split.validation
+            stretches, calls = _places(self.episodes, numbers, (self.seed, 4, _NUMBERS[part]))
+            self._samples[part] = Sample(part, stretches, calls, self._answers(part, stretches, calls))
+        return self._samples[part]
+
+    def holding(self, proposal: Proposal) -> Trials:
+        """The same, of an artifact that holds in memory what a proposal brings."""
+        artifact, manifest, loop = self.artifact, self.artifact.manifest, proposal.plan.loop
+        added = {name: own.weights for name, own in proposal.weights.items()}
+        known = {**manifest.weights, **{name: WeightsRecord(name, {}, None, {}) for name in added}}
+        pruner, pruners = artifact.pruner, dict(artifact.loop_pruners)
+        if proposal.pruner is not None and loop in pruners:
+            pruners[loop] = proposal.pruner
+        elif proposal.pruner is not None:
+            pruner = proposal.pruner
+        held = replace(
+            artifact,
+            manifest=replace(manifest, starts={**manifest.starts, **proposal.starts}, weights=known),
+            block_weights={**artifact.block_weights, **added},
+            pruner=pruner,
+            loop_pruners=pruners,
+        )
+        return replace(self, artifact=held, fresh=self.fresh or bool(added) or proposal.pruner is not None)
+
+    def view(self, plan: Plan) -> View:
+        """The artifact as a plan sees it."""
+        return view_of(self.artifact, plan)
+
+    def observation(self, places: Sequence[tuple[int, int]]) -> Observation:
+        """Normalised observations, by key ``[n, ...]``, of calls by number of the episode and row in it."""
+        spec = self.artifact.manifest.spec
+        return normalized(spec, observed(spec, self.episodes, places))
+
+    def noise(self, spec: PolicySpec, keys: Sequence[tuple[int, ...]]) -> Noise:
+        """The noise of some calls, the same numbers for every plan.
+
+        As many as the original's horizon has are drawn for every step, so that a loop of as many steps has the same,
+        and any loop begins alike.
+
+        Args:
+            spec: of the view of the plan.
+            keys: of each call, what tells it from others: part, stretch, row and draw.
+        """
+        drawn = [_draw(spec, (self.seed, 5, *key)) for key in keys]
+        initial = np.stack([one for one, _ in drawn])
+        if not spec.sampler.stochastic:
+            return Noise(initial)
+        return Noise(initial, np.stack([steps for _, steps in drawn], 1))
+
+    def key(self, part: str, stretch: int, row: int, draw: int) -> tuple[int, ...]:
+        """See ``noise``."""
+        return _NUMBERS[part], stretch, row, draw
+
+    def _answers(self, part: str, stretches: IntArray, calls: IntArray) -> FloatArray:
+        """What the original answers; what is in the state already is not asked for again."""
+        view = view_of(self.artifact, DENSE)
+        spec = view.manifest.spec
+        asked = [(int(s), int(row), draw) for s, row in calls for draw in range(DRAWS)]
+        noise = self.noise(spec, [self.key(part, *one) for one in asked])
+        places = [(int(stretches[s, 0]), row) for s, row, _ in asked]
+        key = f"{part} answers"
+        known = self.state.get(key).get("samples", np.zeros((0, *spec.sample), np.float32))
+        with self.state.reading():
+            if known.shape[1:] != spec.sample or known.dtype != np.float32 or len(known) > len(asked):
+                raise ValueError(f"expected answers float32 [n, {spec.sample}]; found {known.dtype} {known.shape}")
+        if len(known) < len(asked):
+            executor = self.executor if self.executor.view.variant == view.variant else Executor(view, self.device)
+            drawn = calls_at(executor.model, spec, self.episodes, places, noise_tensors(noise, spec.sampler.stochastic))
+            self.bar.stage(f"original, {part} episodes", len(asked), len(known))
+            for found in dense_rounds(executor, drawn, len(known), self.pool):
+                known = np.concatenate([known, found[:, -1].numpy()])
+                self.state.put(key, {"samples": known})
+                self.state.progress["seconds"] = self.clock.elapsed()
+                self.state.save()
+                self.bar.update(len(known), "", self.clock.left())
+        return known.reshape(len(calls), DRAWS, *spec.sample)
+
+
+def _draw(spec: PolicySpec, seed: tuple[int, ...]) -> tuple[FloatArray, FloatArray | None]:
+    """Initial sample ``[T, D]``, and draws ``[K, T, D]`` where the sampler takes any, of one call."""
+    rng, shape, predicted = np.random.default_rng(seed), spec.whole_horizon.sample, spec.sample[0]
+    initial = rng.standard_normal(shape, dtype=np.float32)[:predicted]
+    if not spec.sampler.stochastic:
+        return initial, None
+    return initial, rng.standard_normal((spec.sampler.steps, *shape), dtype=np.float32)[:, :predicted]
+
+
+def _places(episodes: Sequence[Episode], numbers: Sequence[int], seed: tuple[int, ...]) -> tuple[IntArray, IntArray]:
+    """Stretches, and calls among them, as ``Sample`` has them: evenly over at most so many of the episodes."""
+    draw = np.random.default_rng(seed)
+    chosen = np.sort(draw.permutation(np.array(numbers))[:EPISODES])
+    stretches, calls = [], []
+    for stretch, number in enumerate(chosen.tolist()):
+        length = min(episodes[number].calls, STRETCH)
+        first = int(draw.integers(episodes[number].calls - length + 1))
+        last = first + length - 1
+        stretches.append((number, first, last))
+        rows = np.linspace(min(first + 1, last), last, OBSERVATIONS // len(chosen)).round()
+        calls += [(stretch, int(row)) for row in np.unique(rows)]
+    return np.array(stretches, np.int64), np.array(calls, np.int64)
