@@ -39,7 +39,7 @@ SHORTER = {
     "verify": "--calls 4",
     "report": "--runs 1",
     "bench": "--runs 1",
-    "oracle": "--computed-steps 2 --schedules 2 --calls 4 --draws 2",
+    "oracle.py": "--computed-steps 2 --schedules 2 --calls 4 --draws 2",
     "push": "--runs 1",
     "realtime": "--runs 1",
     "record.py": "--episodes 2 --threads 1",

@@ -98,7 +98,6 @@ def test_functions_that_take_a_path(endless: Path, artifact: Path, tmp_path: Pat
         ["calibrate", "PATH", "--trajectories", "PATH"],
         ["calibrate", "ARTIFACT", "--trajectories", "PATH"],
         ["compare", "PATH", "--trajectories", "PATH"],
-        ["oracle", "PATH", "--trajectories", "PATH"],
         ["convert", "PATH", "-o", "OUTPUT"],
         ["convert", "ARTIFACT", "-o", "PATH"],
         ["report", "PATH", "-o", "OUTPUT.html"],

@@ -22,7 +22,7 @@ import torch
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.calls import Calls, prepare_calls
 from ttscompile.calibration.execute import Executor
-from ttscompile.calibration.step_counts import crowded_family
+from ttscompile.calibration.spacing import crowded_family
 from ttscompile.calibration.targets import dense_rounds
 from ttscompile.calibration.task import Task
 from ttscompile.pool import RayPool

@@ -12,8 +12,8 @@ import torch
 
 from ttscompile.calibration import schedule_runs
 from ttscompile.calibration.schedule_runs import Trails
+from ttscompile.calibration.spacing import FEW, crowded_family, other_placements
 from ttscompile.calibration.sparse_loop import SparseLoop
-from ttscompile.calibration.step_counts import FEW, crowded_family, other_placements
 from ttscompile.calibration.task import Task
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import PlanArray

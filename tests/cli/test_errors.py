@@ -37,13 +37,13 @@ def test_a_file_that_is_no_checkpoint(no_checkpoint: Path) -> None:
     assert list(no_checkpoint.parent.iterdir()) == [no_checkpoint]
 
 
-@pytest.mark.parametrize("command", ["inspect", "bench", "calibrate", "compare", "oracle"])
+@pytest.mark.parametrize("command", ["inspect", "bench", "calibrate", "compare"])
 @pytest.mark.parametrize("made", [False, True])
 def test_what_is_no_artifact(command: str, made: bool, tmp_path: Path) -> None:
     directory = tmp_path / "nothing"
     if made:
         directory.mkdir()
-    recorded = command in ("calibrate", "compare", "oracle")
+    recorded = command in ("calibrate", "compare")
     arguments = [command, str(directory)] + ["--trajectories", "calls.npz"] * recorded
     result = CliRunner().invoke(main, arguments)
     assert result.exit_code == 2
@@ -101,7 +101,7 @@ def test_what_is_not_there_is_said_before_the_compiler_is_imported(
     (tmp_path / "compiled").symlink_to(toy_compiled)
     (tmp_path / "here.ckpt").touch()
     monkeypatch.chdir(tmp_path)
-    for module in ("driver", "calibration.pipeline", "calibration.compare", "rivals.oracle"):
+    for module in ("driver", "calibration.pipeline", "calibration.compare"):
         monkeypatch.setitem(sys.modules, f"ttscompile.{module}", None)
     for name in ("convert", "calibrate"):
         monkeypatch.delitem(vars(ttscompile), name, raising=False)

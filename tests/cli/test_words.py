@@ -46,7 +46,6 @@ NEEDED = {
     "doctor": ("A",),
     "fleet": ("A", "--port", "0"),
     "inspect": ("A",),
-    "oracle": ("A", "--trajectories", "calls.npz", "--calls", "2"),
     "push": ("A", "org/name", "--dry-run", "--runs", "1"),
     "realtime": ("A", "--control-hz", "1", "--runs", "1"),
     "report": ("A", "-o", "out.html", "--runs", "1"),

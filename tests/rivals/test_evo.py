@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tests.calibration.tasks import MakeTask
 from tests.rounding import Counted, allowed
-from ttscompile.calibration.step_counts import crowded_family
+from ttscompile.calibration.spacing import crowded_family
 from ttscompile.rivals.evo import POPULATION, Evo, mutate, repair
 
 

@@ -18,12 +18,11 @@ from ..core.lattice import sparsity
 from ..errors import CalibrationError
 from ..ir.pieces import PRUNER
 from ..pool import opened_pool
-from ..rivals.switches import has_head
 from ..runtimes.torch.devices import device_of, exact_arithmetic
 from ..verification.record_golden import record_plans
 from .arguments import JUDGED, calls_to_learn_from, require_directory, require_limits
 from .budget import ERROR, LATENCY, Budget, Goal, cells_of, goal_of, measure_budget
-from .calls import Calls, digest_of, load_episodes, split_episodes, window_of
+from .calls import FRACTION, Calls, digest_of, load_episodes, split_episodes, window_of
 from .execute import Executor
 from .judge import (
     SCHEDULE,
@@ -35,6 +34,7 @@ from .judge import (
     uniform_of,
 )
 from .progress import Bar
+from .pruner.head import has_head
 from .result import CalibrationResult
 from .search import open_search, search_plan
 from .state import StateFile
@@ -57,7 +57,7 @@ def calibrate(
     max_action_error: float | None = None,
     threads: int = 1,
     max_minutes: float = 15.0,
-    validation_fraction: float = 0.25,
+    validation_fraction: float = FRACTION,
     observation: Mapping[str, Sequence[str]] | None = None,
     max_intervals: int | None = None,
     correct: bool = False,

@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from ..core.lattice import PlanArray, Source
-from .execute import workers
+from ..pool import workers
 from .sparse_loop import Place, SparseLoop
 
 BYTES = 2**29

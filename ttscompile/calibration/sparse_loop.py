@@ -17,9 +17,10 @@ from torch import Tensor
 
 from ..core.correction import Correction, components_of, groups_of, jumps_of, numbers_of
 from ..core.lattice import BoolArray, PlanArray, Source
+from ..pool import workers
 from ..runtimes.reference.sampler import correct, features, through
 from .calls import Calls
-from .execute import Executor, State, workers
+from .execute import Executor, State
 from .jumps import Layers, fit_jump
 from .regression import Components, Solved, solve
 
@@ -122,7 +123,7 @@ class SparseLoop:
         Args:
             place: before it.
             rows: of the plan of all calls, ``[1, blocks]``, or of the plan of each.
-            pool: see ``execute.workers``; the lanes go through the network beside each other.
+            pool: see ``pool.workers``; the lanes go through the network beside each other.
         """
         lanes, anchor = [lane.fork() for lane in (*place.fitted, *place.judged)], bool(anchors_of(rows[:, None])[0])
         ends = np.cumsum([len(lane.sample) for lane in lanes])[:-1]

@@ -18,7 +18,6 @@ from ttscompile.cli.doctor import doctor
 from ttscompile.cli.ending import TRACEBACK, Commands
 from ttscompile.cli.fleet import fleet
 from ttscompile.cli.inspect import inspect
-from ttscompile.cli.oracle import oracle
 from ttscompile.cli.push import push
 from ttscompile.cli.realtime import realtime
 from ttscompile.cli.report import report
@@ -53,7 +52,6 @@ for _command, _what in (
     (report, "All about an artifact on one page."),
     (bench, "Time calls, beside what they replace."),
     (compare, "Action error against latency, of plans and strategies."),
-    (oracle, "Would it pay to choose a plan for each call?"),
     (realtime, "Which plans keep up with a control loop on this machine."),
     (push, "Upload an artifact with a model card to the hub."),
     (serve, "Drive a robot from another process, over a WebSocket."),

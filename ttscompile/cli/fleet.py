@@ -14,8 +14,7 @@ from ttscompile.cli.options import artifact_argument, count_option, threads_opti
 from ttscompile.cli.output import only_results_on_stdout, progress
 from ttscompile.cli.server_options import Doorway, door_options
 from ttscompile.cli.types import ANY_TEXT, TEXT, Number
-from ttscompile.runtimes.fleet.copies import LOCAL, FleetSettings, ray_copies
-from ttscompile.runtimes.fleet.server import FleetServer, Plans
+from ttscompile.runtimes.fleet import LOCAL, FleetServer, FleetSettings, Plans, ray_copies
 
 MOST_CLIENTS = 4096
 """A socket each."""

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..calibration.step_counts import crowded_family
+from ..calibration.spacing import crowded_family
 from ..calibration.task import Array, Found, NothingAfter, Task
 from ..core.lattice import BoolArray, PlanArray, Source, whole_steps_plan
 

@@ -18,12 +18,11 @@ import numpy as np
 import torch
 
 from ..artifact.load import load_artifact
-from ..calibration.calls import Actions, Calls, load_episodes, prepare_calls, sample_calls, split_episodes
-from ..calibration.compare import FRACTION
+from ..calibration.calls import FRACTION, Actions, Calls, load_episodes, prepare_calls, sample_calls, split_episodes
 from ..calibration.execute import Executor
 from ..calibration.fit_correction import fit_correction
 from ..calibration.progress import Progress
-from ..calibration.step_counts import crowded_family
+from ..calibration.spacing import crowded_family
 from ..calibration.targets import REPEATS, dense_rounds
 from ..calibration.task import Array
 from ..core.coercion import integer

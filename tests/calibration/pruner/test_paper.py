@@ -16,7 +16,7 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration import judge
 from ttscompile.calibration.pruner import paper
 from ttscompile.calibration.pruner.paper import Paper
-from ttscompile.calibration.step_counts import crowded_family
+from ttscompile.calibration.spacing import crowded_family
 from ttscompile.calibration.task import Clock, Task
 from ttscompile.core.lattice import Source, whole_steps_plan
 from ttscompile.runtimes.settle import pruner_plan

@@ -34,11 +34,11 @@ from torch import Tensor
 
 from ...core.lattice import PlanArray, Source, whole_steps_plan
 from ...ir.plan_head import first_numbers
-from ...rivals.switches import has_head
 from ...runtimes.settle import pruner_plan
 from ..calls import Calls, IntArray
-from ..step_counts import crowded_family
+from ..spacing import crowded_family
 from ..task import Array, Found, NothingAfter, Task
+from .head import has_head
 from .straight_through import Practice, legal, written
 
 UPDATES = 240
