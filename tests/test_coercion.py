@@ -1,4 +1,4 @@
-"""The door for numbers and arrays of callers: what comes through, and what is told about the rest."""
+"""Numbers and arrays of callers: what comes through, and what is told about the rest."""
 
 from __future__ import annotations
 
@@ -115,14 +115,14 @@ def test_views_of_torch_that_numpy_would_not_take_are_resolved() -> None:
     assert np.array_equal(plain(x.clone().requires_grad_(), "x", ObservationError), VALUES)
 
 
-@pytest.mark.parametrize("door", [plain, listed])
+@pytest.mark.parametrize("function", [plain, listed])
 @pytest.mark.parametrize("mask", [False, True])
-def test_masked_arrays_and_those_that_compute_in_their_own_way_are_refused(door: Any, mask: bool) -> None:
+def test_masked_arrays_and_those_that_compute_in_their_own_way_are_refused(function: Any, mask: bool) -> None:
     masked = np.ma.masked_array(VALUES, mask=mask)
     with pytest.raises(ObservationError, match=r"^x is a masked array, .*\.filled\("):
-        door(masked, "x", ObservationError, "float32")
+        function(masked, "x", ObservationError, "float32")
     with pytest.raises(ObservationError, match=r"^x is a Unit, .*expected a plain array\. Use np\.array"):
-        door(VALUES.view(Unit), "x", ObservationError, "float32")
+        function(VALUES.view(Unit), "x", ObservationError, "float32")
     with pytest.raises(ObservationError, match="^x is a masked array"):
         listed([masked, masked], "x", ObservationError, "float32")
 

@@ -28,7 +28,7 @@ from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.progress import Bar
 from ttscompile.calibration.search import open_search, search_plan
 from ttscompile.calibration.state import FILE, StateFile
-from ttscompile.calibration.step_counts import CrowdedSchedules
+from ttscompile.calibration.step_counts import SpacedSchedules
 from ttscompile.calibration.strategies import FITTED, NAMES, strategy_of
 from ttscompile.calibration.targets import draw_calls, with_targets
 from ttscompile.calibration.task import Clock
@@ -116,7 +116,7 @@ def test_a_family_is_not_begun_that_cannot_be_finished(make_task: MakeTask, tmp_
     needed = 2 * whole.comparing(4) + whole.correcting(4)
     with Bar(shown=False) as bar:
         for limit, made in ((0.9 * needed, False), (1.1 * needed, True)):
-            crowded = CrowdedSchedules(whole, StateFile(tmp_path, {}), _Hand(limit), bar)
+            crowded = SpacedSchedules(whole, StateFile(tmp_path, {}), _Hand(limit), bar)
             assert (crowded.best(4, "", (2.0,)) is not None) == made
 
 

@@ -38,7 +38,7 @@ from .pruner.head import has_head
 from .result import CalibrationResult
 from .search import open_search, search_plan
 from .state import StateFile
-from .step_counts import SAFE, SHARE, CrowdedSchedules, budget_of_error, named_plans
+from .step_counts import SAFE, SHARE, SpacedSchedules, budget_of_error, named_plans
 from .strategies import DEFAULT, FITTED, Strategy, strategy_of
 from .targets import draw_calls, with_targets
 from .task import Clock, Found, Search, Task
@@ -188,7 +188,7 @@ def calibrate(
                     f" strategy {strategy!r} needs {fewest}. Its search is the shortest there is; allow more time."
                 )
             task = Task.of(artifact, executor, sets["calibration"], 0, seed, pool)
-            crowded = CrowdedSchedules(task.whole, state, clock, bar)
+            crowded = SpacedSchedules(task.whole, state, clock, bar)
             if budget is None:
                 budget = budget_of_error(crowded, goal, artifact.manifest.steps, len(artifact.manifest.blocks))
             task = replace(task, budget=budget.cells, clock=clock.until(1 - SHARE) if chosen.fits_correction else clock)
@@ -302,7 +302,7 @@ def _search(search: Search, state: StateFile, clock: Clock, bar: Bar, most: int 
 
 
 def _relax(
-    artifact: Artifact, crowded: CrowdedSchedules, task: Task, found: Found, budget: Budget, held_out: Calls
+    artifact: Artifact, crowded: SpacedSchedules, task: Task, found: Found, budget: Budget, held_out: Calls
 ) -> tuple[Found, Budget]:
     """More steps, as long as the held-out error is above what was asked for and at least half of them are left out."""
     steps, blocks = artifact.manifest.steps, len(artifact.manifest.blocks)

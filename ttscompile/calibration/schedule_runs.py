@@ -19,7 +19,7 @@ BYTES = 2**29
 """What kept places may hold of samples and residuals; those that were longest of no use go first."""
 
 
-class Trails:
+class ScheduleRuns:
     """The way of schedules through a sparse loop.
 
     Args:

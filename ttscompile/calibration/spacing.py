@@ -19,7 +19,7 @@ FEW = 128
 """Where there are no more placements, a search tries them all: those of three steps among 16 are 105."""
 
 
-def crowded_steps(steps: int, full_steps: int, crowding: float) -> tuple[int, ...]:
+def spaced_steps(steps: int, full_steps: int, crowding: float) -> tuple[int, ...]:
     """Which steps to compute, in order.
 
     Args:
@@ -35,9 +35,9 @@ def crowded_steps(steps: int, full_steps: int, crowding: float) -> tuple[int, ..
     return tuple(chosen)
 
 
-def crowded_family(steps: int, full_steps: int, crowding: Sequence[float] = CROWDING) -> list[tuple[int, ...]]:
+def spacings(steps: int, full_steps: int, crowding: Sequence[float] = CROWDING) -> list[tuple[int, ...]]:
     """The different schedules that compute ``full_steps`` of the steps."""
-    return list(dict.fromkeys(crowded_steps(steps, full_steps, one) for one in crowding))
+    return list(dict.fromkeys(spaced_steps(steps, full_steps, one) for one in crowding))
 
 
 def other_placements(steps: int, full_steps: int) -> list[tuple[int, ...]] | None:
@@ -45,4 +45,4 @@ def other_placements(steps: int, full_steps: int) -> list[tuple[int, ...]] | Non
     if comb(steps - 1, full_steps - 1) > FEW:
         return None
     every = ((0, *rest) for rest in combinations(range(1, steps), full_steps - 1))
-    return sorted(set(every) - set(crowded_family(steps, full_steps)), reverse=True)  # late steps first, see CROWDING
+    return sorted(set(every) - set(spacings(steps, full_steps)), reverse=True)  # late steps first, see CROWDING

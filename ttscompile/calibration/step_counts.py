@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from ..errors import CalibrationFailedError
 from .budget import Budget, Goal
 from .progress import Bar
-from .spacing import CROWDING, crowded_family
+from .spacing import CROWDING, spacings
 from .state import StateFile
 from .strategies import Strategy
 from .task import Clock, Found, Task
@@ -40,7 +40,7 @@ class Best:
     error: float
 
 
-class CrowdedSchedules:
+class SpacedSchedules:
     """Compares crowded schedules, and remembers every comparison in the state.
 
     Args:
@@ -64,7 +64,7 @@ class CrowdedSchedules:
             crowding: the crowdings of the members of the family.
         """
         found: tuple[Errors, tuple[int, ...]] | None = None
-        members = crowded_family(self._whole.steps, full_steps, crowding)
+        members = spacings(self._whole.steps, full_steps, crowding)
         self._bar.stage(what, len(members))
         for number, steps in enumerate(members):
             errors = self._errors(steps, members[number:])
@@ -93,7 +93,7 @@ class CrowdedSchedules:
             return Errors(float(normalised), float(units))
 
 
-def budget_of_error(crowded: CrowdedSchedules, goal: Goal, steps: int, blocks: int) -> Budget:
+def budget_of_error(crowded: SpacedSchedules, goal: Goal, steps: int, blocks: int) -> Budget:
     """The fewest whole steps with which a crowded schedule is as good as was asked for.
 
     Judged on calls to learn from that its correction was not fitted on: the held-out episodes stay out of it. The goal
@@ -131,7 +131,7 @@ def budget_of_error(crowded: CrowdedSchedules, goal: Goal, steps: int, blocks: i
 
 
 def named_plans(
-    crowded: CrowdedSchedules, task: Task, strategy: Strategy, cells: int
+    crowded: SpacedSchedules, task: Task, strategy: Strategy, cells: int
 ) -> tuple[dict[str, Found], dict[str, str]]:
     """Make ``safe`` and ``fast``, where they can be made: whole steps with a correction fitted on all calls.
 

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..core.lattice import PlanArray
-from .spacing import crowded_family, other_placements
+from .spacing import other_placements, spacings
 from .task import Array, Found, Task
 
 DISTANCES = (8, 4, 2, 1)
@@ -40,7 +40,7 @@ class Tts:
         self._steps: tuple[int, ...] = tuple(range(self._full))
         self.loss = float("nan")
         others = other_placements(model.steps, self._full)
-        self._family = [*crowded_family(model.steps, self._full), *(others or ())]
+        self._family = [*spacings(model.steps, self._full), *(others or ())]
         self._moves = [(distance, i) for distance in DISTANCES for i in range(1, self._full)] if others is None else []
         self.intervals = len(self._family) + len(self._moves)
         self._settled: Found | None = None

@@ -12,7 +12,7 @@ import click
 from ttscompile.artifact.load import load_artifact
 from ttscompile.cli.options import artifact_argument, count_option, threads_option
 from ttscompile.cli.output import only_results_on_stdout, progress
-from ttscompile.cli.server_options import Doorway, door_options
+from ttscompile.cli.server_options import ServerOptions, server_options
 from ttscompile.cli.types import ANY_TEXT, TEXT, Number
 from ttscompile.runtimes.fleet import LOCAL, FleetServer, FleetSettings, Plans, ray_copies
 
@@ -42,7 +42,7 @@ MOST_CLIENTS = 4096
     help="Milliseconds that a request waits for others of its plan.",
 )
 @count_option("--max-waiting", "Requests that may be under way; further ones are refused at once.", default=256)
-@door_options(clients=256, most=MOST_CLIENTS)
+@server_options(clients=256, most=MOST_CLIENTS)
 def fleet(
     directory: Path,
     ray: str,
@@ -60,17 +60,17 @@ def fleet(
     artifact's identity. A plain GET of /health and of /metrics is answered on the same port.
     """
     console = progress()
-    door, artifact = Doorway.taken(options, console), load_artifact(directory)
+    listening, artifact = ServerOptions.taken(options, console), load_artifact(directory)
     Plans.of(artifact, plan)  # before copies are started, which takes a while
     output = sys.stdout
     settings, identity = FleetSettings(copies, threads, batch, wait_ms), artifact.manifest.identity
     with (
         only_results_on_stdout(),  # Ray writes what its processes say there
-        door.audited(),
+        listening.audited(),
         console.status("starting copies") as status,
         ray_copies(ray, directory, identity, settings) as there,
     ):
-        server = FleetServer(artifact, there, plan, max_waiting, door.limits, door.lock)
+        server = FleetServer(artifact, there, plan, max_waiting, listening.limits, listening.lock)
         status.stop()
-        door.warn(console)
-        asyncio.run(door.serve(server, identity, output))
+        listening.warn(console)
+        asyncio.run(listening.serve(server, identity, output))

@@ -12,7 +12,7 @@ import click
 import ttscompile
 from ttscompile.cli.options import artifact_argument, count_option, loop_options, runtime_options, seed_option
 from ttscompile.cli.output import progress
-from ttscompile.cli.server_options import Doorway, door_options
+from ttscompile.cli.server_options import ServerOptions, server_options
 from ttscompile.cli.types import TEXT
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
 from ttscompile.runtimes.executor.settings import INTERPOLATIONS, SEAMS
@@ -26,7 +26,7 @@ MOST_CLIENTS = 128
 @artifact_argument
 @loop_options
 @runtime_options
-@door_options(clients=8, most=MOST_CLIENTS)
+@server_options(clients=8, most=MOST_CLIENTS)
 @click.option(
     "--tier",
     "tiers",
@@ -69,12 +69,13 @@ def serve(
     the end.
     """
     console = progress()
-    door = Doorway.taken(options, console)
-    with door.audited():
+    listening = ServerOptions.taken(options, console)
+    with listening.audited():
         with console.status("loading and measuring"):
             policy = ttscompile.load(directory, runtime, threads, seed, device=device)
             executor = AsyncExecutor(policy, control_hz, ExecutorSettings(tiers=tiers or None, **options))
-        door.warn(console)
+        listening.warn(console)
         with executor:
-            asyncio.run(door.serve(ExecutorServer(executor, door.limits, door.lock), policy.info.identity))
+            server = ExecutorServer(executor, listening.limits, listening.lock)
+            asyncio.run(listening.serve(server, policy.info.identity))
     click.echo(json.dumps({"statistics": executor.statistics().to_json()}, allow_nan=False))

@@ -33,7 +33,7 @@ TOKEN_VARIABLE = "TTSCOMPILE_TOKEN"  # noqa: S105
 """Of the environment; the example client reads it too."""
 
 
-def door_options(clients: int, most: int) -> Decorator:
+def server_options(clients: int, most: int) -> Decorator:
     """Where to listen, the lock, the audit, and what clients may do.
 
     Args:
@@ -97,8 +97,8 @@ def door_options(clients: int, most: int) -> Decorator:
 
 
 @dataclass(frozen=True)
-class Doorway:
-    """What ``door_options`` were given as, checked.
+class ServerOptions:
+    """What ``server_options`` were given as, checked.
 
     Attributes:
         host: to listen on.
@@ -115,8 +115,8 @@ class Doorway:
     audit_file: Path | None
 
     @classmethod
-    def taken(cls, options: dict[str, Any], console: Console) -> Doorway:
-        """Take the options of the door out of those of a command.
+    def taken(cls, options: dict[str, Any], console: Console) -> ServerOptions:
+        """Take these options out of those of a command.
 
         Raises:
             ExecutorError: the token is none, or the address wants a lock; also for TLS, see ``tls_context``.
