@@ -8,20 +8,19 @@ schedule for each call: knowing everything, or what a pruner may know. Nothing i
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 import click
-from rich.console import Console
-from rich.table import Table
 
+from ttscompile.cli.output import counted_parts, print_json, results_console, run, say, table
+from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
 from ttscompile.rivals.oracle import Oracle, oracle
 
 
-@click.command(context_settings={"show_default": True})
+@click.command(cls=FilesCommand, context_settings={"show_default": True})
 @click.argument("directory", type=click.Path(exists=True, path_type=Path))
-@click.option("--trajectories", multiple=True, required=True, type=click.Path(exists=True, path_type=Path))
+@trajectories_options()
 @click.option("--computed-steps", default=3, help="Of a call.")
 @click.option("--schedules", default=16, help="Of as many computed steps, and of one less and one more.")
 @click.option("--calls", default=64, help="Observations to judge on, and as many to learn from, at most.")
@@ -31,6 +30,7 @@ from ttscompile.rivals.oracle import Oracle, oracle
 def main(
     directory: Path,
     trajectories: Sequence[Path],
+    sources: Sources,
     computed_steps: int,
     schedules: int,
     calls: int,
@@ -39,45 +39,34 @@ def main(
     as_json: bool,
 ) -> None:
     """Measure it for the policy of the artifact in DIRECTORY."""
-    progress = Console(stderr=True)
-
-    def tell(what: str, done: int, total: int) -> None:
-        progress.print(f"{what}: {done} of {total}")
-
-    found = oracle(
-        directory,
-        trajectories,
-        computed_steps,
-        schedules=schedules,
-        calls=calls,
-        draws=draws,
-        seed=seed,
-        progress=tell,
-    )
+    sizes = {"schedules": schedules, "calls": calls, "draws": draws, "seed": seed}
+    with counted_parts() as tell:
+        found = oracle(directory, trajectories, computed_steps, observation=sources, **sizes, progress=tell)
     if as_json:
-        print(json.dumps(found.to_json()))
+        print_json(found.to_json())
     else:
         show(found)
 
 
 def show(found: Oracle) -> None:
     """The choices as a table, and what they are."""
-    table = Table("who chooses knows", "error", "gain", "95 % interval", "computed steps")
+    output, made = results_console(), table("who chooses knows", "error", "gain", "95 % interval", "computed steps")
     for number, one in enumerate(found.choices):
         low, high = (f"{100 * bound:.0f}" for bound in one.interval)
         gain = ("", "") if number == 0 else (f"{100 * one.gain:.0f} %", f"{low} .. {high}")
-        table.add_row(one.name, f"{one.error:.4g}", *gain, f"{one.steps:.2f}")
-    Console(width=140).print(table)
+        made.add_row(one.name, f"{one.error:.4g}", *gain, f"{one.steps:.2f}")
+    output.print(made)
     observations, draws = found.calls
     offered = ", ".join(f"{number} of {count} computed steps" for count, number in found.schedules.items())
-    print(
+    say(
+        output,
         f"Error: mean absolute difference of the executed actions, in their units, from those of the dense policy with"
         f" the same noise; {observations} observations with {draws} draws of noise each, of episodes that nothing was"
         f" learned from. Schedules: {offered}; each has a correction of its own. After the fact nobody can choose:"
         " these rows bound what can be gained. The other rows are a regression on what is known before the second step"
-        " is computed."
+        " is computed.",
     )
 
 
 if __name__ == "__main__":
-    main()
+    run(main)
