@@ -80,8 +80,10 @@ docs: $(READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 # An sdist and a wheel in build/release, checked as the index does, and tried in empty environments. Nothing is uploaded.
+# With TAG=v1.2.3 it ends at once unless this is the tag of VERSION.
+TAG :=
 release: $(READY)
-	$(BIN)/python tests/release.py build/release
+	$(BIN)/python tests/release.py build/release $(TAG)
 
 # Both images of containers/, with docker or buildah, and what they are for done in them.
 containers: $(READY)
