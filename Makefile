@@ -27,13 +27,16 @@ lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-# mypy must see the package as it is installed, with passes/ and runtimes/ inside it: it gets a copy laid out like that.
+# mypy must see the package as it is installed, with passes/ and runtimes/ inside it, and the examples as they see each
+# other, from the folders in mypy_path (pyproject.toml): it gets a copy laid out like that.
+TYPED := build/types
 types: $(READY)
-	rm -rf build/types
-	mkdir -p build/types
-	cp -Rp ttscompile build/types/ttscompile
-	cp -Rp passes runtimes build/types/ttscompile/
-	cd build/types && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache -p ttscompile
+	rm -rf $(TYPED)
+	mkdir -p $(TYPED)/recipes
+	cp -Rp ttscompile tests examples plugins/lerobot_policy_ttscompile $(TYPED)
+	cp -Rp passes runtimes $(TYPED)/ttscompile
+	mv $(TYPED)/examples/policies/*.py $(TYPED)/recipes
+	cd $(TYPED) && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache .
 
 # On all cores, each with a file at a time; then, one by one, what takes times.
 pytest: $(READY)

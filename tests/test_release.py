@@ -87,8 +87,8 @@ def test_a_tag_is_the_version_and_the_changelog_has_it(tag: str | None, version:
 
 
 def test_a_wrong_tag_ends_a_release_before_anything_is_built(tmp_path: Path) -> None:
-    words = [sys.executable, release.ROOT / "tests" / "release.py", tmp_path / "out", "v9.9.9"]
-    done = subprocess.run(words, capture_output=True, text=True)
+    words = (sys.executable, release.ROOT / "tests" / "release.py", tmp_path / "out", "v9.9.9")
+    done = subprocess.run([str(word) for word in words], capture_output=True, text=True)
     assert done.returncode == 1
     assert done.stderr.startswith("error: the tag is v9.9.9")
     assert list(tmp_path.iterdir()) == []

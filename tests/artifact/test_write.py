@@ -132,7 +132,7 @@ def test_a_session_follows_the_file_and_not_a_copy(written: Path) -> None:
 def test_the_same_inputs_give_the_same_bytes(written: Path, tmp_path: Path) -> None:
     program = tiny_program()
     models = tiny_models(program)
-    shuffled = replace(program, weights=dict(reversed(program.weights.items())))
+    shuffled = replace(program, weights=dict(reversed([*program.weights.items()])))
     write_artifact(shuffled, dict(reversed(models.items())), tmp_path / "elsewhere" / "again")
     assert contents(tmp_path / "elsewhere" / "again") == contents(written)
 

@@ -7,6 +7,7 @@ they norm: all of that is a table.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -99,7 +100,7 @@ class PiHead(nn.Module):
         model = nn.Module()
         model.layers = nn.ModuleList(_Layer(width, heads, groups, channels, hidden, adaptive) for _ in range(layers))
         model.norm = _Norm(width, adaptive)
-        self.paligemma_with_expert = nn.Module()
+        self.paligemma_with_expert: Any = nn.Module()
         self.paligemma_with_expert.gemma_expert = nn.Module()
         self.paligemma_with_expert.gemma_expert.model = model
         self.action_in_proj, self.action_out_proj = nn.Linear(actions, width), nn.Linear(width, actions)

@@ -120,17 +120,17 @@ class Multistep(DDIMScheduler):
         super().set_timesteps(*args, **kwargs)
         self.before = None
 
-    def step(self, model_output: Any, timestep: Any, sample: Any, **kwargs: Any) -> Any:
+    def step(self, model_output: Any, timestep: Any, sample: Any, *args: Any, **kwargs: Any) -> Any:
         mixed = model_output if self.before is None else 0.9 * model_output + 0.1 * self.before
         self.before = model_output
-        return super().step(mixed, timestep, sample, **kwargs)
+        return super().step(mixed, timestep, sample, *args, **kwargs)
 
 
 class Curved(DDIMScheduler):
     """Adds a small square of the output."""
 
-    def step(self, model_output: Any, timestep: Any, sample: Any, **kwargs: Any) -> Any:
-        result = super().step(model_output, timestep, sample, **kwargs)
+    def step(self, model_output: Any, timestep: Any, sample: Any, *args: Any, **kwargs: Any) -> Any:
+        result: Any = super().step(model_output, timestep, sample, *args, **kwargs)
         result.prev_sample = result.prev_sample + 1e-4 * model_output**2
         return result
 
@@ -138,8 +138,8 @@ class Curved(DDIMScheduler):
 class PerChannel(DDIMScheduler):
     """Scales one channel differently."""
 
-    def step(self, model_output: Any, timestep: Any, sample: Any, **kwargs: Any) -> Any:
-        result = super().step(model_output, timestep, sample, **kwargs)
+    def step(self, model_output: Any, timestep: Any, sample: Any, *args: Any, **kwargs: Any) -> Any:
+        result: Any = super().step(model_output, timestep, sample, *args, **kwargs)
         result.prev_sample[..., 2] *= 1.01
         return result
 
@@ -147,8 +147,8 @@ class PerChannel(DDIMScheduler):
 class Mixing(DDIMScheduler):
     """Takes the mean out of the sample."""
 
-    def step(self, model_output: Any, timestep: Any, sample: Any, **kwargs: Any) -> Any:
-        result = super().step(model_output, timestep, sample, **kwargs)
+    def step(self, model_output: Any, timestep: Any, sample: Any, *args: Any, **kwargs: Any) -> Any:
+        result: Any = super().step(model_output, timestep, sample, *args, **kwargs)
         result.prev_sample = result.prev_sample - 0.01 * sample.mean(dim=1, keepdim=True)
         return result
 
@@ -156,8 +156,8 @@ class Mixing(DDIMScheduler):
 class Shifting(DDIMScheduler):
     """Adds a constant."""
 
-    def step(self, model_output: Any, timestep: Any, sample: Any, **kwargs: Any) -> Any:
-        result = super().step(model_output, timestep, sample, **kwargs)
+    def step(self, model_output: Any, timestep: Any, sample: Any, *args: Any, **kwargs: Any) -> Any:
+        result: Any = super().step(model_output, timestep, sample, *args, **kwargs)
         result.prev_sample = result.prev_sample + 0.01
         return result
 
@@ -165,16 +165,16 @@ class Shifting(DDIMScheduler):
 class OneSided(DDIMScheduler):
     """Bounds the sample from above, so that x0 stops at another value in every step."""
 
-    def step(self, model_output: Any, timestep: Any, sample: Any, **kwargs: Any) -> Any:
-        return super().step(model_output, timestep, sample.clamp(max=0.3), **kwargs)
+    def step(self, model_output: Any, timestep: Any, sample: Any, *args: Any, **kwargs: Any) -> Any:
+        return super().step(model_output, timestep, sample.clamp(max=0.3), *args, **kwargs)
 
 
 class TwoDraws(DDPMScheduler):
     """Draws its noise twice."""
 
-    def step(self, model_output: Any, timestep: Any, sample: Any, generator: Any = None, **kwargs: Any) -> Any:
-        torch.randn(sample.shape, generator=generator, dtype=sample.dtype)
-        return super().step(model_output, timestep, sample, generator=generator, **kwargs)
+    def step(self, model_output: Any, timestep: Any, sample: Any, *args: Any, **kwargs: Any) -> Any:
+        torch.randn(sample.shape, generator=kwargs["generator"], dtype=sample.dtype)
+        return super().step(model_output, timestep, sample, *args, **kwargs)
 
 
 @pytest.mark.parametrize("scheduler_class", [Multistep, Curved, PerChannel, Mixing, Shifting, TwoDraws])
@@ -296,7 +296,7 @@ class CurvedMultistep(DPMSolverMultistepScheduler):
     """Adds a small square of the output."""
 
     def step(self, model_output: Any, *args: Any, **kwargs: Any) -> Any:
-        result = super().step(model_output, *args, **kwargs)
+        result: Any = super().step(model_output, *args, **kwargs)
         result.prev_sample = result.prev_sample + 1e-3 * model_output**2
         return result
 
@@ -312,7 +312,7 @@ class LongMemory(DPMSolverMultistepScheduler):
 
     def step(self, model_output: Any, *args: Any, **kwargs: Any) -> Any:
         self.first = model_output if self.first is None else self.first
-        result = super().step(model_output, *args, **kwargs)
+        result: Any = super().step(model_output, *args, **kwargs)
         result.prev_sample = result.prev_sample + 1e-3 * self.first
         return result
 

@@ -6,6 +6,7 @@ import json
 import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -75,7 +76,7 @@ def _lerobot(folder: Path) -> None:
     from tests.frontends.lerobot_tiny import save_policy
 
     lerobot_unets.save("states", folder / "unet" / "policy")
-    policies = {
+    policies: dict[str, dict[str, Any]] = {
         "images": {
             "cameras": ("top", "wrist"),
             "renamed": {"arm": "observation.state"},

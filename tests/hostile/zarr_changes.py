@@ -48,7 +48,7 @@ DTYPES: tuple[Any, ...] = (
     {"name": "structured", "configuration": {"fields": [["a", "float32"]]}},
     {"name": "numpy.datetime64", "configuration": {"unit": "s", "scale_factor": 2**31}},
 )
-FILLS = (
+FILLS: tuple[Any, ...] = (
     None,
     0,
     -1,

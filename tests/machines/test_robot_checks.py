@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +27,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("made") / "toy"
     artifact = written_artifact(toy_program(noise=0.0, pruner=False), folder / "artifact").path
     update_calibration(artifact, None, {"uniform": uniform_plan(5, 5, 3)}, "uniform", {"strategy": "by hand"})
-    np.savez(folder / "actions.npz", **dict(made.answers(artifact, ("fp32",))))
+    answers: dict[str, Any] = dict(made.answers(artifact, ("fp32",)))
+    np.savez(folder / "actions.npz", **answers)
     return folder
 
 

@@ -76,7 +76,9 @@ class CenterCrop(nn.Module):
 
 def put_in_place() -> None:
     """Make ``import torchvision`` find these."""
-    modules = {name: ModuleType(name) for name in ("", ".models", ".transforms", ".transforms.functional")}
+    modules: dict[str, Any] = {
+        name: ModuleType(name) for name in ("", ".models", ".transforms", ".transforms.functional")
+    }
     modules[".transforms.functional"].center_crop = center_crop
     for each in (Resize, Normalize, CenterCrop):
         setattr(modules[".transforms"], each.__name__, each)
