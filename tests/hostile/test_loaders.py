@@ -17,11 +17,10 @@ import pytest
 import torch
 
 import ttscompile
-from tests.artifact.tiny import tiny_models, tiny_program
+from tests.artifact.tiny import write_tiny
 from tests.frontends.conftest import _config, _weights
 from tests.hostile.forged import rehash
 from ttscompile.artifact import load_artifact
-from ttscompile.artifact.write import write_artifact
 from ttscompile.calibration.state import StateFile
 from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import ArtifactError, CalibrationError, CheckpointError, TrajectoryError, TtscompileError
@@ -36,8 +35,7 @@ Change = Callable[[dict[str, Any]], object]
 
 @pytest.fixture
 def written(tmp_path: Path) -> Path:
-    program = tiny_program()
-    write_artifact(program, tiny_models(program), tmp_path / "compiled")
+    write_tiny(tmp_path / "compiled")
     return tmp_path / "compiled"
 
 
