@@ -1,7 +1,5 @@
 """The artifact that the tests of this folder take apart."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

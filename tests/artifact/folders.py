@@ -1,7 +1,5 @@
 """What is in a folder, for comparing before and after."""
 
-from __future__ import annotations
-
 import zipfile
 from collections.abc import Callable
 from itertools import count

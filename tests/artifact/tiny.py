@@ -1,7 +1,5 @@
 """A policy of two blocks, built by hand: graphs, weights, and ONNX models written with ``onnx.helper``."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The C++ example: built and run where there are a compiler and onnxruntime's headers."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Every file of examples/evaluation/environments against the protocol of its package."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import os

@@ -1,7 +1,5 @@
 """What comes of calibrations that differ in one thing, and of a policy in the course of an episode."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

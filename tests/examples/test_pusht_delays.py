@@ -1,7 +1,5 @@
 """Push-T under the executor with latencies that are given: which action is played when, and what comes of it."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Mapping
 from pathlib import Path

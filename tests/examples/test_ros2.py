@@ -1,7 +1,5 @@
 """The ROS 2 node on a stand-in for rclpy: not on ROS 2, which is not here."""
 
-from __future__ import annotations
-
 import sys
 from array import array
 from collections.abc import Iterator

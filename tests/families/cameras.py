@@ -1,7 +1,5 @@
 """Small policies that see: cameras and an instruction, with towers just large enough to be pieces of their own."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

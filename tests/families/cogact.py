@@ -3,8 +3,6 @@
 Parameters are called as in the original. Token 0 is the sum of timestep and condition.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -4,8 +4,6 @@ Parameters are called as in the original. Everything is sequence first, ``[T, B,
 the encoder is post-norm. It is a condition: it leaves the loop.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -5,8 +5,6 @@ the timestep are computed apart from those of the actions. The ones are computed
 all steps in one batch.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

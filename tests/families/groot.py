@@ -4,8 +4,6 @@ Parameters are called as in the original. Encoder and decoder of the actions hav
 embodiment is chosen when the policy is compiled.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

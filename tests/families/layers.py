@@ -1,7 +1,5 @@
 """Layers as people write them: by hand, fused, rotary, normalised; parts of the modules in this folder."""
 
-from __future__ import annotations
-
 import math
 
 import torch

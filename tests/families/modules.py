@@ -3,8 +3,6 @@
 All take ``sample [B, 6, 3]``, ``timestep [B]`` and ``obs [B, 5, 7]``, and have two layers of width 16.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

@@ -4,8 +4,6 @@ Parameters are called as in LeRobot's checkpoints. In pi0.5 the norms are modula
 they norm: all of that is a table.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -4,8 +4,6 @@ Parameters are called as in a SmolVLA checkpoint. Keys and values of the prefix 
 rotated already; odd layers project them once more, which does not depend on the sample.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

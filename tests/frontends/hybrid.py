@@ -3,8 +3,6 @@
 ``golden/make_hybrid.py`` gives the original implementation the same weights, observations and noise.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """Tiny LeRobot policies with random weights, saved as lerobot saves them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

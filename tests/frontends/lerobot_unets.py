@@ -3,8 +3,6 @@
 ``golden/make_lerobot_unets.py`` gives lerobot the same directories, observations and noise.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

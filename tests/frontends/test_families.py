@@ -1,7 +1,5 @@
 """The rows of the policy families: each can be loaded, and options reach it from the command line and from Python."""
 
-from __future__ import annotations
-
 import inspect
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """LeRobot policies of our own: variants against their definitions, and every way a directory can be wrong."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

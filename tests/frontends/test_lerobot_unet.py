@@ -1,7 +1,5 @@
 """LeRobot's ``diffusion``, against numbers that lerobot gave; see ``golden/make_lerobot_unets.py``."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

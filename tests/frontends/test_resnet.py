@@ -1,7 +1,5 @@
 """The ResNets against those of transformers, which are written independently."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,7 +1,5 @@
 """Flow-matching tables against plain integration in float64."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import pairwise
 from typing import Any

@@ -1,7 +1,5 @@
 """Of every family whose image encoder is a vision transformer the explanation says that its tokens were found."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

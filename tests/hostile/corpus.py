@@ -1,7 +1,5 @@
 """Small files that are as they should be, from which the fuzzer makes bad ones."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """LeRobot data sets with something wrong: tables, their footers, images, metadata, and files that are none."""
 
-from __future__ import annotations
-
 import io
 import json
 import random

@@ -1,7 +1,5 @@
 """HDF5 files of robomimic with something wrong: bytes, shapes, dtypes, filters, links, data that lie elsewhere."""
 
-from __future__ import annotations
-
 import random
 import shutil
 import zlib

@@ -5,8 +5,6 @@ process's operations on files. What is there afterwards is the old artifact, the
 or a state from which calibration goes on; and when nobody kills it, the same is made again and nothing is left over.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

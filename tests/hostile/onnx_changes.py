@@ -1,7 +1,5 @@
 """Changes of ONNX models: where weights lie, shapes, types, operations; and of their bytes."""
 
-from __future__ import annotations
-
 import random
 
 from tests.hostile.mutate import damaged

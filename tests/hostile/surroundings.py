@@ -5,8 +5,6 @@ full, or gone; few files that may be open. Whatever happens, a command ends with
 a few lines without a traceback, and leaves nothing half written. Some surroundings need Linux and root, to mount.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

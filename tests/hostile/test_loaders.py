@@ -1,7 +1,5 @@
 """What the fuzzer found, one test each, and attacks that chance would not find."""
 
-from __future__ import annotations
-
 import io
 import json
 import shutil

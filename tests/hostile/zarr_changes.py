@@ -1,7 +1,5 @@
 """Replay buffers in zarr with something wrong: chunks, metadata, codecs, names and links."""
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import json

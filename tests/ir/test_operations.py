@@ -1,7 +1,5 @@
 """The table of operations: each row by an example, as torch, its meta tensors and onnxruntime see it; and its facts."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Corrupted graphs and programs are found, and the message says where."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

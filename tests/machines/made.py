@@ -8,8 +8,6 @@ and, in the same artifact, of fp32; observations and noise are drawn. Actions ar
 that the residuals of the call before are read.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path

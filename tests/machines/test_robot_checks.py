@@ -1,7 +1,5 @@
 """What the commands of this folder check, on this machine: the same answers pass, and others do not."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

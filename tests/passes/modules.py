@@ -1,7 +1,5 @@
 """Denoisers for the tests of passes, compiled once, and their pieces evaluated one by one."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Simplification of every graph of a program."""
 
-from __future__ import annotations
-
 from tests.passes.modules import compiled
 from ttscompile.ir.program import Program
 from ttscompile.passes.clean_up import CleanUp

@@ -1,7 +1,5 @@
 """One block of a network without a residual stream: the same numbers, and a cut that every other pass understands."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The passes in the driver's order, on real modules: what they compute stays the same, what is hoisted is counted."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

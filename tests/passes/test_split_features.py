@@ -1,7 +1,5 @@
 """A linear layer of concatenated features becomes a sum, and only where that takes work out of the loop."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

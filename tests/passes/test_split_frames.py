@@ -1,7 +1,5 @@
 """What depends on one frame alone is a piece of its own."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from typing import Any

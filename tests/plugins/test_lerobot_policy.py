@@ -1,7 +1,5 @@
 """A compiled policy in LeRobot's own commands, against the original there. Runs where lerobot is installed."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os

@@ -1,7 +1,5 @@
 """Data sets as users have them, written with the libraries that write them."""
 
-from __future__ import annotations
-
 import io
 import itertools
 import json

@@ -1,7 +1,5 @@
 """Data sets as users have them, written with the libraries that write them, and read as the calls of a policy."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Recordings: what is read, and what is refused with which words."""
 
-from __future__ import annotations
-
 import os
 import zipfile
 from collections.abc import Mapping

@@ -3,8 +3,6 @@
 The ResNet is ours, which ``test_resnet.py`` holds against another implementation.
 """
 
-from __future__ import annotations
-
 import sys
 from types import ModuleType
 from typing import Any
