@@ -255,7 +255,7 @@ def test_the_closure_sees_through_modules_and_parents_but_not_into_functions(tmp
 def test_every_pass_has_its_test_and_tests_import_helpers_not_each_other() -> None:
     passes = {p.stem for p in (ROOT / "passes").glob("*.py")} - {"__init__", "base"}
     assert {f"test_{name}.py" for name in passes} <= {p.name for p in (ROOT / "tests" / "passes").iterdir()}
-    found = {}
+    found: dict[str, list[str]] = {}
     for path in (ROOT / "tests").rglob("*.py"):
         lines = re.findall(r"^\s*(?:from|import) [\w.]*\btest_\w+.*", path.read_text(), re.MULTILINE)
         own = [line for line in lines if f"{path.stem} import" not in line]  # in a process of its own

@@ -104,7 +104,8 @@ def _pass_idle(work: Workspace, idle: IdleSteps, operands: _Operands, k: int) ->
     return stop
 
 
-def _apart(work: Workspace, lowered: Sequence[Instructions], keep: BoolArray) -> None:
+# C901, PLR0912: its locals are the state of the loop
+def _apart(work: Workspace, lowered: Sequence[Instructions], keep: BoolArray) -> None:  # noqa: C901, PLR0912
     """Every stream follows its own plan; a block that several compute in a step runs once, on these."""
     blocks, everyone = len(work.current), work.streams
     room = work.sums(max(one.slots for one in lowered))

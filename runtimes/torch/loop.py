@@ -53,7 +53,7 @@ class Denoised:
     residuals: Mapping[int, Tensor]
 
 
-def denoise(
+def denoise(  # noqa: PLR0913  # the tensors of a call, each by its name
     network: Network,
     plan: Instructions,
     keep: BoolArray,

@@ -1,7 +1,5 @@
 """``ttscompile fleet``: what it refuses, and, where Ray is installed, copies that answer in batches by plan."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import os

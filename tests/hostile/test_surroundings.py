@@ -1,7 +1,5 @@
 """Some of what ``surroundings.py`` tries: each is a process, so that the suite has no time for all of them."""
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path

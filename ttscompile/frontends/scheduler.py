@@ -42,7 +42,7 @@ _NAMES = {each.__name__: name for name, each in _CLASSES.items()}
 _SETTINGS = {name: frozenset(inspect.signature(each).parameters) for name, each in _CLASSES.items()}
 
 
-def configured_sampler(
+def configured_sampler(  # noqa: C901, PLR0912  # each setting can be wrong in its own way
     settings: Mapping[str, Any],
     own_steps: int | None,
     options: LoadOptions,
