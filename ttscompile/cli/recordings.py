@@ -24,7 +24,7 @@ class FilesCommand(click.Command):
         expanded: list[str] = []
         taking = ""
         for arg in args:
-            if arg in ("--trajectories", "--with"):
+            if arg in ("-t", "--trajectories", "--with"):
                 taking = arg
             elif taking and not arg.startswith("-"):
                 expanded += [taking, arg]
@@ -61,6 +61,7 @@ def trajectories_options(required: bool = True) -> Decorator:
     """``--trajectories`` as ``trajectories: tuple[Path, ...]`` and ``--observation`` as ``sources: Sources``."""
     return together(
         click.option(
+            "-t",
             "--trajectories",
             required=required,
             multiple=True,
