@@ -37,7 +37,6 @@ SHORTER = {
     "calibrate": "--target-sparsity 0.8 --max-minutes 0.001",
     "compare": "--sparsities 0.8 --intervals 1 --calls 4 --learned-calls 8",
     "verify": "--calls 4",
-    "report": "--runs 1",
     "bench": "--runs 1",
     "oracle.py": "--computed-steps 2 --schedules 2 --calls 4 --draws 2",
     "push": "--runs 1",

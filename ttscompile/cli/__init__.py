@@ -20,7 +20,6 @@ from ttscompile.cli.fleet import fleet
 from ttscompile.cli.inspect import inspect
 from ttscompile.cli.push import push
 from ttscompile.cli.realtime import realtime
-from ttscompile.cli.report import report
 from ttscompile.cli.reuse_tokens import reuse_tokens
 from ttscompile.cli.serve import serve
 from ttscompile.cli.verify import verify
@@ -47,9 +46,8 @@ for _command, _what in (
     (distill, "Train weights for a plan of very few steps, as a last resort."),
     (reuse_tokens, "Compute of new pictures the parts that changed."),
     (warm_start, "Begin calls with the chunk of the call before."),
-    (inspect, "What is in an artifact; a picture of a plan."),
+    (inspect, "What is in an artifact: tables, a picture, a page."),
     (verify, "Does it do what the original did, and do its plans engage?"),
-    (report, "All about an artifact on one page."),
     (bench, "Time calls, beside what they replace."),
     (compare, "Action error against latency, of plans and strategies."),
     (realtime, "Which plans keep up with a control loop on this machine."),
