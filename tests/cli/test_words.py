@@ -45,12 +45,14 @@ NEEDED = {
     "convert": [("policy.ckpt", "-o", "out")],
     "distill": [("A", "-t", "calls.npz", "--updates", "1", "--max-minutes", "0.001")],
     "doctor": [("A",)],
-    "fleet": [("A", "--port", "0")],
     "inspect": [("A",), ("A", "--output", "out.html"), ("A", "--plot", "plan.png")],
     "push": [("A", "org/name", "--dry-run", "--runs", "1")],
     "realtime": [("A", "--control-hz", "1", "--runs", "1")],
     "reuse-tokens": [("A", "-t", "calls.npz", "--calls", "2")],
-    "serve": [("A", "--control-hz", "1", "--port", "0", "--margin-ticks", "0")],
+    "serve": [
+        ("A", "--control-hz", "1", "--port", "0", "--margin-ticks", "0"),
+        ("A", "--copies", "1", "--port", "0"),
+    ],
     "verify": [("A", "--calls", "1")],
     "warm-start": [("A", "-t", "calls.npz", "--calls", "2")],
 }
@@ -121,7 +123,7 @@ def stops_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
         yield
 
     monkeypatch.setattr(listener.Listener, "run", brief)
-    monkeypatch.setattr(sys.modules["ttscompile.cli.fleet"], "ray_copies", nobody)
+    monkeypatch.setattr(sys.modules["ttscompile.cli.serve"], "ray_copies", nobody)
 
 
 @pytest.mark.usefixtures("stops_at_once")

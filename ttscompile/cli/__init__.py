@@ -16,7 +16,6 @@ from ttscompile.cli.convert import convert
 from ttscompile.cli.distill import distill
 from ttscompile.cli.doctor import doctor
 from ttscompile.cli.ending import TRACEBACK, Commands
-from ttscompile.cli.fleet import fleet
 from ttscompile.cli.inspect import inspect
 from ttscompile.cli.push import push
 from ttscompile.cli.realtime import realtime
@@ -52,8 +51,7 @@ for _command, _what in (
     (compare, "Action error against latency, of plans and strategies."),
     (realtime, "Which plans keep up with a control loop on this machine."),
     (push, "Upload an artifact with a model card to the hub."),
-    (serve, "Drive a robot from another process, over a WebSocket."),
-    (fleet, "Answer many robots at once, from copies on a Ray cluster."),
+    (serve, "Drive a robot, or answer many, over a WebSocket."),
 ):
     _command.short_help = _what
     main.add_command(_command)

@@ -17,14 +17,15 @@ Sources = dict[str, tuple[str, ...]]
 
 
 class FilesCommand(click.Command):
-    """Lets ``--trajectories`` and ``--with`` take every word up to the next option, which click's own cannot."""
+    """Lets options whose metavar ends in ``...`` take every word up to the next option, which click's own cannot."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """As click does, with the option repeated before every word."""
         expanded: list[str] = []
         taking = ""
+        many = {word for one in self.params if (one.metavar or "").endswith("...") for word in one.opts}
         for arg in args:
-            if arg in ("-t", "--trajectories", "--with"):
+            if arg in many:
                 taking = arg
             elif taking and not arg.startswith("-"):
                 expanded += [taking, arg]
