@@ -63,7 +63,7 @@ COMMANDS: Mapping[str, Sequence[str]] = {
     "verify": ("verify", "V", "--json"),
     "bench": ("bench", "A", "--runs", "1"),
     "realtime": ("realtime", "A", "--control-hz", "1", "--margin-ticks", "0", "--runs", "1"),
-    "report": ("report", "A", "-o", "OUT/page.html", "--runs", "1"),
+    "inspect -o": ("inspect", "A", "-o", "OUT/page.html"),
     "compare": ("compare", "A", "--trajectories", "calls.npz", "--strategies", "", "--plot", "OUT/frontier.svg"),
     "calibrate": ("calibrate", "OUT/B", "--trajectories", "calls.npz", "--max-minutes", "0.01"),
     "convert": ("convert", "policy.ckpt", "-o", "OUT/C", "--sampler", "ddim", "--steps", "2"),

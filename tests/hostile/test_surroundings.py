@@ -19,7 +19,7 @@ def top(tmp_path_factory: pytest.TempPathFactory) -> Path:
 TRIED = {
     "output in ASCII": ("inspect", 0),
     "COLUMNS=1": ("inspect", 0),
-    "all three closed": ("report", 0),
+    "all three closed": ("inspect -o", 0),
     "standard error full": ("inspect --plot", 2),
     "in a folder that is gone": ("inspect a zip", 2),
     "in a folder whose name is no text": ("inspect", 0),

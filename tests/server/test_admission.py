@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import base64
+import json
 from typing import Any
 
 import pytest
 
+from ttscompile import ObservationSpec
 from ttscompile.runtimes.server.admission import MOST_ADDRESSES, Admission, Pace
 from ttscompile.runtimes.server.limits import ServerLimits
 
@@ -33,6 +36,15 @@ def test_admission_forgets_refusals_after_a_minute_and_counts_networks(audit: An
     assert admission.comes(("2001:db8::77", 7, 0, 0))
     assert [line["event"] for line in audit()] == ["refused", "refused", "cut off"]
     assert audit()[0]["from"] == "[2001:db8::1]:1"
+
+
+def test_a_message_has_room_for_an_observation_as_numbers_or_in_base64() -> None:
+    small, seeing = ObservationSpec((2, 20)), ObservationSpec((480, 640, 3))
+    assert ServerLimits.of({"obs": small}, 3) == ServerLimits(clients=3, message_bytes=1 << 20)
+    found = ServerLimits.of({"obs": small, "front": seeing, "wrist": seeing}, 3).message_bytes
+    assert found == 8 * (40 + 2 * 921_600) + 65_536
+    assert found > len(json.dumps([255] * 921_600, separators=(",", ":"))) * 2
+    assert found > 2 * len(base64.b64encode(bytes(4 * 921_600)))
 
 
 def test_a_full_server_is_no_fault_of_the_client() -> None:
