@@ -1,4 +1,5 @@
-# Two commands for people: `make demo` and `make test`. Each sets up what it needs in .venv, once.
+# Three commands for people: `make demo`, `make quick`, which is what a change needs while it is made, and `make test`,
+# which it needs in the end. Each sets up what it needs in .venv, once.
 #
 #   make PYTHON=python3.12 test      another interpreter (3.11 or later)
 #   make PIP_FLAGS="--extra-index-url https://download.pytorch.org/whl/cpu" test
@@ -16,10 +17,14 @@ BIN := $(VENV)/bin
 READY := $(VENV)/installed.stamp
 
 .DELETE_ON_ERROR:
-.PHONY: demo test lint types pytest test-avx2 test-arm test-matrix benchmark docs release containers test-lerobot clean
+.PHONY: demo quick test lint types pytest test-avx2 test-arm test-matrix benchmark docs release containers test-lerobot clean
 
 demo: $(READY)
 	$(BIN)/python examples/pusht/demo.py
+
+# On two cores two minutes. Every room has tests here; what takes longer is marked slow.
+quick: lint
+	$(BIN)/pytest $(TOGETHER) -m "not slow and not alone and not soak"
 
 test: lint types pytest
 
@@ -27,18 +32,24 @@ lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-# mypy must see the package as it is installed, with passes/ and runtimes/ inside it: it gets a copy laid out like that.
+# mypy must see the package as it is installed, with passes/ and runtimes/ inside it, and the examples as they see each
+# other, from the folders in mypy_path (pyproject.toml): it gets a copy laid out like that.
+TYPED := build/types
 types: $(READY)
-	rm -rf build/types
-	mkdir -p build/types
-	cp -Rp ttscompile build/types/ttscompile
-	cp -Rp passes runtimes build/types/ttscompile/
-	cd build/types && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache -p ttscompile
+	rm -rf $(TYPED)
+	mkdir -p $(TYPED)/recipes
+	cp -Rp ttscompile tests examples plugins/lerobot_policy_ttscompile $(TYPED)
+	cp -Rp passes runtimes $(TYPED)/ttscompile
+	mv $(TYPED)/examples/policies/*.py $(TYPED)/recipes
+	cd $(TYPED) && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache .
 
-# On all cores, each with a file at a time; then, one by one, what takes times.
+# On all cores, each with a file at a time; then, one by one, what takes times. The tests of make quick are measured on
+# the way: what share of the core's lines they run.
+TOGETHER := -n logical --dist loadfile --benchmark-disable
 pytest: $(READY)
-	$(BIN)/pytest -n logical --dist loadfile --benchmark-disable -m "not alone and not soak"
+	$(BIN)/pytest $(TOGETHER) -m "not alone and not soak" --cov --cov-report=
 	$(BIN)/pytest -m "alone and not soak"
+	$(BIN)/python tests/covered.py
 
 # The same as on a processor without AVX-512: torch, MKL, oneDNN, OpenBLAS and numpy each have a switch of their own.
 # onnxruntime has none; its matrix products of fp32 give the same bits with either (Conv and Softmax do not).
@@ -50,7 +61,7 @@ test-avx2: export NPY_DISABLE_CPU_FEATURES := X86_V4 AVX512_ICL AVX512_SPR
 # torch.compile keeps what it compiled, and takes it again under other switches, where it computes something else.
 test-avx2: export TORCHINDUCTOR_CACHE_DIR := $(CURDIR)/build/inductor-avx2
 test-avx2: $(READY)
-	$(BIN)/pytest -n logical --dist loadfile --benchmark-disable -m "not alone and not soak"
+	$(BIN)/pytest $(TOGETHER) -m "not alone and not soak"
 
 # The runtime on emulated ARM processors; see docs/machines.md. The first time takes half an hour.
 test-arm: $(READY)
@@ -80,8 +91,10 @@ docs: $(READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 # An sdist and a wheel in build/release, checked as the index does, and tried in empty environments. Nothing is uploaded.
+# With TAG=v1.2.3 it ends at once unless this is the tag of VERSION.
+TAG :=
 release: $(READY)
-	$(BIN)/python tests/release.py build/release
+	$(BIN)/python tests/release.py build/release $(TAG)
 
 # Both images of containers/, with docker or buildah, and what they are for done in them.
 containers: $(READY)

@@ -46,6 +46,14 @@ def pytest_configure(config: pytest.Config) -> None:
         torch.set_warn_always(True)  # a warning that is given once is an error of whichever test comes first
 
 
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Coverage is that of the quick tests: measuring all of them would cost a quarter more time."""
+    if config.getoption("cov_source", default=None):
+        for item in items:
+            if item.get_closest_marker("slow"):
+                item.add_marker("no_cover")
+
+
 def pytest_terminal_summary(terminalreporter: TerminalReporter) -> None:
     """Say how much was not tested for want of the golden files: a green run without them proves less."""
     skipped = [r for r in terminalreporter.stats.get("skipped", []) if NO_SHARED in str(r.longrepr)]

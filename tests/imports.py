@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -48,7 +48,7 @@ def imports(name: str, path: Path) -> list[Import]:
     ]
 
 
-def home(target: str, known: set[str] | dict[str, Path]) -> str | None:
+def home(target: str, known: Container[str]) -> str | None:
     """The module of the package that ``target`` is, or is a name in; None for somebody else's."""
     while target:
         if target in known:

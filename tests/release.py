@@ -1,9 +1,10 @@
 """Make a release, and try it as its users will: ``make release``, or
 
-    python tests/release.py dist
+    python tests/release.py dist [v1.2.3]
 
-builds the sdist and, from that, the wheel; holds the wheel against the tree; lets twine check both; installs each into
-an empty environment with what it asks for; and lets an artifact that is compiled here run there. Nothing is uploaded.
+ends at once if a tag is given that is not this version's, or the changelog has no section for it. Otherwise it builds
+the sdist and, from that, the wheel; holds the wheel against the tree; lets twine check both; installs each into an
+empty environment with what it asks for; and lets an artifact that is compiled here run there. Nothing is uploaded.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import venv
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 if __name__ == "__main__":
@@ -96,9 +98,18 @@ def changes(version: str) -> str:
     return found[1].strip() if found else ""
 
 
-def project() -> dict[str, object]:
+def not_ready(tag: str | None, version: str = VERSION) -> str | None:
+    """Why a version cannot be released under a tag, or untagged; None if it can."""
+    if tag not in (None, f"v{version}"):
+        return f"the tag is {tag}, and VERSION in ttscompile/measure/versions.py says {version}. Expected v{version}."
+    if not changes(version):
+        return f"CHANGELOG.md has no section '## {version} - DATE'. Write it, or change VERSION."
+    return None
+
+
+def project() -> dict[str, Any]:
     """The table ``project`` of pyproject.toml."""
-    table: dict[str, object] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    table: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     return table
 
 
@@ -110,12 +121,12 @@ def run(words: list[str], cwd: Path | None = None) -> str:
     return done.stdout
 
 
-def main(out: Path) -> None:
+def main(out: Path, tag: str | None = None) -> None:
     """Make and try a release."""
+    if (why := not_ready(tag)) is not None:
+        sys.exit(f"error: {why}")
     from tests.runtimes.toys import toy_program, written_artifact
 
-    if not changes(VERSION):
-        sys.exit(f"error: CHANGELOG.md has no section '## {VERSION} - DATE'. Write it, or change VERSION.")
     out.mkdir(parents=True, exist_ok=True)
     files = build(out)
     if wrong := missing_or_more(files[1]):
@@ -129,4 +140,4 @@ def main(out: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "dist"))
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "dist"), *sys.argv[2:3])

@@ -32,7 +32,7 @@ the fastest wave. Embeddings have waves whose frequencies fall by the same facto
 follows sums over them: the root of their mean square is ``sqrt(1 / (2 log 10^4))``, a quarter, of the fastest. That
 leaves u times the largest angle.
 
-**Promises.** For real policies and their originals the README promises 1e-5 of the range of the actions. That is
+**Promises.** For real policies and their originals the support table promises 1e-5 of the range of the actions. That is
 about the bound of one evaluation of networks of that size, and ten times what is found; tests of it have that figure.
 
 What is compared may be larger or smaller than 1, so all of this is times its largest number: an error of a small

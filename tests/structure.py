@@ -21,10 +21,10 @@ FLOORS = (
     ("core", "measure"),
     ("hub", "ir", "plots", "samplers", "trajectories"),
     ("artifact", "frontends", "lower", "passes"),
-    ("capture", "runtimes"),
+    ("capture", "pool", "runtimes"),
     ("doctor", "verification"),
     ("calibration", "driver", "report"),
-    ("ttscompile",),
+    ("rivals", "ttscompile"),
     ("cli",),
     ("__main__",),
 )

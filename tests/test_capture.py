@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -116,7 +117,7 @@ def test_a_buffer_may_have_the_name_of_an_operation() -> None:
     class Rotates(nn.Module):
         def __init__(self) -> None:
             super().__init__()
-            self.cos = nn.Buffer(torch.rand(2))
+            self.cos: torch.Tensor = nn.Buffer(torch.rand(2))
 
         def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
             return sample * self.cos + timestep.cos()[:, None, None]
@@ -132,7 +133,7 @@ def test_a_buffer_may_have_the_name_of_an_operation() -> None:
 
 
 def test_a_module_that_cannot_be_copied_is_refused() -> None:
-    module = Denoiser(lambda y, t, o: y * module.scale)
+    module: Any = Denoiser(lambda y, t, o: y * module.scale)
     module.scale = nn.Parameter(torch.rand(2)).exp()
     with pytest.raises(CaptureError, match="Denoiser cannot be copied: .*call torch.nn.utils.remove_weight_norm"):
         capture(module, toy_spec())

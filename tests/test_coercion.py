@@ -1,4 +1,4 @@
-"""The door for numbers and arrays of callers: what comes through, and what is told about the rest."""
+"""Numbers and arrays of callers: what comes through, and what is told about the rest."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Unit(np.ndarray):
 
 @pytest.mark.parametrize("kind", [np.matrix, np.recarray, Finalized])
 def test_a_class_that_changes_nothing_is_left_behind(kind: type) -> None:
-    given = VALUES.view(kind)
+    given: Any = VALUES.view(kind)
     found = plain(given, "x", ObservationError)
     assert type(found) is np.ndarray and np.array_equal(found, VALUES)
     assert np.shares_memory(found, given)
@@ -115,19 +115,19 @@ def test_views_of_torch_that_numpy_would_not_take_are_resolved() -> None:
     assert np.array_equal(plain(x.clone().requires_grad_(), "x", ObservationError), VALUES)
 
 
-@pytest.mark.parametrize("door", [plain, listed])
+@pytest.mark.parametrize("function", [plain, listed])
 @pytest.mark.parametrize("mask", [False, True])
-def test_masked_arrays_and_those_that_compute_in_their_own_way_are_refused(door: Any, mask: bool) -> None:
+def test_masked_arrays_and_those_that_compute_in_their_own_way_are_refused(function: Any, mask: bool) -> None:
     masked = np.ma.masked_array(VALUES, mask=mask)
     with pytest.raises(ObservationError, match=r"^x is a masked array, .*\.filled\("):
-        door(masked, "x", ObservationError, "float32")
+        function(masked, "x", ObservationError, "float32")
     with pytest.raises(ObservationError, match=r"^x is a Unit, .*expected a plain array\. Use np\.array"):
-        door(VALUES.view(Unit), "x", ObservationError, "float32")
+        function(VALUES.view(Unit), "x", ObservationError, "float32")
     with pytest.raises(ObservationError, match="^x is a masked array"):
         listed([masked, masked], "x", ObservationError, "float32")
 
 
-@pytest.mark.parametrize("value", [[1.0, 2.0], memoryview(VALUES), 1.0, np.float32(1), None, object()])
+@pytest.mark.parametrize("value", [[1.0, 2.0], memoryview(b"1234"), 1.0, np.float32(1), None, object()])
 def test_what_is_neither_array_nor_tensor_is_refused(value: Any) -> None:
     expected = rf"^x is a {type(value).__name__}; expected a numpy array or a torch tensor\..*np\.int8"
     with pytest.raises(ObservationError, match=expected):
@@ -169,6 +169,9 @@ def test_arguments_that_count_are_whole(make: Callable[[Any], Any], message: str
     from ttscompile.frontends.families import LoadOptions
     from ttscompile.runtimes.server.limits import ServerLimits
 
+    def settings(name: str, value: Any) -> ExecutorSettings:
+        return ExecutorSettings(**{name: value})
+
     given = make(2.5)
     calls: list[Callable[[], Any]] = [
         lambda: ObservationSpec((given, 3)).shape[0],
@@ -177,7 +180,7 @@ def test_arguments_that_count_are_whole(make: Callable[[Any], Any], message: str
         lambda: goal_of(threads=given).threads,
         lambda: ServerLimits(clients=given).clients,
         *(
-            lambda name=name: getattr(ExecutorSettings(**{name: given}), name)
+            lambda name=name: getattr(settings(name, given), name)
             for name in ("n_obs_steps", "horizon", "measured_calls", "latency_window", "down_after", "up_after")
         ),
     ]
@@ -188,9 +191,9 @@ def test_arguments_that_count_are_whole(make: Callable[[Any], Any], message: str
             with pytest.raises(TtscompileError, match=message):
                 call()
     for name in ("reserve", "blend_steps", "max_hold", "margin_ticks", "warm_up", "trace_events"):
-        assert getattr(ExecutorSettings(**{name: np.int8(0)}), name) == 0
+        assert getattr(settings(name, np.int8(0)), name) == 0
         with pytest.raises(TtscompileError, match=f"{name} must be an integer of at least 0"):
-            ExecutorSettings(**{name: True})
+            settings(name, True)
     with pytest.raises(TtscompileError, match="a processor in cores must be an integer"):
         ExecutorSettings(cores=(0.5,))  # type: ignore[arg-type]
     with pytest.raises(TtscompileError, match="a chunk's stop must be an integer of at least 0; found 1.5"):

@@ -41,13 +41,27 @@ MAY_IMPORT = {
     "runtimes": BELOW_ARTIFACT | {"hub"},
     "doctor": BELOW_ARTIFACT | {"runtimes"},
     "verification": BELOW_ARTIFACT | {"frontends", "runtimes", "trajectories"},
-    "calibration": BELOW_ARTIFACT | {"lower", "runtimes", "trajectories", "verification"},
+    "pool": BASE | {"artifact"},
+    "calibration": BELOW_ARTIFACT | {"lower", "pool", "runtimes", "trajectories", "verification"},
+    "rivals": BELOW_ARTIFACT | {"calibration", "runtimes"},
     "report": BELOW_ARTIFACT | {"hub", "plots", "runtimes", "trajectories", "verification"},
     "driver": BELOW_ARTIFACT | {"capture", "frontends", "hub", "lower", "passes", "runtimes", "verification"},
     "cli": BELOW_ARTIFACT
     | {"calibration", "doctor", "driver", "frontends", "plots", "report", "runtimes", "trajectories", "verification"},
 }
 """Part of the package -> the other parts that it may import, anywhere in its code. Design, section 4."""
+
+RIVALS_READ = {
+    f"ttscompile.calibration.{name}"
+    for name in ("calls", "execute", "fit_correction", "progress", "pruner.head", "spacing", "targets", "task", "tts")
+}
+"""What rivals know of calibration: what a strategy is given, and what it may compare."""
+
+FLEET = "ttscompile.runtimes.fleet"
+"""A room with one entrance: whoever is outside imports this module, and none that is in it."""
+
+SERVER = "ttscompile.runtimes.server"
+"""Runtimes do not know it, nor the fleet; both know them."""
 
 MOST_DOORS = 12
 """Other rooms that a room may import: a reader who opens more of them at once is lost."""
@@ -63,6 +77,7 @@ COMPILES = (
     "ttscompile.ir.tokens",
     "ttscompile.lower",
     "ttscompile.passes",
+    "ttscompile.rivals",
     "ttscompile.runtimes.reference",
     "ttscompile.runtimes.torch",
     "ttscompile.samplers",
@@ -95,6 +110,22 @@ def compiles(module: str) -> bool:
     return any(module == name or module.startswith(f"{name}.") for name in COMPILES)
 
 
+def inside_errors(found: list[Import], known: set[str]) -> list[str]:
+    """Imports that go past the entrance of a room, or from the executor to what serves it, one line each."""
+    errors = []
+    for each in found:
+        target = home(each.target, known) or ""
+        told = f"{each.importer}:{each.line} imports {target}: "
+        if target.startswith(f"{FLEET}.") and not each.importer.startswith(FLEET):
+            errors.append(f"{told}the entrance is {FLEET}")
+        served = part(each.importer) == "runtimes" and not each.importer.startswith((FLEET, SERVER))
+        if served and target.startswith((FLEET, SERVER)):
+            errors.append(f"{told}runtimes must not know who serves them")
+        if part(each.importer) == "rivals" and part(target) == "calibration" and target not in RIVALS_READ:
+            errors.append(f"{told}rivals know {sorted(RIVALS_READ)}")
+    return errors
+
+
 def test_every_part_of_the_package_has_its_place_in_the_direction() -> None:
     assert {part(name) for name in MODULES} - {"", "__main__"} == set(MAY_IMPORT)
 
@@ -103,6 +134,28 @@ def test_imports_go_one_way() -> None:
     found = [each for each_module in GRAPH.values() for each in each_module]
     assert len(found) > 100, "the walk over the source found hardly anything"
     assert direction_errors(found, set(MODULES)) == []
+
+
+def test_rooms_are_entered_where_their_entrance_is() -> None:
+    assert inside_errors([each for found in GRAPH.values() for each in found], set(MODULES)) == []
+    read = {home(each.target, MODULES) for name, found in GRAPH.items() if part(name) == "rivals" for each in found}
+    assert read >= RIVALS_READ, "rivals read less: shorten the list"
+
+
+@pytest.mark.parametrize(
+    ("importer", "target"),
+    [
+        ("ttscompile.cli.fleet", f"{FLEET}.server"),
+        ("ttscompile.runtimes.executor.executor", f"{SERVER}.listener"),
+        ("ttscompile.runtimes.load", FLEET),
+        ("ttscompile.rivals.bac", "ttscompile.calibration.pipeline"),
+    ],
+)
+def test_an_import_past_the_entrance_is_found(importer: str, target: str) -> None:
+    allowed = ("ttscompile.cli.fleet", FLEET), (f"{FLEET}.server", f"{FLEET}.copies"), (f"{FLEET}.server", SERVER)
+    for one, other in (*allowed, ("ttscompile.rivals.bac", "ttscompile.calibration.task")):
+        assert inside_errors([Import(one, other, 1, True)], {one, other}) == []
+    assert len(inside_errors([Import(importer, target, 1, True)], {importer, target})) == 1
 
 
 def test_no_modules_import_each_other() -> None:
@@ -125,6 +178,8 @@ def test_no_modules_import_each_other() -> None:
         ("ttscompile.artifact.load", "ttscompile.runtimes.load.load"),
         ("ttscompile.errors", "ttscompile.core.spec"),
         ("ttscompile.driver", "ttscompile.cli"),
+        ("ttscompile.calibration.tts", "ttscompile.rivals.bac"),
+        ("ttscompile.pool", "ttscompile.calibration.execute"),
     ],
 )
 def test_an_import_the_wrong_way_is_found(importer: str, target: str) -> None:
@@ -200,7 +255,7 @@ def test_the_closure_sees_through_modules_and_parents_but_not_into_functions(tmp
 def test_every_pass_has_its_test_and_tests_import_helpers_not_each_other() -> None:
     passes = {p.stem for p in (ROOT / "passes").glob("*.py")} - {"__init__", "base"}
     assert {f"test_{name}.py" for name in passes} <= {p.name for p in (ROOT / "tests" / "passes").iterdir()}
-    found = {}
+    found: dict[str, list[str]] = {}
     for path in (ROOT / "tests").rglob("*.py"):
         lines = re.findall(r"^\s*(?:from|import) [\w.]*\btest_\w+.*", path.read_text(), re.MULTILINE)
         own = [line for line in lines if f"{path.stem} import" not in line]  # in a process of its own

@@ -98,12 +98,11 @@ def test_functions_that_take_a_path(endless: Path, artifact: Path, tmp_path: Pat
         ["calibrate", "PATH", "--trajectories", "PATH"],
         ["calibrate", "ARTIFACT", "--trajectories", "PATH"],
         ["compare", "PATH", "--trajectories", "PATH"],
-        ["oracle", "PATH", "--trajectories", "PATH"],
         ["convert", "PATH", "-o", "OUTPUT"],
         ["convert", "ARTIFACT", "-o", "PATH"],
-        ["report", "PATH", "-o", "OUTPUT.html"],
-        ["report", "ARTIFACT", "-o", "OUTPUT.html", "--comparison", "PATH"],
-        ["report", "ARTIFACT", "-o", "OUTPUT.html", "--trajectories", "PATH"],
+        ["inspect", "PATH", "-o", "OUTPUT.html"],
+        ["inspect", "ARTIFACT", "-o", "OUTPUT.html", "--comparison", "PATH"],
+        ["inspect", "ARTIFACT", "-o", "OUTPUT.html", "--trajectories", "PATH"],
     ],
 )
 def test_commands_that_take_a_path(artifact: Path, tmp_path: Path, command: list[str]) -> None:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import tarfile
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 
 from tests.runtimes.toys import toy_program, written_artifact
 from ttscompile import __version__
@@ -65,3 +68,68 @@ def test_the_version_is_said_once_and_the_changelog_has_it() -> None:
     assert said == ["ttscompile/measure/versions.py"]
     assert len(release.changes(VERSION)) > 1000
     assert release.changes("0.0.9") == ""
+
+
+@pytest.mark.parametrize(
+    ("tag", "version", "why"),
+    [
+        (f"v{VERSION}", VERSION, None),
+        (None, VERSION, None),
+        (VERSION, VERSION, f"the tag is {VERSION}, .* Expected v{VERSION}"),
+        (f"v{VERSION}rc1", VERSION, f"the tag is v{VERSION}rc1"),
+        ("", VERSION, "the tag is ,"),
+        ("v0.0.9", "0.0.9", "no section '## 0.0.9 - DATE'"),
+    ],
+)
+def test_a_tag_is_the_version_and_the_changelog_has_it(tag: str | None, version: str, why: str | None) -> None:
+    found = release.not_ready(tag, version)
+    assert (found is None) if why is None else re.search(why, found or "")
+
+
+def test_a_wrong_tag_ends_a_release_before_anything_is_built(tmp_path: Path) -> None:
+    words = (sys.executable, release.ROOT / "tests" / "release.py", tmp_path / "out", "v9.9.9")
+    done = subprocess.run([str(word) for word in words], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: the tag is v9.9.9")
+    assert list(tmp_path.iterdir()) == []
+
+
+def workflow(name: str) -> dict[Any, Any]:
+    """A workflow; YAML reads its key ``on`` as true."""
+    read: dict[Any, Any] = yaml.safe_load((release.ROOT / ".github" / "workflows" / f"{name}.yml").read_text())
+    return read
+
+
+def test_continuous_integration_runs_all_tests_on_each_python_that_the_package_names() -> None:
+    job = workflow("ci")["jobs"]["test"]
+    named = [str(each).rpartition(" ")[2] for each in release.project()["classifiers"] if "Python :: 3." in each]
+    assert job["strategy"]["matrix"]["python"] == named
+    assert f">={named[0]}" == release.project()["requires-python"]
+    assert job["env"]["PYTHON"] == "python${{ matrix.python }}"
+    assert job["steps"][-1]["run"] == ".ci/run"
+    assert (release.ROOT / ".ci" / "run").read_text().splitlines()[-1] == "make test"
+
+
+def test_a_tag_is_published_without_a_password_after_make_release() -> None:
+    document = workflow("release")
+    assert document[True] == {"push": {"tags": ["v*"]}}
+    build, publish = document["jobs"]["build"], document["jobs"]["publish"]
+    assert 'make release TAG="$GITHUB_REF_NAME"' in [step.get("run") for step in build["steps"]]
+    assert "release.py build/release $(TAG)\n" in (release.ROOT / "Makefile").read_text()
+    assert publish["needs"] == "build"
+    assert publish["permissions"] == {"id-token": "write"}
+    assert document["permissions"] == {"contents": "read"}, "and nobody else may write anything"
+    kept, taken = build["steps"][-1]["with"], publish["steps"][0]["with"]
+    assert (kept["path"], kept["name"]) == ("build/release/", taken["name"])
+    assert (publish["steps"][-1]["uses"], taken["path"]) == ("pypa/gh-action-pypi-publish@release/v1", "dist/")
+    assert "secrets" not in str(document)
+
+
+def test_the_project_says_where_it_is_at_home() -> None:
+    urls = release.project()["urls"]
+    assert set(urls) == {"Homepage", "Documentation", "Issues", "Changelog"}
+    place = urls["Homepage"]
+    for url in urls.values():
+        assert url.startswith(place)
+        _, _, path = url.partition("/blob/main/")
+        assert (release.ROOT / path).exists(), url

@@ -8,6 +8,7 @@ import sys
 import textwrap
 import venv
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -62,12 +63,12 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return python
 
 
-def act(python: Path | str, artifact: Path, call: Path) -> dict[str, object]:
+def act(python: Path | str, artifact: Path, call: Path) -> dict[str, Any]:
     """Load and act in another process, started where no part of the source tree can be imported by accident."""
     command = [str(python), "-W", "error", "-c", ACT, str(artifact), str(call)]
     result = subprocess.run(command, capture_output=True, text=True, cwd=call.parent, check=False)
     assert result.returncode == 0, result.stderr
-    report: dict[str, object] = json.loads(result.stdout)
+    report: dict[str, Any] = json.loads(result.stdout)
     return report
 
 
@@ -78,7 +79,7 @@ def test_a_robot_without_torch_acts_as_the_full_environment_does(robot: Path, co
     assert not set(COMPILERS_ONLY) & set(runs[0]["modules"])
     assert not {"click", "rich"} & set(runs[0]["modules"]), "they are the command line's, and not installed there"
     np.testing.assert_array_equal(runs[0]["action"], here["action"])
-    seconds = min(float(str(run["seconds"])) for run in runs)
+    seconds = min(run["seconds"] for run in runs)
     print(f"import and load without torch: {seconds:.3f} s")
     assert seconds < 2.0
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -66,7 +67,8 @@ def test_with_a_network_that_is_never_wrong_the_rest_meets_the_whole_loop(name: 
     if name.startswith("to"):
         first = (0.0, 1.0)
     else:  # hardly any action is in it
-        bar = float(DDIMScheduler(**BETAS).alphas_cumprod[int(table.timesteps[0])])
+        scheduler: Any = DDIMScheduler(**BETAS)
+        bar = float(scheduler.alphas_cumprod[int(table.timesteps[0])])
         first = (bar**0.5, (1 - bar) ** 0.5)
     shares = [first, *((one.action, one.noise) for one in starts)]
     outs = [network(a, s, action, noise) for a, s in shares]

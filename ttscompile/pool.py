@@ -7,6 +7,7 @@ in the same way, and whatever is random in it was drawn before, or has a seed of
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,8 +68,6 @@ class Here:
         if not work.threads:
             yield from map(work.here, parts)
             return
-        from .calibration.execute import workers
-
         with workers() as threads:
             found = list(threads.map(work.here, parts))
         yield from found
@@ -141,6 +140,25 @@ class RayPool:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self._ray.shutdown()
+
+
+@contextmanager
+def workers() -> Iterator[ThreadPoolExecutor]:
+    """As many threads as torch would use for one operation, for whole calls and without gradients; torch uses one each.
+
+    The operations of a policy are small: divided among threads they spend much of their time waiting for the slowest
+    part, most of all on a machine that does something else as well. Whole calls wait for nobody; and since they are
+    divided in the same way however many workers there are, so are the results.
+    """
+    import torch
+
+    count = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with ThreadPoolExecutor(count, "ttscompile-calibration", torch.set_grad_enabled, (False,)) as pool:
+            yield pool
+    finally:
+        torch.set_num_threads(count)
 
 
 @contextmanager

@@ -5,7 +5,7 @@
 Every row is a way to spend the same number of computed cells a call, mean over the calls: evenly spaced or searched
 steps, switches, gates trained for all calls, and a head trained to decide for each observation, with one direction of
 reuse or with all. Each is measured with and without a correction of the sampler, on windows of consecutive calls of
-episodes that nothing was learned from, against the dense policy with the same noise. ``ttscompile oracle`` says what
+episodes that nothing was learned from, against the dense policy with the same noise. ``oracle.py`` says what
 choosing among schedules could gain.
 """
 
@@ -29,6 +29,7 @@ from rich.table import Table
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import update_calibration
 from ttscompile.calibration.calls import (
+    FRACTION,
     Actions,
     Calls,
     load_episodes,
@@ -43,13 +44,11 @@ from ttscompile.calibration.pruner.paper import UPDATES, Paper
 from ttscompile.calibration.search import search_plan
 from ttscompile.calibration.targets import REPEATS, dense_rounds
 from ttscompile.calibration.task import Clock, Found, Search, Task
-from ttscompile.calibration.tts import Tts, switched
+from ttscompile.calibration.tts import Tts
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import PlanArray, Source
-from ttscompile.runtimes.settle import pruner_plan
-
-FRACTION = 0.25
-"""Share of the episodes to judge on, as in ``ttscompile calibrate``."""
+from ttscompile.rivals.switched import Switched
+from ttscompile.runtimes.plans import pruner_plan
 
 RESAMPLED = 2000
 """Samples of the bootstrap over episodes."""
@@ -118,7 +117,7 @@ def rows_of(directions: Sequence[str], ways: Sequence[str], updates: int) -> lis
     if "searched" in ways:
         rows.append(("searched steps", "TIMESTEP", Tts))
     if "switched" in ways:
-        rows.append(("searched steps, switches", "TIMESTEP", switched))
+        rows.append(("searched steps, switches", "TIMESTEP", Switched))
     for name in directions:
         sources = DIRECTIONS[name]
         if "gates" in ways and name != "ROLLOUT":  # a plan for all calls never computes what it would read

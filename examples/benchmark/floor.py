@@ -76,6 +76,7 @@ def tails_contestant(directory: Path, threads: int, plan: PlanArray) -> Contesta
 
 def floor_ms(plan: PlanArray, artifact: Artifact, blocks: Measurement) -> float:
     """Milliseconds that the computed cells of a plan take at the speed of ``blocks_contestant``."""
+    assert blocks.flops is not None
     rate = blocks.flops / blocks.median_ms
     return plan_flops(plan, artifact.manifest.flops.blocks) / rate
 

@@ -69,7 +69,7 @@ class Clip(nn.Module):
 
     def forward(self, obs: Mapping[str, Tensor]) -> Tensor:
         images = [obs[key].flatten(0, 1) for key in CAMERAS]
-        return self.encoder(obs["state"], images, obs["tokens"], obs["mask"])  # type: ignore[no-any-return]
+        return self.encoder(obs["state"], images, obs["tokens"], obs["mask"])
 
 
 class ResNets(nn.Module):
@@ -83,7 +83,7 @@ class ResNets(nn.Module):
         self.width = TO * self.encoder.width
 
     def forward(self, obs: Mapping[str, Tensor]) -> Tensor:
-        return self.encoder(obs).flatten(1)  # type: ignore[no-any-return]
+        return self.encoder(obs).flatten(1)
 
 
 def compiled(name: str, folder: Path) -> None:

@@ -187,6 +187,7 @@ def reusing(folder: Path, spec: PolicySpec, computed: int, rounds: int = 7) -> N
         expected = timed(whole, obs, noise, plan, times, "int8", f"{name}, int8, new frames, all tokens")
         found = timed(some, obs, noise, plan, times, "int8", f"{name}, int8, new frames, some tokens")
         if number >= 2 * len(plans):  # the first is whole, and those that follow may be the first of their size
+            assert some.last_report is not None
             frames = some.last_report.frames
             shares.append(frames.tokens / frames.of)
             off.setdefault(name, []).append(float(np.abs(found - expected).mean()))

@@ -22,7 +22,7 @@ import torch
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.calls import Calls, prepare_calls
 from ttscompile.calibration.execute import Executor
-from ttscompile.calibration.step_counts import crowded_family
+from ttscompile.calibration.spacing import spacings
 from ttscompile.calibration.targets import dense_rounds
 from ttscompile.calibration.task import Task
 from ttscompile.pool import RayPool
@@ -59,7 +59,7 @@ def main(directory: Path, cores: str, calls: int, full_steps: int, rounds: int) 
                 path = torch.cat(list(dense_rounds(executor, drawn, pool=pool)))
                 dense = time.perf_counter()
                 whole = Task.of(executor.artifact, executor, replace(drawn, path=path), 0, 0, pool).whole
-                family = crowded_family(executor.model.steps, full_steps)
+                family = spacings(executor.model.steps, full_steps)
                 for number in range(len(family)):
                     whole.expect(family[number:])
                 errors = [whole.errors(steps).normalised for steps in family]

@@ -156,6 +156,7 @@ def _compiled(network: Network, directory: Path, threads: int, plans: Iterable[f
 
 def _row(network: Network, threads: int, m: Measurement, sparsity: float | None, floor: float | None) -> Row:
     low, high = tenths(m.times_ms)
+    assert m.flops is not None
     return Row(
         network=network.name,
         width=network.width,

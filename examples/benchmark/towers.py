@@ -84,7 +84,7 @@ def measure(title: str, tower: nn.Module, size: int, rounds: int, profiled: bool
 
     @torch.inference_mode()
     def eager() -> np.ndarray:
-        return module(**{name: torch.from_numpy(value) for name, value in given.items()}).numpy()  # type: ignore[no-any-return]
+        return module(**{name: torch.from_numpy(value) for name, value in given.items()}).numpy()
 
     def running(one: onnxruntime.InferenceSession) -> Callable[[], np.ndarray]:
         read = {value.name: given[value.name] for value in one.get_inputs()}

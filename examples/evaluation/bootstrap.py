@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 RESAMPLES = 10_000
+Values: TypeAlias = Sequence[float] | npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -22,7 +25,7 @@ class Estimate:
         return f"{self.mean:.3f} [{self.low:.3f}, {self.high:.3f}]"
 
 
-def estimate(values: Sequence[float], seed: int = 0) -> Estimate:
+def estimate(values: Values, seed: int = 0) -> Estimate:
     """Mean of one number an episode.
 
     Args:
@@ -38,7 +41,7 @@ def estimate(values: Sequence[float], seed: int = 0) -> Estimate:
     return Estimate(float(array.mean()), float(low), float(high))
 
 
-def paired_difference(values: Sequence[float], baseline: Sequence[float], seed: int = 0) -> Estimate:
+def paired_difference(values: Values, baseline: Values, seed: int = 0) -> Estimate:
     """Mean of ``value - baseline``, episode by episode.
 
     Args:

@@ -8,6 +8,7 @@ import os
 import zipfile
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rollout import Episode
@@ -54,7 +55,7 @@ class Episodes:
                 arrays = {name: stored[name] for name in stored.files if name != PLAIN}
         except (OSError, KeyError, ValueError, zipfile.BadZipFile, zlib.error):
             return None
-        figures = {name: tuple(plain.pop(name)) for name in ("sparsity", "flops", "legalised")}
+        figures: dict[str, Any] = {name: tuple(plain.pop(name)) for name in ("sparsity", "flops", "legalised")}
         actions, scores = arrays.pop("actions"), arrays.pop("scores")
         windows = {name.removeprefix(WINDOWS): array for name, array in arrays.items()}
         return Episode(**plain, **figures, actions=actions, scores=scores, windows=windows)
@@ -64,7 +65,8 @@ class Episodes:
         self._folder.mkdir(parents=True, exist_ok=True)
         beside = self._folder / f".{episode.seed}.{os.getpid()}.npz"
         plain = vars(episode).copy()
-        arrays = {name: plain.pop(name) for name in ("actions", "scores")}
+        arrays: dict[str, Any] = {name: plain.pop(name) for name in ("actions", "scores")}
         arrays |= {f"{WINDOWS}{key}": array for key, array in plain.pop("windows").items()}
-        np.savez_compressed(beside, **{PLAIN: json.dumps(plain)}, **arrays)  # images of simulators become a tenth
+        arrays[PLAIN] = np.array(json.dumps(plain))
+        np.savez_compressed(beside, **arrays)  # images of simulators become a tenth
         beside.replace(self._folder / f"{episode.seed}.npz")

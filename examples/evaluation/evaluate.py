@@ -222,7 +222,7 @@ def task_table(evaluations: Sequence[Evaluation]) -> Table:
     help="Draw score against the latency of a call, which is measured after the episodes.",
 )
 @json_option
-def main(
+def main(  # noqa: C901  # checks each option in turn
     variants: tuple[str, ...],
     environment: str,
     episodes: int,

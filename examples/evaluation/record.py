@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
@@ -28,7 +29,7 @@ def save_trajectories(path: Path, episodes: Sequence[Mapping[str, Array]]) -> No
         episodes: at least one; of each the windows of its calls, by key ``[calls, To, ...]``.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    arrays = {key: np.concatenate([episode[key] for episode in episodes]) for key in episodes[0]}
+    arrays: dict[str, Any] = {key: np.concatenate([episode[key] for episode in episodes]) for key in episodes[0]}
     ends = np.cumsum([len(next(iter(episode.values()))) for episode in episodes])
     np.savez(path, **arrays, episode_ends=ends.astype(np.int64))
 

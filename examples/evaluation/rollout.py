@@ -278,7 +278,7 @@ def action_errors(variant: Variant, episodes: Sequence[Episode]) -> Array:
         windows = stacked([{k: a[row] for k, a in e.windows.items()} for e, row in zip(episodes, rows, strict=True)])
         noise = seeded_noise(variant.noise, seeds, number)
         made = variant.policy.predict_action(windows, noise=noise, plan=variant.plan)["action"]
-        for i in np.flatnonzero(number < np.array(calls)):
+        for i in np.flatnonzero(number < np.array(calls)).tolist():
             taken = episodes[i].actions[number * made.shape[1] : (number + 1) * made.shape[1]]  # the last chunk is cut
             errors[i, number] = np.abs(made[i, : len(taken)] - taken).mean()
     return errors

@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
@@ -51,7 +52,9 @@ def main(directory: Path, folder: Path, out: Path, environment: str) -> None:
         frames.append(world.observe())
         world.step(np.random.default_rng(seed).uniform(100, 400, 2))
         frames.append(world.observe())
-    windows = {key: np.stack([f[key] for f in frames]).reshape(WINDOWS, 2, *frames[0][key].shape) for key in frames[0]}
+    windows: dict[str, Any] = {
+        key: np.stack([f[key] for f in frames]).reshape(WINDOWS, 2, *frames[0][key].shape) for key in frames[0]
+    }
     batch = before({**{key: torch.from_numpy(value) for key, value in windows.items()}, "task": [TASK]})
     batch = {
         key: value.expand(WINDOWS, -1) if "language" in key else value

@@ -129,7 +129,7 @@ def save(workspace: Any, folder: Path, name: str) -> None:
     torch.save(payload, folder / f"{name}_ema_fp16_{workspace.global_step}.ckpt", pickle_module=dill)
 
 
-def train(
+def train(  # noqa: PLR0915  # the recipe, line by line
     config: Any,
     obs: torch.Tensor,
     action: torch.Tensor,

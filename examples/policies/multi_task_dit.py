@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -238,7 +239,8 @@ class Policy:
         """
         beside = folder.with_name(f".{folder.name}.new")
         shutil.rmtree(beside, ignore_errors=True)
-        self.averaged.module.save_pretrained(beside)
+        network: Any = self.averaged.module
+        network.save_pretrained(beside)
         self.before.save_pretrained(beside)
         self.after.save_pretrained(beside)
         weights = load_file(beside / "model.safetensors")

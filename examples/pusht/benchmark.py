@@ -56,7 +56,7 @@ class Contestant:
     """
 
     label: str
-    policy: Policy
+    policy: Policy | EagerPolicy
     plan: Plan | None
     dense_flops: float
     noise: NoiseShape

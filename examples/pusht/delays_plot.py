@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from textwrap import fill
 
+import numpy as np
 from bootstrap import Estimate
 from delays_world import Setup
 
@@ -44,7 +45,9 @@ def plot_delays(scores: Mapping[Setup, Estimate], waiting: Estimate, path: Path,
         axes.errorbar(ticks, means, yerr=errors, marker=marker, capsize=3, linewidth=1.2, label=label)
     hz = next(iter(scores)).hz
     axes.set_xlabel("latency of a call, ticks")
-    above = axes.secondary_xaxis("top", functions=(lambda ticks: ticks * 1e3 / hz, lambda ms: ms * hz / 1e3))
+    above = axes.secondary_xaxis(
+        "top", functions=(lambda ticks: np.multiply(ticks, 1e3 / hz), lambda ms: np.multiply(ms, hz / 1e3))
+    )
     above.set_xlabel(f"ms at {hz:g} Hz")
     axes.set_ylabel("score, mean and 95 % interval")
     axes.set_ylim(0.0, 1.02)

@@ -247,7 +247,7 @@ def main(
     pair = [evaluations[0].rollout.episodes[0], evaluations[-1].rollout.episodes[0]]
     save_animation(animation, PushT, pair, [ORIGINAL, COMPILED])
     console.print(f"the episode of seed {first_seed}, original and compiled: {animation}")
-    console.print(f"everything on one page: .venv/bin/ttscompile report {artifact} -o report.html", soft_wrap=True)
+    console.print(f"everything on one page: .venv/bin/ttscompile inspect {artifact} -o page.html", soft_wrap=True)
     console.print("what to do with a policy of your own: docs/tutorial.md", soft_wrap=True)
 
 

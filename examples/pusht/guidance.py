@@ -193,7 +193,7 @@ def opened(text: str, seam: str, checkpoint: Path) -> Variant:
     if seam not in WAYS:
         return variant
     torch.set_num_threads(1)
-    policy = GuidedPolicy(checkpoint, Path(text.partition(":")[0]), variant.policy.info, WAYS[seam])
+    policy: Any = GuidedPolicy(checkpoint, Path(text.partition(":")[0]), variant.policy.info, WAYS[seam])
     return replace(variant, policy=policy, plan="dense")
 
 

@@ -115,7 +115,8 @@ class World:
 
     def __init__(self, first_seed: int) -> None:
         self._environment, self._first_seed = PushT(), first_seed
-        self.episode, self.best = -1, []
+        self.episode = -1
+        self.best: list[float] = []
 
     def next_episode(self) -> int:
         """Start it; its seed."""

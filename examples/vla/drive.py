@@ -91,7 +91,7 @@ def drive(policy: ttscompile.CompiledPolicy, robot: Robot, task: str, ticks: int
 def record(path: Path, episodes: list[list[dict[str, Any]]], instruct: Instruct) -> None:
     """Frames of episodes as ``ttscompile calibrate`` reads them: one row a frame, tokens in place of the text."""
     rows = [instruct(frame) for frames in episodes for frame in frames]
-    arrays = {key: np.concatenate([row[key] for row in rows]) for key in rows[0]}
+    arrays: dict[str, Any] = {key: np.concatenate([row[key] for row in rows]) for key in rows[0]}
     ends = np.cumsum([len(frames) for frames in episodes])
     np.savez(path, **arrays, episode_ends=ends, meta=np.array('{"frames": true}'))
     print(f"{path}: {len(rows)} frames of {len(episodes)} episodes")

@@ -61,7 +61,7 @@ class Head(nn.Module):
 
     def __init__(self, model: nn.Module) -> None:
         super().__init__()
-        self.model = model
+        self.model: Any = model
 
     def forward(self, sample: Tensor, timestep: Tensor, prefix_mask: Tensor, keys: Tensor, values: Tensor) -> Tensor:
         """The velocity ``[B, T, D]``."""
@@ -89,7 +89,7 @@ def compile_head(model: nn.Module, cache: Any, directory: str | Path, **argument
         arguments: further ones of ``ttscompile.compile_denoiser``.
     """
     keys, values = flatten_cache(cache)
-    config = model.config
+    config: Any = model.config
     spec = PolicySpec(
         sample=(config.chunk_size, config.max_action_dim),
         observations={

@@ -53,7 +53,7 @@ class Feasibility:
     reserve_steps: int = 0
 
     @property
-    def frame(self) -> float:
+    def frame_period(self) -> float:
         """Seconds from one frame to the next, and so for which a call may have to wait for one."""
         return 1 / self.policy_hz
 
@@ -75,12 +75,12 @@ class Feasibility:
     @property
     def needed(self) -> float:
         """How long they have to last."""
-        return self.frame + 2 * self.latency + self.margin
+        return self.frame_period + 2 * self.latency + self.margin
 
     @property
     def max_latency(self) -> float:
         """The longest call with which this would be feasible; not positive if none would be."""
-        return min(self.play, (self.predicted - self.frame - self.margin) / 2)
+        return min(self.play, (self.predicted - self.frame_period - self.margin) / 2)
 
     @property
     def max_policy_hz(self) -> float:
@@ -101,7 +101,7 @@ class Feasibility:
             lasts = f"{_ms(self.play)} ms = {self.horizon_steps} actions"
             return f"latency {_ms(self.latency)} ms > {lasts} at {self.policy_hz:g} Hz, to the next call"
         return (
-            f"frame period {_ms(self.frame)} + 2 x latency {_ms(self.latency)} + margin {_ms(self.margin)}"
+            f"frame period {_ms(self.frame_period)} + 2 x latency {_ms(self.latency)} + margin {_ms(self.margin)}"
             f" = {_ms(self.needed)} ms {'<=' if covered else '>'} {_ms(self.predicted)} ms"
             f" = {self.horizon_steps + self.reserve_steps} actions at {self.policy_hz:g} Hz"
         )

@@ -64,7 +64,7 @@ class Worker:
         self._reset_seed: int | None = None
         self._ready = threading.Event()
         self._latencies: Mapping[str, float] | None = None  # as they were given
-        self._followed = -1, 0.0  # epoch and observation of the last call: how much of its chunk is executed by the next
+        self._followed = -1, 0.0  # epoch and observation of the last call
         self._thread = threading.Thread(target=self._run, name="ttscompile-executor", daemon=True)
 
     # Everybody else's side

@@ -1,1 +1,11 @@
-"""One artifact for many robots that ask at once: copies on a Ray cluster behind one server with a lock."""
+"""One artifact for many robots that ask at once: copies on a Ray cluster behind one server with a lock.
+
+Whoever is outside of this package imports it from here.
+"""
+
+from __future__ import annotations
+
+from .copies import LOCAL, FleetSettings, ray_copies
+from .server import FleetServer, Plans
+
+__all__ = ["LOCAL", "FleetServer", "FleetSettings", "Plans", "ray_copies"]

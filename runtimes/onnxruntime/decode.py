@@ -52,51 +52,51 @@ def _together(work: Workspace, lowered: Instructions, keep: BoolArray) -> None:
     """All streams follow one plan: every instruction is one operation on the whole batch."""
     blocks = len(work.current)
     entries = {cell: work.rollout.entry(cell) for cell in np.flatnonzero(lowered.rollout).tolist()}
-    lane = _Lane(lowered, work.stream, work.current, work.table, work.sums(lowered.slots), entries)
+    operands = _Operands(lowered, work.stream, work.current, work.table, work.sums(lowered.slots), entries)
     k, done, steps = 1, blocks, len(lowered.counts)
     while k < steps:
         count = lowered.counts[k]
         if work.idle is not None and lowered.idle[k] >= WORTH:
-            k = _pass_idle(work, work.idle, lane, k)
+            k = _pass_idle(work, work.idle, operands, k)
             continue
         if count == blocks:
             _run_dense(work, k, keep)
         else:
-            _run_some(work, lane, k, done, keep[k].tolist())
+            _run_some(work, operands, k, done, keep[k].tolist())
         k, done = k + 1, done + count
 
 
-def _run_some(work: Workspace, lane: _Lane, k: int, done: int, kept: Sequence[bool]) -> None:
+def _run_some(work: Workspace, operands: _Operands, k: int, done: int, kept: Sequence[bool]) -> None:
     """Step k, which computes some blocks, or none, after ``done`` cells; ``kept`` says whose residual is, by block."""
-    lowered, stream, current, blocks = lane.lowered, lane.stream, lane.current, len(kept)
+    lowered, hidden, current, blocks = operands.lowered, operands.hidden, operands.current, len(kept)
     count = lowered.counts[k]
-    fresh = before = _flat(work.fresh, 0)  # the first operation takes the stream from there
+    fresh = before = _flat(work.fresh, 0)  # the first operation takes the hidden state from there
     reached = 0
     for cell in lowered.cells[done : done + count]:
         b = cell - k * blocks
         if b != reached:
-            lane.add(before)
+            operands.add(before)
         elif before is fresh:
-            np.copyto(stream, fresh)
-        before, reached = stream, b + 1
+            np.copyto(hidden, fresh)
+        before, reached = hidden, b + 1
         work.run(k, b)
         residual = current[b]
-        np.add(stream, residual, stream)
+        np.add(hidden, residual, hidden)
         if kept[b]:
             np.copyto(work.rollout.entry(cell), work.current[b])
     if reached != blocks:
-        lane.add(before)
+        operands.add(before)
     work.advance(k)
 
 
-def _pass_idle(work: Workspace, idle: IdleSteps, lane: _Lane, k: int) -> int:
+def _pass_idle(work: Workspace, idle: IdleSteps, operands: _Operands, k: int) -> int:
     """Steps in a row without a computed block, from k on; the step that follows them."""
-    lowered, total = lane.lowered, _flat(idle.total, 0)
+    lowered, total = operands.lowered, _flat(idle.total, 0)
     stop = k + lowered.idle[k]
     work.enter_idle(k)
     while k < stop:
         count = lowered.alike[k]
-        np.copyto(total, lane.total(count))
+        np.copyto(total, operands.total(count))
         idle.prepare()
         work.run_idle(k, k + count)
         k += count
@@ -104,11 +104,12 @@ def _pass_idle(work: Workspace, idle: IdleSteps, lane: _Lane, k: int) -> int:
     return stop
 
 
-def _apart(work: Workspace, lowered: Sequence[Instructions], keep: BoolArray) -> None:
+# C901, PLR0912: its locals are the state of the loop
+def _apart(work: Workspace, lowered: Sequence[Instructions], keep: BoolArray) -> None:  # noqa: C901, PLR0912
     """Every stream follows its own plan; a block that several compute in a step runs once, on these."""
     blocks, everyone = len(work.current), work.streams
     room = work.sums(max(one.slots for one in lowered))
-    lanes = [_Lane.of_stream(work, s, one, room) for s, one in enumerate(lowered)]
+    operands = [_Operands.of_stream(work, s, one, room) for s, one in enumerate(lowered)]
     takers: list[list[list[int]]] = [[[] for _ in range(blocks)] for _ in lowered[0].counts]
     for k, b, s in np.argwhere(np.stack([one.computed for one in lowered], axis=2)).tolist():
         takers[k][b].append(s)
@@ -117,67 +118,69 @@ def _apart(work: Workspace, lowered: Sequence[Instructions], keep: BoolArray) ->
         if len(whole) < everyone:
             np.copyto(work.stream, work.fresh)
         if whole:
-            _run_dense_apart(work, [lanes[s] for s in whole], whole, k, keep)
+            _run_dense_apart(work, [operands[s] for s in whole], whole, k, keep)
         reached = [blocks if s in whole else 0 for s in range(everyone)]
         for b, some in enumerate([] if whole else step):
             if not some:
                 continue
             for s in some:
                 if reached[s] != b:
-                    lanes[s].add(lanes[s].stream)
+                    operands[s].add(operands[s].hidden)
                 reached[s] = b + 1
             if len(some) == everyone:
                 work.run(k, b)
             else:
                 residuals = work.run_some(k, b, some)
                 for s, residual in zip(some, residuals, strict=True):
-                    np.copyto(lanes[s].current[b], residual.reshape(lanes[s].current[b].shape))
+                    np.copyto(operands[s].current[b], residual.reshape(operands[s].current[b].shape))
             for s in some:
-                stream, residual = lanes[s].stream, lanes[s].current[b]
-                np.add(stream, residual, stream)
+                hidden, residual = operands[s].hidden, operands[s].current[b]
+                np.add(hidden, residual, hidden)
                 if keep[k, b]:
-                    np.copyto(work.rollout.of_stream(k * blocks + b, s), residual.reshape(lanes[s].shape))
-        for lane, b in zip(lanes, reached, strict=True):
+                    np.copyto(work.rollout.of_stream(k * blocks + b, s), residual.reshape(operands[s].shape))
+        for one, b in zip(operands, reached, strict=True):
             if b != blocks:
-                lane.add(lane.stream)
+                one.add(one.hidden)
         work.advance(k)
 
 
-def _run_dense_apart(work: Workspace, lanes: Sequence[_Lane], streams: Sequence[int], k: int, keep: BoolArray) -> None:
+def _run_dense_apart(
+    work: Workspace, operands: Sequence[_Operands], streams: Sequence[int], k: int, keep: BoolArray
+) -> None:
     """All blocks at step k for these streams, all of the batch or some."""
     if len(streams) == work.streams:
         work.run_dense(k)
     else:
         after, *residuals = work.run_dense_some(k, streams)
-        for i, lane in enumerate(lanes):
-            np.copyto(lane.stream, after[i].reshape(lane.stream.shape))
-            for own, residual in zip(lane.current, residuals, strict=True):
+        for i, one in enumerate(operands):
+            np.copyto(one.hidden, after[i].reshape(one.hidden.shape))
+            for own, residual in zip(one.current, residuals, strict=True):
                 np.copyto(own, residual[i].reshape(own.shape))
     for b in np.flatnonzero(keep[k]).tolist():
-        for s, lane in zip(streams, lanes, strict=True):
-            np.copyto(work.rollout.of_stream(k * len(lane.current) + b, s), lane.current[b].reshape(lane.shape))
+        for s, one in zip(streams, operands, strict=True):
+            np.copyto(work.rollout.of_stream(k * len(one.current) + b, s), one.current[b].reshape(one.shape))
 
 
-class _Lane:
+class _Operands:
     """What the instructions of one plan work on: the whole batch, or one stream of it, as views.
 
-    ``current`` and ``table`` are ``[blocks, *stream]``, ``sums`` are ``[slots, *stream]``, and ``entries`` those of the
-    rollout cache that the plan reads, by flat index.
+    ``hidden`` is the residual stream, ``current`` and ``table`` are ``[blocks, *hidden]``, ``sums`` are ``[slots,
+    *hidden]``, and ``entries`` those of the rollout cache that the plan reads, by flat index.
     """
 
     def __init__(
-        self, lowered: Instructions, stream: Array, current: Array, table: Array, sums: Array, entries: dict[int, Array]
+        self, lowered: Instructions, hidden: Array, current: Array, table: Array, sums: Array, entries: dict[int, Array]
     ) -> None:
-        self.lowered, self.shape = lowered, stream.shape
-        self.stream, self.current = _flat(stream, 0), _flat(current, 1)
+        self.lowered, self.shape = lowered, hidden.shape
+        self.hidden, self.current = _flat(hidden, 0), _flat(current, 1)
         self._table, self._sums = _flat(table, 1), _flat(sums, 1)
         self._summed = self._table if lowered.table else self.current
         self._gaps, self._loads = iter(lowered.gaps), zip(lowered.load_rows, lowered.load_from, strict=True)
         self._entries = {cell: _flat(entry, 0) for cell, entry in entries.items()}
 
     @classmethod
-    def of_stream(cls, work: Workspace, s: int, lowered: Instructions, sums: Array) -> _Lane:
-        """The lane of one stream of the batch."""
+    def of_stream(cls, work: Workspace, s: int, lowered: Instructions, sums: Array) -> _Operands:
+        """Those of one stream of the batch."""
         axis = work.axis
         current, table, sums = (np.moveaxis(array, axis + 1, 1)[:, s] for array in (work.current, work.table, sums))
         entries = {cell: work.rollout.of_stream(cell, s) for cell in np.flatnonzero(lowered.rollout).tolist()}
@@ -196,8 +199,8 @@ class _Lane:
         return total
 
     def add(self, before: Array) -> None:
-        """The stream becomes ``before`` and the sum of the next gap."""
-        np.add(before, self.total(), self.stream)
+        """The hidden state becomes ``before`` and the sum of the next gap."""
+        np.add(before, self.total(), self.hidden)
 
 
 def _flat(array: Array, keep: int) -> Array:

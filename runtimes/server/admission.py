@@ -1,8 +1,8 @@
 """Who is at the server, who may come in, and who came: counted by address from the moment that a socket is accepted.
 
 The library ``websockets`` sees a connection when its handshake begins, which under TLS is late: who never finishes it
-is not seen at all. So the listening socket itself asks the door (``Entrance``), and the socket of a connection says
-when it ends (``Guest``).
+is not seen at all. So the listening socket itself asks (``AdmittingSocket``), and the socket of a connection says when
+it ends (``AdmittedSocket``).
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ MOST_ADDRESSES = 4096
 
 
 @dataclass
-class Visit:
+class Connection:
     """A connection, from its socket's acceptance to its end.
 
     Attributes:
         number: in the order in which they came.
         peer: address and port.
         network: of the address, which limits are counted by.
-        since: time of the door's clock.
+        since: time of the admission's clock.
         client: whether its handshake was accepted.
         answered: whether its handshake was answered, and so told in the audit.
         requests: that it has sent.
@@ -52,7 +52,7 @@ class Visit:
     requests: int = 0
 
 
-class Door:
+class Admission:
     """Counts and limits; used by the server's event loop alone.
 
     Args:
@@ -63,7 +63,7 @@ class Door:
     def __init__(self, limits: ServerLimits, clock: Callable[[], float] = time.monotonic) -> None:
         self.limits = limits
         self._clock = clock
-        self._visits: dict[tuple[Any, Any], Visit] = {}  # two addresses of the server may have one peer
+        self._connections: dict[tuple[Any, Any], Connection] = {}  # two addresses of the server may have one peer
         self._refusals: dict[str, deque[float]] = {}
         self._told: dict[str, float] = {}
         self._count = 0
@@ -71,7 +71,7 @@ class Door:
     @property
     def clients(self) -> int:
         """How many are connected."""
-        return sum(each.client for each in self._visits.values())
+        return sum(each.client for each in self._connections.values())
 
     def comes(self, peer: tuple[Any, ...], own: Any = None) -> bool:
         """Whether the handshake of a new connection may begin.
@@ -82,14 +82,14 @@ class Door:
                 connection, here and in what follows.
         """
         network, now = network_of(peer[0]), self._clock()
-        waiting = [each.network for each in self._visits.values() if not each.client]
+        waiting = [each.network for each in self._connections.values() if not each.client]
         if self._refused_lately(network, now) >= self.limits.refusals_per_minute:
             why = f"{self.limits.refusals_per_minute} of its handshakes failed within a minute"
         elif len(waiting) >= self.limits.handshakes or waiting.count(network) >= self.limits.handshakes_per_address:
             why = "too many handshakes are under way"
         else:
             self._count += 1
-            self._visits[peer, own] = Visit(self._count, _shown(peer), network, now)
+            self._connections[peer, own] = Connection(self._count, _shown(peer), network, now)
             return True
         if now - self._told.get(network, -MINUTE) >= MINUTE:  # one line: whoever is cut off must not fill the disk
             self._remember(self._told, network, now)
@@ -98,11 +98,11 @@ class Door:
 
     def refusal(self, peer: tuple[Any, ...], own: Any = None) -> str:
         """Why one more client of this address cannot be had now; empty if it can."""
-        clients = Counter(each.network for each in self._visits.values() if each.client)
+        clients = Counter(each.network for each in self._connections.values() if each.client)
         if clients.total() >= self.limits.clients:
             return f"{self.limits.clients} clients are connected, and that is how many may be."
         most = self.limits.clients_per_address
-        if most is not None and clients[self._visits[peer, own].network] >= most:
+        if most is not None and clients[self._connections[peer, own].network] >= most:
             return f"{most} clients of this address are connected, and that is how many may be."
         return ""
 
@@ -115,30 +115,31 @@ class Door:
             tls: version of TLS, None without.
             own: as above.
         """
-        visit = self._visits[peer, own]
-        visit.answered, visit.client = True, status == HTTPStatus.SWITCHING_PROTOCOLS
-        if not visit.client and status not in (HTTPStatus.OK, HTTPStatus.SERVICE_UNAVAILABLE):  # no fault of theirs
-            self._refuse(visit.network)
-        event = "let in" if visit.client else "told" if status == HTTPStatus.OK else "refused"
-        _write(event, visit.peer, connection=visit.number, status=int(status), tls=tls)
+        connection = self._connections[peer, own]
+        connection.answered, connection.client = True, status == HTTPStatus.SWITCHING_PROTOCOLS
+        no_fault_of_theirs = status in (HTTPStatus.OK, HTTPStatus.SERVICE_UNAVAILABLE)
+        if not connection.client and not no_fault_of_theirs:
+            self._refuse(connection.network)
+        event = "let in" if connection.client else "told" if status == HTTPStatus.OK else "refused"
+        _write(event, connection.peer, connection=connection.number, status=int(status), tls=tls)
 
     def requested(self, peer: tuple[Any, ...], own: Any = None) -> None:
         """Count a request; of a connection that was cut off meanwhile one may still be read."""
-        if (visit := self._visits.get((peer, own))) is not None:
-            visit.requests += 1
+        if (connection := self._connections.get((peer, own))) is not None:
+            connection.requests += 1
 
     def leaves(self, peer: tuple[Any, ...], own: Any = None) -> None:
         """Forget a connection whose socket is closed."""
-        visit = self._visits.pop((peer, own), None)
-        if visit is None:
+        connection = self._connections.pop((peer, own), None)
+        if connection is None:
             return
-        seconds = round(self._clock() - visit.since, 3)
-        if visit.client:
-            _write("left", visit.peer, connection=visit.number, requests=visit.requests, seconds=seconds)
-        elif not visit.answered:
-            self._refuse(visit.network)
+        seconds = round(self._clock() - connection.since, 3)
+        if connection.client:
+            _write("left", connection.peer, connection=connection.number, requests=connection.requests, seconds=seconds)
+        elif not connection.answered:
+            self._refuse(connection.network)
             why = "it did not finish its handshake"
-            _write("refused", visit.peer, connection=visit.number, why=why, seconds=seconds)
+            _write("refused", connection.peer, connection=connection.number, why=why, seconds=seconds)
 
     def _refuse(self, network: str) -> None:
         if network not in self._refusals:
@@ -159,17 +160,17 @@ class Door:
             del table[next(iter(table))]
 
 
-class Entrance(socket.socket):
-    """A listening socket that asks the door about every connection, before a byte of it is read.
+class AdmittingSocket(socket.socket):
+    """A listening socket that asks about every connection, before a byte of it is read.
 
     Args:
-        door: is asked.
+        admission: is asked.
         family: of addresses.
     """
 
-    def __init__(self, door: Door, family: int) -> None:
+    def __init__(self, admission: Admission, family: int) -> None:
         super().__init__(family, socket.SOCK_STREAM)
-        self._door = door
+        self._admission = admission
         self.setblocking(False)
         if os.name == "posix":  # elsewhere it would let two servers share a port
             self.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -181,32 +182,32 @@ class Entrance(socket.socket):
         accepted, peer = super().accept()
         try:
             own = accepted.getsockname()
-            if self._door.comes(peer, own):
-                return Guest(self._door, peer, own, accepted), peer
+            if self._admission.comes(peer, own):
+                return AdmittedSocket(self._admission, peer, own, accepted), peer
         except OSError:  # of some systems, where the connection has ended already
             pass
         accepted.close()
         raise BlockingIOError  # what an event loop expects; it looks after the others before it comes again
 
 
-class Guest(socket.socket):
-    """The socket of a connection, which tells the door when it is closed.
+class AdmittedSocket(socket.socket):
+    """The socket of a connection, which tells when it is closed.
 
     Args:
-        door: is told.
+        admission: is told.
         peer: address, as ``accept`` gives it.
         own: address of the server that it came to.
         accepted: whose descriptor this one takes over.
     """
 
-    def __init__(self, door: Door, peer: Any, own: Any, accepted: socket.socket) -> None:
+    def __init__(self, admission: Admission, peer: Any, own: Any, accepted: socket.socket) -> None:
         super().__init__(accepted.family, accepted.type, accepted.proto, fileno=accepted.detach())
-        self._door, self._peer, self._own = door, peer, own
+        self._admission, self._peer, self._own = admission, peer, own
 
     def close(self) -> None:
         """As of any socket."""
         super().close()
-        self._door.leaves(self._peer, self._own)
+        self._admission.leaves(self._peer, self._own)
 
 
 class Pace:

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from math import prod
 
 from ttscompile.core.coercion import integer
+from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import ExecutorError
 
 _COUNTS = ("clients", "message_bytes", "handshakes", "handshakes_per_address", "refusals_per_minute")
+
+NUMBER_BYTES = 8
+"""Of a message for each number of an observation: a float32 in base64 takes 5.4 bytes, a pixel in digits takes four."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +46,12 @@ class ServerLimits:
     handshakes: int = 64
     handshakes_per_address: int = 16
     refusals_per_minute: int = 20
+
+    @classmethod
+    def of(cls, observations: Mapping[str, ObservationSpec], clients: int) -> ServerLimits:
+        """Limits of a server that is sent such observations; a message may have 1 MiB at least."""
+        numbers = sum(prod(one.shape) for one in observations.values())
+        return cls(clients, max(cls.message_bytes, NUMBER_BYTES * numbers + (1 << 16)))
 
     def __post_init__(self) -> None:
         for name in (*_COUNTS, *(["clients_per_address"] if self.clients_per_address is not None else [])):

@@ -1,7 +1,7 @@
 """What every server here does alike: who may come in, at which pace, and how requests are read and answered.
 
 The socket, its framing, its limits and its handshake are the library ``websockets``'; messages are ``protocol``'s. Who
-may come in is the matter of ``lock`` and ``door``. One event loop serves all clients. What a client does wrong is
+may come in is the matter of ``lock`` and ``admission``. One event loop serves all clients. What a client does wrong is
 answered to that client: it is told, or its connection is closed, and nobody else notices. A plain GET of ``/health`` or
 ``/metrics`` is answered on the same port, behind the same lock.
 """
@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 from ttscompile.core.coercion import integer
 from ttscompile.errors import ExecutorError, RuntimeUnavailableError, TtscompileError
 
-from .admission import Door, Entrance, Pace
+from .admission import Admission, AdmittingSocket, Pace
 from .limits import ServerLimits
 from .lock import Lock
 from .metrics import CONTENT_TYPE, Metric, exposition
@@ -56,7 +56,7 @@ class Listener(ABC):
     def __init__(self, limits: ServerLimits | None = None, lock: Lock | None = None) -> None:
         self._limits = limits or ServerLimits()
         self._lock = lock or Lock()
-        self._door = Door(self._limits)
+        self._admission = Admission(self._limits)
         self._answers: Counter[tuple[str, str]] = Counter()  # by method and outcome
         self._log = logging.getLogger("ttscompile.serve")
 
@@ -143,12 +143,12 @@ class Listener(ABC):
                 await server.wait_closed()
             self.end()
 
-    async def _listen(self, host: str, port: int) -> list[Entrance]:
+    async def _listen(self, host: str, port: int) -> list[AdmittingSocket]:
         """A socket for each address that the host has, all of one port; two for ``localhost``, where there is IPv6.
 
         An address that this machine has not is left out, with a line in the log, where there is another.
         """
-        loop, made, absent = asyncio.get_running_loop(), list[Entrance](), list[tuple[str, OSError]]()
+        loop, made, absent = asyncio.get_running_loop(), list[AdmittingSocket](), list[tuple[str, OSError]]()
         with ExitStack() as opened:
             try:
                 found = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM)
@@ -156,7 +156,7 @@ class Listener(ABC):
                     if own == 0 and made:
                         own = made[0].getsockname()[1]
                     try:
-                        entrance = opened.enter_context(Entrance(self._door, family))
+                        entrance = opened.enter_context(AdmittingSocket(self._admission, family))
                         entrance.bind((name, own, *more))
                     except OSError as error:
                         if error.errno not in _NOT_HERE:
@@ -188,7 +188,7 @@ class Listener(ABC):
             return response
         if "Upgrade" not in request.headers and request.path in (HEALTH, METRICS):
             return await self._told(connection, request.path)
-        if full := self._door.refusal(connection.remote_address, connection.local_address):
+        if full := self._admission.refusal(connection.remote_address, connection.local_address):
             return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{full}\n")
         return None
 
@@ -200,7 +200,7 @@ class Listener(ABC):
             return connection.respond(status, f"{trouble or 'ok'}\n")
         answers = [({"method": method, "outcome": how}, count) for (method, how), count in self._answers.items()]
         own = [
-            Metric("clients", "gauge", "Clients that are connected.", [({}, self._door.clients)]),
+            Metric("clients", "gauge", "Clients that are connected.", [({}, self._admission.clients)]),
             Metric("requests_total", "counter", "Requests answered, by method and outcome.", answers),
         ]
         response = connection.respond(HTTPStatus.OK, exposition([*own, *self.metrics()]))
@@ -211,7 +211,7 @@ class Listener(ABC):
     def _answered(self, connection: ServerConnection, _: Handshake, response: Response) -> None:
         tls = connection.transport.get_extra_info("ssl_object")
         version, own = tls.version() if tls else None, connection.local_address
-        self._door.answers(connection.remote_address, response.status_code, version, own)
+        self._admission.answers(connection.remote_address, response.status_code, version, own)
 
     async def _client(self, connection: ServerConnection) -> None:
         from websockets.exceptions import ConnectionClosed
@@ -226,7 +226,7 @@ class Listener(ABC):
                 except TimeoutError:
                     await connection.close(1008, f"no complete request for {self._limits.idle_timeout:g} s")
                     return
-                self._door.requested(peer, own)
+                self._admission.requested(peer, own)
                 if wait := pace.wait(loop.time()):
                     await asyncio.sleep(wait)
                 reply = await self._unless_gone(connection, self._reply(text))

@@ -53,7 +53,7 @@ class Denoised:
     residuals: Mapping[int, Tensor]
 
 
-def denoise(
+def denoise(  # noqa: PLR0913  # the tensors of a call, each by its name
     network: Network,
     plan: Instructions,
     keep: BoolArray,
@@ -90,36 +90,36 @@ def denoise(
 
     steps, blocks = keep.shape
     state, residuals = begin(initial, advance), dict[int, Tensor]()
-    lane, cells, k = _Lane(plan, blocks, rollout), iter(plan.cells), 0
+    operands, cells, k = _Operands(plan, blocks, rollout), iter(plan.cells), 0
     while k < steps:
         if network.idle is not None and plan.idle[k]:
             count = plan.alike[k]
-            known = network.idle.prepare(lane.total(count))
+            known = network.idle.prepare(operands.total(count))
             for step in range(k, k + count):
                 state = go_on(state, network.idle.predict(known, state.sample), step)
             k += count
             continue
         first = stream = network.stem(state.sample.permute(1, 2, 0), k)
-        reached, lane.whole = 0, None if plan.counts[k] else lane.whole
+        reached, operands.whole = 0, None if plan.counts[k] else operands.whole
         for cell in islice(cells, plan.counts[k]):
             b = cell - k * blocks
             if b != reached:
-                stream = stream + lane.total()
-            residual = lane.current[b] = network.block(b, k, stream)
+                stream = stream + operands.total()
+            residual = operands.current[b] = network.block(b, k, stream)
             stream, reached = stream + residual, b + 1
             if keep[k, b]:
                 residuals[cell] = residual
         if reached != blocks:
-            stream = stream + lane.total()
+            stream = stream + operands.total()
         if plan.counts[k] == blocks:
-            lane.whole = stream - first
+            operands.whole = stream - first
         prediction = network.tail(stream, k).permute(2, 0, 1)
         state = go_on(state, prediction, k)
         k += 1
     return Denoised(state.sample.permute(1, 2, 0), residuals)
 
 
-class _Lane:
+class _Operands:
     """The residuals that the instructions of a plan work on.
 
     Attributes:

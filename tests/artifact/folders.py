@@ -1,10 +1,10 @@
 """What is in a folder, for comparing before and after."""
 
-from __future__ import annotations
-
 import zipfile
 from collections.abc import Callable
+from itertools import count
 from pathlib import Path
+from typing import Any
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -15,6 +15,18 @@ def flip(path: Path, position: int, bit: int = 0) -> None:
     content = bytearray(path.read_bytes())
     content[position] ^= 1 << bit
     path.write_bytes(content)
+
+
+def failing(original: Callable[..., Any], at: int, error: type[BaseException]) -> Callable[..., Any]:
+    """What does as ``original`` does, but for call number ``at``, from 0, which fails."""
+    numbers = count()
+
+    def call(*args: Any, **kwargs: Any) -> Any:
+        if next(numbers) == at:
+            raise error("no space left on device")
+        return original(*args, **kwargs)
+
+    return call
 
 
 Edit = Callable[[zipfile.ZipFile], object]

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import errno
 import gc
 import os
@@ -83,13 +81,13 @@ def test_entries_that_no_artifact_has(
 def watch(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     """The temporary folders that are made from now on."""
     folders: list[Path] = []
-    original = archive.tempfile.mkdtemp
+    original = tempfile.mkdtemp
 
     def mkdtemp(prefix: str) -> str:
         folders.append(Path(original(prefix=prefix)))
         return str(folders[-1])
 
-    monkeypatch.setattr(archive.tempfile, "mkdtemp", mkdtemp)
+    monkeypatch.setattr(tempfile, "mkdtemp", mkdtemp)
     return folders
 
 

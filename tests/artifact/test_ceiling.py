@@ -1,7 +1,5 @@
 """What reuse can save at most."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -38,7 +36,7 @@ def test_float32_comes_back_bit_by_bit(scale: list[float], data: st.DataObject) 
     offset = data.draw(st.lists(finite, min_size=n, max_size=n))
     affine = Affine(np.array(scale, np.float32), np.array(offset, np.float32))
     triples = st.lists(finite, min_size=3, max_size=3).map(lambda values: np.array(values, np.float32))
-    columns = {name: data.draw(triples) for name in SamplerTable.COLUMNS}
+    columns: dict[str, Any] = {name: data.draw(triples) for name in SamplerTable.COLUMNS}
     timesteps = data.draw(triples)
     base = tiny_spec()
     sampler = replace(base.sampler, timesteps=timesteps, clip=data.draw(st.none() | st.floats(0, 1e9)), **columns)

@@ -1,7 +1,5 @@
 """Corrections among the arrays of an artifact: with and without jumps, and what is missing or too much."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """The golden record's arithmetic: the same on every machine, and small whatever the policy is."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess
@@ -19,6 +17,7 @@ from tests.plans import store_schedules
 from ttscompile.artifact import codec, load_artifact, tensors
 from ttscompile.artifact.codec import identities
 from ttscompile.artifact.files import describe
+from ttscompile.artifact.strict_json import dump
 from ttscompile.artifact.write import write_artifact
 from ttscompile.errors import ArtifactError
 from ttscompile.ir.graph import TensorType
@@ -114,7 +113,7 @@ def forge(directory: Path, file: Path | None = None, **changes: Any) -> None:
     document.pop("checksum")
     if file is not None:
         document["files"][file.name] = vars(describe(file))
-    content = codec.dump({**document, "checksum": codec._checksum(document)})
+    content = dump({**document, "checksum": codec._checksum(document)})
     (directory / "manifest.json").write_bytes(content)
 
 

@@ -1,7 +1,5 @@
 """Blocks of another precision in an artifact: beside fp32, hashed, chosen by ``at_precision``; hostile manifests."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

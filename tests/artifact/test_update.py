@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import errno
 import fcntl
 import os
@@ -12,13 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.artifact.folders import contents, packed
-from tests.artifact.tiny import CHANNELS, HORIZON, STEPS, tiny_models, tiny_program
+from tests.artifact.folders import contents, failing, packed
+from tests.artifact.tiny import CHANNELS, HORIZON, STEPS, tiny_program, write_tiny
 from tests.plans import store_schedules
 from tests.rounding import assert_equal_but_for_rounding
 from ttscompile.artifact import load_artifact
 from ttscompile.artifact.manifest import Manifest, PlanRecord
-from ttscompile.artifact.write import write_artifact
 from ttscompile.core.correction import no_correction
 from ttscompile.errors import ArtifactError, IllegalPlanError
 
@@ -83,8 +80,7 @@ def test_an_update_equals_a_fresh_one_byte_by_byte(written: Path, tmp_path: Path
     assert contents(written) == once
     update(written, by=5, schedules={}, default_plan="other")
     update(written, by=-5)
-    program = tiny_program()
-    write_artifact(program, tiny_models(program), tmp_path / "b")
+    write_tiny(tmp_path / "b")
     update(tmp_path / "b", by=0, pruner_weights=load_artifact(written).pruner)
     assert contents(tmp_path / "b") == contents(written)
 
@@ -177,7 +173,7 @@ def test_one_at_a_time(written: Path) -> None:
         with pytest.raises(ArtifactError, match="another process is changing the artifact"):
             update(written)
         with pytest.raises(ArtifactError, match="another process is changing the artifact"):
-            write_artifact(program, tiny_models(program), written)
+            write_tiny(written, program)
     finally:
         os.close(descriptor)
     update(written)
@@ -214,17 +210,8 @@ def test_failure_anywhere_leaves_the_old_or_the_new(
     outcomes: list[str] = []
     messages: list[str] = []
     for fail_at in range(100):
-        calls = 0
-
-        def failing(*args: Any, fail_at: int = fail_at, **kwargs: Any) -> Any:
-            nonlocal calls
-            calls += 1
-            if calls == fail_at + 1:
-                raise OSError("no space left on device")
-            return original(*args, **kwargs)
-
         with monkeypatch.context() as patch:
-            patch.setattr(os, function, failing)
+            patch.setattr(os, function, failing(original, fail_at, OSError))
             try:
                 update(written, pruner_weights=pruner, schedules={"new": PLAN * 0}, default_plan="new")
                 break

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -12,8 +10,8 @@ import numpy as np
 import onnx
 import pytest
 
-from tests.artifact.folders import contents
-from tests.artifact.tiny import STEPS, tiny_models, tiny_program
+from tests.artifact.folders import contents, failing
+from tests.artifact.tiny import STEPS, tiny_models, tiny_program, write_tiny
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.write import write_artifact
 from ttscompile.core.correction import condition_flops
@@ -132,7 +130,7 @@ def test_a_session_follows_the_file_and_not_a_copy(written: Path) -> None:
 def test_the_same_inputs_give_the_same_bytes(written: Path, tmp_path: Path) -> None:
     program = tiny_program()
     models = tiny_models(program)
-    shuffled = replace(program, weights=dict(reversed(program.weights.items())))
+    shuffled = replace(program, weights=dict(reversed([*program.weights.items()])))
     write_artifact(shuffled, dict(reversed(models.items())), tmp_path / "elsewhere" / "again")
     assert contents(tmp_path / "elsewhere" / "again") == contents(written)
 
@@ -140,9 +138,9 @@ def test_the_same_inputs_give_the_same_bytes(written: Path, tmp_path: Path) -> N
 def test_the_same_bytes_in_another_process(written: Path, tmp_path: Path) -> None:
     script = (
         "import sys; sys.path.insert(0, sys.argv[1])\n"
-        "from tests.artifact.tiny import tiny_models, tiny_program\n"
-        "from ttscompile.artifact.write import write_artifact\n"
-        "program = tiny_program(); write_artifact(program, tiny_models(program), sys.argv[2])\n"
+        "from pathlib import Path\n"
+        "from tests.artifact.tiny import write_tiny\n"
+        "write_tiny(Path(sys.argv[2]))\n"
     )
     for seed in ("1", "77"):
         out = tmp_path / f"seed-{seed}"
@@ -160,7 +158,7 @@ def test_models_are_not_changed_by_writing(tmp_path: Path) -> None:
 
 
 def identity_of(program: Program, folder: Path) -> tuple[str, str]:
-    manifest = write_artifact(program, tiny_models(program), folder)
+    manifest = write_tiny(folder, program)
     return manifest.identity, manifest.model_identity
 
 
@@ -214,7 +212,7 @@ def test_a_policy_without_pruner(tmp_path: Path) -> None:
 def test_an_artifact_is_replaced_whole(written: Path) -> None:
     (written / "pruner-00.onnx").write_bytes(b"left over")
     program = tiny_program(seed=1)
-    manifest = write_artifact(program, tiny_models(program), written)
+    manifest = write_tiny(written, program)
     assert load_artifact(written).manifest.identity == manifest.identity
     assert set(contents(written)) == {"manifest.json", *manifest.files}
     assert [path.name for path in written.parent.iterdir()] == [written.name]
@@ -222,8 +220,7 @@ def test_an_artifact_is_replaced_whole(written: Path) -> None:
 
 def test_a_damaged_artifact_may_be_replaced(written: Path) -> None:
     (written / "weights.safetensors").unlink()
-    program = tiny_program()
-    write_artifact(program, tiny_models(program), written)
+    write_tiny(written)
     load_artifact(written)
 
 
@@ -231,15 +228,14 @@ def test_through_a_link_the_artifact_is_replaced_and_not_the_link(written: Path,
     link = tmp_path / "link"
     link.symlink_to(written)
     program = tiny_program(seed=1)
-    write_artifact(program, tiny_models(program), link)
+    write_tiny(link, program)
     assert link.is_symlink()
     np.testing.assert_array_equal(load_artifact(written).weights["tail.weight"], program.weights["tail.weight"])
 
 
 def test_an_empty_directory_is_taken(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
-    program = tiny_program()
-    write_artifact(program, tiny_models(program), tmp_path / "empty")
+    write_tiny(tmp_path / "empty")
     load_artifact(tmp_path / "empty")
 
 
@@ -259,9 +255,8 @@ def test_what_is_no_artifact_is_left_alone(written: Path, case: str) -> None:
     else:
         (written / "manifest.json").write_text('{"name": "a web application"}')
     before = {p: p.read_bytes() for p in written.parent.rglob("*") if p.is_file()}
-    program = tiny_program()
     with pytest.raises(ArtifactError, match="Give another output directory"):
-        write_artifact(program, tiny_models(program), target)
+        write_tiny(target)
     assert {p: p.read_bytes() for p in written.parent.rglob("*") if p.is_file()} == before
 
 
@@ -283,17 +278,8 @@ def test_failure_anywhere_changes_nothing(
     failed = 0
     first = 1 if function == "mkdir" else 0  # the parent is there, and its mkdir may fail
     for fail_at in range(first, 100):
-        calls = 0
-
-        def failing(*args: Any, fail_at: int = fail_at, **kwargs: Any) -> Any:
-            nonlocal calls
-            calls += 1
-            if calls == fail_at + 1:
-                raise error("no space left on device")
-            return original(*args, **kwargs)
-
         with monkeypatch.context() as patch:
-            patch.setattr(os, function, failing)
+            patch.setattr(os, function, failing(original, fail_at, error))
             try:
                 write_artifact(program, models, target)
             except (Interrupted, ArtifactError):
@@ -371,9 +357,7 @@ def test_models_that_do_not_fit(tmp_path: Path, case: str) -> None:
 
 
 def test_an_embedded_value_is_left_as_it_is(tmp_path: Path) -> None:
-    program = tiny_program()
-    models = tiny_models(program)
-    write_artifact(program, models, tmp_path / "a")
+    write_tiny(tmp_path / "a")
     saved = onnx.load(tmp_path / "a" / "advance.onnx", load_external_data=False)
     values = {t.name: onnx.numpy_helper.to_array(t) for t in saved.graph.initializer if t.name in ("low", "high")}
     assert values == {"low": -1, "high": 1}

@@ -1,12 +1,14 @@
 """A policy of two blocks, built by hand: graphs, weights, and ONNX models written with ``onnx.helper``."""
 
-from __future__ import annotations
+from pathlib import Path
 
 import numpy as np
 import onnx
 from onnx import ModelProto, NodeProto, TensorProto
 from onnx.helper import make_graph, make_model, make_node, make_opsetid, make_tensor_value_info
 
+from ttscompile.artifact.manifest import Manifest
+from ttscompile.artifact.write import write_artifact
 from ttscompile.core.spec import Affine, ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
 from ttscompile.ir.graph import Batch, Graph, Node, Ref, TensorType
 from ttscompile.ir.pieces import LoopPiece, block_name
@@ -186,6 +188,12 @@ def tiny_models(program: Program) -> dict[str, ModelProto]:
         ]
         models[block_name(i)] = model(piece.graph, nodes)
     return {**models, **lower_all_blocks(pieces.blocks, models)}
+
+
+def write_tiny(target: Path, program: Program | None = None) -> Manifest:
+    """Write a program with these models; ``tiny_program`` if none is given."""
+    program = program or tiny_program()
+    return write_artifact(program, tiny_models(program), target)
 
 
 def project(result: str, x: str, weight: str) -> list[NodeProto]:

@@ -18,7 +18,7 @@ from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.progress import Bar
 from ttscompile.calibration.result import CalibrationResult
 from ttscompile.calibration.state import FILE, StateFile
-from ttscompile.calibration.step_counts import CrowdedSchedules, budget_of_error
+from ttscompile.calibration.step_counts import SpacedSchedules, budget_of_error
 from ttscompile.calibration.task import Clock
 from ttscompile.calibration.whole_steps import Errors, WholeSteps
 from ttscompile.core.lattice import Source
@@ -187,7 +187,7 @@ class _Judged(WholeSteps):
 def test_an_error_is_as_few_steps_as_do(tmp_path: Path, limit: float, full: int) -> None:
     whole, state = _Judged(), StateFile(tmp_path, {})
     with Bar(shown=False) as bar:
-        crowded = CrowdedSchedules(whole, state, Clock(), bar)
+        crowded = SpacedSchedules(whole, state, Clock(), bar)
         budget = budget_of_error(crowded, Goal("max_action_error", limit), 100, BLOCKS)
         assert budget.cells == full * BLOCKS
         asked = len(whole.asked)
@@ -197,10 +197,10 @@ def test_an_error_is_as_few_steps_as_do(tmp_path: Path, limit: float, full: int)
 
 def test_an_error_out_of_reach_and_one_out_of_time_are_failures(tmp_path: Path) -> None:
     with Bar(shown=False) as bar:
-        crowded = CrowdedSchedules(_Judged(), StateFile(tmp_path, {}), Clock(), bar)
+        crowded = SpacedSchedules(_Judged(), StateFile(tmp_path, {}), Clock(), bar)
         with pytest.raises(CalibrationFailedError, match="at least half of the cells: 10 with 1 of .*, 0.2 with 50 of"):
             budget_of_error(crowded, Goal("max_action_error", 0.1), 100, BLOCKS)
-        late = CrowdedSchedules(_Judged(), StateFile(tmp_path, {}), Clock(0.0), bar)
+        late = SpacedSchedules(_Judged(), StateFile(tmp_path, {}), Clock(0.0), bar)
         with pytest.raises(CalibrationFailedError, match="time limit ended the search .*: none tried"):
             budget_of_error(late, Goal("max_action_error", 0.1), 100, BLOCKS)
 

@@ -28,15 +28,16 @@ from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.progress import Bar
 from ttscompile.calibration.search import open_search, search_plan
 from ttscompile.calibration.state import FILE, StateFile
-from ttscompile.calibration.step_counts import CrowdedSchedules
+from ttscompile.calibration.step_counts import SpacedSchedules
 from ttscompile.calibration.strategies import FITTED, NAMES, strategy_of
 from ttscompile.calibration.targets import draw_calls, with_targets
 from ttscompile.calibration.task import Clock
 from ttscompile.calibration.tokens import reuse_tokens
-from ttscompile.calibration.tts import Tts, switched
+from ttscompile.calibration.tts import Tts
 from ttscompile.calibration.warm_start import warm_start
 from ttscompile.core.lattice import PlanArray, Source, uniform_plan
 from ttscompile.errors import CalibrationError, CalibrationFailedError
+from ttscompile.rivals.switched import Switched
 from ttscompile.runtimes.reference.model import Contexts, ReferenceModel
 from ttscompile.trajectories import load_trajectories
 
@@ -116,7 +117,7 @@ def test_a_family_is_not_begun_that_cannot_be_finished(make_task: MakeTask, tmp_
     needed = 2 * whole.comparing(4) + whole.correcting(4)
     with Bar(shown=False) as bar:
         for limit, made in ((0.9 * needed, False), (1.1 * needed, True)):
-            crowded = CrowdedSchedules(whole, StateFile(tmp_path, {}), _Hand(limit), bar)
+            crowded = SpacedSchedules(whole, StateFile(tmp_path, {}), _Hand(limit), bar)
             assert (crowded.best(4, "", (2.0,)) is not None) == made
 
 
@@ -150,7 +151,7 @@ def test_only_corrections_need_many_calls(artifact: Path, recording: Path) -> No
 
 def test_without_a_pruner_no_time_is_kept_for_it(make_task: MakeTask) -> None:
     task = make_task(20, calls=4)
-    with_head, without = (switched(one) for one in (task, replace(task, pruner={})))
+    with_head, without = (Switched(one) for one in (task, replace(task, pruner={})))
     assert (with_head.closing, without.closing) == (5, 0)
     assert Tts(task).closing == 0  # the default leaves the pruner alone
 

@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from ttscompile.calibration import schedule_runs
-from ttscompile.calibration.schedule_runs import Trails
+from ttscompile.calibration.schedule_runs import ScheduleRuns
+from ttscompile.calibration.spacing import FEW, other_placements, spacings
 from ttscompile.calibration.sparse_loop import SparseLoop
-from ttscompile.calibration.step_counts import FEW, crowded_family, other_placements
 from ttscompile.calibration.task import Task
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import PlanArray
@@ -24,7 +24,7 @@ from .tasks import MakeTask
 
 SCHEDULES = ((0, 2, 5), (0, 2, 7), (0, 4, 5), (0, 2, 7), (0, 2), (0,), (0, 4, 5, 6))
 
-Counted = Callable[[Trails, Sequence[tuple[int, ...]]], tuple[list[torch.Tensor], int]]
+Counted = Callable[[ScheduleRuns, Sequence[tuple[int, ...]]], tuple[list[torch.Tensor], int]]
 
 
 @pytest.fixture
@@ -44,18 +44,18 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> Counted:
 
     monkeypatch.setattr(ReferenceModel, "block", counting)
 
-    def count(made: Trails, schedules: Sequence[tuple[int, ...]]) -> tuple[list[torch.Tensor], int]:
+    def count(made: ScheduleRuns, schedules: Sequence[tuple[int, ...]]) -> tuple[list[torch.Tensor], int]:
         evaluated.clear()
         return [made.end(steps).samples for steps in schedules], len(evaluated)
 
     return count
 
 
-def runs_of(task: Task, reads: bool | None, bytes_: int = schedule_runs.BYTES) -> Trails:
+def runs_of(task: Task, reads: bool | None, bytes_: int = schedule_runs.BYTES) -> ScheduleRuns:
     fitted = None if reads is None else task.executor.select(task.calls, range(30))
     judged, model = task.executor.select(task.calls, range(30, 40)), task.executor.model
     loop = SparseLoop(task.executor, fitted, judged, reads=bool(reads), whole=True)
-    return Trails(loop, model.steps, model.blocks, bytes_)
+    return ScheduleRuns(loop, model.steps, model.blocks, bytes_)
 
 
 def without_jumps(task: Task, plan: PlanArray, reads: bool) -> Correction | None:
@@ -127,7 +127,7 @@ def test_where_there_are_few_placements_all_are_tried(steps: int, count: int, pl
         assert others is None
         return
     assert others is not None
-    every = [*crowded_family(steps, count), *others]
+    every = [*spacings(steps, count), *others]
     assert len(every) == len(set(every)) == placements <= FEW
     assert all(len(set(one)) == count and one[0] == 0 and list(one) == sorted(one) for one in every)
     assert np.max(every) < steps

@@ -103,24 +103,24 @@ def test_a_pruners_plan_needs_an_observation(pruned: Path, tmp_path: Path) -> No
     picture = tmp_path / "plan.png"
     result = CliRunner().invoke(main, ["inspect", str(pruned), "--plot", str(picture)])
     assert result.exit_code == 2
-    assert "Add --observation FILE.npz" in result.stderr
+    assert "Add --trajectories FILE" in result.stderr
     assert not picture.exists()
     rng = np.random.default_rng(0)
-    np.savez(tmp_path / "calls.npz", obs=rng.uniform(100, 400, (2, 2, 20)).astype(np.float32))
-    run("inspect", pruned, "--plot", picture, "--observation", tmp_path / "calls.npz")
+    np.savez(tmp_path / "calls.npz", obs=rng.uniform(100, 400, (2, 2, 20)).astype(np.float32), episode_ends=[2])
+    run("inspect", pruned, "--plot", picture, "-t", tmp_path / "calls.npz")
     assert picture.exists()
 
 
 @pytest.mark.parametrize(
     ("arrays", "reason"),
     [
-        ({"state": np.zeros((2, 20), np.float32)}, "has no array 'obs'"),
-        ({"obs": np.zeros((0, 2, 20), np.float32)}, "at least one"),
+        ({"state": np.zeros((2, 2, 20), np.float32), "episode_ends": [2]}, "has no array 'obs'"),
+        ({"obs": np.zeros((0, 2, 20), np.float32), "episode_ends": [0]}, "the first of them above 0"),
     ],
 )
 def test_an_observation_that_does_not_fit(arrays: dict[str, Any], reason: str, pruned: Path, tmp_path: Path) -> None:
     np.savez(tmp_path / "calls.npz", **arrays)
-    arguments = ["inspect", pruned, "--plot", tmp_path / "plan.png", "--observation", tmp_path / "calls.npz"]
+    arguments = ["inspect", pruned, "--plot", tmp_path / "plan.png", "-t", tmp_path / "calls.npz"]
     result = CliRunner().invoke(main, [str(a) for a in arguments])
     assert result.exit_code == 2
     assert reason in result.stderr

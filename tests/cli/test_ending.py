@@ -155,7 +155,7 @@ def test_files_do_not_take_the_place_of_closed_streams(toy_compiled: Path, tmp_p
     """A library that prints would print into them."""
     code = "import os, sys; os.closerange(0, 3); os.execv(sys.argv[1], sys.argv[1:])"
     page = tmp_path / "page.html"
-    words = [sys.executable, "-c", code, *COMMAND, "report", toy_compiled, "-o", page, "--runs", "1"]
+    words = [sys.executable, "-c", code, *COMMAND, "inspect", toy_compiled, "-o", page]
     assert subprocess.run(list(map(str, words))).returncode == 0
     assert page.read_text().startswith("<!doctype html>")
     inside = "import os; from ttscompile.cli import main; main.main(['--version'], standalone_mode=False); "

@@ -37,13 +37,13 @@ def test_a_file_that_is_no_checkpoint(no_checkpoint: Path) -> None:
     assert list(no_checkpoint.parent.iterdir()) == [no_checkpoint]
 
 
-@pytest.mark.parametrize("command", ["inspect", "bench", "calibrate", "compare", "oracle"])
+@pytest.mark.parametrize("command", ["inspect", "bench", "calibrate", "compare"])
 @pytest.mark.parametrize("made", [False, True])
 def test_what_is_no_artifact(command: str, made: bool, tmp_path: Path) -> None:
     directory = tmp_path / "nothing"
     if made:
         directory.mkdir()
-    recorded = command in ("calibrate", "compare", "oracle")
+    recorded = command in ("calibrate", "compare")
     arguments = [command, str(directory)] + ["--trajectories", "calls.npz"] * recorded
     result = CliRunner().invoke(main, arguments)
     assert result.exit_code == 2
@@ -59,14 +59,17 @@ def test_what_is_no_artifact(command: str, made: bool, tmp_path: Path) -> None:
         (["convert", "policy.ckpt"], "Missing option '-o'"),
         (["convert", "policy.ckpt", "-o", "out", "--sampler", "pndm"], "'pndm' is not one of"),
         (["convert", "policy.ckpt", "-o", "out", "--steps", "0"], "not in the range"),
-        (["calibrate", "out"], "Missing option '--trajectories'"),
-        (["calibrate", "out", "--trajectories"], "Missing option '--trajectories'"),
-        (["inspect", "out", "--plan", "dense"], "give --plot FILE too"),
+        (["calibrate", "out"], "Missing option '-t' / '--trajectories'"),
+        (["calibrate", "out", "--trajectories"], "Missing option '-t' / '--trajectories'"),
+        (["inspect", "out", "--plan", "dense"], "--plan is for --plot: give it too"),
         (["bench", "out", "--against", "eager"], "give --checkpoint FILE too"),
         (["bench", "out", "--against", "tensorrt"], "'tensorrt' is not one of original, eager, onnxruntime-dense"),
         (["bench", "out", "--seed", "-1"], "-1 is not in the range 0<=x<="),
-        (["serve", "out", "--control-hz", "10", "--seed", "-1"], "-1 is not in the range 0<=x<="),
-        (["report", "out", "-o", "report.pdf"], "ends in .html"),
+        (["serve", "out"], "give --control-hz HZ to drive one robot, or --copies N to answer many"),
+        (["serve", "out", "--control-hz", "10", "--wait-ms", "1"], "--wait-ms is for --copies: give it too"),
+        (["inspect", "out", "-o", "page.pdf"], "ends in .html"),
+        (["inspect", "out", "--verify"], "--verify is for --output: give it too"),
+        (["inspect", "out", "-t", "calls.npz"], "--trajectories is for --output or --plot: give one of them too"),
         (["deploy"], "No such command"),
     ],
 )
@@ -101,7 +104,7 @@ def test_what_is_not_there_is_said_before_the_compiler_is_imported(
     (tmp_path / "compiled").symlink_to(toy_compiled)
     (tmp_path / "here.ckpt").touch()
     monkeypatch.chdir(tmp_path)
-    for module in ("driver", "calibration.pipeline", "calibration.compare", "rivals.oracle"):
+    for module in ("driver", "calibration.pipeline", "calibration.compare"):
         monkeypatch.setitem(sys.modules, f"ttscompile.{module}", None)
     for name in ("convert", "calibrate"):
         monkeypatch.delitem(vars(ttscompile), name, raising=False)

@@ -42,8 +42,8 @@ def test_bench_says_how_much_of_a_call_is_frames(seeing: Path, toy_compiled: Pat
     assert told not in run("bench", toy_compiled, "--runs", 1, "--against", "")
 
 
-def test_the_report_has_a_row_and_a_column_for_them(seeing: Path, tmp_path: Path) -> None:
-    run("report", seeing, "-o", tmp_path / "report.html", "--runs", 2)
-    page = (tmp_path / "report.html").read_text()
+def test_the_page_has_a_row_and_a_column_for_them(seeing: Path, tmp_path: Path) -> None:
+    run("inspect", seeing, "-o", tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text()
     assert "once a frame, or instruction" in page
     assert "of it frames" in page

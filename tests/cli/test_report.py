@@ -88,7 +88,7 @@ def calls(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(*arguments: object) -> Result:
-    return CliRunner().invoke(main, ["report", *(str(a) for a in arguments)], catch_exceptions=False)
+    return CliRunner().invoke(main, ["inspect", *(str(a) for a in arguments)], catch_exceptions=False)
 
 
 def pictures_of(reader: Reader) -> list[np.ndarray]:
@@ -102,7 +102,7 @@ def page(calibrated: Path, calls: Path, tmp_path_factory: pytest.TempPathFactory
     point = {"series": HOSTILE, "name": "0.9", "error": 2.0, "latency_ms": 12.5}
     comparison = calls.with_name("comparison.json")
     comparison.write_text(json.dumps({"points": [point], "yardsticks": {"all": 9.0}}))
-    options = ("--verify", "--episode", 1, "--runs", 2, "--comparison", comparison)
+    options = ("--verify", "--comparison", comparison)
     result = run(calibrated, "-o", output, "--trajectories", calls, *options)
     assert result.exit_code == 0, result.stderr
     assert load_artifact(calibrated).manifest.short_identity in result.stdout
@@ -144,7 +144,7 @@ def test_the_page_says_what_was_found(page: str, calibrated: Path) -> None:
         "Hoisting",
         "once a call, 5 steps in one batch",
         "schedule (default)",
-        "3 consecutive calls of calls.npz[1]",
+        "4 consecutive calls of calls.npz[0]",
         "ms a call",
         "on the frontier",
         "12.5",
@@ -204,7 +204,7 @@ def test_a_check_that_failed_is_told_and_is_the_exit_status(
     rung = Rung("one block", "failed", "block 2 differs", 0.5, 1e-4, "relative", "Convert it again.", 1, (2,))
     found = Verification("compiled", None, None, (rung,), 1.0)
     monkeypatch.setattr(ttscompile, "verify", lambda *_, **__: found, raising=False)
-    result = run(toy_compiled, "-o", tmp_path / "r.html", "--runs", 1, "--verify")
+    result = run(toy_compiled, "-o", tmp_path / "r.html", "--verify")
     assert result.exit_code == 1
     text = Reader((tmp_path / "r.html").read_text()).text
     assert "FAILED at one block. Convert it again." in text
@@ -224,7 +224,7 @@ def test_arrays_of_other_names_reach_the_episode_and_the_checks(
         return Verification("compiled", None, None, (Rung("one block", "passed", "it holds"),), 1.0)
 
     monkeypatch.setattr(ttscompile, "verify", verify, raising=False)
-    options = ("--trajectories", frames, "--observation", "obs=state:2", "--verify", "--runs", 1)
+    options = ("--trajectories", frames, "--observation", "obs=state:2", "--verify")
     result = run(calibrated, "-o", tmp_path / "r.html", *options)
     assert result.exit_code == 0, result.stderr
     assert given == [calibrated, (frames,), {"obs": ("state:2",)}]
@@ -239,9 +239,9 @@ def test_text_in_pictures_is_no_formula() -> None:
 
 
 def test_an_artifact_that_is_not_calibrated(toy_compiled: Path, tmp_path: Path) -> None:
-    assert run(toy_compiled, "-o", tmp_path / "r.html", "--runs", 1).exit_code == 0
+    assert run(toy_compiled, "-o", tmp_path / "r.html").exit_code == 0
     text = Reader((tmp_path / "r.html").read_text()).text
-    assert "Not run for this report" in text
+    assert "Not run for this page" in text
     assert "Not calibrated: every call is dense" in text
     assert "calibrate the artifact first" in text
 
@@ -253,7 +253,7 @@ def test_what_is_no_comparison_is_refused_and_nothing_is_written(
     content: str, calibrated: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "c.json").write_text(content)
-    result = run(calibrated, "-o", tmp_path / "r.html", "--runs", 1, "--comparison", tmp_path / "c.json")
+    result = run(calibrated, "-o", tmp_path / "r.html", "--comparison", tmp_path / "c.json")
     assert result.exit_code == 2
     assert "compare" in result.stderr
     assert not (tmp_path / "r.html").exists()
@@ -268,15 +268,13 @@ def test_a_report_replaces_another_only_when_it_is_whole(
         raise ReportError("in the middle")
 
     monkeypatch.setattr(facts, "provenance", fail)
-    assert run(calibrated, "-o", tmp_path / "r.html", "--runs", 1).exit_code == 2
+    assert run(calibrated, "-o", tmp_path / "r.html").exit_code == 2
     assert (tmp_path / "r.html").read_text() == "old"
 
 
-def test_bad_input_is_one_message(calibrated: Path, calls: Path, tmp_path: Path) -> None:
-    result = run(calibrated, "-o", tmp_path / "no" / "r.html", "--runs", 1)
+def test_bad_input_is_one_message(calibrated: Path, tmp_path: Path) -> None:
+    result = run(calibrated, "-o", tmp_path / "no" / "r.html")
     assert (result.exit_code, "cannot be written" in result.stderr) == (2, True)
-    result = run(calibrated, "-o", tmp_path / "r.html", "--trajectories", calls, "--episode", 2)
-    assert (result.exit_code, "there are 2 episodes" in result.stderr) == (2, True)
     result = run(tmp_path, "-o", tmp_path / "r.html")
     assert (result.exit_code, "not an artifact" in result.stderr) == (2, True)
 
@@ -303,7 +301,7 @@ def test_what_is_missing_is_named(
     for name in [name for name in sys.modules if name.partition(".")[0] == package]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, package, None)
-    result = run(calibrated, "-o", tmp_path / "r.html", "--runs", 1)
+    result = run(calibrated, "-o", tmp_path / "r.html")
     assert result.exit_code == 2
     assert package in result.stderr
     assert "'ttscompile[compile]'" in result.stderr

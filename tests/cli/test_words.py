@@ -17,6 +17,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from ttscompile.cli import main
+from ttscompile.cli.sections import Section
 from ttscompile.runtimes.server import listener
 
 NO_TEXT = os.fsdecode(b"\xff\xfe.html")
@@ -38,24 +39,24 @@ UNKIND = (
 )
 
 NEEDED = {
-    "bench": ("A", "--runs", "1"),
-    "calibrate": ("A", "--trajectories", "calls.npz", "--max-minutes", "0.001"),
-    "compare": ("A", "--trajectories", "calls.npz", "--strategies", "", "--calls", "1"),
-    "convert": ("policy.ckpt", "-o", "out"),
-    "distill": ("A", "--trajectories", "calls.npz", "--updates", "1", "--max-minutes", "0.001"),
-    "doctor": ("A",),
-    "fleet": ("A", "--port", "0"),
-    "inspect": ("A",),
-    "oracle": ("A", "--trajectories", "calls.npz", "--calls", "2"),
-    "push": ("A", "org/name", "--dry-run", "--runs", "1"),
-    "realtime": ("A", "--control-hz", "1", "--runs", "1"),
-    "report": ("A", "-o", "out.html", "--runs", "1"),
-    "reuse-tokens": ("A", "--trajectories", "calls.npz", "--calls", "2"),
-    "serve": ("A", "--control-hz", "1", "--port", "0", "--margin-ticks", "0"),
-    "verify": ("A", "--calls", "1"),
-    "warm-start": ("A", "--trajectories", "calls.npz", "--calls", "2"),
+    "bench": [("A", "--runs", "1")],
+    "calibrate": [("A", "-t", "calls.npz", "--max-minutes", "0.001")],
+    "compare": [("A", "-t", "calls.npz", "--strategies", "", "--calls", "1")],
+    "convert": [("policy.ckpt", "-o", "out")],
+    "distill": [("A", "-t", "calls.npz", "--updates", "1", "--max-minutes", "0.001")],
+    "doctor": [("A",)],
+    "inspect": [("A",), ("A", "--output", "out.html"), ("A", "--plot", "plan.png")],
+    "push": [("A", "org/name", "--dry-run", "--runs", "1")],
+    "realtime": [("A", "--control-hz", "1", "--runs", "1")],
+    "reuse-tokens": [("A", "-t", "calls.npz", "--calls", "2")],
+    "serve": [
+        ("A", "--control-hz", "1", "--port", "0", "--margin-ticks", "0"),
+        ("A", "--copies", "1", "--port", "0"),
+    ],
+    "verify": [("A", "--calls", "1")],
+    "warm-start": [("A", "-t", "calls.npz", "--calls", "2")],
 }
-"""A command line of each command that can be run, and ends soon."""
+"""Command lines of each command that can be run, and end soon: one for each section of its options."""
 
 
 def parameters() -> Iterator[tuple[str, click.Parameter]]:
@@ -78,9 +79,17 @@ def there(toy_compiled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.chdir(tmp_path)
 
 
+def line_for(command: str, parameter: click.Parameter) -> tuple[str, ...]:
+    """The first command line in which the parameter is of use."""
+    sections: tuple[Section, ...] = getattr(main.commands[command], "sections", ())
+    needs = next((section.needs for section in sections if parameter.name in section.options), ())
+    wanted = {word for one in main.commands[command].params if one.name in needs for word in one.opts}
+    return next(line for line in NEEDED[command] if not wanted or wanted & set(line))
+
+
 def with_word(command: str, parameter: click.Parameter, word: str) -> list[str]:
     """The command line with this word for the parameter."""
-    words = list(NEEDED[command])
+    words = list(line_for(command, parameter))
     if isinstance(parameter, click.Argument):
         return [command, *words[1:], "--", word]
     name = max(parameter.opts, key=len)
@@ -114,7 +123,7 @@ def stops_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
         yield
 
     monkeypatch.setattr(listener.Listener, "run", brief)
-    monkeypatch.setattr(sys.modules["ttscompile.cli.fleet"], "ray_copies", nobody)
+    monkeypatch.setattr(sys.modules["ttscompile.cli.serve"], "ray_copies", nobody)
 
 
 @pytest.mark.usefixtures("stops_at_once")
@@ -156,10 +165,10 @@ def assert_of_use(value: object, words: list[str]) -> None:
 )
 @pytest.mark.usefixtures("stops_at_once")
 def test_the_url_is_where_the_server_listens(word: str, url: str) -> None:
-    result = CliRunner().invoke(main, ["serve", *NEEDED["serve"], "--host", word])
+    result = CliRunner().invoke(main, ["serve", *NEEDED["serve"][0], "--host", word])
     if word == "0.0.0.0":
         assert (result.exit_code, result.stdout) == (2, "") and "may be reached from other machines" in result.stderr
-        result = CliRunner().invoke(main, ["serve", *NEEDED["serve"], "--host", word, "--insecure"])
+        result = CliRunner().invoke(main, ["serve", *NEEDED["serve"][0], "--host", word, "--insecure"])
         assert "warning: there is no token and no certificate: whoever reaches 0.0.0.0 can drive" in result.stderr
     assert result.exit_code == 0, result.stderr
     assert json.loads(result.stdout.splitlines()[0])["url"].startswith(url)
@@ -167,6 +176,6 @@ def test_the_url_is_where_the_server_listens(word: str, url: str) -> None:
 
 @pytest.mark.parametrize("word", ["", "l" * 300, NO_TEXT, "example.org", "0", "nan"])
 def test_a_host_that_is_no_address_is_refused(word: str) -> None:
-    result = CliRunner().invoke(main, ["serve", *NEEDED["serve"], f"--host={word}"])
+    result = CliRunner().invoke(main, ["serve", *NEEDED["serve"][0], f"--host={word}"])
     assert (result.exit_code, result.stdout) == (2, "")
     assert "expected an IP address of this machine" in result.stderr

@@ -142,7 +142,8 @@ class Logger:
 
 class Publisher:
     def __init__(self, kind: type) -> None:
-        self.kind, self.published = kind, []
+        self.kind = kind
+        self.published: list[Any] = []
 
     def publish(self, message: Any) -> None:
         assert type(message) is self.kind

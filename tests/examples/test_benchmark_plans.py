@@ -17,15 +17,20 @@ from ttscompile import Source
 from ttscompile.artifact import load_artifact
 from ttscompile.cli.timing import Contestant, Measurement
 from ttscompile.errors import RuntimeUnavailableError
+from ttscompile.runtimes.onnxruntime.sessions import Bound, open_sessions
+from ttscompile.runtimes.onnxruntime.workspace import Workspace
 from ttscompile.runtimes.random_calls import random_calls
+
+NO_NOISE = ttscompile.Noise(np.zeros((1, 4, 2), np.float32))
+"""For contestants that make their own."""
 
 
 @pytest.mark.parametrize("steps", [8, 16, 100])
 @pytest.mark.parametrize("sparsity", [0.0, 0.8, 0.9, 0.95, 0.98])
 def test_a_plan_has_its_share_of_reused_cells(steps: int, sparsity: float) -> None:
     plan = plan_at(steps, 24, sparsity)
-    if (1 - sparsity) * steps < 1 - 1e-9:
-        assert plan is None
+    assert (plan is None) == ((1 - sparsity) * steps < 1 - 1e-9)
+    if plan is None:
         return
     assert plan.shape == (steps, 24)
     assert np.count_nonzero(plan == Source.COMPUTE) == round((1 - sparsity) * steps * 24)
@@ -60,9 +65,9 @@ def test_the_floor_runs_every_block_as_often_as_it_says(
 ) -> None:
     directory, plans = tiny
     ran = []
-    monkeypatch.setattr(floor.Bound, "run", lambda self: ran.append(self))
+    monkeypatch.setattr(Bound, "run", lambda self: ran.append(self))
     contestant = floor.blocks_contestant(directory, threads)
-    contestant.call({}, None)
+    contestant.call({}, NO_NOISE)
     assert len(ran) == 3 * floor.SEQUENCES
     assert ran[:3] == ran[3:6]
     assert len(set(map(id, ran))) == 3
@@ -77,7 +82,7 @@ def test_the_floor_runs_every_block_as_often_as_it_says(
 
 def test_the_floors_blocks_compute_numbers(tiny: tuple[Path, dict[float, np.ndarray]]) -> None:
     artifact = load_artifact(tiny[0])
-    sessions = floor.open_sessions(artifact, 1)
+    sessions = open_sessions(artifact, 1)
     for b in range(3):
         bound = floor._bind(artifact, sessions[f"block_{b:02d}"], b)
         bound.run()
@@ -88,17 +93,21 @@ def test_the_floors_blocks_compute_numbers(tiny: tuple[Path, dict[float, np.ndar
 def test_tails_take_every_step(tiny: tuple[Path, dict[float, np.ndarray]], monkeypatch: pytest.MonkeyPatch) -> None:
     directory, plans = tiny
     steps: list[int] = []
-    advance, idle = floor.Workspace.advance, floor.Workspace.run_idle
+    advance, idle = Workspace.advance, Workspace.run_idle
 
-    def run_idle(self: floor.Workspace, first: int, stop: int) -> None:
+    def counted(self: Workspace, k: int) -> None:
+        steps.append(k)
+        advance(self, k)
+
+    def run_idle(self: Workspace, first: int, stop: int) -> None:
         steps.extend(range(first, stop))
         idle(self, first, stop)
 
-    monkeypatch.setattr(floor.Workspace, "advance", lambda self, k: (steps.append(k), advance(self, k)))
-    monkeypatch.setattr(floor.Workspace, "run_idle", run_idle)
+    monkeypatch.setattr(Workspace, "advance", counted)
+    monkeypatch.setattr(Workspace, "run_idle", run_idle)
     for plan in plans.values():
         contestant = floor.tails_contestant(directory, 1, plan)
-        contestant.call({}, None)
+        contestant.call({}, NO_NOISE)
         assert steps == list(range(8))
         steps.clear()
 
@@ -108,15 +117,13 @@ def test_passes_are_pooled_and_every_group_has_its_threads() -> None:
     seen = []
 
     def contestant(label: str) -> Contestant:
-        return Contestant(
-            label, "", lambda *_: seen.append((label, rounds.torch.get_num_threads())), lambda: None, spec, 1.0
-        )
+        return Contestant(label, "", lambda *_: seen.append((label, torch.get_num_threads())), lambda: None, spec, 1.0)
 
-    before = rounds.torch.get_num_threads()
+    before = torch.get_num_threads()
     groups = {1: [contestant("a"), contestant("b")], 2: [contestant("a")]}
     ticks = []
     measured = rounds.measure_in_passes(groups, rounds.Effort(2, 3), lambda: ticks.append(1))
-    assert rounds.torch.get_num_threads() == before
+    assert torch.get_num_threads() == before
     assert [[len(m.times_ms) for m in measured[threads]] for threads in (1, 2)] == [[6, 6], [6]]
     assert measured[1][0].median_ms == pytest.approx(np.median(measured[1][0].times_ms))
     assert {one for one in seen if one[0] == "b"} == {("b", 1)}
@@ -140,7 +147,7 @@ def test_without_torch_compile_the_reason_is_told(monkeypatch: pytest.MonkeyPatc
 
         return call
 
-    monkeypatch.setattr(rounds.torch, "compile", refuse)
+    monkeypatch.setattr(torch, "compile", refuse)
     with pytest.raises(RuntimeUnavailableError, match=r"RuntimeError: no C\+\+ compiler \(inductor needs"):
         rounds.torch_compile_contestant(random_network(16, "ddim", 8, layers=1), 1.0, 1)
 

@@ -2,14 +2,13 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from floor import FLOOR, TAILS
 from networks import random_network
 from requirements import (
-    DENSE,
-    EAGER,
     LONGER,
     OURS,
     Settings,
@@ -22,7 +21,7 @@ from requirements import (
     subject,
     subject_of,
 )
-from rounds import Effort
+from rounds import DENSE, EAGER, Effort
 
 import ttscompile
 from ttscompile.cli.timing import Measurement
@@ -51,7 +50,9 @@ def timed(
     return {1: {m.label: m for m in single}, 2: {m.label: m for m in double}}
 
 
-def verdicts(of: Subject, warm: dict = MET, long: dict = MET | {"calls": 10_000}, **times: float) -> list[bool | None]:
+def verdicts(
+    of: Subject, warm: dict[str, Any] = MET, long: dict[str, Any] = MET | {"calls": 10_000}, **times: float
+) -> list[bool | None]:
     return [one.met for one in judge(of, timed(of, **times), warm, long)]
 
 
@@ -77,7 +78,7 @@ def test_figures_that_meet_every_requirement(tiny: Subject) -> None:
         ({8}, {"long": MET | {"calls": 10_000, "repeatable": False}}),
     ],
 )
-def test_a_figure_that_misses_is_seen(tiny: Subject, missed: set[int], change: dict) -> None:
+def test_a_figure_that_misses_is_seen(tiny: Subject, missed: set[int], change: dict[str, Any]) -> None:
     found = verdicts(tiny, **change)
     assert {i for i, met in enumerate(found) if met is False} == missed
     assert None not in found
@@ -112,7 +113,7 @@ def test_all_of_it_runs(tiny: Subject, capsys: pytest.CaptureFixture[str]) -> No
 
 
 def test_the_plan_is_the_one_that_a_warm_call_executes(tiny: Subject) -> None:
-    np.testing.assert_array_equal(tiny.plan, tiny.artifact.plans["reuse-50%")].cells
+    np.testing.assert_array_equal(tiny.plan, tiny.artifact.plans["reuse-50%"].cells
     dense = subject_of(tiny.directory, tiny.network, "dense")
     assert dense.plan.sum() == 0
 

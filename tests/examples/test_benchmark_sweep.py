@@ -1,6 +1,5 @@
 """The sweep's quick run from end to end, its table and its picture."""
 
-import io
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -9,8 +8,9 @@ import pytest
 from click.testing import CliRunner
 from drawing import draw
 from drawing import main as draw_main
-from rich.console import Console
 from sweep import COMPILED, QUICK, Row, main, networks, results_table
+
+from tests.examples.printed import printed
 
 
 def row(contestant: str, sparsity: float | None, ms: float, floor: float | None, threads: int = 1) -> Row:
@@ -26,9 +26,7 @@ ROWS = [
 
 
 def test_the_table_has_ratios_to_eager_and_to_the_floor() -> None:
-    console = Console(width=200, file=io.StringIO())
-    console.print(results_table(ROWS))
-    lines = console.file.getvalue().splitlines()
+    lines = printed(results_table(ROWS))
     sparse = next(line for line in lines if COMPILED in line)
     assert {"95%", "24", "21.6..26.4", "50.0", "12", "2.00"} <= set(sparse.split())
     alone = next(line for line in lines if "back to back" in line)

@@ -1,5 +1,7 @@
 """What vla.cpp is given, and what is told of the times."""
 
+import ctypes
+
 import numpy as np
 import pytest
 import vla_cpp
@@ -15,7 +17,7 @@ def test_they_are_square_and_start_with_padding(height: int, width: int) -> None
 
 
 def test_the_structures_have_the_sizes_of_the_interface() -> None:
-    assert (vla_cpp.ctypes.sizeof(vla_cpp.Image), vla_cpp.ctypes.sizeof(vla_cpp.Inputs)) == (24, 80)
+    assert (ctypes.sizeof(vla_cpp.Image), ctypes.sizeof(vla_cpp.Inputs)) == (24, 80)
 
 
 def test_medians_are_of_the_calls_that_count_and_beside_those_of_the_first() -> None:

@@ -1,11 +1,10 @@
 """The C++ example: built and run where there are a compiler and onnxruntime's headers."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnxruntime
@@ -51,12 +50,13 @@ def test_an_episode_is_what_python_computes(program: Path, tmp_path: Path, strea
     (tmp_path / "call.onnx").write_bytes(model)
     rng = np.random.default_rng(streams)
     episode, written, expected = Episode(model, streams), np.zeros((8, 7), np.bool_), []
-    reads, feeds = np.zeros(4, int), {}
+    reads = np.zeros(4, int)
+    feeds: dict[str, Any] = {}
     if streams == 2:  # of a calibrated schedule
         empty = no_correction(8, toy.spec.sample)
-        own = [rng.normal(0, 0.01, each.shape).astype(np.float32) for each in (empty.weights, empty.bias)]
+        weights, bias = (rng.normal(0, 0.01, each.shape).astype(np.float32) for each in (empty.weights, empty.bias))
         numbers = load_artifact(tmp_path / "artifact").manifest.condition_numbers
-        feeds = Correction(np.arange(8) % 3 == 0, *own, *random_reading(rng, numbers, empty)).inputs()
+        feeds = Correction(np.arange(8) % 3 == 0, weights, bias, *random_reading(rng, numbers, empty)).inputs()
     for r in range(CALLS):
         plan = random_plan(rng, 8, groups(toy), written, 0.3)
         obs, drawn = inputs(policy, rng, streams)

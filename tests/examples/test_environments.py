@@ -1,7 +1,5 @@
 """Every file of examples/evaluation/environments against the protocol of its package."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import os
@@ -117,7 +115,8 @@ def test_the_picture_is_of_now(environment: Environment) -> None:
         pictures.append(environment.picture().copy())
     first, other, again, earlier = pictures
     assert first.ndim == 3
-    assert (first.shape[2], first.dtype) == (3, np.uint8)
+    assert first.shape[2] == 3
+    assert first.dtype == np.uint8
     np.testing.assert_array_equal(first, again)
     assert (first != other).any()
     assert (first != earlier).any()

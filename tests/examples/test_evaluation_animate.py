@@ -1,16 +1,18 @@
 """The animation shows what happened, and is small."""
 
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 from animate import CAPTION, save_animation
 from environments.pusht import PushT
 from PIL import Image
-from rollout import Recorder
+from PIL.GifImagePlugin import GifImageFile
+from rollout import Episode, Recorder
 
 
-def circling(seed, steps):
+def circling(seed: int, steps: int) -> Episode:
     one = Recorder(PushT(), seed)
     one.windows.append(one.look())
     for angle in 0.1 * np.arange(steps):
@@ -19,13 +21,16 @@ def circling(seed, steps):
 
 
 @pytest.mark.parametrize(("hz", "every"), [(10.0, 2), (25.0, 5)])
-def test_animation_is_readable_and_small(tmp_path, monkeypatch, hz, every):
+def test_animation_is_readable_and_small(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hz: float, every: int
+) -> None:
     monkeypatch.setattr(PushT, "hz", hz)
     path = tmp_path / "pictures" / "episode.gif"
     longer, shorter = circling(0, 48), circling(1, 24)
     save_animation(path, PushT, [longer, shorter], ["dense", "compiled"], size=160)
     assert path.stat().st_size < 1_500_000
     with Image.open(path) as image:
+        assert isinstance(image, GifImageFile)
         assert image.format == "GIF"
         assert image.size == (320, 160 + CAPTION)
         assert image.n_frames == len(range(0, 48, every)) + 1

@@ -1,6 +1,8 @@
 """Episodes that are kept on disk."""
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,14 +23,14 @@ class Info:
 class Policy:
     """Counts its calls; moves nowhere."""
 
-    info = Info()
+    info: Any = Info()
     last_report = None
     calls = 0
 
-    def reset(self):
+    def reset(self) -> None:
         pass
 
-    def predict_action(self, obs_dict, noise=None, plan=None):
+    def predict_action(self, obs_dict: Any, noise: Any = None, plan: Any = None) -> Any:
         self.calls += 1
         return {"action": np.full((len(obs_dict["obs"]), 8, 2), 256.0, np.float32)}
 
@@ -36,13 +38,13 @@ class Policy:
 SHAPE = NoiseShape(2, (16, 2), False)
 
 
-def variant(plan=None, **changes):
-    policy = Policy()
+def variant(plan: str | None = None, **changes: Any) -> Variant:
+    policy: Any = Policy()
     policy.info = type("Changed", (Info,), changes)()
     return Variant("v", policy, plan, SHAPE)
 
 
-def episode(seed=7):
+def episode(seed: int = 7) -> Episode:
     draw = np.random.default_rng(seed)
     return Episode(
         seed,
@@ -58,11 +60,11 @@ def episode(seed=7):
     )
 
 
-def cached(root, one, environment="pusht", runtime="onnxruntime"):
+def cached(root: Path, one: Variant, environment: str = "pusht", runtime: str = "onnxruntime") -> Episodes:
     return Episodes(root, environment, one, runtime)
 
 
-def test_an_episode_is_read_as_it_was_written(tmp_path):
+def test_an_episode_is_read_as_it_was_written(tmp_path: Path) -> None:
     cache = cached(tmp_path, variant())
     assert cache.read(7) is None
     cache.write(episode())
@@ -91,13 +93,15 @@ def test_an_episode_is_read_as_it_was_written(tmp_path):
         (None, {"precision": "int8"}, False),
     ],
 )
-def test_only_what_computes_the_same_finds_it(tmp_path, plan, changes, found):
+def test_only_what_computes_the_same_finds_it(
+    tmp_path: Path, plan: str | None, changes: dict[str, str], found: bool
+) -> None:
     cached(tmp_path, variant()).write(episode())
     assert (cached(tmp_path, variant(plan, **changes)).read(7) is not None) == found
     assert cached(tmp_path, variant(plan, **changes), runtime="reference").read(7) is None
 
 
-def test_calibration_does_not_change_the_dense_policy(tmp_path):
+def test_calibration_does_not_change_the_dense_policy(tmp_path: Path) -> None:
     cached(tmp_path, variant("dense")).write(episode())
     assert cached(tmp_path, variant("dense", identity="j" * 64)).read(7) is not None
     assert cached(tmp_path, variant("dense", model_identity="n" * 64)).read(7) is None
@@ -105,12 +109,12 @@ def test_calibration_does_not_change_the_dense_policy(tmp_path):
     assert cached(tmp_path, variant("dense", warm_steps=3)).read(7) is None, "its calls begin otherwise"
 
 
-def test_pinned_noise_has_episodes_of_its_own(tmp_path):
+def test_pinned_noise_has_episodes_of_its_own(tmp_path: Path) -> None:
     cached(tmp_path, variant()).write(episode())
     assert cached(tmp_path, replace(variant(), noise=replace(SHAPE, pinned=True))).read(7) is None
 
 
-def test_a_damaged_file_is_as_good_as_none(tmp_path):
+def test_a_damaged_file_is_as_good_as_none(tmp_path: Path) -> None:
     cache = cached(tmp_path, variant())
     cache.write(episode())
     (file,) = tmp_path.glob("*/7.npz")
@@ -118,20 +122,21 @@ def test_a_damaged_file_is_as_good_as_none(tmp_path):
     assert cache.read(7) is None
 
 
-def test_another_environment_has_episodes_of_its_own(tmp_path):
+def test_another_environment_has_episodes_of_its_own(tmp_path: Path) -> None:
     cached(tmp_path, variant()).write(episode())
     assert cached(tmp_path, variant(), "pusht-pixels").read(7) is None
 
 
-def test_kept_episodes_are_not_run_again(tmp_path):
+def test_kept_episodes_are_not_run_again(tmp_path: Path) -> None:
     one = variant()
     cache = cached(tmp_path, one)
     first = run_episodes(PushT, one, [1, 2], 2, cache=cache)
-    calls = one.policy.calls
-    done = []
+    policy: Any = one.policy
+    calls = policy.calls
+    done: list[int] = []
     more = run_episodes(PushT, one, [2, 3, 1], 2, done.append, cache)
     assert [e.seed for e in more.episodes] == [2, 3, 1]
-    assert 0 < one.policy.calls - calls <= calls
+    assert 0 < policy.calls - calls <= calls
     np.testing.assert_array_equal(more.episodes[2].scores, first.episodes[0].scores)
     np.testing.assert_array_equal(more.episodes[2].windows["obs"], first.episodes[0].windows["obs"])
     assert done[-1] == 3

@@ -1,15 +1,18 @@
 """The recorded file is a trajectory file."""
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 from record import save_trajectories
 
 
-def episode(calls, start):
+def episode(calls: int, start: int) -> dict[str, Any]:
     obs = np.arange(start, start + calls * 40, dtype=np.float32).reshape(calls, 2, 20)
     return {"obs": obs, "observation.image": np.full((calls, 1, 3, 4, 4), start % 251, np.uint8)}
 
 
-def test_rows_are_calls_in_order_and_ends_are_counted(tmp_path):
+def test_rows_are_calls_in_order_and_ends_are_counted(tmp_path: Path) -> None:
     path = tmp_path / "new" / "calls.npz"
     episodes = [episode(3, 0), episode(1, 1000), episode(2, 2000)]
     save_trajectories(path, episodes)
@@ -22,7 +25,7 @@ def test_rows_are_calls_in_order_and_ends_are_counted(tmp_path):
         assert file["observation.image"].dtype == np.uint8
 
 
-def test_the_same_episodes_give_the_same_bytes(tmp_path):
+def test_the_same_episodes_give_the_same_bytes(tmp_path: Path) -> None:
     for name in ("a.npz", "b.npz"):
         save_trajectories(tmp_path / name, [episode(2, 5)])
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()

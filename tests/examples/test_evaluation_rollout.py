@@ -1,7 +1,9 @@
 """Lockstep episodes: what the policy is given, and what is made of what it answers."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,13 +24,13 @@ class StayAway:
 
     def __init__(self) -> None:
         self.resets = 0
-        self.asked: list[tuple[np.ndarray, object, object]] = []
+        self.asked: list[tuple[np.ndarray, Any, Any]] = []
         self.last_report: SimpleNamespace | None = None
 
-    def reset(self):
+    def reset(self) -> None:
         self.resets += 1
 
-    def predict_action(self, obs, *, noise, plan=None):
+    def predict_action(self, obs: Any, *, noise: Any, plan: Any = None) -> Any:
         windows = obs["obs"]
         self.asked.append((windows, noise, plan))
         plans = np.full((len(windows), 3, 2), Source.COMPUTE, dtype=np.int8)
@@ -38,18 +40,19 @@ class StayAway:
         return {"action": np.full((count, 8, 2), 40.0, dtype=np.float32)}
 
 
-def variant(policy, plan=None):
+def variant(policy: Any, plan: str | None = None) -> Variant:
     return Variant("v", policy, plan, SHAPE)
 
 
-def test_score_of_an_episode_is_the_last():
+def test_score_of_an_episode_is_the_last() -> None:
     one = Episode(3, "", {"obs": np.zeros((4, 2, 20))}, np.zeros((3, 2)), np.array([0.1, 0.8, 0.8]), False, {})
     assert (one.score, one.calls) == (0.8, 4)
 
 
-def test_noise_is_a_function_of_seed_and_call():
+def test_noise_is_a_function_of_seed_and_call() -> None:
     together = seeded_noise(SHAPE, [4, 9], call=2)
     alone = seeded_noise(SHAPE, [9], call=2)
+    assert together.steps is not None and alone.steps is not None
     assert together.initial.shape == (2, 16, 2)
     assert together.steps.shape == (3, 2, 16, 2)
     assert together.initial.dtype == together.steps.dtype == np.float32
@@ -57,27 +60,28 @@ def test_noise_is_a_function_of_seed_and_call():
     np.testing.assert_array_equal(together.steps[:, 1:], alone.steps)
 
 
-def test_noise_differs_between_seeds_calls_and_steps():
+def test_noise_differs_between_seeds_calls_and_steps() -> None:
     one = seeded_noise(SHAPE, [4, 5], call=0)
     later = seeded_noise(SHAPE, [4, 5], call=1)
+    assert one.steps is not None and later.steps is not None
     draws = [one.initial[0], one.initial[1], later.initial[0], later.initial[1], *one.steps[:, 0], *later.steps[:, 0]]
     assert len({draw.tobytes() for draw in draws}) == len(draws)
 
 
-def test_pinned_noise_is_that_of_the_first_call():
+def test_pinned_noise_is_that_of_the_first_call() -> None:
     pinned = replace(SHAPE, pinned=True)
     first, later = seeded_noise(SHAPE, [4, 5], call=0), seeded_noise(pinned, [4, 5], call=3)
     np.testing.assert_array_equal(later.initial, first.initial)
     np.testing.assert_array_equal(later.steps, first.steps)
 
 
-def test_another_sampler_starts_from_the_same_noise():
+def test_another_sampler_starts_from_the_same_noise() -> None:
     fewer = seeded_noise(NoiseShape(steps=2, sample=(16, 2), stochastic=False), [4], call=0)
     np.testing.assert_array_equal(fewer.initial, seeded_noise(SHAPE, [4], call=0).initial)
     assert fewer.steps is None
 
 
-def test_two_policies_see_the_same_noise_and_first_observation():
+def test_two_policies_see_the_same_noise_and_first_observation() -> None:
     first, second = StayAway(), StayAway()
     run_batch(PushT, variant(first, "dense"), [1, 2])
     run_batch(PushT, variant(second), [1, 2])
@@ -89,13 +93,13 @@ def test_two_policies_see_the_same_noise_and_first_observation():
     np.testing.assert_array_equal(first.asked[0][0], second.asked[0][0])
 
 
-def test_the_batch_stays_the_same_when_an_episode_is_done():
+def test_the_batch_stays_the_same_when_an_episode_is_done() -> None:
     class OneSolved(PushT):
-        def reset(self, seed):
-            super().reset(seed, [60.0, 60.0, 256.0, 256.0, np.pi / 4] if seed == 1 else None)
+        def reset(self, seed: int, state: Sequence[float] | None = None) -> None:
+            super().reset(seed, [60.0, 60.0, 256.0, 256.0, np.pi / 4] if seed == 1 else state)
 
     policy = StayAway()
-    running = []
+    running: list[int] = []
     result = run_batch(OneSolved, variant(policy), [0, 1], on_call=running.append)
     assert [len(windows) for windows, _, _ in policy.asked] == [2] * 38
     assert [e.calls for e in result.episodes] == [38, 1]
@@ -109,9 +113,9 @@ def test_the_batch_stays_the_same_when_an_episode_is_done():
     assert sum(result.legalised) == 39
 
 
-def test_batches_give_what_single_episodes_give():
+def test_batches_give_what_single_episodes_give() -> None:
     policy = StayAway()
-    done = []
+    done: list[int] = []
     batched = run_episodes(PushT, variant(policy), range(5), batch=2, on_done=done.append)
     assert policy.resets == 3
     assert done[-1] == 5
@@ -126,55 +130,64 @@ def test_batches_give_what_single_episodes_give():
 class Counting:
     """An environment of numbers: the frame is how many actions were taken, and their sum."""
 
-    title, hz, max_steps, task, measures = "Counting", 1.0, 11, "count", {}
+    title, hz, max_steps, task = "Counting", 1.0, 11, "count"
+    measures: Mapping[str, float] = MappingProxyType({})
 
-    def reset(self, seed):
+    def reset(self, seed: int) -> None:
         self.seed, self.steps, self.sum, self.looked = seed, 0, 0.0, 0
 
     @property
-    def done(self):
+    def done(self) -> bool:
         return self.steps == self.max_steps
 
-    success = done
+    @property
+    def success(self) -> bool:
+        return self.done
 
     @property
-    def score(self):
+    def score(self) -> float:
         return self.steps / self.max_steps
 
-    def observe(self):
+    def observe(self) -> Any:
         self.looked += 1
         seen = np.array([self.steps, self.sum], np.float32)
         return {"seen": seen, "seed": np.array([self.seed], np.int64), "unused": np.zeros(7)}
 
-    def step(self, action):
+    def step(self, action: Any) -> None:
         assert not self.done
         self.steps, self.sum = self.steps + 1, self.sum + float(action[0])
 
-    def rest(self):
+    def rest(self) -> Any:
         return np.zeros(1, np.float32)
+
+    def picture(self) -> Any:
+        raise NotImplementedError
+
+    def close(self) -> None:
+        pass
 
 
 class Adder:
     """Chunks of four actions ``[1]``, each its number in the episode."""
 
-    def __init__(self, frames):
+    def __init__(self, frames: int) -> None:
         observation = {"seen": ObservationSpec((frames, 2)), "seed": ObservationSpec((1,), dtype="int64", window=False)}
         self.info = SimpleNamespace(observation=observation, action=ChunkSpec(1, 0, 4))
 
-    def reset(self):
+    def reset(self) -> None:
         self.calls = 0
 
-    def predict_action(self, obs, *, noise, plan=None):
+    def predict_action(self, obs: Any, *, noise: Any, plan: Any = None) -> Any:
         assert obs.keys() == self.info.observation.keys()
         first, self.calls = 4 * self.calls, self.calls + 1
         return {"action": np.arange(first, first + 4, dtype=np.float32).reshape(1, 4, 1)}
 
 
 @pytest.mark.parametrize("frames", [1, 2, 4, 6])
-def test_windows_are_the_last_frames_as_the_policy_specifies(frames):
-    made = []
+def test_windows_are_the_last_frames_as_the_policy_specifies(frames: int) -> None:
+    made: list[Counting] = []
 
-    def make():
+    def make() -> Counting:
         made.append(Counting())
         return made[-1]
 
@@ -193,7 +206,7 @@ def test_windows_are_the_last_frames_as_the_policy_specifies(frames):
     assert made[0].looked == 2 + 2 * seen + max(seen - 2, 0), "frames that nobody sees may be images: they cost"
 
 
-def test_a_policy_of_another_environment_is_refused():
+def test_a_policy_of_another_environment_is_refused() -> None:
     with pytest.raises(
         TtscompileError, match=r"v observes \['obs'\] and gives actions of shape \[2\]; Counting offers"
     ):

@@ -1,5 +1,8 @@
 """Score against latency, and episodes on several processes."""
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 from bootstrap import Estimate
@@ -16,21 +19,23 @@ from ttscompile.core.lattice import uniform_plan
 class Sleeper:
     """A policy of a known latency, which counts."""
 
-    def __init__(self, log, name):
+    def __init__(self, log: list[Any], name: str) -> None:
         self.log, self.name = log, name
 
-    def reset(self, seed=None):
+    def reset(self, seed: int | None = None) -> None:
         self.log.append((self.name, "reset"))
 
-    def predict_action(self, obs_dict, *, noise, plan="default"):
+    def predict_action(self, obs_dict: Any, *, noise: Any, plan: Any = "default") -> None:
         assert obs_dict["obs"].shape == (1, 2, 20)
         self.log.append((self.name, plan, float(noise.initial[0, 0, 0])))
 
 
-def test_calls_are_timed_in_turn_with_equal_noise():
-    log = []
+def test_calls_are_timed_in_turn_with_equal_noise() -> None:
+    log: list[Any] = []
     shape = NoiseShape(3, (4, 2), True)
-    variants = [Variant("a", Sleeper(log, "a"), None, shape), Variant("b", Sleeper(log, "b"), "dense", shape)]
+    first: Any = Sleeper(log, "a")
+    second: Any = Sleeper(log, "b")
+    variants = [Variant("a", first, None, shape), Variant("b", second, "dense", shape)]
     found = time_calls(variants, {"obs": np.zeros((7, 2, 20), np.float32)}, calls=3)
     assert [one.label for one in found] == ["a", "b"]
     assert all(0 < one.median <= one.p90 for one in found)
@@ -44,19 +49,20 @@ def test_calls_are_timed_in_turn_with_equal_noise():
     assert len({call[2] for call in calls}) == 5
 
 
-def test_no_call_is_spared_the_frames_of_the_one_before():
-    log = []
+def test_no_call_is_spared_the_frames_of_the_one_before() -> None:
+    log: list[Any] = []
 
     class Seeing(Sleeper):
-        def forget_frames(self):
+        def forget_frames(self) -> None:
             self.log.append((self.name, "forgets"))
 
-    shape = NoiseShape(3, (4, 2), True)
-    time_calls([Variant("a", Seeing(log, "a"), None, shape)], {"obs": np.zeros((7, 2, 20), np.float32)}, calls=2)
+    policy: Any = Seeing(log, "a")
+    variant = Variant("a", policy, None, NoiseShape(3, (4, 2), True))
+    time_calls([variant], {"obs": np.zeros((7, 2, 20), np.float32)}, calls=2)
     assert [one[1] for one in log] == ["reset", *["forgets", "default"] * 4]
 
 
-def test_the_picture_is_the_same_file_twice(tmp_path):
+def test_the_picture_is_the_same_file_twice(tmp_path: Path) -> None:
     scores = [Estimate(0.9, 0.85, 0.95), Estimate(0.8, 0.7, 0.88)]
     for name in ("one.png", "two.png"):
         plot_scores(
@@ -66,7 +72,7 @@ def test_the_picture_is_the_same_file_twice(tmp_path):
 
 
 @pytest.mark.slow
-def test_processes_fill_the_cache_with_the_episodes_of_one(compiled_pusht, tmp_path):
+def test_processes_fill_the_cache_with_the_episodes_of_one(compiled_pusht: Path, tmp_path: Path) -> None:
     """Two short-lived processes against this one; only what is missing is run."""
     import shutil
 
@@ -77,14 +83,14 @@ def test_processes_fill_the_cache_with_the_episodes_of_one(compiled_pusht, tmp_p
     store_schedules(artifact, None, {"one": plan}, "one", {"strategy": "interval"})
     text, told = f"{artifact}:one", []
 
-    def fill():
+    def fill() -> None:
         cache = tmp_path / "cache"
         fill_cache("pusht", [text], [7, 8], 1, "onnxruntime", cache, Processes(2), lambda *shown: told.append(shown))
 
     fill()
     assert told == [(text, 0), (text, 1), (text, 2)]
     cache = Episodes(tmp_path / "cache", "pusht", open_variant(text, "onnxruntime", 1), "onnxruntime")
-    assert [cache.read(seed).seed for seed in (7, 8)] == [7, 8]
+    assert [(kept := cache.read(seed)) and kept.seed for seed in (7, 8)] == [7, 8]
     told.clear()
     fill()
     assert told == [(text, 2)]

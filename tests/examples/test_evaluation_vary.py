@@ -1,9 +1,8 @@
 """What comes of calibrations that differ in one thing, and of a policy in the course of an episode."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
+from typing import Any
 
 import click
 import drift
@@ -47,22 +46,27 @@ class Counting:
     def reset(self) -> None:
         self.calls = 0
 
-    def predict_action(self, obs_dict, noise, plan):
+    def predict_action(self, obs_dict: Any, noise: Any, plan: Any) -> Any:
         self.calls += 1
         made = obs_dict["obs"][:, :1, :2] + noise.initial[:, :1] + self.share * self.calls
         return {"action": np.repeat(made, 8, axis=1)}
 
 
-def test_errors_are_of_calls_in_order_and_end_with_the_episode():
-    ours = Variant("ours", Counting(3.0), None, SHAPE)
+def counting(label: str) -> Variant:
+    policy: Any = Counting(3.0)
+    return Variant(label, policy, None, SHAPE)
+
+
+def test_errors_are_of_calls_in_order_and_end_with_the_episode() -> None:
+    ours = counting("ours")
     found = action_errors(ours, [episode(1, 3), episode(2, 1, executed=3)])
-    np.testing.assert_allclose(found, [[2, 4, 6], [2, np.nan, np.nan]], rtol=1e-5)
+    np.testing.assert_allclose(found, np.array([[2, 4, 6], [2, np.nan, np.nan]]), rtol=1e-5)
     np.testing.assert_allclose(action_errors(ours, [episode(1, 3)]), [[2, 4, 6]], rtol=1e-5)
     np.testing.assert_allclose(action_errors(ours, [episode(1, 3, share=3.0)]), [[0, 0, 0]], atol=1e-5)
 
 
-def test_a_drift_keeps_what_a_tenth_of_the_episodes_reached():
-    dense = Variant("dense", Counting(3.0), None, SHAPE)
+def test_a_drift_keeps_what_a_tenth_of_the_episodes_reached() -> None:
+    dense = counting("dense")
     episodes = [episode(1, 4), *(episode(seed, 2) for seed in range(2, 13))]
     found = drift.measured("ours", dense, episodes, episodes)
     assert [one.mean for one in found.errors] == pytest.approx([2, 4]), "one of twelve goes on"
@@ -72,7 +76,7 @@ def test_a_drift_keeps_what_a_tenth_of_the_episodes_reached():
 
 
 @pytest.mark.parametrize("text", ["episodes", "episodes=", "hours=1,2", "seed=a"])
-def test_what_may_differ_is_said(text):
+def test_what_may_differ_is_said(text: str) -> None:
     with pytest.raises(click.UsageError, match=r"expected one of episodes, minutes, seed, '=' and numbers"):
         vary.parsed(text)
 

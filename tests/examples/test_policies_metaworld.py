@@ -1,7 +1,5 @@
 """The policy of Meta-World's tasks: its checkpoint compiled and eager, its demonstrations, what it was trained on."""
 
-from __future__ import annotations
-
 import importlib.util
 from pathlib import Path
 from types import ModuleType

@@ -1,7 +1,5 @@
 """The U-Net for Push-T: its checkpoint compiled and eager, and what it was trained on."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,14 +1,14 @@
 """The benchmark's own arithmetic; no time is asserted."""
 
-import io
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from benchmark import WARM_UP, Contestant, Measurement, measure, random_plan, scripted_windows, speed_table, to_json
-from rich.console import Console
 from variants import NoiseShape
 
+from tests.examples.printed import printed
 from ttscompile import Source
 from ttscompile.core.lattice import illegal_cells
 from ttscompile.measure.machine import fingerprint, one_line
@@ -19,14 +19,14 @@ SHAPE = NoiseShape(steps=4, sample=(16, 2), stochastic=False)
 class Scripted:
     """Answers nothing, and writes down who was asked what."""
 
-    def __init__(self, name, log, reports):
+    def __init__(self, name: str, log: list[Any], reports: bool) -> None:
         self.name, self.log, self.reports = name, log, reports
-        self.last_report = None
+        self.last_report: Any = None
 
-    def reset(self):
+    def reset(self) -> None:
         self.log.append((self.name, "reset", None))
 
-    def predict_action(self, obs, *, noise, plan=None):
+    def predict_action(self, obs: Any, *, noise: Any, plan: Any = None) -> Any:
         self.log.append((self.name, plan, noise.initial.tobytes()))
         if self.reports:
             timings = SimpleNamespace(prologue=1.0, pruner=2.0)
@@ -37,7 +37,7 @@ class Scripted:
 
 
 @pytest.mark.parametrize("computed", [0.01, 0.05, 0.5, 1.0])
-def test_random_plan_has_its_share_and_is_legal_when_warm(computed):
+def test_random_plan_has_its_share_and_is_legal_when_warm(computed: float) -> None:
     plan = random_plan(100, 24, computed, seed=3)
     groups = [i % 3 for i in range(24)]
     assert plan.dtype == np.int8
@@ -48,12 +48,14 @@ def test_random_plan_has_its_share_and_is_legal_when_warm(computed):
     np.testing.assert_array_equal(plan, random_plan(100, 24, computed, seed=3))
 
 
-def test_contestants_take_turns_on_the_same_noise():
-    log = []
+def test_contestants_take_turns_on_the_same_noise() -> None:
+    log: list[Any] = []
+    first_policy: Any = Scripted("a", log, reports=False)
+    second_policy: Any = Scripted("b", log, reports=True)
     given = np.zeros((4, 2), np.int8)
     contestants = [
-        Contestant("eager", Scripted("a", log, reports=False), None, 80.0, SHAPE),
-        Contestant("given", Scripted("b", log, reports=True), given, 80.0, SHAPE),
+        Contestant("eager", first_policy, None, 80.0, SHAPE),
+        Contestant("given", second_policy, given, 80.0, SHAPE),
     ]
     first, second = measure(contestants, runs=4)
     assert log[:2] == [("a", "reset", None), ("b", "reset", None)]
@@ -69,7 +71,7 @@ def test_contestants_take_turns_on_the_same_noise():
     assert len(first.ms) == len(second.ms) == 4
 
 
-def test_ratios_are_of_medians():
+def test_ratios_are_of_medians() -> None:
     measurements = [
         Measurement("eager", (900.0, 1000.0, 5000.0), None, None, 16e9, 0.0, None),
         Measurement("dense", (250.0, 250.0, 250.0), 1.0, 0.0, 15e9, 0.0, None),
@@ -77,9 +79,7 @@ def test_ratios_are_of_medians():
     ]
     assert measurements[0].median == 1000.0
     assert measurements[0].quartiles == (950.0, 3000.0)
-    console = Console(file=io.StringIO(), width=200)
-    console.print(speed_table(measurements, threads=1))
-    row = next(line for line in console.file.getvalue().splitlines() if "sparse" in line)
+    row = next(line for line in printed(speed_table(measurements, threads=1)) if "sparse" in line)
     assert "25.00" in row
     assert "40.0" in row  # calls a second, and times eager
     assert "10.0" in row
@@ -89,13 +89,13 @@ def test_ratios_are_of_medians():
     assert document["flops_shares"] == {"prologue": 0.01, "pruner": 0.002}
 
 
-def test_scripted_windows_move():
+def test_scripted_windows_move() -> None:
     windows = scripted_windows(4)
     assert [window.shape for window in windows] == [(1, 2, 20)] * 4
     assert len({window.tobytes() for window in windows}) == 4
 
 
-def test_fingerprint_names_the_machine():
+def test_fingerprint_names_the_machine() -> None:
     machine = fingerprint()
     assert machine["cores"] >= 1
     assert machine["processor"]

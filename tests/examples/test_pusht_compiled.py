@@ -34,7 +34,7 @@ def windows() -> np.ndarray:
     return np.stack([frames, frames], axis=1)
 
 
-def test_dense_compiled_is_the_eager_policy(compiled_pusht, pusht_checkpoint, windows):
+def test_dense_compiled_is_the_eager_policy(compiled_pusht: Path, pusht_checkpoint: Path, windows: np.ndarray) -> None:
     eager = EagerPolicy(pusht_checkpoint, threads=1)
     dense = open_variant(f"{compiled_pusht}:dense", "onnxruntime", 1)
     assert dense.noise == eager.noise
@@ -46,14 +46,16 @@ def test_dense_compiled_is_the_eager_policy(compiled_pusht, pusht_checkpoint, wi
         np.testing.assert_allclose(found[key], expected[key], rtol=0, atol=PROMISED * 512)
 
 
-def test_eager_policy_has_no_plans(pusht_checkpoint, windows):
+def test_eager_policy_has_no_plans(pusht_checkpoint: Path, windows: np.ndarray) -> None:
     eager = EagerPolicy(pusht_checkpoint, threads=1)
     noise = seeded_noise(eager.noise, [0, 1], call=0)
     with pytest.raises(ValueError, match="computes everything"):
         eager.predict_action({"obs": windows}, noise=noise, plan=np.zeros((100, 24), np.int8))
 
 
-def test_contestants_of_the_benchmark(compiled_pusht, pusht_checkpoint, monkeypatch):
+def test_contestants_of_the_benchmark(
+    compiled_pusht: Path, pusht_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("benchmark.WARM_UP", 1)  # the dense call, so that every cache is written
     given = random_plan(100, 24, 0.05, seed=0)
     contestants, info = contestants_for(compiled_pusht, pusht_checkpoint, 1, given)
@@ -69,7 +71,7 @@ def test_contestants_of_the_benchmark(compiled_pusht, pusht_checkpoint, monkeypa
 
 
 @pytest.mark.slow
-def test_scripts_run_as_they_stand(compiled_layer, tmp_path):
+def test_scripts_run_as_they_stand(compiled_layer: Path, tmp_path: Path) -> None:
     calls = tmp_path / "calls.npz"
     told = run("record.py", compiled_layer, "-o", calls, "--episodes", 1)
     assert "1 episodes" in told

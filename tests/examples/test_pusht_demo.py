@@ -1,35 +1,32 @@
 """The tables that the demo ends with; ``make demo`` runs the rest."""
 
-import io
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from benchmark import Measurement
 from demo import COMPILED, DENSE, ORIGINAL, calibration_table, compare, conclusion, final_table
 from episodes import Episodes
-from evaluate import summarise
-from rich.console import Console
+from evaluate import Evaluation, summarise
 from rollout import Episode, Rollout
 from variants import open_variant
 
+from tests.examples.printed import printed
 from tests.plans import store_schedules
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.result import CalibrationResult, PlanScore
 from ttscompile.core.lattice import uniform_plan
 
 
-def printed(table):
-    console = Console(file=io.StringIO(), width=160)
-    console.print(table)
-    lines = console.file.getvalue().replace("┃", "│").splitlines()
-    return [[cell.strip() for cell in line.split("│")[1:-1]] for line in lines]
+def cells(table: Any) -> list[list[str]]:
+    return [[cell.strip() for cell in line.replace("┃", "│").split("│")[1:-1]] for line in printed(table, 160)]
 
 
-def rollout(coverage, seed=0):
+def rollout(coverage: float, seed: int = 0) -> Rollout:
     one = Episode(
         seed,
         "",
@@ -52,7 +49,7 @@ SPEEDS = [
 ]
 
 
-def evaluations(original, dense, compiled):
+def evaluations(original: float, dense: float, compiled: float) -> list[Evaluation]:
     """Of one episode each, which covered so much of the goal."""
     first = rollout(original)
     return [
@@ -61,8 +58,8 @@ def evaluations(original, dense, compiled):
     ]
 
 
-def test_final_table_has_speed_and_score_of_each():
-    rows = printed(final_table(SPEEDS, evaluations(0.97, 0.96, 0.76)))
+def test_final_table_has_speed_and_score_of_each() -> None:
+    rows = cells(final_table(SPEEDS, evaluations(0.97, 0.96, 0.76)))
     assert ["", "original", "16 steps, all computed", "compiled"] in rows
     assert ["ms a call, 1 thread", "1000.0", "500.0", "25.0"] in rows
     assert ["calls a second", "1.0", "2.0", "40.0"] in rows
@@ -77,7 +74,7 @@ def test_final_table_has_speed_and_score_of_each():
     assert ["its difference from all computed", "", "", "-100% [-100%, -100%]"] in rows
 
 
-def test_the_conclusion_says_whether_success_was_kept():
+def test_the_conclusion_says_whether_success_was_kept() -> None:
     kept = conclusion(SPEEDS, evaluations(0.97, 0.96, 0.98))
     assert kept.startswith("A compiled call takes 25 ms where the original takes 1000 ms: it is 40 times faster.")
     assert "Its success is not told apart from that of the original:" in kept
@@ -90,7 +87,7 @@ def test_the_conclusion_says_whether_success_was_kept():
 
 
 @pytest.mark.slow
-def test_episodes_that_were_run_before_are_compared(compiled_pusht, tmp_path):
+def test_episodes_that_were_run_before_are_compared(compiled_pusht: Path, tmp_path: Path) -> None:
     """Without running any: the three policies, from the files of their episodes to the figures."""
     original, artifact = (shutil.copytree(compiled_pusht, tmp_path / name) for name in ("original", "compiled"))
     manifest = load_artifact(artifact).manifest
@@ -105,7 +102,7 @@ def test_episodes_that_were_run_before_are_compared(compiled_pusht, tmp_path):
     assert [round(one.score.mean * 0.95, 6) for one in found] == [0.8, 0.8, 0.7]
 
 
-def test_calibration_table_names_the_default_and_the_baseline():
+def test_calibration_table_names_the_default_and_the_baseline() -> None:
     result = CalibrationResult(
         strategy="tts",
         seed=0,
@@ -121,12 +118,12 @@ def test_calibration_table_names_the_default_and_the_baseline():
         stopped="finished",
         seconds=60.0,
     )
-    rows = printed(calibration_table(result))
+    rows = cells(calibration_table(result))
     assert ["schedule (default)", "11.0", "47.0", "95.0%", "93.0%"] in rows
     assert ["uniform", "91.0", "288.0", "95.0%", "94.0%"] in rows
 
 
-def test_a_bad_checkpoint_is_one_clear_error(tmp_path):
+def test_a_bad_checkpoint_is_one_clear_error(tmp_path: Path) -> None:
     bad = tmp_path / "not-a-policy.ckpt"
     bad.write_text("nothing of the kind")
     script = Path(__file__).parents[2] / "examples" / "pusht" / "demo.py"

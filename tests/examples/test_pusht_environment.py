@@ -14,17 +14,17 @@ def demonstrations(shared: Path) -> dict[str, np.ndarray]:
         return {name: file[name] for name in file.files}
 
 
-def test_keypoints_turn_and_move_with_the_block():
+def test_keypoints_turn_and_move_with_the_block() -> None:
     quarter = keypoints([100.0, 200.0], np.pi / 2)
     np.testing.assert_allclose(quarter, np.stack([100 - KEYPOINTS[:, 1], 200 + KEYPOINTS[:, 0]], axis=-1))
 
 
-def test_embedded_keypoints_are_the_published_ones(shared):
+def test_embedded_keypoints_are_the_published_ones(shared: Path) -> None:
     published = np.load(shared / "data" / "pusht_keypoints_local.npy", allow_pickle=False)
     np.testing.assert_allclose(KEYPOINTS, published, rtol=1e-7)
 
 
-def test_keypoints_are_those_of_the_demonstrations(demonstrations):
+def test_keypoints_are_those_of_the_demonstrations(demonstrations: dict[str, np.ndarray]) -> None:
     state = demonstrations["state"].astype(np.float64)
     error = np.abs(keypoints(state[:, 2:4], state[:, 4]) - demonstrations["keypoint"]).max(axis=(1, 2))
     # 58 of the 25,650 frames, where the block is pressed into a wall or the agent, were recorded with keypoints of
@@ -33,7 +33,7 @@ def test_keypoints_are_those_of_the_demonstrations(demonstrations):
     assert error.max() < 2.1
 
 
-def test_every_demonstrated_keypoint_set_is_a_rigid_motion_of_ours(demonstrations):
+def test_every_demonstrated_keypoint_set_is_a_rigid_motion_of_ours(demonstrations: dict[str, np.ndarray]) -> None:
     world = demonstrations["keypoint"].astype(np.float64)
     centred = world - world.mean(axis=1, keepdims=True)
     local = KEYPOINTS - KEYPOINTS.mean(axis=0)
@@ -45,7 +45,7 @@ def test_every_demonstrated_keypoint_set_is_a_rigid_motion_of_ours(demonstration
     assert np.abs(residual).max() < 0.1
 
 
-def test_observation_is_keypoints_then_agent():
+def test_observation_is_keypoints_then_agent() -> None:
     state = [10.0, 20.0, 100.0, 200.0, 0.0]
     seen = observation(state)
     assert seen.shape == (20,)
@@ -55,7 +55,7 @@ def test_observation_is_keypoints_then_agent():
     np.testing.assert_array_equal(observation([state, state]), [seen, seen])
 
 
-def test_placed_block_has_its_vertices_where_the_state_says():
+def test_placed_block_has_its_vertices_where_the_state_says() -> None:
     environment = PushT()
     environment.reset(seed=0)
     world = environment._gym.unwrapped
@@ -63,10 +63,10 @@ def test_placed_block_has_its_vertices_where_the_state_says():
     # A quarter turn takes the stem's end (15, 120) to (-120, 15).
     corners = [tuple(world.block.local_to_world(v)) for shape in world.block.shapes for v in shape.get_vertices()]
     assert any(np.allclose(corner, (200 - 120, 300 + 15)) for corner in corners)
-    np.testing.assert_allclose(world.get_obs(), [30, 40, 200, 300, np.pi / 2])
+    np.testing.assert_allclose(world.get_obs(), np.array([30, 40, 200, 300, np.pi / 2]))
 
 
-def test_keypoints_lie_on_the_block_of_the_simulator():
+def test_keypoints_lie_on_the_block_of_the_simulator() -> None:
     environment = PushT()
     environment.reset(seed=3)
     world = environment._gym.unwrapped
@@ -88,7 +88,7 @@ def replay_error(states: np.ndarray, actions: np.ndarray) -> tuple[float, float,
     return error[:, :2].max(), error[:, 2:4].max(), error[:, 4].max()
 
 
-def test_demonstrated_actions_lead_to_the_demonstrated_states(demonstrations):
+def test_demonstrated_actions_lead_to_the_demonstrated_states(demonstrations: dict[str, np.ndarray]) -> None:
     ends = demonstrations["episode_ends"]
     errors = []
     for episode in range(0, len(ends), 15):
@@ -104,7 +104,7 @@ def test_demonstrated_actions_lead_to_the_demonstrated_states(demonstrations):
     assert angle.max() < 0.01
 
 
-def test_an_episode_ends_after_the_original_number_of_steps():
+def test_an_episode_ends_after_the_original_number_of_steps() -> None:
     environment, steps = PushT(), 0
     environment.reset(seed=0)
     while not environment.done:
@@ -113,7 +113,7 @@ def test_an_episode_ends_after_the_original_number_of_steps():
     assert steps == environment.max_steps == 300
 
 
-def test_the_score_is_the_best_coverage_as_a_share_of_what_counts_as_success():
+def test_the_score_is_the_best_coverage_as_a_share_of_what_counts_as_success() -> None:
     environment = PushT()
     environment.reset(seed=0, state=[60.0, 60.0, 256.0, 256.0, np.pi / 4])
     environment.step([60.0, 60.0])
@@ -132,7 +132,7 @@ def test_the_score_is_the_best_coverage_as_a_share_of_what_counts_as_success():
     assert environment.measures["best coverage"] >= first
 
 
-def test_picture_shows_agent_block_and_target_where_they_are():
+def test_picture_shows_agent_block_and_target_where_they_are() -> None:
     environment = PushT()
     environment.reset(seed=0, state=[100.0, 400.0, 300.0, 200.0, 0.0])
     assert environment.picture().shape == (512, 512, 3)
@@ -146,7 +146,7 @@ def test_picture_shows_agent_block_and_target_where_they_are():
     assert nothing.min() > 240
 
 
-def test_pixels_are_what_gym_pusht_observes():
+def test_pixels_are_what_gym_pusht_observes() -> None:
     import gymnasium
 
     environment = PushTPixels()

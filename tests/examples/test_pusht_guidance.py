@@ -1,7 +1,5 @@
 """Guidance to the chunk before: its weights, its gradient, and what a chunk is guided to."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any

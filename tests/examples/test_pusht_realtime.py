@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,18 +30,18 @@ class Pusher:
     def reset(self) -> None:
         pass
 
-    def predict_action(self, obs_dict, noise, plan):
+    def predict_action(self, obs_dict: Any, noise: Any, plan: Any) -> Any:
         assert noise.initial.shape == (1, 16, 2)
         block = obs_dict["obs"][:, -1, :18].reshape(1, 9, 2).mean(axis=1)
         return {"action_pred": np.repeat(block[:, None], 16, axis=1)}
 
 
 @pytest.fixture(scope="module")
-def info(compiled_pusht: Path) -> Info:
+def info(compiled_pusht: Path) -> Any:
     return Info(ttscompile.load(compiled_pusht).info)
 
 
-def test_a_quick_policy_misses_nothing_and_a_slow_one_is_seen_to(info: Info, tmp_path: Path) -> None:
+def test_a_quick_policy_misses_nothing_and_a_slow_one_is_seen_to(info: Any, tmp_path: Path) -> None:
     shape = NoiseShape(4, (16, 2), True)
     quick = drive("quick", NumberedNoise(Pusher(), info, shape, True), 20, 2.0, 0, 3, tmp_path / "quick.json")
     assert quick.missed_ticks <= quick.late_ticks  # none, unless the loop itself stood still
@@ -49,7 +50,7 @@ def test_a_quick_policy_misses_nothing_and_a_slow_one_is_seen_to(info: Info, tmp
         assert quick.statistics["ticks"] >= 35
 
     class Slow(Pusher):
-        def predict_action(self, obs_dict, noise, plan):
+        def predict_action(self, obs_dict: Any, noise: Any, plan: Any) -> Any:
             import time
 
             time.sleep(0.7)
@@ -62,11 +63,11 @@ def test_a_quick_policy_misses_nothing_and_a_slow_one_is_seen_to(info: Info, tmp
     assert names.count("tick") == quick.statistics["ticks"]
 
 
-def test_noise_is_numbered_from_the_seed_of_the_episode(info: Info) -> None:
-    seen = []
+def test_noise_is_numbered_from_the_seed_of_the_episode(info: Any) -> None:
+    seen: list[float] = []
 
     class Noting(Pusher):
-        def predict_action(self, obs_dict, noise, plan):
+        def predict_action(self, obs_dict: Any, noise: Any, plan: Any) -> Any:
             seen.append(float(noise.initial[0, 0, 0]))
             return super().predict_action(obs_dict, noise, plan)
 

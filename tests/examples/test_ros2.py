@@ -1,7 +1,5 @@
 """The ROS 2 node on a stand-in for rclpy: not on ROS 2, which is not here."""
 
-from __future__ import annotations
-
 import sys
 from array import array
 from collections.abc import Iterator
@@ -170,7 +168,9 @@ def test_joints_come_in_any_order_and_pictures_as_rows_of_bytes(node_module: Mod
     with pytest.raises(ObservationError, match=r"joints \['hip'\] are not in the message"):
         node_module.from_joints(state, ["hip"], "float32")
     rows = bytes([0, 51, 102, 153, 204, 255, 9, 9])  # two pixels, and two bytes that belong to none
-    picture = node_module.from_picture(ros.Image(height=1, width=2, encoding="rgb8", step=8, data=rows), "float32")
+    picture = node_module.from_picture(
+        ros.Image(height=1, width=2, encoding="rgb8", step=8, data=array("B", rows)), "float32"
+    )
     np.testing.assert_allclose(picture, np.array([[[0, 0.6]], [[0.2, 0.8]], [[0.4, 1]]]), rtol=1e-6)
     with pytest.raises(ObservationError, match="found 'bgr8'"):
         node_module.from_picture(ros.Image(encoding="bgr8"), "float32")

@@ -1,7 +1,5 @@
 """The example of a whole vision-language-action policy, on the tiny one that lerobot saved."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -67,7 +67,6 @@ def test_jitter_is_measured_beside_the_plan_that_a_robot_runs(toy_compiled: Path
         (["--control-hz", 25, "--policy-hz", 10], "no multiple of policy_hz"),
         (["--control-hz", 10, "--plan", "quick"], "no plan 'quick'"),
         (["--control-hz", 10, "--horizon", 9], "Give at most 2"),
-        (["--control-hz", 10, "--reserve", 1], "Give at most 0"),
         ([], "--control-hz"),
     ],
 )

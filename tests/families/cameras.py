@@ -1,9 +1,8 @@
 """Small policies that see: cameras and an instruction, with towers just large enough to be pieces of their own."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -32,7 +31,7 @@ class Tower(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         for layer in self.layers:
             x = torch.relu(layer(x))
-        return self.out(x.mean((2, 3)))  # type: ignore[no-any-return]
+        return self.out(x.mean((2, 3)))
 
 
 class Patches(nn.Module):
@@ -40,7 +39,7 @@ class Patches(nn.Module):
 
     def __init__(self, kind: str) -> None:
         super().__init__()
-        sizes = {"hidden_size": 64, "intermediate_size": 256, "num_hidden_layers": 3, "num_attention_heads": 2}
+        sizes: Any = {"hidden_size": 64, "intermediate_size": 256, "num_hidden_layers": 3, "num_attention_heads": 2}
         clip = VisionConfig(**sizes, image_size=SIDE, patch_size=4)
         siglip = SiglipConfig(**sizes, image_size=SIDE, patch_size=4)
         self.tower = ClipVision(clip) if kind == "clip" else Siglip(siglip, (SIDE, SIDE))
@@ -51,7 +50,7 @@ class Patches(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         seen = self.tower(2 * x - 1)
-        return self.out(seen if self.pooled else seen.mean(1))  # type: ignore[no-any-return]
+        return self.out(seen if self.pooled else seen.mean(1))
 
 
 class Eyes(nn.Module):
@@ -78,7 +77,7 @@ class Eyes(nn.Module):
         rows = [x.flatten(0, 1) for x in images]
         if self.kind in ("stacked", "clip", "siglip"):
             seen = self.towers[0](torch.stack(rows, 1).flatten(0, 1))
-            return seen.reshape(-1, TO * len(images) * seen.shape[-1])  # type: ignore[no-any-return]
+            return seen.reshape(-1, TO * len(images) * seen.shape[-1])
         own = [self.towers[i % len(self.towers)](x) for i, x in enumerate(rows)]
         return torch.cat([x.reshape(-1, TO * x.shape[-1]) for x in own], -1)
 
@@ -95,7 +94,7 @@ class Reader(nn.Module):
         x = self.embed(tokens) * mask[..., None]
         for layer in self.layers:
             x = torch.relu(layer(x))
-        return self.out(x.mean(1))  # type: ignore[no-any-return]
+        return self.out(x.mean(1))
 
 
 class Encoder(nn.Module):
@@ -125,7 +124,7 @@ class Denoiser(nn.Module):
         x, seen = self.embed(sample) + timestep.reshape(-1, 1, 1), self.read(features)[:, None]
         for block in self.blocks:
             x = x + torch.relu(block(x) + seen)
-        return self.head(x)  # type: ignore[no-any-return]
+        return self.head(x)
 
 
 def compile_seeing(folder: Path) -> None:

@@ -1,7 +1,5 @@
 """What every family has to pass."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from pathlib import Path

@@ -3,7 +3,7 @@
 Parameters are called as in the original. Token 0 is the sum of timestep and condition.
 """
 
-from __future__ import annotations
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -42,6 +42,7 @@ class CogACTHead(nn.Module):
     ) -> None:
         super().__init__()
         self.guidance = guidance
+        self.z_embedder: Any
         self.x_embedder, self.t_embedder, self.z_embedder = (
             _Linear(actions, width),
             TimestepEmbedder(width),

@@ -4,9 +4,8 @@ Parameters are called as in the original. Everything is sequence first, ``[T, B,
 the encoder is post-norm. It is a condition: it leaves the loop.
 """
 
-from __future__ import annotations
-
 import math
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -85,7 +84,8 @@ class DiTPolicyHead(nn.Module):
         self.ac_proj = nn.Sequential(
             nn.Linear(actions, actions), nn.GELU(approximate="tanh"), nn.Linear(actions, width)
         )
-        self.encoder, self.decoder = nn.Module(), nn.Module()
+        self.encoder: Any = nn.Module()
+        self.decoder: Any = nn.Module()
         self.encoder.layers = nn.ModuleList(_Encoder(width, heads, hidden) for _ in range(layers))
         self.decoder.layers = nn.ModuleList(_Decoder(width, heads, hidden) for _ in range(layers))
         self.eps_out = _Final(width, actions)

@@ -5,9 +5,8 @@ the timestep are computed apart from those of the actions. The ones are computed
 all steps in one batch.
 """
 
-from __future__ import annotations
-
 import math
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -75,7 +74,8 @@ class DitaHead(nn.Module):
     def __init__(self, width: int, heads: int, hidden: int, layers: int, actions: int) -> None:
         super().__init__()
         self.width = width
-        self.transformer, self.transformer.model = nn.Module(), nn.Module()
+        self.transformer: Any = nn.Module()
+        self.transformer.model = nn.Module()
         self.transformer.model.layers = nn.ModuleList(_Layer(width, heads, hidden) for _ in range(layers))
         self.transformer.model.norm = _Norm(width)
         self.transformer.lm_head = nn.Linear(width, actions, bias=False)

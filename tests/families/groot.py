@@ -4,9 +4,8 @@ Parameters are called as in the original. Encoder and decoder of the actions hav
 embodiment is chosen when the policy is compiled.
 """
 
-from __future__ import annotations
-
 import math
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -102,7 +101,7 @@ class _Layer(nn.Module):
 class _Time(nn.Module):
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.timestep_embedder = nn.Module()
+        self.timestep_embedder: Any = nn.Module()
         self.timestep_embedder.linear_1 = nn.Linear(256, width)
         self.timestep_embedder.linear_2 = nn.Linear(width, width)
 

@@ -1,7 +1,5 @@
 """Action heads of vision-language-action models, rebuilt, and what their originals made; see ``golden/README.md``."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import diffusers

@@ -1,7 +1,5 @@
 """Layers as people write them: by hand, fused, rotary, normalised; parts of the modules in this folder."""
 
-from __future__ import annotations
-
 import math
 
 import torch
@@ -25,11 +23,11 @@ class Waves(nn.Module):
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.half = width // 2
+        self.count = width // 2
         self.up, self.down = nn.Linear(width, 2 * width), nn.Linear(2 * width, width)
 
     def forward(self, t: Tensor) -> Tensor:
-        frequencies = torch.exp(-math.log(10000) * torch.arange(self.half, dtype=torch.float32) / self.half)
+        frequencies = torch.exp(-math.log(10000) * torch.arange(self.count, dtype=torch.float32) / self.count)
         angle = t[:, None].float() * frequencies[None]
         return self.down(functional.silu(self.up(torch.cat([angle.cos(), angle.sin()], -1))))
 

@@ -3,8 +3,6 @@
 All take ``sample [B, 6, 3]``, ``timestep [B]`` and ``obs [B, 5, 7]``, and have two layers of width 16.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch
@@ -21,7 +19,9 @@ class Base(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.a, self.z, self.o = nn.Linear(CHANNELS, WIDTH), nn.Linear(WIDTH, CHANNELS), nn.Linear(FEATURES, WIDTH)
+        self.a: nn.Module = nn.Linear(CHANNELS, WIDTH)
+        self.z: nn.Module = nn.Linear(WIDTH, CHANNELS)
+        self.o = nn.Linear(FEATURES, WIDTH)
         self.w = Waves(WIDTH)
         self.p = nn.Parameter(0.1 * torch.randn(1, HORIZON, WIDTH))
 
@@ -248,7 +248,8 @@ class Rotor(Base):
                 torch.view_as_real(torch.view_as_complex(one.unflatten(-1, (-1, 2))) * self.r[:, None]).flatten(3)
                 for one in (q, k)
             )
-            y = functional.scaled_dot_product_attention(*(one.transpose(1, 2) for one in (q, k, v)))
+            q, k, v = (one.transpose(1, 2) for one in (q, k, v))
+            y = functional.scaled_dot_product_attention(q, k, v)
             x = x + self.e(y.transpose(1, 2).flatten(2))
         return self.z(x)
 

@@ -4,9 +4,8 @@ Parameters are called as in LeRobot's checkpoints. In pi0.5 the norms are modula
 they norm: all of that is a table.
 """
 
-from __future__ import annotations
-
 import math
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -99,7 +98,7 @@ class PiHead(nn.Module):
         model = nn.Module()
         model.layers = nn.ModuleList(_Layer(width, heads, groups, channels, hidden, adaptive) for _ in range(layers))
         model.norm = _Norm(width, adaptive)
-        self.paligemma_with_expert = nn.Module()
+        self.paligemma_with_expert: Any = nn.Module()
         self.paligemma_with_expert.gemma_expert = nn.Module()
         self.paligemma_with_expert.gemma_expert.model = model
         self.action_in_proj, self.action_out_proj = nn.Linear(actions, width), nn.Linear(width, actions)

@@ -4,8 +4,6 @@ Parameters are called as in an RDT checkpoint. The norm divides by the deviation
 that is what timm 1.0.3 does, which RDT was trained with.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional

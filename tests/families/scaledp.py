@@ -3,8 +3,6 @@
 Parameters are called as in the original. It computes the waves of its timestep in bfloat16 whatever its weights are.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -4,9 +4,8 @@ Parameters are called as in a SmolVLA checkpoint. Keys and values of the prefix 
 rotated already; odd layers project them once more, which does not depend on the sample.
 """
 
-from __future__ import annotations
-
 import math
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -99,7 +98,7 @@ class SmolVLAHead(nn.Module):
         super().__init__()
         self.width = width
         each = [_Layer(width, heads, groups, channels, hidden, crosses=i % 2 == 1) for i in range(layers)]
-        self.vlm_with_expert = nn.Module()
+        self.vlm_with_expert: Any = nn.Module()
         self.vlm_with_expert.lm_expert = _Expert(each, width)
         self.action_in_proj, self.action_out_proj = nn.Linear(actions, width), nn.Linear(width, actions)
         self.action_time_mlp_in, self.action_time_mlp_out = nn.Linear(2 * width, width), nn.Linear(width, width)

@@ -4,8 +4,6 @@ A test of a family compiles it and calls ``record``, which compares what it find
 differ the message holds the row to paste. ``python -m tests.families.support`` writes the table into the page.
 """
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``compile_denoiser`` on modules that nobody prepared: which blocks it finds, and that it computes the same."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The support table is what the record says, and the record is what the tests of the families found."""
 
-from __future__ import annotations
-
 from ttscompile.frontends.refusals import DIRECTORIES, POLICIES, STATES
 
 from .support import PAGE, in_page, read_record, render

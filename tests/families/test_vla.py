@@ -1,7 +1,5 @@
 """Action heads of vision-language-action models against outputs of the originals; see ``golden/README.md``."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

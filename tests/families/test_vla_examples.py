@@ -1,7 +1,5 @@
 """The wrappers of ``examples/vla`` for other people's modules, on stand-ins with what the wrappers use of these."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Random weights by the names of parameters, the same here and where the golden files were made."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

@@ -1,6 +1,4 @@
-"""``ttscompile fleet``: what it refuses, and, where Ray is installed, copies that answer in batches by plan."""
-
-from __future__ import annotations
+"""``ttscompile serve --copies``: what it refuses; and, where Ray is installed, copies that answer in batches."""
 
 import importlib.util
 import json
@@ -37,6 +35,10 @@ ray_needed = pytest.mark.skipif(
         (("--plan", "memory"), "another robot's"),
         (("--plan", "nothing"), "expected one of ['dense', 'evenly']"),
         (("--copies", "0"), "0 is not in the range"),
+        (("--control-hz", "10"), "give --control-hz HZ to drive one robot, or --copies N to answer many"),
+        (("--margin-ticks", "0"), "--margin-ticks is for --control-hz: give it too"),
+        (("--device", "cpu"), "--device is for --control-hz: give it too"),
+        (("--plan", "dense", "--plan", "evenly"), "--copies takes one --plan"),
     ],
 )
 def test_what_cannot_be_is_refused_before_anything_starts(
@@ -44,14 +46,14 @@ def test_what_cannot_be_is_refused_before_anything_starts(
 ) -> None:
     monkeypatch.delenv("TTSCOMPILE_TOKEN", raising=False)
     monkeypatch.setitem(sys.modules, "ray", None)
-    result = CliRunner().invoke(main, ["fleet", str(planned), *options])
+    result = CliRunner().invoke(main, ["serve", str(planned), "--copies", "1", *options])
     assert (result.exit_code, result.stdout) == (2, ""), result.output
     assert message in " ".join(result.stderr.split())
 
 
 def test_without_ray_it_says_what_to_install(planned: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    result = CliRunner().invoke(main, ["fleet", str(planned)])
+    result = CliRunner().invoke(main, ["serve", str(planned), "--copies", "1"])
     assert (result.exit_code, result.stdout) == (2, "")
     assert "pip install 'ttscompile[ray,serve]'" in " ".join(result.stderr.split())
 
@@ -59,7 +61,7 @@ def test_without_ray_it_says_what_to_install(planned: Path, monkeypatch: pytest.
 @contextmanager
 def running(planned: Path, *options: str) -> Iterator[str]:
     """The command, until the block ends; its url."""
-    command = [sys.executable, "-m", "ttscompile", "fleet", str(planned), "--port", "0", *options]
+    command = [sys.executable, "-m", "ttscompile", "serve", str(planned), "--copies", "1", "--port", "0", *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         try:
@@ -90,7 +92,7 @@ def test_a_fleet_is_answered_in_batches_of_one_plan(planned: Path) -> None:
                 refused[i, turn] = str(error)
         client.close()
 
-    with running(planned, "--copies", "1", "--wait-ms", "50") as url:
+    with running(planned, "--wait-ms", "50") as url:
         assert get(url, "/health") == (200, "ok\n")
         robots = [threading.Thread(target=robot, args=(i, url)) for i in range(12)]
         for each in robots:
@@ -112,7 +114,7 @@ def test_a_fleet_is_answered_in_batches_of_one_plan(planned: Path) -> None:
 @pytest.mark.slow
 @ray_needed
 def test_a_copy_that_dies_is_replaced_and_the_fleet_is_answered(planned: Path) -> None:
-    with running(planned, "--copies", "1") as url:
+    with running(planned) as url:
         call = Client(url, timeout=60.0)
         assert call("predict", obs={"obs": [1.0, 0.0]})["action"]
         (copy,) = processes("ServeReplica:")

@@ -1,7 +1,5 @@
 """The server of a fleet, with copies that are scripted: what it lets through, and what it tells."""
 
-from __future__ import annotations
-
 import asyncio
 import importlib.util
 import threading

@@ -5,8 +5,6 @@
 Pages of mapped files are not counted: the system takes them back when others need the room.
 """
 
-from __future__ import annotations
-
 import sys
 import threading
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Small checkpoints, built as the original saves them but with plain dictionaries for the configuration."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@
 ``golden/make_hybrid.py`` gives the original implementation the same weights, observations and noise.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -168,13 +166,13 @@ def fill(shapes: Mapping[str, torch.Tensor], seed: int) -> dict[str, torch.Tenso
 def normalizer(variant: str) -> dict[str, torch.Tensor]:
     """Scale and offset of every key and of the action."""
     made = VARIANTS[variant]
-    fields = {}
+    fields: dict[str, Any] = {}
     for key, attributes in made["obs"].items():
         if attributes.get("type") == "rgb":
-            scale, offset = (np.array([value], np.float32) for value in made["image"])
+            fields[key] = [np.array([value], np.float32) for value in made["image"]]
         else:
-            scale, offset = np.linspace(0.5, 2, attributes["shape"][0]), np.linspace(-0.4, 0.3, attributes["shape"][0])
-        fields[key] = (scale, offset)
+            (width,) = attributes["shape"]
+            fields[key] = (np.linspace(0.5, 2, width), np.linspace(-0.4, 0.3, width))
     fields["action"] = (np.linspace(0.5, 2, ACTION), np.linspace(-1, 1, ACTION))
     return {
         f"normalizer.params_dict.{key}.{name}": torch.from_numpy(np.asarray(value, np.float32))

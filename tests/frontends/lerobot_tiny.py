@@ -1,7 +1,5 @@
 """Tiny LeRobot policies with random weights, saved as lerobot saves them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
@@ -14,9 +12,9 @@ from ttscompile.frontends.lerobot_multi_task_dit import MultiTaskDiTConfig, Netw
 
 TO, DS, DA, SIDE = 2, 5, 3, 24
 
-VISION = {"hidden_size": 8, "intermediate_size": 12, "num_hidden_layers": 1, "num_attention_heads": 2}
+VISION: dict[str, Any] = {"hidden_size": 8, "intermediate_size": 12, "num_hidden_layers": 1, "num_attention_heads": 2}
 VISION |= {"image_size": 16, "patch_size": 8}
-TEXT = {"hidden_size": 8, "intermediate_size": 12, "num_hidden_layers": 1, "num_attention_heads": 2}
+TEXT: dict[str, Any] = {"hidden_size": 8, "intermediate_size": 12, "num_hidden_layers": 1, "num_attention_heads": 2}
 TEXT |= {"vocab_size": 20, "max_position_embeddings": 9, "eos_token_id": 19}
 
 _BASE: dict[str, Any] = {
@@ -122,7 +120,7 @@ def write_processors(
 
 def _statistics(generator: torch.Generator, images: list[str]) -> dict[str, torch.Tensor]:
     """Every statistic of every feature; the last channel of state and action never changed."""
-    found = {}
+    found: dict[str, torch.Tensor] = {}
     for key, width in (("observation.state", DS), ("action", DA), *((image, 3) for image in images)):
         shape = (width, 1, 1) if key in images else (width,)
         low, spread = torch.randn(shape, generator=generator), torch.rand(shape, generator=generator) + 0.5

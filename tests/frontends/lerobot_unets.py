@@ -3,8 +3,6 @@
 ``golden/make_lerobot_unets.py`` gives lerobot the same directories, observations and noise.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
@@ -104,7 +102,7 @@ def save(variant: str, directory: Path) -> Path:
     inputs = {key: each for key, each in described.items() if key not in outputs}
     own = {"input_features": inputs, "output_features": outputs, "normalization_mapping": made["modes"]}
     write_json(directory / "config.json", _BASE | own | made["settings"])
-    statistics = {}
+    statistics: dict[str, torch.Tensor] = {}
     for key, (kind, shape) in features.items():
         of = (shape[0], 1, 1) if kind == "VISUAL" else tuple(shape)
         low, width = torch.linspace(-0.3, 0.2, shape[0]).reshape(of), torch.linspace(0.7, 1.4, shape[0]).reshape(of)

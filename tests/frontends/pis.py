@@ -3,8 +3,6 @@
 ``golden/make_lerobot_pi.py`` gives lerobot the same directories, observations and noise.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -45,12 +43,12 @@ def save(kind: str, directory: Path) -> Path:
     inputs: dict[str, Any] = {STATE: {"type": "STATE", "shape": [STATE_DIM]}}
     inputs |= {key: {"type": "VISUAL", "shape": [3, *SIZES[0]]} for key in CAMERAS}
     outputs = {"action": {"type": "ACTION", "shape": [ACTION_DIM]}}
-    entries = {"type": kind, "device": "cpu", "input_features": inputs, "output_features": outputs}
+    entries: dict[str, Any] = {"type": kind, "device": "cpu", "input_features": inputs, "output_features": outputs}
     entries |= {"chunk_size": HORIZON, "n_action_steps": 4, "max_state_dim": PADDED, "max_action_dim": PADDED}
     entries |= {"num_inference_steps": STEPS, "image_resolution": list(SIZES[0]), "tokenizer_max_length": LENGTH}
     write_json(directory / "config.json", entries | {"normalization_mapping": _MODES})
     norm = {"eps": 1e-8, "features": inputs | outputs, "norm_map": _MODES}
-    statistics = {}
+    statistics: dict[str, torch.Tensor] = {}
     for key, count in ((STATE, STATE_DIM), ("action", ACTION_DIM)):
         low = torch.linspace(-1.5, 0.5, count)
         statistics |= {f"{key}.{name}": low.clone() for name in ("mean", "q01")}

@@ -1,7 +1,5 @@
 """Reading files that are hostile, damaged or foreign: one clear error, and nothing of the file is executed."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import pickle

@@ -1,7 +1,5 @@
 """Configuration to policy: variants, sizes, samplers, and every way in which configuration and weights can disagree."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

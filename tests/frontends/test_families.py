@@ -1,13 +1,12 @@
 """The rows of the policy families: each can be loaded, and options reach it from the command line and from Python."""
 
-from __future__ import annotations
-
 import inspect
 import subprocess
 import sys
 from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import click
 import pytest
@@ -45,8 +44,9 @@ def test_options_are_the_arguments_of_convert_and_of_the_command_line() -> None:
 @pytest.mark.parametrize("option", sorted(OPTIONS))
 def test_an_option_of_other_families_is_refused_before_anything_is_loaded(option: str, tmp_path: Path) -> None:
     own = Family("own", "our own", "a file", "file", lambda path: True, "there_is_no_such_module", frozenset())
+    given: dict[str, Any] = {option: 7 if option in ("steps", "prediction_horizon") else "x"}
     with pytest.raises(CheckpointError, match=rf"the option {option} is for .* policies; this is one of our own"):
-        own.load(tmp_path / "policy", LoadOptions(**{option: 7 if option in ("steps", "prediction_horizon") else "x"}))
+        own.load(tmp_path / "policy", LoadOptions(**given))
 
 
 def test_the_narrower_family_is_asked_first(tmp_path: Path) -> None:

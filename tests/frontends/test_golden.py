@@ -1,7 +1,5 @@
 """Parity with the original implementation, on checkpoints that it saved."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

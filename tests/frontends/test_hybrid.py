@@ -1,7 +1,5 @@
 """Diffusion Policy's transformer on images, against numbers that the original gave; see ``golden/make_hybrid.py``."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Callable

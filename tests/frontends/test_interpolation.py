@@ -1,7 +1,5 @@
 """``${...}`` in a configuration: resolved by a small safe language, or refused by the key's name."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

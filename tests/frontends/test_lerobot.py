@@ -1,7 +1,5 @@
 """LeRobot policies of our own: variants against their definitions, and every way a directory can be wrong."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,7 +33,7 @@ from ..runtimes.agreement import call_terms, largest_difference
 from .lerobot_tiny import DA, DS, SIDE, TEXT, TO, VISION, change_json, dit_config, save_policy
 
 STATE, TOKENS, MASK = "observation.state", "observation.language.tokens", "observation.language.attention_mask"
-PLAIN = {"use_rope": False, "use_positional_encoding": True}
+PLAIN: dict[str, Any] = {"use_rope": False, "use_positional_encoding": True}
 
 
 def load(directory: Path, **options: Any) -> tuple[EncodedDenoiser, Any]:
@@ -201,7 +199,9 @@ def test_identity_leaves_as_it_is(tmp_path: Path) -> None:
 def test_samplers_against_plain_loops(tmp_path: Path, objective: str, options: dict[str, int]) -> None:
     """The table against diffusers' own loop, and against textbook integration."""
     flow = objective != "sample"
-    changes = {"objective": "flow_matching", "integration_method": objective} if flow else {"prediction_type": "sample"}
+    changes: dict[str, Any] = (
+        {"objective": "flow_matching", "integration_method": objective} if flow else {"prediction_type": "sample"}
+    )
     module, spec = load(save_policy(tmp_path, **PLAIN, **changes), **options)
     obs, x = observe(spec), torch.randn(2, 8, DA, generator=torch.Generator().manual_seed(0))
     noise = x.numpy().copy()
@@ -210,7 +210,7 @@ def test_samplers_against_plain_loops(tmp_path: Path, objective: str, options: d
         condition = module.encoder({spec.arguments[key]: value for key, value in obs.items()})
 
         def network(value: torch.Tensor, t: Any) -> torch.Tensor:
-            return module.denoiser(value, torch.full((2,), t), condition)  # type: ignore[no-any-return]
+            return module.denoiser(value, torch.full((2,), t), condition)
 
         if not flow:
             scheduler = DDIMScheduler(20, prediction_type="sample", beta_schedule="squaredcos_cap_v2")
@@ -248,13 +248,13 @@ def test_rk4_with_plain_attention_compiles(tmp_path: Path) -> None:
     with Counted() as counted:
         expected = spec.chunk.normalizer.unnormalize(eager_policy(module, spec)(obs, noise).numpy())
     artifact = load_artifact(tmp_path / "compiled")
-    runtimes = [open_runtime(artifact, name) for name in ("onnxruntime", "reference")]
+    product, reference = (open_runtime(artifact, name) for name in ("onnxruntime", "reference"))
     for name in ("onnxruntime", "reference"):
         policy = ttscompile.load(tmp_path / "compiled", runtime=name)
         found = policy.predict_action(obs, noise=noise, plan="dense")["action_pred"]
         assert_equal_but_for_rounding(found, expected, counted.terms, counted.angle)
         assert len(policy.info.blocks) == 2 and policy.info.K == 12
-    found = largest_difference(artifact, *runtimes, np.random.default_rng(1), streams=2, calls=3)
+    found = largest_difference(artifact, product, reference, np.random.default_rng(1), streams=2, calls=3)
     assert found < bound(call_terms(artifact))
 
 

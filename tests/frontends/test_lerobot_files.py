@@ -1,7 +1,5 @@
 """Files by which LeRobot takes a compiled policy for one of its own. ``tests/plugins`` has LeRobot read them."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

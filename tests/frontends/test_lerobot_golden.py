@@ -1,7 +1,5 @@
 """Parity with LeRobot 0.6.1: from raw state, image and tokens to the action, in the loop and in both runtimes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Parity with LeRobot 0.6.1's pi0 and pi0.5 at tiny sizes: from raw images, state and tokens to robot actions."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Every way in which a LeRobot directory can be wrong, or another policy's."""
 
-from __future__ import annotations
-
 import json
 import re
 import resource

@@ -1,7 +1,5 @@
 """Parity with LeRobot 0.6.1's SmolVLA: from raw images, state and instruction to robot actions."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Mapping

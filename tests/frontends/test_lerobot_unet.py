@@ -1,7 +1,5 @@
 """LeRobot's ``diffusion``, against numbers that lerobot gave; see ``golden/make_lerobot_unets.py``."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -265,7 +263,7 @@ def test_a_network_that_was_compiled_in_training(changed: Callable[..., Path]) -
 def test_options_of_other_types(saved: Path, option: str) -> None:
     """There is no instruction to compile in."""
     with pytest.raises(CheckpointError, match=f"the option {option} is for LeRobot's multi_task_dit"):
-        load_checkpoint_policy(saved, options=LoadOptions(**{option: "push"}))
+        load_checkpoint_policy(saved, options=LoadOptions(**dict[str, Any]({option: "push"})))
 
 
 def test_the_command_line_says_what_is_wrong(changed: Callable[..., Path], tmp_path: Path) -> None:

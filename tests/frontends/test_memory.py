@@ -1,7 +1,5 @@
 """How much memory a conversion takes, as a multiple of the weights."""
 
-from __future__ import annotations
-
 import math
 import subprocess
 import sys

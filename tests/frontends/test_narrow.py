@@ -1,7 +1,5 @@
 """``prediction_horizon``: fewer steps are predicted, and they are the original's."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

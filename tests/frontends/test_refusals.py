@@ -1,7 +1,5 @@
 """What is no policy that this compiler reads, in miniature: each is named, with how it was told and what to do."""
 
-from __future__ import annotations
-
 import json
 import zipfile
 from collections.abc import Callable

@@ -1,6 +1,6 @@
 """The ResNets against those of transformers, which are written independently."""
 
-from __future__ import annotations
+from typing import Any
 
 import pytest
 import torch
@@ -19,7 +19,11 @@ def test_another_implementation_gives_the_same(name: str) -> None:
     for key, value in network.state_dict().items():
         if "running" in key:
             value.uniform_(0.5, 1.5)
-    settings = {"hidden_sizes": [64, 128, 256, 512], "depths": list(DEPTHS[name]), "layer_type": "basic"}
+    settings: dict[str, Any] = {
+        "hidden_sizes": [64, 128, 256, 512],
+        "depths": list(DEPTHS[name]),
+        "layer_type": "basic",
+    }
     other = ResNetModel(ResNetConfig(embedding_size=64, **settings)).eval()
     # Both keep their weights in the order of the computation, but for the shortcuts: here last, and there first.
     weights = network.state_dict()

@@ -1,7 +1,5 @@
 """Checkpoints under DPM-Solver++ against diffusers' own loop around the network as it was trained."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,6 @@
 """Sampler tables against the diffusers schedulers they are measured on, and the schedulers that are refused."""
 
-from __future__ import annotations
-
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -111,73 +110,62 @@ def test_paths_are_told_apart() -> None:
     np.testing.assert_array_equal(rows, [[1, 0, 0, 0]] * 2)  # both end on x0 itself
 
 
-class Multistep(DDIMScheduler):
-    """Averages with the output of the step before."""
+def near_miss(base: type[Any], name: str, change: Callable[[Any, Any, Any], Any]) -> type[Any]:
+    """A scheduler whose next sample is ``change(next, output, sample)``."""
+
+    def step(self: Any, model_output: Any, timestep: Any, sample: Any, *args: Any, **kwargs: Any) -> Any:
+        result = base.step(self, model_output, timestep, sample, *args, **kwargs)
+        result.prev_sample = change(result.prev_sample, model_output, sample)
+        return result
+
+    return type(name, (base,), {"step": step})
+
+
+class Remembering:
+    """What a scheduler saw before is kept until it begins anew."""
 
     before: Any = None
 
     def set_timesteps(self, *args: Any, **kwargs: Any) -> None:
-        super().set_timesteps(*args, **kwargs)
+        super().set_timesteps(*args, **kwargs)  # type: ignore[misc]  # of the scheduler beside it
         self.before = None
 
-    def step(self, model_output: Any, timestep: Any, sample: Any, **kwargs: Any) -> Any:
+
+class Multistep(Remembering, DDIMScheduler):
+    """Averages with the output of the step before."""
+
+    def step(self, model_output: Any, timestep: Any, sample: Any, *args: Any, **kwargs: Any) -> Any:
         mixed = model_output if self.before is None else 0.9 * model_output + 0.1 * self.before
         self.before = model_output
-        return super().step(mixed, timestep, sample, **kwargs)
-
-
-class Curved(DDIMScheduler):
-    """Adds a small square of the output."""
-
-    def step(self, model_output: Any, timestep: Any, sample: Any, **kwargs: Any) -> Any:
-        result = super().step(model_output, timestep, sample, **kwargs)
-        result.prev_sample = result.prev_sample + 1e-4 * model_output**2
-        return result
-
-
-class PerChannel(DDIMScheduler):
-    """Scales one channel differently."""
-
-    def step(self, model_output: Any, timestep: Any, sample: Any, **kwargs: Any) -> Any:
-        result = super().step(model_output, timestep, sample, **kwargs)
-        result.prev_sample[..., 2] *= 1.01
-        return result
-
-
-class Mixing(DDIMScheduler):
-    """Takes the mean out of the sample."""
-
-    def step(self, model_output: Any, timestep: Any, sample: Any, **kwargs: Any) -> Any:
-        result = super().step(model_output, timestep, sample, **kwargs)
-        result.prev_sample = result.prev_sample - 0.01 * sample.mean(dim=1, keepdim=True)
-        return result
-
-
-class Shifting(DDIMScheduler):
-    """Adds a constant."""
-
-    def step(self, model_output: Any, timestep: Any, sample: Any, **kwargs: Any) -> Any:
-        result = super().step(model_output, timestep, sample, **kwargs)
-        result.prev_sample = result.prev_sample + 0.01
-        return result
+        return super().step(mixed, timestep, sample, *args, **kwargs)
 
 
 class OneSided(DDIMScheduler):
     """Bounds the sample from above, so that x0 stops at another value in every step."""
 
-    def step(self, model_output: Any, timestep: Any, sample: Any, **kwargs: Any) -> Any:
-        return super().step(model_output, timestep, sample.clamp(max=0.3), **kwargs)
+    def step(self, model_output: Any, timestep: Any, sample: Any, *args: Any, **kwargs: Any) -> Any:
+        return super().step(model_output, timestep, sample.clamp(max=0.3), *args, **kwargs)
 
 
 class TwoDraws(DDPMScheduler):
     """Draws its noise twice."""
 
-    def step(self, model_output: Any, timestep: Any, sample: Any, generator: Any = None, **kwargs: Any) -> Any:
-        torch.randn(sample.shape, generator=generator, dtype=sample.dtype)
-        return super().step(model_output, timestep, sample, generator=generator, **kwargs)
+    def step(self, model_output: Any, timestep: Any, sample: Any, *args: Any, **kwargs: Any) -> Any:
+        torch.randn(sample.shape, generator=kwargs["generator"], dtype=sample.dtype)
+        return super().step(model_output, timestep, sample, *args, **kwargs)
 
 
-@pytest.mark.parametrize("scheduler_class", [Multistep, Curved, PerChannel, Mixing, Shifting, TwoDraws])
+NEAR_MISSES = [
+    Multistep,
+    near_miss(DDIMScheduler, "Curved", lambda after, out, sample: after + 1e-4 * out**2),
+    near_miss(DDIMScheduler, "PerChannel", lambda x, out, sample: x * (1 + 0.01 * (torch.arange(x.shape[-1]) == 2))),
+    near_miss(DDIMScheduler, "Mixing", lambda after, out, sample: after - 0.01 * sample.mean(dim=1, keepdim=True)),
+    near_miss(DDIMScheduler, "Shifting", lambda after, out, sample: after + 0.01),
+    TwoDraws,
+]
+
+
+@pytest.mark.parametrize("scheduler_class", NEAR_MISSES)
 def test_near_misses_are_refused(scheduler_class: type[Any]) -> None:
     """Each differs from a good scheduler by little, and each is found out."""
     with pytest.raises(SpecError, match=f"{scheduler_class.__name__} does not have the form"):
@@ -292,29 +280,19 @@ def test_second_order_is_the_formula() -> None:
     assert table.memory_to_next[0].tolist() == [0]  # the first step has nothing to remember
 
 
-class CurvedMultistep(DPMSolverMultistepScheduler):
-    """Adds a small square of the output."""
-
-    def step(self, model_output: Any, *args: Any, **kwargs: Any) -> Any:
-        result = super().step(model_output, *args, **kwargs)
-        result.prev_sample = result.prev_sample + 1e-3 * model_output**2
-        return result
-
-
-class LongMemory(DPMSolverMultistepScheduler):
+class LongMemory(Remembering, DPMSolverMultistepScheduler):
     """Keeps a trace of the first output for ever."""
 
-    first: Any = None
-
-    def set_timesteps(self, *args: Any, **kwargs: Any) -> None:
-        super().set_timesteps(*args, **kwargs)
-        self.first = None
-
     def step(self, model_output: Any, *args: Any, **kwargs: Any) -> Any:
-        self.first = model_output if self.first is None else self.first
-        result = super().step(model_output, *args, **kwargs)
-        result.prev_sample = result.prev_sample + 1e-3 * self.first
+        self.before = model_output if self.before is None else self.before
+        result: Any = super().step(model_output, *args, **kwargs)
+        result.prev_sample = result.prev_sample + 1e-3 * self.before
         return result
+
+
+CurvedMultistep = near_miss(
+    DPMSolverMultistepScheduler, "CurvedMultistep", lambda after, out, sample: after + 1e-3 * out**2
+)
 
 
 @pytest.mark.parametrize("scheduler_class", [CurvedMultistep, LongMemory])

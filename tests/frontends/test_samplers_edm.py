@@ -1,7 +1,5 @@
 """EDM's preconditioning against its formulas, from the module to the actions."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from pathlib import Path
 

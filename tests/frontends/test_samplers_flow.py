@@ -1,7 +1,5 @@
 """Flow-matching tables against plain integration in float64."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
@@ -145,7 +143,12 @@ def test_memories_of_the_wrong_shape(to_next: tuple[int, ...], to_memory: tuple[
     columns = {name: np.zeros(4, np.float32) for name in SamplerTable.COLUMNS}
     with pytest.raises(SpecError, match=message):
         SamplerTable(
-            "mine", np.arange(4), clip=None, **columns, memory_to_next=np.zeros(to_next), to_memory=np.zeros(to_memory)
+            "mine",
+            np.arange(4),
+            clip=None,
+            **columns,
+            memory_to_next=np.zeros(to_next, np.float32),
+            to_memory=np.zeros(to_memory, np.float32),
         )
 
 
@@ -153,5 +156,10 @@ def test_memories_that_are_not_finite() -> None:
     columns = {name: np.zeros(1, np.float32) for name in SamplerTable.COLUMNS}
     with pytest.raises(SpecError, match="finite"):
         SamplerTable(
-            "mine", [0], clip=None, **columns, memory_to_next=np.full((1, 1), np.nan), to_memory=np.zeros((1, 1, 4))
+            "mine",
+            np.array([0]),
+            clip=None,
+            **columns,
+            memory_to_next=np.full((1, 1), np.nan, np.float32),
+            to_memory=np.zeros((1, 1, 4), np.float32),
         )

@@ -1,7 +1,5 @@
 """The U-Nets of Diffusion Policy and 3D Diffusion Policy: what the originals gave; see ``golden/make_unets.py``."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable
 from contextlib import nullcontext

@@ -1,9 +1,8 @@
 """Of every family whose image encoder is a vision transformer the explanation says that its tokens were found."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -34,6 +33,6 @@ def test_of_a_clip_for_each_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     sizes = {"hidden_size": 64, "intermediate_size": 256, "num_hidden_layers": 3, "image_size": 64}
     monkeypatch.setattr(lerobot_tiny, "VISION", lerobot_tiny.VISION | sizes)
     monkeypatch.setattr(lerobot_tiny, "SIDE", 72)
-    changes = {"image_crop_shape": [64, 64], "use_separate_rgb_encoder_per_camera": True}
+    changes: dict[str, Any] = {"image_crop_shape": [64, 64], "use_separate_rgb_encoder_per_camera": True}
     directory = lerobot_tiny.save_policy(tmp_path, ("front", "wrist"), **changes)
     assert told(directory) == ["frame_00: 65 tokens", "frame_01: 65 tokens"]

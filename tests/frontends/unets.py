@@ -3,8 +3,6 @@
 ``golden/make_unets.py`` gives the original implementations the same weights, observations and noise.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

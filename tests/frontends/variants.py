@@ -1,7 +1,5 @@
 """The variants of Diffusion Policy's network, and the types of the fixtures that build and save a checkpoint of one."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What tests of vision-language-action models and the makers of their golden files share."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Zip files that lie: names that leave the folder, links, bombs, sizes and offsets that are not so."""
 
-from __future__ import annotations
-
 import random
 import stat
 import struct

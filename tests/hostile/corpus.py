@@ -1,11 +1,10 @@
 """Small files that are as they should be, from which the fuzzer makes bad ones."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -75,7 +74,7 @@ def _lerobot(folder: Path) -> None:
     from tests.frontends.lerobot_tiny import save_policy
 
     lerobot_unets.save("states", folder / "unet" / "policy")
-    policies = {
+    policies: dict[str, dict[str, Any]] = {
         "images": {
             "cameras": ("top", "wrist"),
             "renamed": {"arm": "observation.state"},

@@ -1,7 +1,5 @@
 """LeRobot data sets with something wrong: tables, their footers, images, metadata, and files that are none."""
 
-from __future__ import annotations
-
 import io
 import json
 import random
@@ -216,7 +214,8 @@ def _image(rng: random.Random) -> bytes | None:
     if kind == 2:
         return rng.randbytes(rng.choice((0, 1, 100)))
     if kind == 3 and content[:4] == b"\x89PNG":
-        return declared_png(*rng.choices((4, 9000, 60_000, 2**31 - 1), k=2), content)
+        width, height = rng.choices((4, 9000, 60_000, 2**31 - 1), k=2)
+        return declared_png(width, height, content)
     return content
 
 

@@ -1,7 +1,5 @@
 """Artifacts and states of somebody who knows the format: what was changed has hashes that are right again."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import random

@@ -83,13 +83,13 @@ def run(target: str, options: argparse.Namespace, corpus: Path, folder: Path) ->
     size = max(1, min(PORTION, -(-options.cases // options.processes)))
     portions = [(first, min(first + size, stop)) for first in range(options.first, stop, size)]
     with ThreadPoolExecutor(options.processes) as pool:
-        found = pool.map(lambda each: _portion(target, options.seed, *each, corpus, folder), portions)
+        found = pool.map(lambda each: _portion(target, options.seed, each, corpus, folder), portions)
         return [report for reports in found for report in reports]
 
 
-def _portion(target: str, seed: int, first: int, stop: int, corpus: Path, folder: Path) -> list[dict[str, Any]]:
+def _portion(target: str, seed: int, cases: tuple[int, int], corpus: Path, folder: Path) -> list[dict[str, Any]]:
     """Cases of one process, and of further ones after each that died."""
-    reports = []
+    reports, (first, stop) = list[dict[str, Any]](), cases
     while first < stop:
         with tempfile.TemporaryDirectory(dir=folder) as work:
             report = _process(target, seed, first, stop, corpus, Path(work))
@@ -273,6 +273,7 @@ def _remove(folder: Path) -> None:
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["worker"]:
-        worker(sys.argv[2], *map(int, sys.argv[3:6]), *map(Path, sys.argv[6:8]))
+        seed, first, stop = map(int, sys.argv[3:6])
+        worker(sys.argv[2], seed, first, stop, Path(sys.argv[6]), Path(sys.argv[7]))
     else:
         raise SystemExit(main())

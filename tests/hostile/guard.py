@@ -4,8 +4,6 @@ Python's audit hooks tell of every file that is opened, every process and every 
 taken away again, so this belongs in a process of its own.
 """
 
-from __future__ import annotations
-
 import os
 import resource
 import sys

@@ -1,7 +1,5 @@
 """HDF5 files of robomimic with something wrong: bytes, shapes, dtypes, filters, links, data that lie elsewhere."""
 
-from __future__ import annotations
-
 import random
 import shutil
 import zlib
@@ -208,5 +206,5 @@ def _attributes(rng: random.Random, file: h5py.File, secret: Path) -> None:
         item.attrs.create("texts", ["x" * rng.choice((1, 10**5))] * 20, dtype=h5py.string_dtype())
 
 
-CHANGES = (_shape, _shape, _dtype, _link, _link, _elsewhere, _elsewhere, _filters, _filters, _names, _other_kind, _many)
-CHANGES = (*CHANGES, _attributes)
+_TWICE = (_shape, _link, _elsewhere, _filters)
+CHANGES = (*_TWICE, *_TWICE, _dtype, _names, _other_kind, _many, _attributes)

@@ -5,8 +5,6 @@ process's operations on files. What is there afterwards is the old artifact, the
 or a state from which calibration goes on; and when nobody kills it, the same is made again and nothing is left over.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os
@@ -92,8 +90,9 @@ class Prepared:
         from unittest.mock import patch
 
         from ttscompile import driver
+        from ttscompile.artifact.write import write_artifact
 
-        with patch.object(driver, "write_artifact", wraps=driver.write_artifact) as write:
+        with patch.object(driver, "write_artifact", wraps=write_artifact) as write:
             convert()
         assert write.call_count == 1
         assert not write.call_args.kwargs
@@ -104,7 +103,7 @@ class Prepared:
         from ttscompile.calibration import tts
         from ttscompile.calibration.pipeline import calibrate
 
-        tts.DISTANCES = (1,)  # type: ignore[misc]  # this process is forked, and ends with it
+        setattr(tts, "DISTANCES", (1,))  # noqa: B010  # a constant; this process is forked, and ends with it
         arguments: dict[str, Any] = {"target_sparsity": 0.7, "max_intervals": 4, "progress": False, "max_minutes": 60}
         calibrate(path, [self._recording], resume=resume, **arguments)
 

@@ -1,7 +1,5 @@
 """Kill at each operation on files that writing a small artifact, updating it and saving a state take."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys

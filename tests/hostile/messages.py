@@ -1,7 +1,5 @@
 """Messages to the executor's server, and a server without a socket to answer them."""
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import json

@@ -1,7 +1,5 @@
 """Damage: of bytes, and of JSON documents."""
 
-from __future__ import annotations
-
 import copy
 import os
 import random

@@ -1,7 +1,5 @@
 """Checkpoints and recordings that lie: pickles that would run code, sizes that are not so, bombs."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -5,8 +5,6 @@ full, or gone; few files that may be open. Whatever happens, a command ends with
 a few lines without a traceback, and leaves nothing half written. Some surroundings need Linux and root, to mount.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os
@@ -65,7 +63,7 @@ COMMANDS: Mapping[str, Sequence[str]] = {
     "verify": ("verify", "V", "--json"),
     "bench": ("bench", "A", "--runs", "1"),
     "realtime": ("realtime", "A", "--control-hz", "1", "--margin-ticks", "0", "--runs", "1"),
-    "report": ("report", "A", "-o", "OUT/page.html", "--runs", "1"),
+    "inspect -o": ("inspect", "A", "-o", "OUT/page.html"),
     "compare": ("compare", "A", "--trajectories", "calls.npz", "--strategies", "", "--plot", "OUT/frontier.svg"),
     "calibrate": ("calibrate", "OUT/B", "--trajectories", "calls.npz", "--max-minutes", "0.01"),
     "convert": ("convert", "policy.ckpt", "-o", "OUT/C", "--sampler", "ddim", "--steps", "2"),
@@ -95,8 +93,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 counted[status] += 1
                 if told:
                     wrong.append({"command": command, "status": status, "wrong": told})
-            told = {"surrounding": name, "statuses": dict(sorted(counted.items())), "wrong": wrong}
-            print(json.dumps(told | {"seconds": round(time.monotonic() - began, 1)}), flush=True)
+            found = {"surrounding": name, "statuses": dict(sorted(counted.items())), "wrong": wrong}
+            print(json.dumps(found | {"seconds": round(time.monotonic() - began, 1)}), flush=True)
             failures += len(wrong)
     return 1 if failures else 0
 
@@ -126,7 +124,7 @@ def run(top: Path, surrounding: str, words: Sequence[str]) -> tuple[int, str]:
     mounts = surrounding in MOUNTED
     if words[0] == "calibrate" and not mounts:
         shutil.copytree(top / "A", out / "B")
-    setup = (SETTINGS | MOUNTED)[surrounding]
+    setup = {**SETTINGS, **MOUNTED}[surrounding]
     if words[0] == "calibrate" and mounts:  # on the disk itself; where it does not fit there is none
         setup += '; cp -r "$TOP/A" "$OUT/B" 2>/dev/null'
     here = {name: top / name for name in ("A", "V", "A.zip", "calls.npz", "policy.ckpt")}

@@ -1,7 +1,5 @@
 """What is fuzzed: for each, a folder of good files, one bad file a case, and what a user would do with it."""
 
-from __future__ import annotations
-
 import json
 import random
 import shutil

@@ -3,8 +3,6 @@
 All of it runs in one process of its own, which forks: pytest's has threads.
 """
 
-from __future__ import annotations
-
 import errno
 import json
 import subprocess

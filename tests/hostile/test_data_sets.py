@@ -1,7 +1,5 @@
 """Data sets of others: what the fuzzer found in their readers, and the process that they are read in."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import os

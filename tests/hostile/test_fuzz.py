@@ -1,7 +1,5 @@
 """A few hundred cases of the fuzzer; the record of the long run is in docs/security.md."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

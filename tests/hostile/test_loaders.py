@@ -1,7 +1,5 @@
 """What the fuzzer found, one test each, and attacks that chance would not find."""
 
-from __future__ import annotations
-
 import io
 import json
 import shutil
@@ -17,11 +15,10 @@ import pytest
 import torch
 
 import ttscompile
-from tests.artifact.tiny import tiny_models, tiny_program
+from tests.artifact.tiny import write_tiny
 from tests.frontends.conftest import _config, _weights
 from tests.hostile.forged import rehash
 from ttscompile.artifact import load_artifact
-from ttscompile.artifact.write import write_artifact
 from ttscompile.calibration.state import StateFile
 from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import ArtifactError, CalibrationError, CheckpointError, TrajectoryError, TtscompileError
@@ -36,8 +33,7 @@ Change = Callable[[dict[str, Any]], object]
 
 @pytest.fixture
 def written(tmp_path: Path) -> Path:
-    program = tiny_program()
-    write_artifact(program, tiny_models(program), tmp_path / "compiled")
+    write_tiny(tmp_path / "compiled")
     return tmp_path / "compiled"
 
 

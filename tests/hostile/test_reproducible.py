@@ -1,7 +1,5 @@
 """The same inputs give the same bytes: in another process, with another hash seed, in a folder of another name."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Some of what ``surroundings.py`` tries: each is a process, so that the suite has no time for all of them."""
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path
@@ -21,7 +19,7 @@ def top(tmp_path_factory: pytest.TempPathFactory) -> Path:
 TRIED = {
     "output in ASCII": ("inspect", 0),
     "COLUMNS=1": ("inspect", 0),
-    "all three closed": ("report", 0),
+    "all three closed": ("inspect -o", 0),
     "standard error full": ("inspect --plot", 2),
     "in a folder that is gone": ("inspect a zip", 2),
     "in a folder whose name is no text": ("inspect", 0),

@@ -1,7 +1,5 @@
 """Replay buffers in zarr with something wrong: chunks, metadata, codecs, names and links."""
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import json
@@ -48,7 +46,7 @@ DTYPES: tuple[Any, ...] = (
     {"name": "structured", "configuration": {"fields": [["a", "float32"]]}},
     {"name": "numpy.datetime64", "configuration": {"unit": "s", "scale_factor": 2**31}},
 )
-FILLS = (
+FILLS: tuple[Any, ...] = (
     None,
     0,
     -1,

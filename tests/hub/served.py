@@ -1,7 +1,5 @@
 """A hub on this machine: as much of its HTTP interface as ``huggingface_hub`` needs to list, download and upload."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """The card of an artifact: what it says, and what it keeps to itself."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

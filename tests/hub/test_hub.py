@@ -1,7 +1,5 @@
 """Artifacts and checkpoints from a hub, and back: what is downloaded, what is not, what is there without a network."""
 
-from __future__ import annotations
-
 import json
 import os
 import pickle

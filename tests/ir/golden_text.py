@@ -1,7 +1,5 @@
 """Compare the text of a graph with a golden text, whatever its values are called."""
 
-from __future__ import annotations
-
 import difflib
 import re
 

@@ -1,7 +1,5 @@
 """Are the types that a graph records what torch's own shape functions give?"""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

@@ -4,8 +4,6 @@ Each takes ``x``: float32 ``[B, 4, 6]`` between 0.1 and 0.9, and ``i``: int64 ``
 tensor, or several of which the first one counts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Cases of the IR that real networks have seldom."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Golden texts of what the passes make, and proof that the comparator can say no."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.ir.golden_text import assert_text

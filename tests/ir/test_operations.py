@@ -1,11 +1,10 @@
 """The table of operations: each row by an example, as torch, its meta tensors and onnxruntime see it; and its facts."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import pytest
 import torch
@@ -25,6 +24,12 @@ from ttscompile.ir.flops import graph_flops
 from ttscompile.ir.graph import Graph, Node, TensorType
 from ttscompile.ir.operations import OPERATIONS, Linear, Movement, axes_along, operation, permutation
 from ttscompile.lower.program import lower_graph
+
+
+def of(name: str | Node) -> Callable[[str], str]:
+    """What is wrong, and with which operation."""
+    return lambda message: f"{name}: {message}"
+
 
 UNLOWERED = """
     cumprod searchsorted hypot copysign fmax fmin lgamma digamma erfinv i0 special_i0
@@ -98,8 +103,8 @@ def test_a_row_with_an_onnx_form_computes_the_same_in_onnxruntime(names: list[st
     (found,) = run(lower_graph(graph, "examples"), weights, inputs)
     both = zip(names, torch.from_numpy(found).split(numbers, 1), expected.split(numbers, 1), strict=True)
     for name, left, right in both:
-        wide = {"rtol": 0.0, "atol": _cancelled(inputs["obs"], right)} if name == "group_norm" else {}
-        torch.testing.assert_close(left, right, equal_nan=True, msg=lambda m, n=name: f"{n}: {m}", **wide)
+        wide: dict[str, Any] = {"rtol": 0.0, "atol": _cancelled(inputs["obs"], right)} if name == "group_norm" else {}
+        torch.testing.assert_close(left, right, equal_nan=True, msg=of(name), **wide)
 
 
 def _cancelled(obs: Tensor, normalised: Tensor) -> float:
@@ -182,7 +187,7 @@ def test_elementwise_is_elementwise() -> None:
         bare = replace(graph, inputs=types)
         moved = {name: value.flatten()[order].view(shape) for name, value in wide.items()}
         expected = _first(bare, wide).flatten()[order].view(shape)
-        torch.testing.assert_close(_first(bare, moved), expected, equal_nan=True, msg=lambda m, n=node: f"{n}: {m}")
+        torch.testing.assert_close(_first(bare, moved), expected, equal_nan=True, msg=of(node))
 
 
 def test_linear_is_linear() -> None:
@@ -198,7 +203,7 @@ def test_linear_is_linear() -> None:
                 other |= {name: value for name, value in left.items() if name not in together}
             total = {name: left[name] + right[name] - zero[name] if name in together else left[name] for name in names}
             expected = _first(graph, left) + _first(graph, right) - _first(graph, zero)
-            torch.testing.assert_close(_first(graph, total), expected, msg=lambda m, n=node: f"{n}: {m}")
+            torch.testing.assert_close(_first(graph, total), expected, msg=of(node))
 
 
 def test_movements_move() -> None:
@@ -227,7 +232,7 @@ def test_what_lies_across_is_treated_alike(fact: str) -> None:
         for axis in set(range(rank)) - set(mixed):
             after = axis - (y.dim() < rank and min(mixed) < axis)
             turned = _first(graph, {**inputs, name: inputs[name].flip(axis)})
-            torch.testing.assert_close(turned, y.flip(after), msg=lambda m, n=node: f"{n}: {m}")
+            torch.testing.assert_close(turned, y.flip(after), msg=of(node))
 
 
 def test_filled_is_filled() -> None:

@@ -1,7 +1,5 @@
 """Corrupted graphs and programs are found, and the message says where."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -67,6 +65,6 @@ def test_weight_of_another_shape_or_missing() -> None:
 
 def test_inputs_in_another_order() -> None:
     sound = program(chain(1))
-    swapped = replace(sound.denoiser, inputs=dict(reversed(sound.denoiser.inputs.items())))
+    swapped = replace(sound.denoiser, inputs=dict(reversed([*sound.denoiser.inputs.items()])))
     with pytest.raises(PassError, match="inputs .* expected"):
         verify(replace(sound, denoiser=swapped))

@@ -8,8 +8,6 @@ onnxruntime and what the tests need; this package without its extras. Then ``mad
 Times mean nothing under emulation, and none is measured.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import shlex

@@ -8,8 +8,6 @@ and, in the same artifact, of fp32; observations and noise are drawn. Actions ar
 that the residuals of the call before are read.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -50,7 +48,8 @@ def make(folder: Path) -> None:
         artifact = unfinished / name / "artifact"
         ttscompile.convert(checkpoint, artifact, sampler="dpmsolver++", steps=STEPS, precision="int8")
         calibrate(artifact, unfinished / name / "calls.npz")
-        np.savez(unfinished / name / ACTIONS, **dict(answers(artifact)))
+        made: dict[str, Any] = dict(answers(artifact))
+        np.savez(unfinished / name / ACTIONS, **made)
     Once(unfinished / "once").folder("toy", lambda directory: written_artifact(toy_program(), directory))
     unfinished.rename(folder)
 
@@ -58,7 +57,7 @@ def make(folder: Path) -> None:
 def calibrate(artifact: Path, recording: Path) -> None:
     """Give an artifact evenly spaced steps and their correction, fitted to calls with drawn observations."""
     calls = random_calls(load_artifact(artifact).manifest.spec, CALLS * EPISODES, seed=0)
-    arrays = {key: np.concatenate([obs[key] for obs, _ in calls]) for key in calls[0][0]}
+    arrays: dict[str, Any] = {key: np.concatenate([obs[key] for obs, _ in calls]) for key in calls[0][0]}
     ends = np.arange(1, EPISODES + 1) * CALLS
     np.savez(recording, episode_ends=ends, **arrays)
     ttscompile.calibrate(artifact, [recording], 0.5, "interval", correct=True, progress=False)

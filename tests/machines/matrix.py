@@ -8,8 +8,6 @@ which has AVX2 and no AVX-512. With ``--all`` the whole suite runs as well, in t
 and with the switches of ``make test-avx2``. Every row is printed at the end; what was not found is a row too.
 """
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

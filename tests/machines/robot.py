@@ -8,8 +8,6 @@ actions, and runs the tests that need no compiler, unless ``--artifacts`` leaves
 fails. No time is measured.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import shutil

@@ -1,11 +1,10 @@
 """What the commands of this folder check, on this machine: the same answers pass, and others do not."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +25,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("made") / "toy"
     artifact = written_artifact(toy_program(noise=0.0, pruner=False), folder / "artifact").path
     store_schedules(artifact, None, {"uniform": uniform_plan(5, 5, 3)}, "uniform", {"strategy": "by hand"})
-    np.savez(folder / "actions.npz", **dict(made.answers(artifact, ("fp32",))))
+    answers: dict[str, Any] = dict(made.answers(artifact, ("fp32",)))
+    np.savez(folder / "actions.npz", **answers)
     return folder
 
 

@@ -1,7 +1,5 @@
 """A builder of small graphs, so that tests of passes read like the graphs they are about."""
 
-from __future__ import annotations
-
 from ttscompile.ir.graph import Argument, Batch, Graph, Node, Ref, Size, TensorType
 
 B = Batch()

@@ -1,10 +1,9 @@
 """Denoisers for the tests of passes, compiled once, and their pieces evaluated one by one."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -82,7 +81,8 @@ class SequenceFirst(TokenDecoder):
     def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
         h = self.embed(sample).transpose(0, 1).contiguous()
         bias = self.obs(obs).transpose(0, 1).mean(0, keepdim=True) + timestep[None, :, None]
-        for layer in self.layers:
+        layers: Any = self.layers
+        for layer in layers:
             h = h + layer.linear2(torch.tanh(layer.linear1(h) + bias.mean(-1, keepdim=True)))
         return self.head(h.transpose(0, 1))
 
@@ -104,14 +104,14 @@ class UNet(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        sizes = {"diffusion_step_embed_dim": 8, "down_dims": (8, 16), "cond_predict_scale": True}
+        sizes: Any = {"diffusion_step_embed_dim": 8, "down_dims": (8, 16), "cond_predict_scale": True}
         self.net = ConditionalUnet1D(UNetConfig(2, global_cond_dim=21, **sizes))
 
     def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
-        return self.net(sample, timestep, obs.flatten(1))  # type: ignore[no-any-return]
+        return self.net(sample, timestep, obs.flatten(1))
 
 
-MODULES = {
+MODULES: dict[str, Callable[[], nn.Module]] = {
     "tokens": TokenDecoder,
     "condition encoder mixes tokens": lambda: TokenDecoder(encoder_layers=1),
     "adaLN": AdaLN,
@@ -222,11 +222,11 @@ class Doubled(nn.Module):
 
     def __init__(self, double: Callable[[torch.Tensor], torch.Tensor], halve: Callable[..., torch.Tensor]) -> None:
         super().__init__()
-        self.ff, self.double, self.halve = nn.Linear(2, 2), double, halve
+        self.ff, self.twice, self.halve = nn.Linear(2, 2), double, halve
 
     def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
-        x = self.double(sample) * self.double(obs)[:, None, :2]
-        x = x + torch.tanh(self.ff(x)) * self.double(timestep)[:, None, None]
+        x = self.twice(sample) * self.twice(obs)[:, None, :2]
+        x = x + torch.tanh(self.ff(x)) * self.twice(timestep)[:, None, None]
         return self.halve(x + self.ff(x))
 
 

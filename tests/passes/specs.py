@@ -1,7 +1,5 @@
 """Policy specifications for toy denoisers."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ttscompile import ChunkSpec, ObservationSpec, PolicySpec, SamplerTable

@@ -1,11 +1,10 @@
 """Simplification of every graph of a program."""
 
-from __future__ import annotations
-
 from tests.passes.modules import compiled
+from ttscompile.ir.program import Program
 from ttscompile.passes.clean_up import CleanUp
 
 
 def test_clean_up_is_idempotent() -> None:
     _, program = compiled("tokens")
-    assert CleanUp()(program).program is program
+    assert CleanUp[Program]()(program).program is program

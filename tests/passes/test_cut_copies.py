@@ -1,7 +1,5 @@
 """Copies of a doubled batch are cut by their number."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """The block finder on graphs that have blocks, almost have them, and have none."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import nn

@@ -1,7 +1,5 @@
 """What is left in the loop, and when the rest is computed."""
 
-from __future__ import annotations
-
 from tests.passes.graphs import B
 from tests.passes.modules import SHAPE, compiled, graph_inputs, hoisted
 from ttscompile import ObservationSpec

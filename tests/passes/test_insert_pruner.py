@@ -1,7 +1,5 @@
 """The plan head: what it reads, what it may cost, what it makes of step 0."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

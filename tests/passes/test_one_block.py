@@ -1,7 +1,5 @@
 """One block of a network without a residual stream: the same numbers, and a cut that every other pass understands."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np
@@ -15,7 +13,7 @@ from tests.passes.specs import toy_spec
 from ttscompile.driver import transform
 from ttscompile.errors import PassError
 from ttscompile.ir.evaluate import evaluate
-from ttscompile.ir.graph import Graph
+from ttscompile.ir.graph import Batch, Graph
 from ttscompile.ir.program import Captured
 from ttscompile.passes.find_residual_blocks import find_residual_blocks
 from ttscompile.passes.one_block import OneBlock
@@ -29,7 +27,7 @@ def captured(graph: Graph) -> Captured:
     return Captured(toy_spec(sample=(4, 8)), graph, weights)
 
 
-def plain(*shape: object) -> Graph:
+def plain(*shape: int | Batch) -> Graph:
     b = Builder()
     h = b.op("first", "linear.default", SHAPE, b.input("sample", *SHAPE), b.constant("w", 8, 8))
     return b.graph(b.op("last", "gelu.default", shape or SHAPE, h))

@@ -1,7 +1,5 @@
 """The denoiser cut along its residual stream."""
 
-from __future__ import annotations
-
 import torch
 
 from tests.passes.graphs import B, Builder

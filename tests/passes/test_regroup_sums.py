@@ -1,7 +1,5 @@
 """Regrouping of sums: what is added to the stream becomes one value; nothing else is touched."""
 
-from __future__ import annotations
-
 import torch
 
 from tests.passes.graphs import B, Builder

@@ -1,7 +1,5 @@
 """A tower that is a vision transformer has a form for some of its tokens."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """A linear layer of concatenated features becomes a sum, and only where that takes work out of the loop."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 
@@ -65,7 +63,7 @@ def test_modulations_become_a_sum_of_a_table_and_a_condition() -> None:
             values.append(evaluate(program.prologue, weights, inputs))
     for one, other in zip(*values, strict=True):
         assert_equal_but_for_rounding(one, other, counted.terms)
-    pieces = Hoist()(CleanUp()(result.program).program).program.pieces
+    pieces = Hoist()(CleanUp[Cut]()(result.program).program).program.pieces
     assert pieces.step is not None
     assert not any("linear" in node.op for node in pieces.step.nodes)
     assert any("linear" in node.op for node in pieces.condition.nodes)
@@ -90,7 +88,7 @@ def test_features_of_another_dtype_stay_together() -> None:
 
 def test_runs_before_hoist_only() -> None:
     with pytest.raises(PassError, match="takes a program that is Cut; found Program"):
-        SplitFeatures()(Hoist()(_program(True)).program)  # type: ignore[arg-type]  # type: ignore[arg-type]
+        SplitFeatures()(Hoist()(_program(True)).program)  # type: ignore[arg-type]
 
 
 def test_a_class_token_for_every_image_is_no_table() -> None:

@@ -1,7 +1,5 @@
 """Token splitting: what is token-wise moves above the concatenation, what is not stays below it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

@@ -1,7 +1,5 @@
 """What crosses between pieces has an axis of streams, also where a stream has several rows."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

@@ -1,7 +1,5 @@
 """Attention gets an axis of heads, and masks a row for each query."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Tiny policies with random weights that LeRobot's own classes make and save. Needs lerobot."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A robot that never moves, and ``lerobot-rollout`` with it. Needs lerobot."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

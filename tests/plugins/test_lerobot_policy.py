@@ -1,7 +1,5 @@
 """A compiled policy in LeRobot's own commands, against the original there. Runs where lerobot is installed."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os
@@ -126,7 +124,7 @@ def test_committed_actions_are_kept_and_padding_is_none(
     def chunk(delay: int | None, rest: torch.Tensor | None) -> torch.Tensor:
         torch.manual_seed(0)
         policy.reset()
-        return policy.predict_action_chunk(batch, noise, inference_delay=delay, prev_chunk_left_over=rest)  # type: ignore[no-any-return]
+        return policy.predict_action_chunk(batch, noise, inference_delay=delay, prev_chunk_left_over=rest)
 
     without = chunk(None, None)
     for delay, rest in ((0, left_over), (2, None), (2, left_over[3:])):
@@ -161,12 +159,17 @@ def test_of_a_repository_an_artifact_s_files_are_downloaded(
     saved: tuple[str, Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import huggingface_hub
-    from huggingface_hub.utils import filter_repo_objects
+    from huggingface_hub.utils import filter_repo_objects  # type: ignore[attr-defined]  # it has no __all__
 
     _, _, compiled = saved
     policy, _, _ = opened(compiled)
     asked: list[dict[str, Any]] = []
-    monkeypatch.setattr(huggingface_hub, "snapshot_download", lambda _, **words: asked.append(words) or str(compiled))
+
+    def download(_: str, **words: Any) -> str:
+        asked.append(words)
+        return str(compiled)
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", download)
     again = type(policy).from_pretrained("org/name", config=policy.config, revision="main")
     assert again._policy.info.identity == policy._policy.info.identity and asked[0].pop("revision") == "main"
     own = {each.name for each in compiled.iterdir()}

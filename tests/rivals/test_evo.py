@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tests.calibration.tasks import MakeTask
 from tests.rounding import Counted, allowed
-from ttscompile.calibration.step_counts import crowded_family
+from ttscompile.calibration.spacing import spacings
 from ttscompile.rivals.evo import POPULATION, Evo, mutate, repair
 
 
@@ -51,7 +51,7 @@ def test_generations_get_better_and_begin_with_whole_steps(make_task: MakeTask) 
     task = make_task(20)
     search = Evo(task)
     assert search._population.shape == (POPULATION, 10, 6)
-    assert search._population[0][list(crowded_family(10, 3)[0])].all()
+    assert search._population[0][list(spacings(10, 3)[0])].all()
     losses = []
     for generation in range(6):
         search.advance(generation)

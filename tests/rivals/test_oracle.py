@@ -1,16 +1,13 @@
-"""The oracle on a small policy: which episodes, schedules and calls it takes, and what it prints."""
+"""The oracle on a small policy: which episodes, schedules and calls it takes."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from tests.calibration import policies
-from ttscompile.cli import main
 from ttscompile.errors import CalibrationError
 from ttscompile.rivals.choosing import AFTER, OBSERVATION, SINGLE
 from ttscompile.rivals.oracle import Oracle, oracle, placements
@@ -64,17 +61,3 @@ def test_two_episodes_are_too_few(compiled: Path, tmp_path: Path) -> None:
     np.savez(few, obs=np.zeros((4, 2, 3), np.float32) + np.arange(4)[:, None, None], episode_ends=np.array([2, 4]))
     with pytest.raises(CalibrationError, match="hold 2 episodes; expected three at least"):
         oracle(compiled, [few], 3)
-
-
-def test_the_command(compiled: Path, recording: Path) -> None:
-    asked = ["oracle", str(compiled), "--trajectories", str(recording), "--computed-steps", "2", "--schedules", "2"]
-    result = CliRunner().invoke(main, [*asked, "--calls", "4", "--draws", "2"])
-    assert result.exit_code == 0, result.output
-    assert "who chooses knows" in result.stdout and SINGLE in result.stdout
-    assert "4 observations with 2 draws of noise each" in " ".join(result.stdout.split())
-    made = json.loads(CliRunner().invoke(main, [*asked, "--calls", "4", "--draws", "2", "--json"]).stdout)
-    assert made["budget"] == 2 and made["choices"][0]["name"] == SINGLE
-    refused = CliRunner().invoke(
-        main, ["oracle", str(compiled), "--trajectories", str(recording), "--computed-steps", "99"]
-    )
-    assert refused.exit_code == 2 and "found 99" in refused.output

@@ -10,8 +10,9 @@ import torch
 
 from tests.calibration.tasks import MakeTask
 from ttscompile.artifact.load import load_artifact
+from ttscompile.calibration.pruner.head import has_head
 from ttscompile.core.lattice import PlanArray, Source, whole_steps_plan
-from ttscompile.rivals.switches import Switch, capacity, fit_switches, has_head, head_features, head_weights
+from ttscompile.rivals.switches import Switch, capacity, fit_switches, head_features, head_weights
 from ttscompile.runtimes.plans import pruner_plan
 
 STEPS, BLOCKS, CALLS = 6, 4, 64

@@ -13,7 +13,7 @@ import pytest
 from tests.executor.simulation import FakeClock
 from ttscompile.errors import ExecutorError
 from ttscompile.runtimes.executor import AsyncExecutor
-from ttscompile.runtimes.server.admission import Door, Entrance
+from ttscompile.runtimes.server.admission import Admission, AdmittingSocket
 from ttscompile.runtimes.server.executor_server import ExecutorServer
 
 from .serving import Quick
@@ -44,13 +44,13 @@ def test_a_name_s_addresses_have_one_port_and_absent_ones_are_left_out(
 ) -> None:
     made: list[Any] = []
 
-    class Socket(Entrance):
+    class Socket(AdmittingSocket):
         """Fails where the case says so, for IPv6; which a machine of tests may lack, so IPv4 stands in for it."""
 
-        def __init__(self, door: Door, family: int) -> None:
+        def __init__(self, admission: Admission, family: int) -> None:
             self.six = family == socket.AF_INET6
             self._fail("make")
-            super().__init__(door, socket.AF_INET)
+            super().__init__(admission, socket.AF_INET)
             made.append(self)
 
         def _fail(self, step: str) -> None:
@@ -70,13 +70,13 @@ def test_a_name_s_addresses_have_one_port_and_absent_ones_are_left_out(
         six, four = (socket.AF_INET6, 1, 6, ""), (socket.AF_INET, 1, 6, "")
         return [(*six, ("::1", port, 0, 0)) if each == V6 else (*four, ("127.0.0.1", port)) for each in addresses]
 
-    async def listen(server: ExecutorServer) -> list[Entrance]:
+    async def listen(server: ExecutorServer) -> list[AdmittingSocket]:
         monkeypatch.setattr(
             asyncio.get_running_loop(), "getaddrinfo", lambda *a, **k: asyncio.to_thread(found, *a, **k)
         )
         return await server._listen("localhost", 0)
 
-    monkeypatch.setattr("ttscompile.runtimes.server.listener.Entrance", Socket)
+    monkeypatch.setattr("ttscompile.runtimes.server.listener.AdmittingSocket", Socket)
     with AsyncExecutor(Quick(FakeClock()), 20, latencies={"dense": 0.01}) as executor:
         server = ExecutorServer(executor)
         if left is None:

@@ -1,7 +1,5 @@
 """Data sets as users have them, written with the libraries that write them."""
 
-from __future__ import annotations
-
 import io
 import itertools
 import json
@@ -10,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Literal
 
 import h5py
 import numpy as np
@@ -54,7 +52,9 @@ def as_npz(path: Path) -> Path:
     return path / "it.npz"
 
 
-def as_zarr(path: Path, version: int = 2, compressor: Any = "auto", zipped: bool = False, **more: np.ndarray) -> Path:
+def as_zarr(
+    path: Path, version: Literal[2, 3] = 2, compressor: Any = "auto", zipped: bool = False, **more: np.ndarray
+) -> Path:
     """As the replay buffers that Diffusion Policy publishes."""
     target = path / "it.zarr"
     group = zarr.open_group(str(target), mode="w", zarr_format=version)
@@ -68,7 +68,7 @@ def as_zarr(path: Path, version: int = 2, compressor: Any = "auto", zipped: bool
 def as_hdf5(path: Path) -> Path:
     """As robomimic writes them; episode 10 comes after episode 2."""
     with h5py.File(path / "it.hdf5", "w") as file:
-        for demo, begin, end in (("demo_2", 0, ENDS[0]), ("demo_10", *ENDS)):
+        for demo, begin, end in (("demo_2", 0, ENDS[0]), ("demo_10", ENDS[0], ENDS[1])):
             for name, array in arrays().items():
                 file.create_dataset(f"data/{demo}/obs/{name}", data=array[begin:end], compression="gzip")
             file[f"data/{demo}/actions"] = np.zeros((end - begin, 2))
@@ -137,7 +137,7 @@ def _write_video(file: Path, begin: int, end: int, codec: str) -> None:
 
     file.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(file), "w") as container:
-        stream = container.add_stream(codec, rate=FPS)
+        stream: Any = container.add_stream(codec, rate=FPS)
         stream.width, stream.height, stream.pix_fmt = 32, 16, "yuv420p"
         for i in range(begin, end):
             frame = av.VideoFrame.from_ndarray(np.full((16, 32, 3), shade(i), np.uint8), format="rgb24")

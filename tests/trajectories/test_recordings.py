@@ -1,11 +1,10 @@
 """Data sets as users have them, written with the libraries that write them, and read as the calls of a policy."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numcodecs
@@ -111,7 +110,8 @@ def test_a_zarr_codec_that_unpickles_is_never_run(declared: str, tmp_path: Path)
 def test_a_zarr_array_of_nothing_but_its_size_is_refused(tmp_path: Path) -> None:
     store = as_zarr(tmp_path)
     shutil.rmtree(store / "data" / "state")
-    zarr.open_group(str(store))["data"].create_array("state", shape=(10**9, 5), chunks=(1000, 5), dtype="f4")
+    data: Any = zarr.open_group(str(store))["data"]
+    data.create_array("state", shape=(10**9, 5), chunks=(1000, 5), dtype="f4")
     with pytest.raises(TrajectoryError, match="in proportion to a file of"):
         load_trajectories([store], LOW, 3, SOURCES)
 

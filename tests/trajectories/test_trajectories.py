@@ -1,7 +1,5 @@
 """Recordings: what is read, and what is refused with which words."""
 
-from __future__ import annotations
-
 import os
 import zipfile
 from collections.abc import Mapping
@@ -210,7 +208,7 @@ def test_numbers_that_a_call_would_refuse_are_refused_in_a_recording(file: Path)
     ):
         load(saved(file, **content))
     content["obs"][3, 1, 2] = 2e6
-    normalizer = Affine(np.array([1.0, 1.0, 0.4]), np.zeros(3))
+    normalizer = Affine(np.array([1.0, 1.0, 0.4], np.float32), np.zeros(3, np.float32))
     specs = SPECS | {"obs": ObservationSpec((2, 3), normalizer)}
     assert load(saved(file, **content), specs)[1].observations["obs"][1, 1, 2] == 2e6
     specs |= {"goal": ObservationSpec((4,), dtype="int64", bounds=(0.0, 9.0))}

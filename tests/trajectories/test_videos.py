@@ -1,7 +1,5 @@
 """LeRobot data sets whose images are in videos."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys

@@ -1,7 +1,5 @@
 """Break an artifact so that its bytes still fit each other: what changed is what it computes."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """A calibrated artifact with a golden record, to be broken in copies."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

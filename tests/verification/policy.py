@@ -1,7 +1,5 @@
 """A policy of ten steps and six blocks, large enough that what is not computed is time saved, and plans for it."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 import torch

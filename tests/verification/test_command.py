@@ -1,7 +1,5 @@
 """``ttscompile verify``; and that every command says which artifact its figures are of."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What a plan saves in time is judged by medians of calls in turn, with a clock that the test moves."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path

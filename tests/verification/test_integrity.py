@@ -1,7 +1,5 @@
 """A bit flipped anywhere in an artifact is found."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

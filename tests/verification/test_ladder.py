@@ -1,7 +1,5 @@
 """A sound artifact holds; each way of breaking one fails at its rung, which names step and block."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

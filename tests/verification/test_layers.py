@@ -1,7 +1,5 @@
 """A network that is one block: its layers are recorded, and the first that differs is named."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterable
 from itertools import combinations

@@ -1,7 +1,5 @@
 """Plans of an artifact with int8 blocks are verified as ``load`` runs them, not in fp32 alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

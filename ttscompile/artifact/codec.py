@@ -191,7 +191,8 @@ def plan_fault(manifest: Manifest, plan: PlanRecord) -> str | None:
     return None
 
 
-def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:
+# C901, PLR0912: a condition for each part
+def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:  # noqa: C901, PLR0912
     blocks = len(manifest.blocks)
     if len(manifest.flops.blocks) != blocks:
         fields["flops"].fail(f"FLOPs of {blocks} blocks")

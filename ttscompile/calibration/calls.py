@@ -25,6 +25,10 @@ LARGEST = 1e30
 """Error of actions that are not numbers, or off by more: finite, so that means and comparisons of plans mean something,
 and a record can hold them."""
 
+FRACTION = 0.25
+"""Share of the episodes that plans are judged on where nothing else is asked for: who splits with the seed of a
+calibration judges on episodes that it saw nothing of."""
+
 
 @dataclass(frozen=True)
 class Split:

@@ -35,7 +35,7 @@ from ..runtimes.policy import CompiledPolicy
 from ..runtimes.random_calls import random_noise
 from ..trajectories.episodes import Episode
 from .budget import cells_of, goal_of, with_plans
-from .calls import LARGEST, Calls, Split, digest_of, load_episodes, sample_calls, split_episodes
+from .calls import FRACTION, LARGEST, Calls, Split, digest_of, load_episodes, sample_calls, split_episodes
 from .execute import Executor
 from .progress import Progress
 from .saved_searches import Outcome, Searches
@@ -46,9 +46,6 @@ from .task import Array, Found, Task
 
 LEARNED = 256
 """Calls that strategies learn from, at most. ``calibrate`` takes more: its corrections are better."""
-
-FRACTION = 0.25
-"""Share of the episodes to judge on. It is the default of ``calibrate``: with its seed, its plans saw none of them."""
 
 WARM_UP = 2
 """Rounds whose times do not count, where there are more than these; their actions count."""

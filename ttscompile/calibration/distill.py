@@ -28,7 +28,8 @@ from ..lower.precision import quantize_model
 from ..runtimes.torch.devices import device_of, exact_arithmetic
 from ..verification.record_golden import record_plans
 from .arguments import JUDGED, calls_to_learn_from, require_directory, require_limits
-from .calls import Actions, Calls, digest_of, load_episodes, split_episodes
+from .calls import FRACTION, Actions, Calls, digest_of, load_episodes, split_episodes
+from .clock import Clock
 from .execute import Executor
 from .fit_correction import fit_correction
 from .judge import SCHEDULE
@@ -37,7 +38,6 @@ from .result import PlanScore
 from .state import DISTILLATION, StateFile
 from .student import Student, trainable
 from .targets import draw_calls, with_targets
-from .clock import Clock
 
 UPDATES = 600
 """Of the weights, if there is time. On Push-T with 2 of 16 steps and 3,072 calls the held-out error has stopped falling
@@ -92,7 +92,7 @@ def distill(
     updates: int = UPDATES,
     seed: int = 0,
     max_minutes: float = 15.0,
-    validation_fraction: float = 0.25,
+    validation_fraction: float = FRACTION,
     observation: Mapping[str, Sequence[str]] | None = None,
     device: str | None = None,
     resume: bool = False,

@@ -10,8 +10,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from copy import copy
 from typing import Any
 
@@ -272,20 +270,3 @@ def last(samples: Iterable[Tensor]) -> Tensor:
 def _numbers(streams: BoolArray, beside: Tensor) -> Tensor:
     """Numbers of those streams that are True, on the device of a tensor."""
     return torch.from_numpy(np.flatnonzero(streams)).to(beside.device)
-
-
-@contextmanager
-def workers() -> Iterator[ThreadPoolExecutor]:
-    """As many threads as torch would use for one operation, for whole calls and without gradients; torch uses one each.
-
-    The operations of a policy are small: divided among threads they spend much of their time waiting for the slowest
-    part, most of all on a machine that does something else as well. Whole calls wait for nobody; and since they are
-    divided in the same way however many workers there are, so are the results.
-    """
-    count = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with ThreadPoolExecutor(count, "ttscompile-calibration", torch.set_grad_enabled, (False,)) as pool:
-            yield pool
-    finally:
-        torch.set_num_threads(count)

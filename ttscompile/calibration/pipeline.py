@@ -18,12 +18,12 @@ from ..core.lattice import sparsity
 from ..errors import CalibrationError
 from ..ir.pieces import PRUNER
 from ..pool import opened_pool
-from ..rivals.switches import has_head
 from ..runtimes.torch.devices import device_of, exact_arithmetic
 from ..verification.record_golden import record_plans
 from .arguments import JUDGED, calls_to_learn_from, require_directory, require_limits
 from .budget import ERROR, LATENCY, Budget, Goal, cells_of, goal_of, measure_budget
-from .calls import Calls, digest_of, load_episodes, split_episodes, window_of
+from .calls import FRACTION, Calls, digest_of, load_episodes, split_episodes, window_of
+from .clock import Clock
 from .execute import Executor
 from .judge import (
     SCHEDULE,
@@ -35,13 +35,13 @@ from .judge import (
     uniform_of,
 )
 from .progress import Bar
+from .pruner.head import has_head
 from .result import CalibrationResult
 from .search import open_search, search_plan
 from .state import StateFile
-from .step_counts import SAFE, SHARE, CrowdedSchedules, budget_of_error, named_plans
+from .step_counts import SAFE, SHARE, SpacedSchedules, budget_of_error, named_plans
 from .strategies import DEFAULT, FITTED, Strategy, strategy_of
 from .targets import draw_calls, with_targets
-from .clock import Clock
 from .task import Found, Search, Task
 
 
@@ -58,7 +58,7 @@ def calibrate(
     max_action_error: float | None = None,
     threads: int = 1,
     max_minutes: float = 15.0,
-    validation_fraction: float = 0.25,
+    validation_fraction: float = FRACTION,
     observation: Mapping[str, Sequence[str]] | None = None,
     max_intervals: int | None = None,
     correct: bool = False,
@@ -189,7 +189,7 @@ def calibrate(
                     f" strategy {strategy!r} needs {fewest}. Its search is the shortest there is; allow more time."
                 )
             task = Task.of(artifact, executor, sets["calibration"], 0, seed, pool)
-            crowded = CrowdedSchedules(task.whole, state, clock, bar)
+            crowded = SpacedSchedules(task.whole, state, clock, bar)
             if budget is None:
                 budget = budget_of_error(crowded, goal, artifact.manifest.steps, len(artifact.manifest.blocks))
             task = replace(task, budget=budget.cells, clock=clock.until(1 - SHARE) if chosen.fits_correction else clock)
@@ -303,7 +303,7 @@ def _search(search: Search, state: StateFile, clock: Clock, bar: Bar, most: int 
 
 
 def _relax(
-    artifact: Artifact, crowded: CrowdedSchedules, task: Task, found: Found, budget: Budget, held_out: Calls
+    artifact: Artifact, crowded: SpacedSchedules, task: Task, found: Found, budget: Budget, held_out: Calls
 ) -> tuple[Found, Budget]:
     """More steps, as long as the held-out error is above what was asked for and at least half of them are left out."""
     steps, blocks = artifact.manifest.steps, len(artifact.manifest.blocks)

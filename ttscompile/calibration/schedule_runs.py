@@ -12,14 +12,14 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from ..core.lattice import PlanArray, Source
-from .execute import workers
+from ..pool import workers
 from .sparse_loop import Place, SparseLoop
 
 BYTES = 2**29
 """What kept places may hold of samples and residuals; those that were longest of no use go first."""
 
 
-class Trails:
+class ScheduleRuns:
     """The way of schedules through a sparse loop.
 
     Args:

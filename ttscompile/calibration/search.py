@@ -6,8 +6,8 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 
-from .strategies import strategy_of
 from .clock import Clock
+from .strategies import strategy_of
 from .task import Found, Search, Task
 
 CLOSING_SHARE = 0.3

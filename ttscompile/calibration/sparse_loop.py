@@ -17,9 +17,10 @@ from torch import Tensor
 
 from ..core.correction import Correction, components_of, groups_of, jumps_of, numbers_of
 from ..core.lattice import BoolArray, PlanArray, Source
+from ..pool import workers
 from ..runtimes.reference.sampler import correct, features, through
 from .calls import Calls
-from .execute import Executor, State, workers
+from .execute import Executor, State
 from .jumps import Layers, fit_jump
 from .regression import Components, Solved, solve
 
@@ -56,8 +57,8 @@ class Place:
     """
 
     step: int
-    fitted: tuple[_Lane, ...]
-    judged: tuple[_Lane, ...]
+    fitted: tuple[_Batch, ...]
+    judged: tuple[_Batch, ...]
     solved: tuple[Solved, ...] = ()
     anchors: tuple[bool, ...] = ()
     jumps: Mapping[int, Layers] = field(default_factory=dict)
@@ -65,17 +66,17 @@ class Place:
     @property
     def samples(self) -> Tensor:
         """Those of the judged calls, ``[N, T, D]``."""
-        return torch.cat([lane.sample for lane in self.judged])
+        return torch.cat([batch.sample for batch in self.judged])
 
     @property
     def fitted_samples(self) -> Tensor:
         """Those of the calls that corrections are fitted on, ``[N, T, D]``."""
-        return torch.cat([lane.sample for lane in self.fitted])
+        return torch.cat([batch.sample for batch in self.fitted])
 
     @property
     def held(self) -> list[Tensor]:
         """The samples and residuals of it; places share those that nothing changed between them."""
-        return [tensor for lane in (*self.fitted, *self.judged) for tensor in lane.held]
+        return [tensor for batch in (*self.fitted, *self.judged) for tensor in batch.held]
 
 
 class SparseLoop:
@@ -107,14 +108,14 @@ class SparseLoop:
             self._known = torch.cat([self._components.values, *others]).float()
             self._episodes = fitted.episodes
 
-        def lanes(calls: Calls | None) -> tuple[_Lane, ...]:
+        def batches(calls: Calls | None) -> tuple[_Batch, ...]:
             if calls is None:
                 return ()
             size = max(1, STREAMS // calls.window) * calls.window
             parts = [np.arange(i, min(i + size, calls.count)) for i in range(0, calls.count, size)]
-            return tuple(_Lane(executor, executor.select(calls, part), whole and executor.alike) for part in parts)
+            return tuple(_Batch(executor, executor.select(calls, part), whole and executor.alike) for part in parts)
 
-        self.begin = Place(0, lanes(fitted), lanes(judged))
+        self.begin = Place(0, batches(fitted), batches(judged))
 
     def after(self, place: Place, rows: PlanArray, pool: ThreadPoolExecutor) -> Place:
         """The place after one step more.
@@ -122,19 +123,19 @@ class SparseLoop:
         Args:
             place: before it.
             rows: of the plan of all calls, ``[1, blocks]``, or of the plan of each.
-            pool: see ``execute.workers``; the lanes go through the network beside each other.
+            pool: see ``pool.workers``; the batches go through the network beside each other.
         """
-        lanes, anchor = [lane.fork() for lane in (*place.fitted, *place.judged)], bool(anchors_of(rows[:, None])[0])
-        ends = np.cumsum([len(lane.sample) for lane in lanes])[:-1]
-        own = [rows] * len(lanes) if len(rows) == 1 else np.split(rows, ends)
-        list(pool.map(partial(_Lane.predict, k=place.step), lanes, own))
-        fitted, judged, solved = tuple(lanes[: len(place.fitted)]), tuple(lanes[len(place.fitted) :]), place.solved
+        batches, anchor = [batch.fork() for batch in (*place.fitted, *place.judged)], bool(anchors_of(rows[:, None])[0])
+        ends = np.cumsum([len(batch.sample) for batch in batches])[:-1]
+        own = [rows] * len(batches) if len(rows) == 1 else np.split(rows, ends)
+        list(pool.map(partial(_Batch.predict, k=place.step), batches, own))
+        fitted, judged, solved = tuple(batches[: len(place.fitted)]), tuple(batches[len(place.fitted) :]), place.solved
         if self._components is not None:
-            read, missing = (torch.cat(column, 1) for column in zip(*map(_Lane.missing, fitted), strict=True))
+            read, missing = (torch.cat(column, 1) for column in zip(*map(_Batch.missing, fitted), strict=True))
             solved = (*solved, solve(read.double(), self._components.values, missing.double(), self._groups))
             added = solved[-1].bias + torch.einsum("nf,fdt->dnt", self._known, solved[-1].observed)
-            for lane, part in zip(lanes, added.tensor_split(ends.tolist(), dim=1), strict=True):
-                lane.correct(solved[-1].weight, part, anchor)
+            for batch, part in zip(batches, added.tensor_split(ends.tolist(), dim=1), strict=True):
+                batch.correct(solved[-1].weight, part, anchor)
         return Place(place.step + 1, fitted, judged, solved, (*place.anchors, anchor), place.jumps)
 
     def end(self, plan: PlanArray) -> Place:
@@ -160,19 +161,19 @@ class SparseLoop:
 
     def _jumped(self, place: Place) -> Place | None:
         """The place after the jump that ends there; None if that does not hold."""
-        lanes = [lane.fork() for lane in (*place.fitted, *place.judged)]
-        fitted, judged = tuple(lanes[: len(place.fitted)]), tuple(lanes[len(place.fitted) :])
-        known = torch.cat([self._known, torch.cat([lane.history for lane in lanes])], 1)
-        missing = torch.cat([lane.left for lane in fitted])
+        batches = [batch.fork() for batch in (*place.fitted, *place.judged)]
+        fitted, judged = tuple(batches[: len(place.fitted)]), tuple(batches[len(place.fitted) :])
+        known = torch.cat([self._known, torch.cat([batch.history for batch in batches])], 1)
+        missing = torch.cat([batch.left for batch in fitted])
         landing = place.step - 1
         found = fit_jump(known[: len(missing)], missing, self._episodes, landing)
         if found is None:
             return None
         layers, added = found
         added = torch.cat([added, through(layers, known[len(missing) :])])
-        ends = np.cumsum([len(lane.sample) for lane in lanes])[:-1].tolist()
-        for lane, part in zip(lanes, added.tensor_split(ends), strict=True):
-            lane.add(part)
+        ends = np.cumsum([len(batch.sample) for batch in batches])[:-1].tolist()
+        for batch, part in zip(batches, added.tensor_split(ends), strict=True):
+            batch.add(part)
         return replace(place, fitted=fitted, judged=judged, jumps={**place.jumps, landing: layers})
 
     def correction(self, place: Place) -> Correction | None:
@@ -200,7 +201,7 @@ class SparseLoop:
         return replace(without, reading=reading, inner=inner, middle=middle, outer=outer) if all(found) else None
 
 
-class _Lane:
+class _Batch:
     """Some of the calls at a place.
 
     Args:
@@ -225,7 +226,7 @@ class _Lane:
         """See ``Place``."""
         return [*self._carried, self._total, *self._state.timestep.values()]
 
-    def fork(self) -> _Lane:
+    def fork(self) -> _Batch:
         """Another one at the same place; what happens to one of the two does not happen to the other."""
         other = copy(self)
         other._state = self._state.copy()

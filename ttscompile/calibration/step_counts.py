@@ -1,29 +1,19 @@
-"""Whole steps, crowded where the policy needs them: where a search starts, and the best for a number of steps.
-
-The best are for an error budget, and for plans beside the target.
-"""
+"""How many steps a plan computes: the fewest for an error; twice and half as many for the plans beside the target."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
-from math import comb
-
-import numpy as np
 
 from ..errors import CalibrationFailedError
 from .budget import Budget, Goal
+from .clock import Clock
 from .progress import Bar
+from .spacing import CROWDING, spacings
 from .state import StateFile
 from .strategies import Strategy
-from .clock import Clock
 from .task import Found, Task
 from .whole_steps import Errors, WholeSteps
-
-CROWDING = (2.0, 3.0, 1.5, 4.0, 1.0, 2.5, 3.5, 5.0, 0.6, 0.4)
-"""1 is even, above it the steps crowd towards the end, below it towards the start. In the order in which they are
-tried: late steps mattered most wherever it was measured, and time may end the search."""
 
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 """Numbers of computed steps that an error budget is tried with, before bisection between two of them."""
@@ -31,43 +21,11 @@ COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 TRIED = (1.0, 2.0, 3.0, 4.0)
 """Those of ``CROWDING`` that are tried while only the number of steps is in question."""
 
-FEW = 128
-"""Where there are no more placements, a search tries them all: those of three steps among 16 are 105."""
-
 SAFE, FAST = "safe", "fast"
 """Plans beside the target: one computes twice as many cells, the other half as many; the robot chooses."""
 
 SHARE = 0.2
 """Share of the time limit that is kept from the search for these plans."""
-
-
-def crowded_steps(steps: int, full_steps: int, crowding: float) -> tuple[int, ...]:
-    """Which steps to compute, in order.
-
-    Args:
-        steps: K, the number of denoising steps.
-        full_steps: how many steps are computed; step 0 is one of them.
-        crowding: the i-th of m is at ``K * (1 - (1 - i/m) ** crowding)``.
-    """
-    wished = steps * (1 - (1 - np.arange(full_steps) / full_steps) ** crowding)
-    chosen: list[int] = []
-    for i, wish in enumerate(wished):  # distinct, in order, and leaving room for those that follow
-        earliest = chosen[-1] + 1 if chosen else 0
-        chosen.append(int(np.clip(np.floor(wish), earliest, steps - full_steps + i)))
-    return tuple(chosen)
-
-
-def crowded_family(steps: int, full_steps: int, crowding: Sequence[float] = CROWDING) -> list[tuple[int, ...]]:
-    """The different schedules that compute ``full_steps`` of the steps."""
-    return list(dict.fromkeys(crowded_steps(steps, full_steps, one) for one in crowding))
-
-
-def other_placements(steps: int, full_steps: int) -> list[tuple[int, ...]] | None:
-    """All other schedules of ``full_steps`` of the steps, step 0 among them; None if there are more than ``FEW``."""
-    if comb(steps - 1, full_steps - 1) > FEW:
-        return None
-    every = ((0, *rest) for rest in combinations(range(1, steps), full_steps - 1))
-    return sorted(set(every) - set(crowded_family(steps, full_steps)), reverse=True)  # late steps first, see CROWDING
 
 
 @dataclass(frozen=True)
@@ -83,7 +41,7 @@ class Best:
     error: float
 
 
-class CrowdedSchedules:
+class SpacedSchedules:
     """Compares crowded schedules, and remembers every comparison in the state.
 
     Args:
@@ -107,7 +65,7 @@ class CrowdedSchedules:
             crowding: the crowdings of the members of the family.
         """
         found: tuple[Errors, tuple[int, ...]] | None = None
-        members = crowded_family(self._whole.steps, full_steps, crowding)
+        members = spacings(self._whole.steps, full_steps, crowding)
         self._bar.stage(what, len(members))
         for number, steps in enumerate(members):
             errors = self._errors(steps, members[number:])
@@ -136,7 +94,7 @@ class CrowdedSchedules:
             return Errors(float(normalised), float(units))
 
 
-def budget_of_error(crowded: CrowdedSchedules, goal: Goal, steps: int, blocks: int) -> Budget:
+def budget_of_error(crowded: SpacedSchedules, goal: Goal, steps: int, blocks: int) -> Budget:
     """The fewest whole steps with which a crowded schedule is as good as was asked for.
 
     Judged on calls to learn from that its correction was not fitted on: the held-out episodes stay out of it. The goal
@@ -174,7 +132,7 @@ def budget_of_error(crowded: CrowdedSchedules, goal: Goal, steps: int, blocks: i
 
 
 def named_plans(
-    crowded: CrowdedSchedules, task: Task, strategy: Strategy, cells: int
+    crowded: SpacedSchedules, task: Task, strategy: Strategy, cells: int
 ) -> tuple[dict[str, Found], dict[str, str]]:
     """Make ``safe`` and ``fast``, where they can be made: whole steps with a correction fitted on all calls.
 

@@ -83,7 +83,7 @@ STRATEGIES = (
     Strategy(
         "tts-switches",
         "the same, and single cells moved by the observation",
-        "calibration.tts:switched",
+        "rivals.switched:Switched",
         fits_correction=True,
         uses_pruner=True,
     ),

@@ -24,9 +24,10 @@ from ..artifact.load import Artifact
 from ..core.correction import Correction
 from ..core.lattice import PlanArray, Source
 from ..errors import CalibrationError
+from ..pool import workers
 from ..runtimes.reference.sampler import Carried
 from .calls import Actions, Calls, IntArray
-from .execute import Executor, State, last, workers
+from .execute import Executor, State, last
 
 Array = npt.NDArray[Any]
 

@@ -11,11 +11,11 @@ import torch
 from ..artifact.view import view_of
 from ..core.plan import Plan
 from ..core.spec import PolicySpec
-from ..pool import Here, Pool, Work, artifact_elsewhere, place_of
+from ..pool import Here, Pool, Work, artifact_elsewhere, place_of, workers
 from ..trajectories.episodes import Episode
 from .calls import Calls, Split, prepare_calls, sample_calls, sample_windows
 from .clock import Clock
-from .execute import Executor, workers
+from .execute import Executor
 from .progress import Bar
 from .state import StateFile
 

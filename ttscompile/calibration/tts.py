@@ -5,23 +5,16 @@ about the observation and the noise, and everything in between is nearly linear.
 its own, fitted on some of the calls, and is judged by the true error of its actions on others. It starts with a family
 of crowded schedules. Where there are few others, it tries them all; else it moves one step of the best at a time, far
 at first, until no move helps. The winner's correction is fitted again, on all calls.
-
-``switched`` then lets the pruner depart from the schedule (``pruner.adaptation``). That never made a plan better that
-could be told from chance (``docs/evidence/ablation.md``), so ``tts`` does without.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
 from ..core.lattice import PlanArray
-from ..rivals.adaptation import Adaptation
-from ..rivals.switches import has_head
-from .step_counts import crowded_family, other_placements
+from .spacing import other_placements, spacings
 from .task import Array, Found, Task
 
 DISTANCES = (8, 4, 2, 1)
@@ -33,25 +26,23 @@ class Tts:
 
     Args:
         task: see ``Task``.
-        adapts: whether the pruner may depart from the schedule, where the artifact has one.
 
     Attributes:
         loss: error of the plan on calls that its correction was not fitted on.
     """
 
-    def __init__(self, task: Task, adapts: bool = False) -> None:
+    closing = 0
+
+    def __init__(self, task: Task) -> None:
         self._task, self._whole = task, task.whole
-        self._adapts = adapts and has_head(task.pruner)
         model = task.executor.model
         self._full = min(max(1, task.budget // model.blocks), model.steps)
         self._steps: tuple[int, ...] = tuple(range(self._full))
         self.loss = float("nan")
         others = other_placements(model.steps, self._full)
-        self._family = [*crowded_family(model.steps, self._full), *(others or ())]
+        self._family = [*spacings(model.steps, self._full), *(others or ())]
         self._moves = [(distance, i) for distance in DISTANCES for i in range(1, self._full)] if others is None else []
-        self.closing = Adaptation.INTERVALS if self._adapts else 0
-        self.intervals = len(self._family) + len(self._moves) + self.closing
-        self._adaptation: Adaptation | None = None
+        self.intervals = len(self._family) + len(self._moves)
         self._settled: Found | None = None
 
     @property
@@ -61,8 +52,8 @@ class Tts:
 
     @property
     def done(self) -> bool:
-        """Whether the schedule is settled, and the pruner fitted to it where it may be."""
-        return self._settled is not None and (self._adaptation is None or self._adaptation.done)
+        """Whether the schedule is settled."""
+        return self._settled is not None
 
     @property
     def settling(self) -> float:
@@ -72,15 +63,10 @@ class Tts:
     def close(self) -> None:
         """Settle the schedule, with a correction from all calls."""
         if self._settled is None:
-            task, self._settled = self._task, self._task.whole_steps(self._steps)
-            corrected = replace(task, executor=task.executor.corrected(self._settled.correction))
-            self._adaptation = Adaptation(corrected, self._settled.schedule) if self._adapts else None
+            self._settled = self._task.whole_steps(self._steps)
 
     def advance(self, interval: int) -> None:
-        """Try a schedule of the family, or two moves of a step; or adapt the plan to observations."""
-        if self._adaptation is not None:
-            self._adaptation.advance()
-            return
+        """Try a schedule of the family, or two moves of a step."""
         if interval < len(self._family):
             self._whole.expect(self._family[interval:])
             self._try([self._family[interval]])
@@ -93,30 +79,23 @@ class Tts:
 
     def state(self) -> dict[str, Array]:
         """Computed steps and their error; corrections are fitted again."""
-        state: dict[str, Array] = {
+        return {
             "steps": np.array(self._steps, np.int64),
             "loss": np.array(self.loss),
             "settled": np.array(int(self._settled is not None)),
         }
-        return state if self._adaptation is None else {**state, **self._adaptation.state()}
 
     def restore(self, state: Mapping[str, Array]) -> None:
         """Go back to where ``state`` was taken."""
         self._steps, self.loss = tuple(int(k) for k in state["steps"]), float(state["loss"])
         if state["settled"]:
             self.close()
-        if self._adaptation is not None:
-            self._adaptation.restore(state)
 
     def found(self) -> Found:
-        """The schedule with its correction, and the pruner if plans that depend on the observation were better."""
+        """The schedule with its correction."""
         self.close()
         assert self._settled is not None
-        if self._adaptation is None:
-            return self._settled
-        notes = {**self._settled.notes, "switches": self._adaptation.switches}
-        pruner, correction = self._adaptation.pruner, self._settled.correction
-        return replace(self._settled, notes=notes, pruner=pruner, pruner_correction=correction)
+        return self._settled
 
     def _candidates(self, distance: int, i: int) -> list[tuple[int, ...]]:
         """The schedules with the i-th step moved in either direction, where it can be."""
@@ -135,6 +114,3 @@ class Tts:
         if not 0 < target < self._task.executor.model.steps or target in self._steps:
             return None
         return tuple(sorted((*self._steps[:i], target, *self._steps[i + 1 :])))
-
-
-switched = partial(Tts, adapts=True)

@@ -16,7 +16,7 @@ from ..pool import Here, Pool, Work
 from .calls import Actions, Calls, IntArray
 from .execute import Executor
 from .fit_correction import fit_correction
-from .schedule_runs import Trails
+from .schedule_runs import ScheduleRuns
 from .sparse_loop import SparseLoop, anchors_of
 from .targets import executor_elsewhere, where
 
@@ -65,7 +65,7 @@ class WholeSteps:
         self._executor, self._actions, self._calls = executor, actions, calls
         self._reading: dict[int, bool] = {}
         self._known: dict[tuple[int, ...], Errors] = {}
-        self._trails: dict[bool | None, Trails] = {}
+        self._runs: dict[bool | None, ScheduleRuns] = {}
         self._pool = pool or Here()
         self._work = Work(self.measured, _measured_elsewhere, (*where(executor), calls, seed))
         order = np.random.default_rng((seed, 3, 0)).permutation(calls.count // calls.window)
@@ -155,11 +155,11 @@ class WholeSteps:
 
     def _error_of(self, steps: Sequence[int], reads: bool | None) -> Errors:
         """Errors of a schedule with a correction that may, or may not, read the observation; None: without one."""
-        if reads not in self._trails:
+        if reads not in self._runs:
             fitted = None if reads is None else self._fitted
             loop = SparseLoop(self._executor, fitted, self._compared, reads=bool(reads), whole=True)
-            self._trails[reads] = Trails(loop, self.steps, self._executor.model.blocks)
-        return self._errors(self._trails[reads].end(steps).samples)
+            self._runs[reads] = ScheduleRuns(loop, self.steps, self._executor.model.blocks)
+        return self._errors(self._runs[reads].end(steps).samples)
 
     def comparing(self, full_steps: int) -> float:
         """Seconds that ``errors`` of a schedule takes, by those so far; 0 before any."""

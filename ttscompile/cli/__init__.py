@@ -16,12 +16,9 @@ from ttscompile.cli.convert import convert
 from ttscompile.cli.distill import distill
 from ttscompile.cli.doctor import doctor
 from ttscompile.cli.ending import TRACEBACK, Commands
-from ttscompile.cli.fleet import fleet
 from ttscompile.cli.inspect import inspect
-from ttscompile.cli.oracle import oracle
 from ttscompile.cli.push import push
 from ttscompile.cli.realtime import realtime
-from ttscompile.cli.report import report
 from ttscompile.cli.reuse_tokens import reuse_tokens
 from ttscompile.cli.serve import serve
 from ttscompile.cli.verify import verify
@@ -48,16 +45,13 @@ for _command, _what in (
     (distill, "Train weights for a plan of very few steps, as a last resort."),
     (reuse_tokens, "Compute of new pictures the parts that changed."),
     (warm_start, "Begin calls with the chunk of the call before."),
-    (inspect, "What is in an artifact; a picture of a plan."),
+    (inspect, "What is in an artifact: tables, a picture, a page."),
     (verify, "Does it do what the original did, and do its plans engage?"),
-    (report, "All about an artifact on one page."),
     (bench, "Time calls, beside what they replace."),
     (compare, "Action error against latency, of plans and strategies."),
-    (oracle, "Would it pay to choose a plan for each call?"),
     (realtime, "Which plans keep up with a control loop on this machine."),
     (push, "Upload an artifact with a model card to the hub."),
-    (serve, "Drive a robot from another process, over a WebSocket."),
-    (fleet, "Answer many robots at once, from copies on a Ray cluster."),
+    (serve, "Drive a robot, or answer many, over a WebSocket."),
 ):
     _command.short_help = _what
     main.add_command(_command)

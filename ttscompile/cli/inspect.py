@@ -1,64 +1,123 @@
-"""``ttscompile inspect``: what is in an artifact, and a picture of one of its plans."""
+"""``ttscompile inspect``: what is in an artifact, as tables, as a picture of a plan, or all of it on a page."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import click
-import numpy as np
-import numpy.typing as npt
 
 from ttscompile.artifact.load import Artifact, load_artifact
-from ttscompile.cli.options import artifact_argument, json_option
-from ttscompile.cli.output import print_json, progress, results, say
+from ttscompile.cli.options import artifact_argument, json_option, runtime_options, threads_option
+from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results, say
+from ttscompile.cli.page import checked, require_page, write_page
+from ttscompile.cli.recordings import Sources, trajectories_options
+from ttscompile.cli.sections import Section, SectionedCommand
 from ttscompile.cli.summary import print_summary
-from ttscompile.cli.types import FILE, PICTURE, TEXT
+from ttscompile.cli.types import FILE, NEW_FILE, PICTURE, TEXT
 from ttscompile.core.lattice import PlanArray
-from ttscompile.errors import ArtifactError, ObservationError
+from ttscompile.errors import ArtifactError
 from ttscompile.plots.maps import plot_plan
+from ttscompile.report import Given
+from ttscompile.report.comparison import read_comparison
+from ttscompile.report.measure import run_episode
 from ttscompile.report.summary import document
-from ttscompile.runtimes.open import open_runtime
-from ttscompile.runtimes.policy import CompiledPolicy
-from ttscompile.trajectories import read_npz
+from ttscompile.report.verified import NOT_RUN
+from ttscompile.runtimes.load import open_policy
+from ttscompile.trajectories import Episode, load_trajectories
 
 SCHEDULE = "schedule"
 """Name that calibration gives to its best plan that does not depend on the observation."""
 
+SECTIONS = (
+    Section("What a page or a picture shows of an episode", ("trajectories", "sources"), ("output", "picture")),
+    Section("What a picture shows", ("name",), ("picture",)),
+    Section("What a page shows", ("verifies", "comparison", "threads", "runtime", "device"), ("output",)),
+)
 
-@click.command()
+
+@click.command(cls=SectionedCommand, sections=SECTIONS)
 @artifact_argument
+@click.option(
+    "-o",
+    "--output",
+    type=NEW_FILE,
+    help="Write all about it into this page (.html), which needs no other file: its plans, its times on this machine,"
+    " its errors, its limits.",
+)
 @click.option("--plot", "picture", type=PICTURE, help="Draw a plan into this file (.png, .svg or .pdf).")
+@trajectories_options(required=False, what="Run the first of these recorded episodes, and show what its calls execute.")
 @click.option(
-    "--plan", "name", type=TEXT, help="The plan to draw. Without this option it is the artifact's default plan."
+    "--plan", "name", type=TEXT, help="Draw this plan. Without this option it is the default plan of the artifact."
 )
+@click.option("--verify", "verifies", is_flag=True, help="Run the checks of 'ttscompile verify', which take minutes.")
 @click.option(
-    "--observation",
+    "--comparison",
     type=FILE,
-    help="An .npz file with an array for each key of the observation, of one call or of the calls of one episode. It is"
-    " needed for plans that depend on the observation; the plan of its last call is drawn.",
+    help="Draw the points that 'ttscompile bench DIRECTORY -t FILE... --json' printed into this file.",
 )
+@threads_option("Threads that the timed calls compute with.")
+@runtime_options
 @json_option
-def inspect(directory: Path, picture: Path | None, name: str | None, observation: Path | None, as_json: bool) -> None:
-    """Show what the artifact DIRECTORY holds: the policy, its blocks, what they cost, its plans and calibration."""
-    if picture is None and (name is not None or observation is not None):
-        raise click.UsageError("--plan and --observation choose what --plot draws; give --plot FILE too.")
-    artifact = load_artifact(directory)
+@click.pass_context
+def inspect(
+    context: click.Context,
+    directory: Path,
+    output: Path | None,
+    picture: Path | None,
+    trajectories: tuple[Path, ...],
+    sources: Sources,
+    name: str | None,
+    verifies: bool,
+    comparison: Path | None,
+    threads: int,
+    runtime: str,
+    device: str | None,
+    as_json: bool,
+) -> None:
+    """Show what the artifact DIRECTORY holds: the policy, its blocks, what they cost, its plans and calibration.
+
+    With -o it also times calls of every plan, and writes a page. The exit status is 1 if a check of --verify failed;
+    the page is written all the same.
+    """
+    if output is not None:
+        require_page(output)
+    console, artifact = progress(), load_artifact(directory)
+    episode = _first_episode(artifact, trajectories, sources) if trajectories else None
+    passed, section = True, NOT_RUN
+    if output is not None:
+        compared = None if comparison is None else read_comparison(comparison)
+        with only_results_on_stdout(), console.status("loading") as status:
+            if verifies:
+                passed, section = checked(
+                    directory, artifact.manifest.identity, trajectories, sources, threads, status.update
+                )
+            policy = open_policy(artifact, runtime, threads, seed=0, device=device)
+            told = write_page(output, artifact, policy, Given(episode, compared, section, threads), status.update)
+        say(console, told)
     if picture is not None:
-        name = name or _drawn_by_default(artifact, observation)
+        name = name or _drawn_by_default(artifact, episode)
         kinds = [block.kind for block in artifact.manifest.blocks]
-        plot_plan(_plan(artifact, name, observation), kinds, picture, f"plan {name!r}")
-        say(progress(), f"wrote {picture}")
+        plot_plan(_plan(artifact, name, episode), kinds, picture, f"plan {name!r}")
+        say(console, f"wrote {picture}")
     if as_json:
         print_json(document(artifact))
     else:
         print_summary(artifact, results())
+    if not passed:
+        say(console, "failed: the artifact does not hold what it promises; the page says where.")
+        context.exit(1)
 
 
-def _drawn_by_default(artifact: Artifact, observation: Path | None) -> str:
-    """The default plan; without an observation the best schedule in place of plans that depend on one."""
+def _first_episode(artifact: Artifact, trajectories: tuple[Path, ...], sources: Sources) -> Episode:
+    spec = artifact.manifest.spec
+    return load_trajectories(trajectories, spec.observations, spec.chunk.stop - spec.chunk.start, sources)[0]
+
+
+def _drawn_by_default(artifact: Artifact, episode: Episode | None) -> str:
+    """The default plan; without an episode the best schedule in place of plans that depend on the observation."""
     default = artifact.manifest.default_plan
     record = artifact.manifest.plans.get(default)
-    if record is None or record.kind != "pruner" or observation is not None or SCHEDULE not in artifact.plans:
+    if record is None or record.kind != "pruner" or episode is not None or SCHEDULE not in artifact.plans:
         return default
     say(
         progress(),
@@ -68,33 +127,16 @@ def _drawn_by_default(artifact: Artifact, observation: Path | None) -> str:
     return SCHEDULE
 
 
-def _plan(artifact: Artifact, name: str, observation: Path | None) -> PlanArray:
-    """The plan to draw, int8 ``[K, blocks]``."""
+def _plan(artifact: Artifact, name: str, episode: Episode | None) -> PlanArray:
+    """The plan to draw, int8 ``[K, blocks]``: of one that is made for each observation, what the last call executed."""
     if (cells := artifact.plan(name).cells) is not None:
         return cells
-    if observation is None:
-        others = [each for each, one in artifact.plans.items() if not one.pruned]
+    if episode is None:
+        others = ", ".join(each for each, one in artifact.plans.items() if not one.pruned)
         raise ArtifactError(
-            f"{artifact.path}: plan {name!r} is made for each observation, and none was given. Add --observation"
-            f" FILE.npz, or draw a schedule with --plan: {', '.join(others)}."
+            f"{artifact.path}: plan {name!r} is made for each observation, and none was given. Add --trajectories"
+            f" FILE, or draw a schedule with --plan: {others}."
         )
-    policy = CompiledPolicy(artifact, open_runtime(artifact), seed=0)  # of this artifact, whatever is there by now
-    for call in _calls(observation, artifact):
-        policy.predict_action(call, plan=name)
-    report = policy.last_report
-    assert report is not None  # there is at least one call
-    plan: PlanArray = report.plan[0]
+    course = run_episode(open_policy(artifact, seed=0), episode, name)  # of this artifact, whatever is there by now
+    plan: PlanArray = course.plans[-1]
     return plan
-
-
-def _calls(path: Path, artifact: Artifact) -> list[dict[str, npt.NDArray[np.generic]]]:
-    """The observations of consecutive calls, ``[1, ...]`` an array; the policy checks all but their number."""
-    specs = artifact.manifest.spec.observations
-    stored = read_npz(path)
-    if missing := [key for key in specs if key not in stored]:
-        raise ObservationError(f"{path}: has no array {missing[0]!r}; expected {list(specs)}, found {list(stored)}.")
-    rows = {k: stored[k] if stored[k].ndim > len(spec.shape) else stored[k][None] for k, spec in specs.items()}
-    counts = {k: len(a) for k, a in rows.items()}
-    if len(set(counts.values())) != 1 or 0 in counts.values():
-        raise ObservationError(f"{path}: expected as many calls for every key, at least one; found {counts}.")
-    return [{k: a[i : i + 1] for k, a in rows.items()} for i in range(min(counts.values()))]

@@ -102,27 +102,19 @@ def names_option(name: str, known: Sequence[str], *, default: str, help: str) ->
 
 
 loop_options = together(
-    click.option("--control-hz", type=RATE, required=True, help="Rate of the control loop in Hz."),
     click.option(
         "--policy-hz",
         type=RATE,
-        help="Rate in Hz of the frames and actions that the policy was trained with. Without this option it is the"
-        " control rate.",
+        help="Rate in Hz of the frames and actions that the policy was trained with. Without this option it is that of"
+        " --control-hz.",
     ),
     count_option(
         "--horizon",
-        "Actions that are executed from one call to the next. Without this option it is as many as the policy executes"
-        " of a chunk.",
+        "Execute so many actions from one call to the next. Without this option it is as many as the policy executes of"
+        " a chunk.",
         default=None,
     ),
-    count_option(
-        "--reserve",
-        "Further actions of a chunk that may be executed while the next chunk is late. Without this option it is all"
-        " that the policy predicts.",
-        default=None,
-        least=0,
-    ),
-    count_option("--margin-ticks", "Control ticks by which a chunk has to come before it is needed.", least=0),
-    threads_option("Threads that the policy computes with."),
+    count_option("--margin-ticks", "Have each chunk come so many control ticks before it is needed.", least=0),
 )
-"""Of commands that run an artifact in a control loop; their meanings are those of ``ExecutorSettings``."""
+LOOP_OPTIONS = ("policy_hz", "horizon", "margin_ticks")
+"""Of commands that run an artifact in a control loop, and their parameters, which ``ExecutorSettings`` has too."""

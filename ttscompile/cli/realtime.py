@@ -11,9 +11,16 @@ import numpy as np
 
 import ttscompile
 from ttscompile.artifact.manifest import marked
-from ttscompile.cli.options import artifact_argument, json_option, loop_options, runs_option, runtime_options
+from ttscompile.cli.options import (
+    artifact_argument,
+    json_option,
+    loop_options,
+    runs_option,
+    runtime_options,
+    threads_option,
+)
 from ttscompile.cli.output import print_identity, print_json, progress, results, say, table
-from ttscompile.cli.types import SECONDS, TEXT
+from ttscompile.cli.types import RATE, SECONDS, TEXT
 from ttscompile.core.plan import UNIFORM
 from ttscompile.errors import DeadlineMissedError
 from ttscompile.measure.machine import fingerprint, one_line
@@ -29,6 +36,8 @@ JITTER_HZ = 200
 
 @click.command()
 @artifact_argument
+@click.option("--control-hz", type=RATE, required=True, help="Rate of the control loop in Hz.")
+@threads_option("Threads that the policy computes with.")
 @loop_options
 @runtime_options
 @click.option(

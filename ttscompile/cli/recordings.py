@@ -17,14 +17,15 @@ Sources = dict[str, tuple[str, ...]]
 
 
 class FilesCommand(click.Command):
-    """Lets ``--trajectories`` and ``--with`` take every word up to the next option, which click's own cannot."""
+    """Lets options whose metavar ends in ``...`` take every word up to the next option, which click's own cannot."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """As click does, with the option repeated before every word."""
         expanded: list[str] = []
         taking = ""
+        many = {word for one in self.params if (one.metavar or "").endswith("...") for word in one.opts}
         for arg in args:
-            if arg in ("--trajectories", "--with"):
+            if arg in many:
                 taking = arg
             elif taking and not arg.startswith("-"):
                 expanded += [taking, arg]
@@ -57,17 +58,23 @@ def require_recordings(paths: Iterable[Path]) -> None:
         require_path(path, TrajectoryError, "Give the file or the directory of a recording.")
 
 
-def trajectories_options(required: bool = True) -> Decorator:
-    """``--trajectories`` as ``trajectories: tuple[Path, ...]`` and ``--observation`` as ``sources: Sources``."""
+def trajectories_options(required: bool = True, what: str = "Learn from these recorded episodes.") -> Decorator:
+    """``--trajectories`` as ``trajectories: tuple[Path, ...]`` and ``--observation`` as ``sources: Sources``.
+
+    Args:
+        required: whether the command does nothing without recordings.
+        what: the sentence that says what is done with them.
+    """
     return together(
         click.option(
+            "-t",
             "--trajectories",
             required=required,
             multiple=True,
             type=PATH,
             metavar="FILE...",
-            help="Recordings of episodes: .npz files, zarr replay buffers of Diffusion Policy, HDF5 files of robomimic,"
-            " or LeRobot data sets. Every word up to the next option is one.",
+            help=f"{what} They are .npz files, zarr replay buffers of Diffusion Policy, HDF5 files of robomimic, or"
+            " LeRobot data sets; every word up to the next option is one.",
         ),
         click.option(
             "--observation",
@@ -76,7 +83,7 @@ def trajectories_options(required: bool = True) -> Decorator:
             multiple=True,
             callback=_sources,
             metavar="KEY=NAME,NAME:N",
-            help="The arrays that a key of the observation is made of, where a recording of frames names them"
-            " otherwise. They are joined in this order; NAME:N takes the first N numbers of an array.",
+            help="Make a key of the observation of these arrays, joined in this order, where a recording of frames has"
+            " other names. NAME:N takes the first N numbers of an array.",
         ),
     )

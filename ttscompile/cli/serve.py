@@ -1,39 +1,67 @@
-"""``ttscompile serve``: an artifact drives a robot whose program is another process, in any language."""
+"""``ttscompile serve``: an artifact answers programs in other processes, those of one robot or of many."""
 
 from __future__ import annotations
 
 import asyncio
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
 import click
 
 import ttscompile
-from ttscompile.cli.options import artifact_argument, count_option, loop_options, runtime_options, seed_option
-from ttscompile.cli.output import progress
-from ttscompile.cli.server_options import Doorway, door_options
-from ttscompile.cli.types import TEXT
+from ttscompile.artifact.load import load_artifact
+from ttscompile.cli.options import (
+    LOOP_OPTIONS,
+    artifact_argument,
+    count_option,
+    loop_options,
+    runtime_options,
+    threads_option,
+)
+from ttscompile.cli.output import only_results_on_stdout, progress
+from ttscompile.cli.sections import Section, SectionedCommand
+from ttscompile.cli.server_options import FLEET_CLIENTS, ROBOT_CLIENTS, SERVER_OPTIONS, ServerOptions, server_options
+from ttscompile.cli.types import ANY_TEXT, RATE, TEXT, Number
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
 from ttscompile.runtimes.executor.settings import INTERPOLATIONS, SEAMS
+from ttscompile.runtimes.fleet import LOCAL, FleetServer, FleetSettings, Plans, ray_copies
 from ttscompile.runtimes.server.executor_server import ExecutorServer
+from ttscompile.runtimes.server.limits import ServerLimits
 
-MOST_CLIENTS = 128
+MOST_ROBOT_CLIENTS = 128
 """A socket each, and threads that wait for actions; a process may have 1024 files open where nothing else is said."""
 
+BATCHES_WAITING = 16
+"""Requests of a fleet that may be under way, in full batches of every copy; further ones are refused at once."""
 
-@click.command()
+SECTIONS = (
+    Section("One robot", (*LOOP_OPTIONS, "max_hold", "seam", "interpolation", "runtime", "device"), ("control_hz",)),
+    Section("Many robots", ("ray", "wait_ms"), ("copies",)),
+    Section("Who may connect", SERVER_OPTIONS),
+)
+
+
+@click.command(cls=SectionedCommand, sections=SECTIONS)
 @artifact_argument
-@loop_options
-@runtime_options
-@door_options(clients=8, most=MOST_CLIENTS)
+@click.option("--control-hz", type=RATE, help="Drive one robot, whose control loop has this rate in Hz.")
+@count_option(
+    "--copies", "Answer many robots, with so many copies of the policy, which run on Ray.", default=None, most=4096
+)
 @click.option(
-    "--tier",
-    "tiers",
+    "--plan",
+    "plans",
     type=TEXT,
     multiple=True,
-    help="A plan to run; may be repeated, from the slowest to the fastest, which are fallen back to when calls are"
-    " late. Without this option it is the default plan.",
+    help="Run this plan. Without this option it is the default plan. With --control-hz it may be repeated, from the"
+    " slowest plan to the fastest: a faster one is run when calls are late. With --copies it is the plan of requests"
+    " that name none.",
+)
+@threads_option("Threads that the policy, or each copy of it, computes with.")
+@loop_options
+@count_option(
+    "--max-hold", "Repeat the last action for so many control ticks when there is no other.", default=3, least=0
 )
 @click.option(
     "--seam",
@@ -49,32 +77,87 @@ MOST_CLIENTS = 128
     show_default=True,
     help="What is between two actions where the control loop is faster than the policy.",
 )
-@count_option(
-    "--max-hold", "Control ticks for which the last action is repeated when there is no other.", default=3, least=0
+@runtime_options
+@click.option(
+    "--ray",
+    type=ANY_TEXT,
+    metavar="ADDRESS|local",
+    default=LOCAL,
+    show_default=True,
+    help="Run the copies on this Ray cluster, or on cores of this machine.",
 )
-@seed_option("Seed of the policy's noise. Without this option each run draws other noise.", default=None)
+@click.option(
+    "--wait-ms",
+    type=Number(0, 10_000),
+    default=5.0,
+    show_default=True,
+    help="Let a request wait so many milliseconds for others of its plan, to be one call with them.",
+)
+@server_options
 def serve(
     directory: Path,
-    control_hz: float,
+    control_hz: float | None,
+    copies: int | None,
+    plans: tuple[str, ...],
     threads: int,
     runtime: str,
     device: str | None,
-    tiers: tuple[str, ...],
-    seed: int | None,
+    ray: str,
+    wait_ms: float,
     **options: Any,
 ) -> None:
-    """Serve the artifact DIRECTORY on a WebSocket until it is interrupted; docs/serve.md has the protocol.
+    """Serve the artifact DIRECTORY on a WebSocket until it is interrupted.
 
-    The first line on standard output is a JSON object with the url and the artifact's identity; statistics follow at
-    the end.
+    With --control-hz it drives one robot, in a control loop; docs/serve.md has the protocol. With --copies it answers
+    many robots, each request by itself; docs/howto/fleet.md has that protocol. The first line on standard output is a
+    JSON object with the url and the artifact's identity. Standard error gets a line for each connection.
     """
+    if (control_hz is None) == (copies is None):
+        raise click.UsageError("give --control-hz HZ to drive one robot, or --copies N to answer many.")
+    server = ServerOptions.taken(options, progress())
+    with server.audited():
+        if control_hz is not None:
+            policy = {"runtime": runtime, "threads": threads, "device": device}
+            _serve_robot(directory, server, control_hz, ExecutorSettings(tiers=plans or None, **options), policy)
+        elif copies is not None:
+            if len(plans) > 1:
+                raise click.UsageError("--copies takes one --plan, that of requests that name none.")
+            _serve_fleet(directory, server, ray, FleetSettings(copies, threads, wait_ms=wait_ms), *plans)
+
+
+def _serve_robot(
+    directory: Path, server: ServerOptions, control_hz: float, settings: ExecutorSettings, how: dict[str, Any]
+) -> None:
+    """In a control loop, with a policy that is loaded so; statistics follow at the end."""
+    clients = server.max_clients or ROBOT_CLIENTS
+    if clients > MOST_ROBOT_CLIENTS:
+        raise click.UsageError(f"--max-clients is at most {MOST_ROBOT_CLIENTS} with --control-hz; found {clients}.")
     console = progress()
-    door = Doorway.taken(options, console)
-    with door.audited():
-        with console.status("loading and measuring"):
-            policy = ttscompile.load(directory, runtime, threads, seed, device=device)
-            executor = AsyncExecutor(policy, control_hz, ExecutorSettings(tiers=tiers or None, **options))
-        door.warn(console)
-        with executor:
-            asyncio.run(door.serve(ExecutorServer(executor, door.limits, door.lock), policy.info.identity))
+    with console.status("loading and measuring"):
+        policy = ttscompile.load(directory, **how)
+        executor = AsyncExecutor(policy, control_hz, settings)
+    server.warn(console)
+    with executor:
+        limits = ServerLimits.of(policy.info.observation, clients)
+        asyncio.run(server.serve(ExecutorServer(executor, limits, server.lock), policy.info.identity))
     click.echo(json.dumps({"statistics": executor.statistics().to_json()}, allow_nan=False))
+
+
+def _serve_fleet(
+    directory: Path, server: ServerOptions, ray: str, settings: FleetSettings, plan: str | None = None
+) -> None:
+    """From copies of the policy."""
+    console, artifact = progress(), load_artifact(directory)
+    Plans.of(artifact, plan)  # before copies are started, which takes a while
+    output, identity = sys.stdout, artifact.manifest.identity
+    limits = ServerLimits.of(artifact.manifest.spec.observations, server.max_clients or FLEET_CLIENTS)
+    with (
+        only_results_on_stdout(),  # Ray writes what its processes say there
+        console.status("starting copies") as status,
+        ray_copies(ray, directory, identity, settings) as copies,
+    ):
+        waiting = BATCHES_WAITING * settings.copies * settings.batch
+        fleet = FleetServer(artifact, copies, plan, waiting, limits, server.lock)
+        status.stop()
+        server.warn(console)
+        asyncio.run(server.serve(fleet, identity, output))

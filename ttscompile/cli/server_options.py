@@ -1,4 +1,4 @@
-"""What commands that listen have in common: where, for whom, and until when."""
+"""Where a server listens, for whom, and until when."""
 
 from __future__ import annotations
 
@@ -16,155 +16,128 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import click
 
-from ttscompile.cli.options import Decorator, count_option, together
+from ttscompile.cli.options import count_option, together
 from ttscompile.cli.output import say
-from ttscompile.cli.types import ADDRESS, FILE, NEW_FILE
-from ttscompile.core.paths import require_free_or_path
-from ttscompile.errors import ExecutorError, OutputError
+from ttscompile.cli.types import ADDRESS, FILE
+from ttscompile.errors import ExecutorError
 from ttscompile.runtimes.server.admission import AUDIT
-from ttscompile.runtimes.server.limits import ServerLimits
 from ttscompile.runtimes.server.listener import Listener
 from ttscompile.runtimes.server.lock import Lock, hashed, read_by_others, read_token, tls_context
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+ROBOT_CLIENTS, FLEET_CLIENTS = 8, 256
+"""That may be connected where nothing is said."""
+
 TOKEN_VARIABLE = "TTSCOMPILE_TOKEN"  # noqa: S105
 """Of the environment; the example client reads it too."""
 
 
-def door_options(clients: int, most: int) -> Decorator:
-    """Where to listen, the lock, the audit, and what clients may do.
+SERVER_OPTIONS = ("host", "port", "token_file", "tls", "insecure", "max_clients")
+"""Parameters of ``server_options``."""
 
-    Args:
-        clients: that may be connected, where nothing is said.
-        most: that may be asked for.
-    """
-    return together(
-        click.option(
-            "--host",
-            type=ADDRESS,
-            default="127.0.0.1",
-            show_default=True,
-            help="Address to listen on: an IP address of this machine, or localhost. One that other machines may reach"
-            " needs a token and a certificate.",
-        ),
-        click.option(
-            "--port",
-            type=click.IntRange(0, 65535),
-            default=8765,
-            show_default=True,
-            help="Port to listen on; 0 takes any that is free.",
-        ),
-        click.option(
-            "--token-file",
-            type=FILE,
-            help=f"File with the token that clients must send. The environment's {TOKEN_VARIABLE} can hold it instead."
-            " There is no option for the token itself: other users could read it in the list of processes.",
-        ),
-        click.option(
-            "--tls-certificate",
-            type=FILE,
-            help="Certificate of the server in PEM format, with those between it and its authority's. Clients use wss://.",
-        ),
-        click.option("--tls-key", type=FILE, help="Its private key in PEM format, if that is in a file of its own."),
-        click.option(
-            "--insecure",
-            is_flag=True,
-            help="Listen beyond this machine without a token or a certificate: whoever reaches the port can drive the"
-            " robot.",
-        ),
-        click.option(
-            "--audit-file",
-            type=NEW_FILE,
-            help="File that a line of JSON is appended to for each connection. Without this option it is standard"
-            " error.",
-        ),
-        count_option("--max-clients", "Clients that may be connected.", default=clients, most=most),
-        count_option(
-            "--max-clients-per-address",
-            "Of these, clients of one address. Without this option it is all of them.",
-            default=None,
-            most=most,
-        ),
-        count_option(
-            "--max-requests-per-second", "Requests of one client; further ones wait their turn.", default=2000
-        ),
-        count_option(
-            "--max-message-bytes", "Size of a message that is still read.", default=1 << 20, least=128, most=1 << 30
-        ),
-    )
+
+def _papers(_: click.Context, __: click.Parameter, files: tuple[Path, ...]) -> tuple[Path, ...]:
+    if len(files) > 2:
+        raise click.BadParameter(f"expected a certificate, and its key if that is in another file; found {len(files)}.")
+    return files
+
+
+server_options = together(
+    click.option(
+        "--host",
+        type=ADDRESS,
+        default="127.0.0.1",
+        show_default=True,
+        help="Listen on this IP address of this machine, or on localhost. One that other machines may reach needs a"
+        " token and a certificate.",
+    ),
+    click.option(
+        "--port",
+        type=click.IntRange(0, 65535),
+        default=8765,
+        show_default=True,
+        help="Listen on this port; 0 takes any that is free.",
+    ),
+    click.option(
+        "--token-file",
+        type=FILE,
+        help=f"Let in clients that send the token in this file. The environment's {TOKEN_VARIABLE} can hold it instead."
+        " There is no option for the token itself: other users could read it in the list of processes.",
+    ),
+    click.option(
+        "--tls",
+        type=FILE,
+        multiple=True,
+        metavar="CERTIFICATE [KEY]...",
+        callback=_papers,
+        help="Have clients use wss:// with this certificate in PEM format, which those between it and its authority's"
+        " follow in the same file; then its private key, if that is in a file of its own.",
+    ),
+    click.option(
+        "--insecure",
+        is_flag=True,
+        help="Listen beyond this machine without a token or a certificate: whoever reaches the port can drive the"
+        " robot.",
+    ),
+    count_option(
+        "--max-clients",
+        f"Let so many clients connect. Without this option it is {ROBOT_CLIENTS} with --control-hz, and {FLEET_CLIENTS}"
+        " with --copies.",
+        default=None,
+        most=4096,
+    ),
+)
+"""Where to listen, the lock, and how many may come."""
 
 
 @dataclass(frozen=True)
-class Doorway:
-    """What ``door_options`` were given as, checked.
+class ServerOptions:
+    """What ``server_options`` were given as, checked.
 
     Attributes:
         host: to listen on.
         port: 0 for any that is free.
         lock: who may come in.
-        limits: what clients may do.
-        audit_file: that the audit goes to; None for standard error.
+        max_clients: that may be connected; None for what is usual.
     """
 
     host: str
     port: int
     lock: Lock
-    limits: ServerLimits
-    audit_file: Path | None
+    max_clients: int | None
 
     @classmethod
-    def taken(cls, options: dict[str, Any], console: Console) -> Doorway:
-        """Take the options of the door out of those of a command.
+    def taken(cls, options: dict[str, Any], console: Console) -> ServerOptions:
+        """Take these options out of those of a command.
 
         Raises:
             ExecutorError: the token is none, or the address wants a lock; also for TLS, see ``tls_context``.
-            UsageError: a key without a certificate.
         """
         token_file, host = options.pop("token_file"), options.pop("host")
-        certificate, key = options.pop("tls_certificate"), options.pop("tls_key")
+        papers = options.pop("tls")
         token_hash = _token_hash(token_file)
         if token_file is not None and read_by_others(token_file):
             say(
                 console,
                 f"warning: {token_file} may be read by other users of this machine. Run: chmod 600 {token_file}",
             )
-        if key is not None and certificate is None:
-            raise click.UsageError("--tls-key is the key of a certificate. Give --tls-certificate too.")
-        lock = Lock(token_hash, tls_context(certificate, key) if certificate else None, options.pop("insecure"))
+        lock = Lock(token_hash, tls_context(*papers) if papers else None, options.pop("insecure"))
         if host != "localhost":  # that name's addresses are looked at when it listens
             lock.require(host)
-        limits = ServerLimits(
-            clients=options.pop("max_clients"),
-            message_bytes=options.pop("max_message_bytes"),
-            clients_per_address=options.pop("max_clients_per_address"),
-            requests_per_second=options.pop("max_requests_per_second"),
-        )
-        return cls(host, options.pop("port"), lock, limits, options.pop("audit_file"))
+        return cls(host, options.pop("port"), lock, options.pop("max_clients"))
 
     def warn(self, console: Console) -> None:
         """Say it where whoever comes is let in."""
         if self.lock.insecure and self.lock.missing():
             say(console, f"warning: there is {self.lock.missing()}: whoever reaches {self.host} can drive the robot.")
 
+    @staticmethod
     @contextmanager
-    def audited(self) -> Iterator[None]:
-        """Write the audit's lines to the end of a file that nobody else may read, or to standard error.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
-        handler: logging.Handler = logging.StreamHandler(sys.stderr)
-        if self.audit_file is not None:
-            require_free_or_path(self.audit_file, OutputError, "Give a file, or leave --audit-file out.")
-            try:
-                os.close(os.open(self.audit_file, os.O_CREAT | os.O_WRONLY, 0o600))
-                handler = logging.FileHandler(self.audit_file, encoding="utf-8")
-            except OSError as error:
-                raise OutputError(
-                    f"{self.audit_file}: cannot be written: {error.strerror}. Give another --audit-file."
-                ) from error
+    def audited() -> Iterator[None]:
+        """Write the audit's lines to standard error."""
+        handler = logging.StreamHandler(sys.stderr)
         before = AUDIT.level, AUDIT.propagate
         AUDIT.addHandler(handler)
         AUDIT.setLevel(logging.INFO)
@@ -175,7 +148,6 @@ class Doorway:
             AUDIT.removeHandler(handler)
             AUDIT.setLevel(before[0])
             AUDIT.propagate = before[1]
-            handler.close()
 
     async def serve(self, server: Listener, identity: str, output: TextIO | None = None) -> None:
         """Let a server listen until the process is told to end, and write its address, one line of JSON.

@@ -1,4 +1,4 @@
-"""The door for what callers give: what comes through is a plain int, or a plain numpy array whose every number counts.
+"""What callers give, made plain or refused: an int, or a numpy array of numpy's own class whose every number counts.
 
 Arrays of other libraries keep more than numbers: a mask, a unit, an operation of their own. Numpy's functions follow
 that, and the code that computes does not; so it is refused here, or left behind where it changes nothing. Torch's

@@ -16,7 +16,7 @@ from .finding import Finding, Level
 PYTHON = (3, 11)
 PROJECT = "ttscompile"
 ENABLES = {
-    "compile": "convert, calibrate, compare, report, pictures, runtime='torch' and 'reference'",
+    "compile": "convert, calibrate, bench -t, inspect -o, pictures, runtime='torch' and 'reference'",
     "lerobot": "convert --task of LeRobot policies",
     "recordings": "recordings in zarr, HDF5 and LeRobot's format",
     "serve": "serve",

@@ -52,7 +52,7 @@ def configured_loops(settings: Mapping[str, Any], own_steps: int | None, options
     return loops_of(lambda each: configured_sampler(settings, own_steps, each, **more), options, own or "no scheduler")
 
 
-def configured_sampler(
+def configured_sampler(  # noqa: C901, PLR0912  # each setting can be wrong in its own way
     settings: Mapping[str, Any],
     own_steps: int | None,
     options: LoadOptions,

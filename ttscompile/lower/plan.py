@@ -59,7 +59,8 @@ class LoweredPlan:
     any_of_group: str
 
 
-def lower_plan(w: GraphWriter, plan: str, index: str, groups: Sequence[int], steps: int, together: int) -> LoweredPlan:
+# PLR0915: a node a line
+def lower_plan(w: GraphWriter, plan: str, index: str, groups: Sequence[int], steps: int, together: int) -> LoweredPlan:  # noqa: PLR0915
     """Write the nodes that lower a plan.
 
     Args:

@@ -1,4 +1,4 @@
-"""``ttscompile report``: everything about an artifact on one page that needs nothing else to be read."""
+"""``ttscompile inspect -o``: everything about an artifact on one page that needs nothing else to be read."""
 
 from .build import Given, build
 from .page import Page, Picture, Section, Table, render

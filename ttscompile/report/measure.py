@@ -46,7 +46,7 @@ class Latency:
 
 @dataclass(frozen=True)
 class Course:
-    """One episode with the default plan.
+    """One episode with one plan.
 
     Attributes:
         name: file and number of the episode.
@@ -99,18 +99,19 @@ def measure_parts(policy: CompiledPolicy, spec: PolicySpec, plans: Sequence[str]
     return found
 
 
-def run_episode(policy: CompiledPolicy, episode: Episode) -> Course:
-    """The default plan on consecutive calls, from a reset.
+def run_episode(policy: CompiledPolicy, episode: Episode, plan: str | None = None) -> Course:
+    """A plan on consecutive calls, from a reset.
 
     Args:
         policy: loaded with a seed; it is reset before and after.
         episode: its first ``EPISODE_CALLS`` calls are run.
+        plan: its name; None for the policy's default.
     """
     policy.reset()
     made = []
     for row in range(min(episode.calls, EPISODE_CALLS)):
         obs = {key: array[row : row + 1] for key, array in episode.observations.items()}
-        made.append(_call(policy, obs, None))
+        made.append(_call(policy, obs, plan))
     policy.reset()
     plans = np.stack([report.plan[0] for report in made])
     return Course(episode.name, plans, tuple(report.legalised[0] for report in made))

@@ -91,7 +91,7 @@ def require_packages() -> None:
             importlib.import_module(name)
         except ModuleNotFoundError as error:
             raise RuntimeUnavailableError(
-                f"a report needs {name}, and {error.name!r} is not installed. Run: pip install 'ttscompile[compile]',"
+                f"the page needs {name}, and {error.name!r} is not installed. Run: pip install 'ttscompile[compile]',"
                 " or read the figures with: ttscompile inspect DIR --json."
             ) from error
 

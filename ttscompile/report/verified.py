@@ -1,4 +1,4 @@
-"""What ``ttscompile verify`` found, as a section of a report."""
+"""What ``ttscompile verify`` found, as a section of the page."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from ..verification import Rung, Verification
 from .page import Picture, Section, Table
 from .pictures import drawn, plain
 
-NOT_RUN = Section("Verification", ("Not run for this report: --verify adds it, ttscompile verify DIR runs it alone.",))
+NOT_RUN = Section("Verification", ("Not run for this page: --verify adds it, ttscompile verify DIR runs it alone.",))
 
 
 def verified(found: Verification) -> Section:

@@ -6,11 +6,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from ..calibration.pruner.head import has_head
 from ..calibration.task import Array, Task
 from ..core.lattice import PlanArray, Source
 from ..runtimes.plans import pruner_plan
 from .linear import Matrix, linearise
-from .switches import capacity, fit_switches, has_head, head_features, head_weights
+from .switches import capacity, fit_switches, head_features, head_weights
 
 LINEARISED = 32
 """Calls that an interval linearises."""

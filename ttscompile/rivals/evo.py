@@ -12,7 +12,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..calibration.step_counts import crowded_family
+from ..calibration.spacing import spacings
 from ..calibration.task import Array, Found, NothingAfter, Task
 from ..core.lattice import BoolArray, PlanArray, Source, whole_steps_plan
 
@@ -81,7 +81,7 @@ class Evo(NothingAfter):
         """Whole-step plans, and random ones."""
         task, model = self._task, self._task.executor.model
         draw = task.draw(10**6)
-        family = crowded_family(model.steps, max(1, task.budget // model.blocks))
+        family = spacings(model.steps, max(1, task.budget // model.blocks))
         whole = [whole_steps_plan(model.steps, model.blocks, steps) == Source.COMPUTE for steps in family]
         random = draw.random((POPULATION - len(whole), *whole[0].shape)) < task.budget / whole[0].size
         return np.stack([repair(one, task.budget, self._least, draw) for one in (*whole, *random)])

@@ -18,12 +18,11 @@ import numpy as np
 import torch
 
 from ..artifact.load import load_artifact
-from ..calibration.calls import Actions, Calls, load_episodes, prepare_calls, sample_calls, split_episodes
-from ..calibration.compare import FRACTION
+from ..calibration.calls import FRACTION, Actions, Calls, load_episodes, prepare_calls, sample_calls, split_episodes
 from ..calibration.execute import Executor
 from ..calibration.fit_correction import fit_correction
 from ..calibration.progress import Progress
-from ..calibration.step_counts import crowded_family
+from ..calibration.spacing import spacings
 from ..calibration.targets import REPEATS, dense_rounds
 from ..calibration.task import Array
 from ..core.coercion import integer
@@ -163,7 +162,7 @@ def placements(steps: int, count: int, most: int, seed: int) -> list[tuple[int, 
     """Schedules that compute ``count`` of the steps, step 0 among them: all, or crowded ones and others at random."""
     if comb(steps - 1, count - 1) <= most:
         return [(0, *rest) for rest in combinations(range(1, steps), count - 1)]
-    found = dict.fromkeys(islice(crowded_family(steps, count), most))
+    found = dict.fromkeys(islice(spacings(steps, count), most))
     draw = np.random.default_rng((seed, 8, count))
     while len(found) < most:
         found[(0, *sorted(int(k) for k in draw.choice(np.arange(1, steps), count - 1, replace=False)))] = None

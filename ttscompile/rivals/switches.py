@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..calibration.calls import Calls, IntArray
+from ..calibration.pruner.head import NAMES
 from ..core.lattice import BoolArray, PlanArray, Source
 from ..ir.evaluate import Evaluator
 from ..ir.graph import Graph, Ref, backward_slice
@@ -36,10 +37,6 @@ ENTERING = 300
 WORTH = 0.003
 """Share of the squared error by which another switch has to lower it."""
 
-
-NAMES = frozenset(
-    f"pruner.{n}" for n in ("hidden.weight", "hidden.bias", "code.weight", "code.bias", "step", "block", "base")
-)
 
 CODE, MARGIN, EDGE = 1.0, 64.0, 1e-3
 """Logits: what a switch moves; what no sum of switches moves; where a switch flips."""
@@ -169,11 +166,6 @@ def _blocked(leaving: IntArray, entering: IntArray, steps: int, blocks: int, swi
         touched[tuple(zip(*switch.touched, strict=True))] = True
     blocked: BoolArray = (b == c) | touched[k, b] | touched[m, c] | own[k, c] | own[m, b]
     return blocked
-
-
-def has_head(constants: Mapping[str, Any]) -> bool:
-    """Whether the pruner is the head that this module knows."""
-    return set(constants) >= NAMES
 
 
 def capacity(constants: Mapping[str, npt.NDArray[Any]]) -> int:

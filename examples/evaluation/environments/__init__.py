@@ -37,20 +37,28 @@ class Environment(Protocol):
         hz: actions a second.
         max_steps: actions after which an episode ends.
         task: what has to be done, where there are several tasks: the seed decides; else empty.
-        done: the task is solved, or ``max_steps`` actions were taken.
-        success: the task is solved. It stays solved.
-        score: 0 to 1, what the episode is worth so far: 1 if it is solved. It never falls.
-        measures: further figures so far, by name; tables show their means.
     """
 
     title: str
     hz: float
     max_steps: int
     task: str
-    done: bool
-    success: bool
-    score: float
-    measures: Mapping[str, float]
+
+    @property
+    def done(self) -> bool:
+        """The task is solved, or ``max_steps`` actions were taken."""
+
+    @property
+    def success(self) -> bool:
+        """The task is solved. It stays solved."""
+
+    @property
+    def score(self) -> float:
+        """0 to 1, what the episode is worth so far: 1 if it is solved. It never falls."""
+
+    @property
+    def measures(self) -> Mapping[str, float]:
+        """Further figures so far, by name; tables show their means."""
 
     def reset(self, seed: int) -> None:
         """Start the episode of this seed."""

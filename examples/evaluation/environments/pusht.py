@@ -106,7 +106,7 @@ class PushT:
     title, hz, max_steps, task = "Push-T", 10.0, 300, ""
 
     def __init__(self) -> None:
-        self._gym = gymnasium.make(
+        self._gym: Any = gymnasium.make(
             "gym_pusht/PushT-v0",
             obs_type="state",
             render_mode="rgb_array",
@@ -152,7 +152,7 @@ class PushT:
         seen = observation(self.state)
         return {"obs": seen, "observation.state": seen}
 
-    def step(self, action: Array) -> None:
+    def step(self, action: npt.ArrayLike) -> None:
         """Send the agent towards a position ``[2]``, pixels, for 0.1 s."""
         self.state, _, terminated, truncated, info = self._gym.step(np.asarray(action, dtype=np.float64))
         self.coverage = max(self.coverage, float(info["coverage"]))

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import numpy.typing as npt
 
-from . import Array, Frame
+from . import Frame
 from .pusht import PushT
 
 NOISE = 4.0
@@ -28,7 +29,7 @@ class PushTNoisy(PushT):
         errors = np.random.default_rng(self._frame).normal(0, NOISE, 20).astype(np.float32)
         return {key: exact + errors for key, exact in super().observe().items()}
 
-    def step(self, action: Array) -> None:
+    def step(self, action: npt.ArrayLike) -> None:
         """See ``PushT``."""
         super().step(action)
         self._frame[1] += 1

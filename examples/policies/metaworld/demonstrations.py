@@ -11,6 +11,7 @@ from __future__ import annotations
 import sys
 import warnings
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
@@ -48,7 +49,7 @@ def demonstrate(environment: MetaWorld, seed: int, task: str) -> dict[str, npt.N
     rng = np.random.default_rng([seed, 1])
     expert = ENV_POLICY_MAP[task]()
     environment.reset(seed, task)
-    rows = []
+    rows: list[tuple[Any, Any, bool]] = []
     left, after, push = 0, 0, np.zeros(4)
     while after < AFTER_SUCCESS and len(rows) < MAX_STEPS:
         action = np.clip(expert.get_action(environment.state), -1.0, 1.0)
@@ -81,7 +82,7 @@ def main(output: Path, episodes: int) -> None:
             if part is not None:
                 parts.append(part)
         print(f"{task:26} {episodes} of {tried} episodes", flush=True)
-    frames = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    frames: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     ends = np.cumsum([len(part["action"]) for part in parts])
     np.savez_compressed(output, **frames, episode_ends=ends)
 

@@ -88,7 +88,7 @@ class TtscompilePolicy(PreTrainedPolicy):
         if not directory.is_dir():
             from huggingface_hub import snapshot_download
 
-            wanted = {"allow_patterns": _FILES, "ignore_patterns": "*/*"}  # patterns take folders for names
+            wanted: Any = {"allow_patterns": _FILES, "ignore_patterns": "*/*"}  # patterns take folders for names
             directory = Path(snapshot_download(str(pretrained_name_or_path), **wanted, **hub))
         assert isinstance(config, TtscompileConfig)
         return cls(config, directory).eval()
@@ -111,7 +111,7 @@ class TtscompilePolicy(PreTrainedPolicy):
             noise: ``[B, T, D]`` that a chunk starts from, if this call computes one; None draws it.
         """
         drawn = None if self._policy.queued else self._noise(batch, noise)
-        return self._policy.select_action(batch, drawn)  # type: ignore[no-any-return]
+        return self._policy.select_action(batch, drawn)
 
     def predict_action_chunk(
         self,
@@ -131,7 +131,7 @@ class TtscompilePolicy(PreTrainedPolicy):
                 them (``predict_action(prefix=)``). Those after them have no influence: this is not LeRobot's guidance.
         """
         prefix = _committed(inference_delay, prev_chunk_left_over)
-        return self._policy.predict_action_chunk(batch, self._noise(batch, noise), prefix=prefix)  # type: ignore[no-any-return]
+        return self._policy.predict_action_chunk(batch, self._noise(batch, noise), prefix=prefix)
 
     def supports_rtc(self) -> bool:
         """Whether chunks can be joined to what is executed meanwhile; if not, the log says why."""

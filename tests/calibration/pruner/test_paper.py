@@ -16,10 +16,10 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration import judge
 from ttscompile.calibration.pruner import paper
 from ttscompile.calibration.pruner.paper import Paper
-from ttscompile.calibration.step_counts import crowded_family
+from ttscompile.calibration.spacing import spacings
 from ttscompile.calibration.task import Clock, Task
 from ttscompile.core.lattice import Source, whole_steps_plan
-from ttscompile.runtimes.settle import pruner_plan
+from ttscompile.runtimes.plans import pruner_plan
 
 BUDGET = 20
 
@@ -62,7 +62,7 @@ def test_windows_of_one_episode_are_divided(make_task: MakeTask, windows: int) -
 
 def test_nothing_is_kept_that_is_worse_than_whole_steps(task: Task) -> None:
     search = trained(task, 1)
-    family = crowded_family(10, 3)
+    family = spacings(10, 3)
     best = min(task.error(whole_steps_plan(10, 6, steps), search._compared) for steps in family)
     assert search.loss <= best * (1 + 1e-5)
     assert trained(task, 11).loss <= search.loss

@@ -6,8 +6,6 @@ Not run by the tests. Needs a clone of microsoft/CogACT (b174a1b), and timm 0.9.
     PYTHONPATH=timm-0.9.10 python -m tests.families.golden.make_cogact path/to/CogACT
 """
 
-from __future__ import annotations
-
 import sys
 from functools import partial
 from pathlib import Path

@@ -5,8 +5,6 @@ Not run by the tests. Needs a clone of SudeepDasari/dit-policy (ba22ee3)::
     python -m tests.families.golden.make_dit_policy path/to/dit-policy
 """
 
-from __future__ import annotations
-
 import importlib
 from pathlib import Path
 

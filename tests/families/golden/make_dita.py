@@ -5,8 +5,6 @@ Not run by the tests. Needs a clone of RoboDita/Dita (66350e7)::
     python -m tests.families.golden.make_dita path/to/Dita
 """
 
-from __future__ import annotations
-
 import importlib
 import sys
 from pathlib import Path

@@ -5,8 +5,6 @@ Not run by the tests. Needs a clone of huggingface/lerobot (7427f31)::
     python -m tests.families.golden.make_groot path/to/lerobot
 """
 
-from __future__ import annotations
-
 import importlib
 from pathlib import Path
 

@@ -5,8 +5,6 @@ Not run by the tests. Needs a clone of huggingface/lerobot (7427f31)::
     python -m tests.families.golden.make_pi path/to/lerobot
 """
 
-from __future__ import annotations
-
 import importlib
 from pathlib import Path
 from types import SimpleNamespace
@@ -33,7 +31,7 @@ def run(folder: Path) -> dict[str, Arrays]:
 def _run(name: str, seed: int) -> Arrays:
     """The velocity at two timesteps, and the actions of ten Euler steps; part of one prefix is masked."""
     original = importlib.import_module(f"lerobot.policies.{name}.modeling_{name}")
-    model = _expert(original, getattr(original, f"{name.upper()}Pytorch"))
+    model: Any = _expert(original, getattr(original, f"{name.upper()}Pytorch"))
     seeded(model, seed, "paligemma_with_expert.paligemma.", "paligemma_with_expert.gemma_expert.lm_head.")
     draw = normal(seed + 100)
     keys, values = (draw(BATCH, LAYERS, PREFIX, 1, CHANNELS) for _ in range(2))
@@ -45,8 +43,8 @@ def _run(name: str, seed: int) -> Arrays:
     def step(sample: Tensor, timestep: Tensor) -> Tensor:
         cache = DynamicCache()
         for layer in range(LAYERS):
-            pair = (torch.from_numpy(each[:, layer]).transpose(1, 2).contiguous() for each in (keys, values))
-            cache.update(*pair, layer)
+            key, value = (torch.from_numpy(each[:, layer]).transpose(1, 2).contiguous() for each in (keys, values))
+            cache.update(key, value, layer)
         given = {"prefix_pad_masks": torch.from_numpy(mask), "past_key_values": cache, **own}
         return model.denoise_step(**given, x_t=sample, timestep=timestep)
 

@@ -6,8 +6,6 @@ Not run by the tests. Needs a clone of thu-ml/RoboticsDiffusionTransformer (deb7
     PYTHONPATH=timm-1.0.3 python -m tests.families.golden.make_rdt path/to/RoboticsDiffusionTransformer
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -6,8 +6,6 @@ Not run by the tests. Needs a clone of juruobenruo/DexVLA (fc21a82), and timm 0.
     PYTHONPATH=timm-0.9.10 python -m tests.families.golden.make_scaledp path/to/DexVLA
 """
 
-from __future__ import annotations
-
 import importlib
 import itertools
 import sys

@@ -5,8 +5,6 @@ Not run by the tests. Needs a clone of huggingface/lerobot (7427f31)::
     python -m tests.families.golden.make_smolvla path/to/lerobot
 """
 
-from __future__ import annotations
-
 import importlib
 from pathlib import Path
 from types import SimpleNamespace
@@ -34,7 +32,7 @@ def run(folder: Path) -> dict[str, Arrays]:
     """The velocity at two timesteps, and the actions of ten Euler steps; part of one prefix is masked."""
     lerobot(folder, "smolvla")
     original = importlib.import_module("lerobot.policies.smolvla.modeling_smolvla")
-    model = _expert(original)
+    model: Any = _expert(original)
     seeded(model, SEED, "vlm_with_expert.vlm.")
     draw = normal(6)
     keys, values = (draw(LAYERS, BATCH, GROUPS, PREFIX, CHANNELS) for _ in range(2))
@@ -86,7 +84,8 @@ def _expert(original: Any) -> nn.Module:
         "image_size": 16,
         "patch_size": 8,
     }
-    tiny = SmolVLMConfig(text_config=text, vision_config=vision, pad_token_id=0)
+    settings: Any = {"pad_token_id": 0}  # not in its signature
+    tiny = SmolVLMConfig(text_config=text, vision_config=vision, **settings)
     tokenizer = SimpleNamespace(fake_image_token_id=1, global_image_token_id=2)
     settings = SimpleNamespace(
         vlm_model_name="none",

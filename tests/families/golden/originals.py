@@ -1,7 +1,5 @@
 """What the generators of this folder share: a clone at its commit, modules that are left out, weights and noise."""
 
-from __future__ import annotations
-
 import importlib
 import io
 import subprocess

@@ -7,8 +7,6 @@ in its place that has ``models.resnet18`` with torchvision's names, and the tran
     PYTHONPATH=path/to/diffusion_policy:path/to/robomimic:. python -m tests.frontends.golden.make_hybrid
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch

@@ -5,8 +5,6 @@ Not run by the tests. Needs lerobot 0.6.1 with transformers; this repository has
     PYTHONPATH=. python -m tests.frontends.golden.make_lerobot_pi
 """
 
-from __future__ import annotations
-
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory

@@ -5,8 +5,6 @@ Not run by the tests. Needs lerobot 0.6.1 with transformers, the shared golden f
     PYTHONPATH=. python -m tests.frontends.golden.make_lerobot_smolvla SHARED/golden/lerobot_whole
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path

@@ -7,8 +7,6 @@ Not run by the tests. Needs lerobot 0.6.1 with diffusers, and torchvision; this 
 A torchvision whose compiled part does not fit the build of torch will do: its networks and transforms are Python.
 """
 
-from __future__ import annotations
-
 import sys
 from importlib import import_module
 from pathlib import Path

@@ -7,8 +7,6 @@ YanjieZe/3D-Diffusion-Policy importable, and this repository. torchvision and py
         python -m tests.frontends.golden.make_unets
 """
 
-from __future__ import annotations
-
 import sys
 import typing
 from importlib import import_module

@@ -3,8 +3,6 @@
 The ResNet is ours, which ``test_resnet.py`` holds against another implementation.
 """
 
-from __future__ import annotations
-
 import sys
 from types import ModuleType
 from typing import Any
@@ -76,7 +74,9 @@ class CenterCrop(nn.Module):
 
 def put_in_place() -> None:
     """Make ``import torchvision`` find these."""
-    modules = {name: ModuleType(name) for name in ("", ".models", ".transforms", ".transforms.functional")}
+    modules: dict[str, Any] = {
+        name: ModuleType(name) for name in ("", ".models", ".transforms", ".transforms.functional")
+    }
     modules[".transforms.functional"].center_crop = center_crop
     for each in (Resize, Normalize, CenterCrop):
         setattr(modules[".transforms"], each.__name__, each)

@@ -1,5 +1,1 @@
-"""What the pruner learns: where a plan departs from its schedule because of the observation.
-
-``linear`` predicts the effect of every change of a plan, ``switches`` chooses exchanges of cells by it and writes
-them into the weights of the pruner, and ``adaptation`` does one after the other and keeps what lowers the error.
-"""
+"""The pruner, trained to make a plan for each observation, as arXiv 2605.13316 does: ``paper``."""

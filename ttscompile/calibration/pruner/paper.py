@@ -34,11 +34,11 @@ from torch import Tensor
 
 from ...core.lattice import PlanArray, Source, whole_steps_plan
 from ...ir.plan_head import first_numbers
-from ...rivals.switches import has_head
 from ...runtimes.plans import pruner_plan
 from ..calls import Calls, IntArray
-from ..step_counts import crowded_family
+from ..spacing import spacings
 from ..task import Array, Found, NothingAfter, Task
+from .head import has_head
 from .straight_through import Practice, legal, written
 
 UPDATES = 240
@@ -186,7 +186,7 @@ class Paper(NothingAfter):
     def _best_steps(self, cells: int) -> Sequence[int]:
         """The schedule of so many cells with the lowest error, as far as there is time to try."""
         task, model = self._task, self._task.executor.model
-        family = crowded_family(model.steps, max(1, min(cells // model.blocks, model.steps)))
+        family = spacings(model.steps, max(1, min(cells // model.blocks, model.steps)))
         tried = [
             (task.error(whole_steps_plan(model.steps, model.blocks, steps), self._compared), steps)
             for steps in task.clock.in_time(family)
