@@ -87,7 +87,7 @@ def test_manifest_comes_back(manifest: Manifest) -> None:
 
 
 def test_a_manifest_with_plans_comes_back(manifest: Manifest) -> None:
-    plans = {"tts": PlanRecord("pruner", None, 0.5)}
+    plans = {"tts": PlanRecord("pruner", sparsity=None, flops_sparsity=0.5)}
     changed = replace(manifest, plans=plans, default_plan="tts", calibration={"seed": 0, "loss": [1.5, {"a": None}]})
     again = codec.decode(codec.encode(changed))
     assert again.plans == plans
@@ -128,6 +128,12 @@ def change(manifest: Manifest, edit: Change) -> bytes:
     return dump({**document, "checksum": codec._checksum(document)})
 
 
+def plan(kind: str, **fields: Any) -> dict[str, Any]:
+    """A plan as it stands in a manifest."""
+    plain: dict[str, Any] = to_json(PlanRecord("all"))
+    return {**plain, "kind": kind, **fields}
+
+
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
@@ -156,10 +162,19 @@ def change(manifest: Manifest, edit: Change) -> bytes:
         (lambda d: d["files"]["stem.onnx"].update(sha256="ab"), "64 hexadecimal"),
         (lambda d: d.update(identity="A" * 64), "64 hexadecimal"),
         (lambda d: d.update(default_plan="none"), r"default_plan: expected one of \['dense'\]"),
-        (lambda d: d["plans"].update(s={"kind": "schedule", "sparsity": 0.5, "flops_sparsity": 0.5}), "file of plans"),
-        (lambda d: d["plans"].update(s={"kind": "pruner", "sparsity": 1.5, "flops_sparsity": 0.5}), r"0\.\.1"),
-        (lambda d: d["plans"].update(s={"kind": "magic", "sparsity": 0.5, "flops_sparsity": 0.5}), "'schedule'"),
-        (lambda d: d["plans"].update(dense={"kind": "pruner", "sparsity": 0, "flops_sparsity": 0}), "called 'dense'"),
+        (lambda d: d["plans"].update(s=plan("schedule")), "file of plans"),
+        (lambda d: d["plans"].update(s=plan("all", loop="ddim-2")), r"a loop, one of \['original'\]"),
+        (lambda d: d["plans"].update(s=plan("all", weights="mine")), r"weights, one of \['original'\]"),
+        (
+            lambda d: d["plans"].update(s=plan("all", precision={"blocks": "int8"})),
+            "parts in the precision that the artifact",
+        ),
+        (lambda d: d["plans"].update(s=plan("all", otherwise="dense")), "exactly where the loop begins with one"),
+        (lambda d: d["starts"].update(s={"loop": "original", "steps": 3}), "fewer steps than the 3 of loop"),
+        (lambda d: d["starts"].update(original={"loop": "original", "steps": 2}), "another name than the loops"),
+        (lambda d: d["plans"].update(s=plan("pruner", sparsity=1.5)), r"0\.\.1"),
+        (lambda d: d["plans"].update(s=plan("magic")), "'schedule'"),
+        (lambda d: d["plans"].update(dense=plan("pruner")), "called 'dense'"),
         (lambda d: d["requires"].update(onnxruntime="latest"), "a version like"),
         (lambda d: d["requires"].update(opset=0), "at least 1"),
         (lambda d: d.update(calibration=[]), "calibration: expected an object"),
@@ -179,7 +194,7 @@ def test_another_schema_version_says_what_to_do(manifest: Manifest, version: obj
 
 def test_a_future_schema_is_named_before_anything_else_is_read() -> None:
     content = dump({"format": "ttscompile artifact", "schema_version": SCHEMA_VERSION + 1, "new": "thing"})
-    expected = f"schema_version: expected {SCHEMA_VERSION}, .*; found {SCHEMA_VERSION + 1}"
+    expected = f"schema_version: expected {SCHEMA_VERSION} or the one before, .*; found {SCHEMA_VERSION + 1}"
     with pytest.raises(ArtifactError, match=expected):
         codec.decode(content)
 

@@ -9,6 +9,7 @@ import pytest
 
 from tests.runtimes.plans import jumping
 from ttscompile.artifact.corrections import correction_arrays, read_corrections
+from ttscompile.artifact.manifest import PlanRecord
 from ttscompile.core.correction import no_correction
 from ttscompile.errors import ArtifactError
 
@@ -18,8 +19,8 @@ WITH, WITHOUT = jumping(FIVE), no_correction(5, (4, 2))
 
 def of_plans(*names: str) -> Any:
     """What a manifest says of a policy of five steps, with plans of these names."""
-    spec = SimpleNamespace(sample=(4, 2))
-    return SimpleNamespace(plans=dict.fromkeys(names), steps=5, spec=spec, condition_numbers=7)
+    plans, spec = {name: PlanRecord("all") for name in names}, SimpleNamespace(sample=(4, 2))
+    return SimpleNamespace(plans=plans, starts={}, steps_of=lambda loop: 5, spec=spec, condition_numbers=7)
 
 
 def test_what_is_stored_is_read_again() -> None:

@@ -241,8 +241,9 @@ def test_unknown_names_are_errors(written: Path) -> None:
     artifact = load_artifact(written)
     with pytest.raises(ArtifactError, match=r"no graph 'advance'; it has \['condition'"):
         artifact.graph("advance")
-    with pytest.raises(ArtifactError, match=r"no schedule 'fast'; it has \['dense'\]"):
-        artifact.plans["fast"].cells
+    for name in ("fast", "dense@fp8", "fast@fp32"):
+        with pytest.raises(IllegalPlanError, match=rf"no plan '{name}'; it has \['dense'\]"):
+            artifact.plan(name)
 
 
 @pytest.mark.alone

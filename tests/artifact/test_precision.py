@@ -1,4 +1,4 @@
-"""Blocks of another precision in an artifact: beside fp32, hashed, chosen by ``at_precision``; hostile manifests."""
+"""Blocks of another precision in an artifact: beside fp32, hashed, chosen by a plan; hostile manifests."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,6 +18,7 @@ from ttscompile.artifact.bind import LoweredPieces
 from ttscompile.artifact.load import load_artifact, read_manifest
 from ttscompile.artifact.manifest import Manifest, PrecisionError
 from ttscompile.artifact.strict_json import Value
+from ttscompile.artifact.view import view_of
 from ttscompile.artifact.write import write_artifact
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import ArtifactError
@@ -68,29 +69,25 @@ def test_the_identity_tells_the_precision_and_a_calibration_belongs_to_both(int8
     assert unmeasured.identity == both.identity, "figures about an artifact are not what it computes"
 
 
-def test_blocks_are_opened_in_the_precision_that_was_asked_for(int8: Path) -> None:
+def test_blocks_are_opened_in_the_precision_of_the_plan(int8: Path) -> None:
     artifact = load_artifact(int8)
     assert artifact.manifest.precision is not None and artifact.manifest.precision.error == ERROR
-    assert artifact.at_precision("int8") is artifact
-    plain = artifact.at_precision("fp32")
-    assert plain.manifest.precision_name == "fp32" and artifact.manifest.precision_name == "int8"
+    assert artifact.default is artifact.plans["full"]
+    assert artifact.default.precision == {"blocks": "int8"} and artifact.plans["dense"].precision == {}
     x = np.random.default_rng(0).standard_normal((2, HORIZON, WIDTH)).astype(np.float32)
     feed = {"stream_0": x, "modulation": np.zeros((2, 1, WIDTH), np.float32)}
     results = []
-    for one in (artifact, plain):
+    for view in (view_of(artifact), view_of(artifact, "dense"), view_of(artifact, "full@fp32")):
         options = onnxruntime.SessionOptions()
         options.add_session_config_entry("session.x64quantprecision", "1")  # sums do not saturate without VNNI either
-        path = str(one.onnx_path("block_00"))
+        path = str(int8 / view.onnx_file("block_00"))
         session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
         results.append(session.run(None, feed)[0])
-        assert one.onnx_path("stem").name == "stem.onnx"
+        assert view.onnx_file("stem") == "stem.onnx"
     expected = x @ artifact.weights["block.0.weight"].T
     assert_equal_but_for_rounding(results[1], expected, terms=WIDTH)
+    np.testing.assert_array_equal(results[1], results[2])
     assert 0 < np.linalg.norm(results[0] - expected) / np.linalg.norm(expected) < 0.02
-    with pytest.raises(ArtifactError, match=r"'bf16': expected one that the artifact holds, \['fp32', 'int8'\]"):
-        artifact.at_precision("bf16")
-    with pytest.raises(ArtifactError, match=r"holds, \['fp32'\]. Convert .* --precision int8"):
-        plain.at_precision("int8")
 
 
 def test_a_piece_of_the_prologue_has_a_model_of_its_own(tmp_path: Path) -> None:
@@ -100,8 +97,9 @@ def test_a_piece_of_the_prologue_has_a_model_of_its_own(tmp_path: Path) -> None:
     artifact = load_artifact(tmp_path / "a")
     record = artifact.manifest.precision
     assert record is not None and (record.kept, record.parts, record.blocks) == (("step",), {"step": None}, 0)
-    assert (artifact.onnx_file("step"), artifact.onnx_file("block_00")) == ("step_int8.onnx", "block_00.onnx")
-    assert artifact.with_parts(["blocks"]).onnx_file("step") == "step.onnx"
+    view, plain = view_of(artifact), view_of(artifact, "dense")
+    assert (view.onnx_file("step"), view.onnx_file("block_00")) == ("step_int8.onnx", "block_00.onnx")
+    assert plain.onnx_file("step") == "step.onnx"
 
 
 def test_a_calibration_keeps_the_precision(int8: Path) -> None:
@@ -196,5 +194,7 @@ def test_a_hostile_record_is_refused(int8: Path, change: Change, message: str) -
 
 def test_a_precision_of_null_is_refused(int8: Path) -> None:
     document = codec.to_json(read_manifest(int8)) | {"precision": None}
-    with pytest.raises(ArtifactError, match="files: expected exactly the files"):
+    with pytest.raises(ArtifactError, match="parts in the precision that the artifact has models in, none"):
         codec.from_json(Value(document, "manifest.json"))
+    with pytest.raises(ArtifactError, match="files: expected exactly the files"):
+        codec.from_json(Value({**document, "plans": {}, "default_plan": "dense"}, "manifest.json"))

@@ -2,7 +2,7 @@ import pytest
 
 from ttscompile.artifact.manifest import PlanRecord
 from ttscompile.artifact.strict_json import Value, dump, parse
-from ttscompile.artifact.typed_json import from_json
+from ttscompile.artifact.typed_json import from_json, to_json
 from ttscompile.core.untrusted_json import MAX_DEPTH
 from ttscompile.errors import ArtifactError
 
@@ -68,4 +68,4 @@ def test_number_refuses(data: object) -> None:
 @pytest.mark.parametrize("data", [-0.01, 1.01])
 def test_share_refuses(data: float) -> None:
     with pytest.raises(ArtifactError, match=r"0\.\.1"):
-        from_json(PlanRecord, Value({"kind": "schedule", "sparsity": data, "flops_sparsity": None}, "x"))
+        from_json(PlanRecord, Value({**to_json(PlanRecord("all")), "sparsity": data}, "x"))

@@ -11,12 +11,14 @@ import numpy as np
 import pytest
 
 from tests.artifact.folders import contents, failing, packed
-from tests.artifact.tiny import CHANNELS, HORIZON, STEPS, tiny_program, write_tiny
+from tests.artifact.tiny import tiny_program, write_tiny
 from tests.plans import store_schedules
 from tests.rounding import assert_equal_but_for_rounding
 from ttscompile.artifact import load_artifact
-from ttscompile.artifact.manifest import Manifest, PlanRecord
-from ttscompile.core.correction import no_correction
+from ttscompile.artifact.block_weights import BlockWeights
+from ttscompile.artifact.manifest import Manifest, PlanRecord, StartRecord
+from ttscompile.artifact.write import update_plans
+from ttscompile.core.plan import Plan, TokenReuse
 from ttscompile.errors import ArtifactError, IllegalPlanError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -59,8 +61,8 @@ def test_plans_weights_and_record_are_replaced(written: Path) -> None:
     assert manifest.model_identity == before.model_identity
     assert manifest.default_plan == "tts"
     assert manifest.plans == {
-        "mine": PlanRecord("schedule", 0.5, 0.5),
-        "tts": PlanRecord("pruner", 0.75, None),
+        "mine": PlanRecord("schedule", sparsity=0.5, flops_sparsity=0.5),
+        "tts": PlanRecord("pruner", sparsity=0.75, flops_sparsity=None),
     }
     assert manifest.calibration == RECORD
     np.testing.assert_array_equal(artifact.plans["mine"].cells, PLAN)
@@ -89,7 +91,7 @@ def test_schedules_alone(written: Path) -> None:
     update(written)
     before = load_artifact(written)
     manifest = update(written, pruner_weights=None, schedules={"a": PLAN, "b-95%": PLAN * 0}, default_plan="a")
-    assert {name: plan.kind for name, plan in manifest.plans.items()} == {"a": "schedule", "b-95%": "schedule"}
+    assert {name: plan.kind for name, plan in manifest.plans.items()} == {"a": "schedule", "b-95%": "all"}
     assert manifest.stores.pruner == before.manifest.stores.pruner
     assert manifest.plans["b-95%"].flops_sparsity == 0
     manifest = update(written, pruner_weights=None, schedules={}, default_plan="dense", record={})
@@ -102,30 +104,27 @@ def test_the_pruner_beside_a_default_schedule(written: Path) -> None:
     """What was measured of each stands in its own record, whichever of the two is the default."""
     record = {"plans": {"pruner": {"sparsity": 0.75, "flops_sparsity": 0.5}, "mine": {"sparsity": 0.5}}}
     beside = update(written, default_plan="mine", record=record).plans
-    assert beside == {"mine": PlanRecord("schedule", 0.5, 0.5), "pruner": PlanRecord("pruner", 0.75, 0.5)}
+    assert beside == {
+        "mine": PlanRecord("schedule", sparsity=0.5, flops_sparsity=0.5),
+        "pruner": PlanRecord("pruner", sparsity=0.75, flops_sparsity=0.5),
+    }
     assert set(update(written, default_plan="dense", schedules={}).plans) == {"pruner"}
 
 
 BAD: list[tuple[dict[str, Any], type[Exception], str]] = [
-    ({"schedules": {"dense": PLAN}}, ArtifactError, "not 'dense'"),
-    ({"schedules": {"../x": PLAN}}, ArtifactError, "schedule '../x'"),
-    ({"schedules": {"": PLAN}}, ArtifactError, "schedule ''"),
-    ({"schedules": {"pruner": PLAN}, "default_plan": "dense"}, ArtifactError, "cannot be called 'pruner'"),
+    ({"schedules": {"dense": PLAN}}, ArtifactError, "plan 'dense': expected another name"),
+    ({"schedules": {"../x": PLAN}}, ArtifactError, "plan '../x'"),
+    ({"schedules": {"": PLAN}}, ArtifactError, "plan ''"),
     ({"schedules": {"a": PLAN[:2]}}, IllegalPlanError, "'a': plan has shape"),
     ({"schedules": {"a": PLAN.astype(np.int64)}}, IllegalPlanError, "int64"),
     ({"schedules": {"a": PLAN[::-1]}}, IllegalPlanError, "step 0"),
     ({"pruner_weights": None}, ArtifactError, "default plan 'tts'"),
     ({"pruner_weights": {}}, ArtifactError, "3 differ"),
-    ({"default_plan": "no such name!"}, ArtifactError, "cannot be called"),
+    ({"default_plan": "no such name!"}, ArtifactError, "expected letters, digits"),
     ({"record": {"x": float("nan")}}, ArtifactError, "expected JSON"),
     ({"record": {"x": np.zeros(2)}}, ArtifactError, "expected JSON"),
     ({"record": {"plans": {"tts": {"sparsity": 1.5}}}}, ArtifactError, r"sparsity: expected a number in 0\.\.1"),
     ({"model_identity": "0" * 64}, ArtifactError, "converted again"),
-    (
-        {"schedules": {}, "corrections": {"tts": no_correction(STEPS, (HORIZON, CHANNELS))}},
-        ArtifactError,
-        "exactly when there are sched",
-    ),
 ]
 
 
@@ -137,6 +136,43 @@ def test_arguments_that_do_not_fit(
     with pytest.raises(error, match=message):
         update(written, **changes)
     assert contents(written) == before
+
+
+FIELDS: list[tuple[dict[str, Any], str]] = [
+    ({"loop": "ddim-2"}, r"plan 'mine': expected a loop, one of \['original'\]"),
+    ({"weights": "trained"}, r"plan 'mine': expected weights, one of \['original'\]"),
+    ({"precision": {"blocks": "int8"}}, "plan 'mine': expected parts in the precision that the artifact has models in"),
+    ({"tokens": TokenReuse(0.1, 8)}, "plan 'mine': expected no reuse of tokens"),
+    ({"otherwise": Plan()}, r"plan 'mine': its plan for calls without a chunk is none of"),
+]
+
+
+@pytest.mark.parametrize(("fields", "message"), FIELDS)
+def test_a_plan_that_names_what_the_artifact_lacks_is_not_written(
+    written: Path, fields: dict[str, Any], message: str
+) -> None:
+    before = contents(written)
+    with pytest.raises(ArtifactError, match=message):
+        update_plans(written, {"mine": Plan(cells=PLAN, **fields)}, "mine", {})
+    assert contents(written) == before
+
+
+def test_what_no_plan_names_any_more_is_gone(written: Path) -> None:
+    """Weights and starts belong to the plans that name them."""
+    start, weights = {"last-2": StartRecord("original", 2)}, {"own": BlockWeights({}, {})}
+    dense = load_artifact(written).plans["dense"]
+    plans = {"dense": dense, "mine": Plan(cells=PLAN, weights="own")}
+    plans["warm"] = Plan("last-2", PLAN[:2] * 0, otherwise=dense)
+    manifest = update_plans(written, plans, "mine", {}, weights=weights, starts=start)
+    assert (set(manifest.weights), set(manifest.starts)) == ({"own"}, {"last-2"})
+    loaded = load_artifact(written).plans
+    assert loaded["mine"].weights == "own"
+    assert loaded["warm"].otherwise is loaded["dense"]
+    manifest = update_plans(written, {"dense": loaded["dense"], "warm": loaded["warm"]}, "warm")
+    assert (set(manifest.weights), set(manifest.starts)) == (set(), {"last-2"})
+    assert set(contents(written)) == {"manifest.json", *manifest.files}
+    with pytest.raises(ArtifactError, match="fewer steps than the 3 of loop 'original'"):
+        update_plans(written, plans, "warm", starts={"last-2": StartRecord("original", 3)}, weights=weights)
 
 
 @pytest.mark.parametrize("edit", ["dtype", "shape", "name"])
@@ -213,7 +249,7 @@ def test_failure_anywhere_leaves_the_old_or_the_new(
         with monkeypatch.context() as patch:
             patch.setattr(os, function, failing(original, fail_at, OSError))
             try:
-                update(written, pruner_weights=pruner, schedules={"new": PLAN * 0}, default_plan="new")
+                update(written, pruner_weights=pruner, schedules={"new": PLAN}, default_plan="new")
                 break
             except ArtifactError as error:
                 messages.append(str(error))

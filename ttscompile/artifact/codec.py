@@ -225,6 +225,8 @@ def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:  # no
         files |= weights.files
     if files != set(manifest.files):
         fields["files"].fail(f"exactly the files {sorted(files)}")
+    if manifest.stores.plans is None and any(plan.kind == "schedule" for plan in manifest.plans.values()):
+        fields["stores"].fail("a file of plans, because there are schedules")
     if DENSE in manifest.plans:
         fields["plans"].fail("no plan called 'dense', which every artifact has")
     if manifest.default_plan not in {DENSE, *manifest.plans}:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from ..core.correction import condition_flops, numbers_of
 from ..core.lattice import plan_flops, sparsity
-from ..core.plan import DENSE, ORIGINAL, Plan
+from ..core.plan import DENSE, ORIGINAL, Plan, Variant
 from ..core.spec import SamplerTable
 from ..core.update import update_flops
 from ..errors import ArtifactError
@@ -199,8 +199,12 @@ def plan_records(manifest: Manifest, plans: Mapping[str, Plan], record: Mapping[
         ArtifactError: names that cannot be, fields that name what the artifact lacks, or sparsities that are no shares.
         IllegalPlanError: cells that do not fit the policy.
     """
-    made, own = dict[str, PlanRecord](), {name: plan for name, plan in plans.items() if name != DENSE}
-    for name, plan in sorted(own.items()):
+    made = dict[str, PlanRecord]()
+    for name, plan in sorted(plans.items()):
+        if name == DENSE:
+            if plan.cells is None or plan.cells.any() or plan.variant != Variant() or plan.correction is not None:
+                raise ArtifactError("plan 'dense': expected another name, since that is the original policy.")
+            continue
         if _PLAN_NAME.fullmatch(name) is None:
             raise ArtifactError(f"plan {name!r}: expected letters, digits and _ . % -.")
         otherwise = None
