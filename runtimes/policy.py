@@ -345,7 +345,8 @@ class CompiledPolicy:
         if isinstance(plan, str | Plan):
             return plan_of(self._artifact, plan)
         own = self._default.otherwise or self._default
-        return Plan(own.loop, np.asarray(plan), precision=own.precision, tokens=own.tokens)
+        cells: Any = plan  # whatever it is: the runtime checks it
+        return Plan(own.loop, cells, precision=own.precision, tokens=own.tokens)
 
     def _prefix_refusal(self, plan: Plan) -> str | None:
         """Why a call with this plan takes no prefix; None if it does."""

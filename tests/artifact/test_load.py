@@ -19,7 +19,7 @@ from ttscompile.artifact.codec import identities
 from ttscompile.artifact.files import describe
 from ttscompile.artifact.strict_json import dump
 from ttscompile.artifact.write import write_artifact
-from ttscompile.errors import ArtifactError
+from ttscompile.errors import ArtifactError, IllegalPlanError
 from ttscompile.ir.graph import TensorType
 
 

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import textwrap
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -171,8 +172,9 @@ def test_what_no_plan_names_any_more_is_gone(written: Path) -> None:
     manifest = update_plans(written, {"dense": loaded["dense"], "warm": loaded["warm"]}, "warm")
     assert (set(manifest.weights), set(manifest.starts)) == (set(), {"last-2"})
     assert set(contents(written)) == {"manifest.json", *manifest.files}
+    whole = {**plans, "warm": replace(plans["warm"], cells=PLAN * 0)}
     with pytest.raises(ArtifactError, match="fewer steps than the 3 of loop 'original'"):
-        update_plans(written, plans, "warm", starts={"last-2": StartRecord("original", 3)}, weights=weights)
+        update_plans(written, whole, "warm", starts={"last-2": StartRecord("original", 3)}, weights=weights)
 
 
 @pytest.mark.parametrize("edit", ["dtype", "shape", "name"])

@@ -141,9 +141,9 @@ def test_what_overflows_is_not_made_an_action(corrected: Corrected, runtime: str
     obs, noise = random_inputs(artifact, np.random.default_rng(3), 1)
     policy = ttscompile.load(artifact.path, runtime)
     weights = np.full_like(correction.weights, 3e38)
-    policy._artifact = replace(artifact, corrections={"fast": replace(correction, weights=weights)})
+    plan = replace(policy.plans["fast"], correction=replace(correction, weights=weights))
     with pytest.raises(ttscompile.TtscompileError, match="not finite"):
-        policy.predict_action(obs, Noise(noise.initial, noise.steps))
+        policy.predict_action(obs, Noise(noise.initial, noise.steps), plan)
 
 
 def test_a_record_of_before_is_held_against_what_it_is_bounded_to(corrected: Corrected) -> None:
@@ -152,8 +152,9 @@ def test_a_record_of_before_is_held_against_what_it_is_bounded_to(corrected: Cor
     opened = open_runtime(artifact)
     sample, _ = opened.predict(obs, noise, Plan(cells=plan, correction=correction))
     golden: Any = SimpleNamespace(initial=noise.initial, draws=noise.steps, network_observations=lambda spec: obs)
+    golden.in_loop = lambda loop: golden
     plans = np.broadcast_to(plan, (2, STREAMS, *plan.shape))
     for beyond, expected in ((5.0, True), (0.5, False)):
         stored = np.where(np.abs(sample) == 1, sample * beyond, sample)
         record = GoldenPlan(plan=plans, sample=np.stack([stored, stored[::-1]]), path=np.zeros(0, np.float32))
-        assert (_replay(artifact, golden, opened, "fast", record)[3] < 1e-3) == expected
+        assert (_replay(artifact, golden, opened, artifact.plans["fast"], record)[3] < 1e-3) == expected

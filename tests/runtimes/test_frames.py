@@ -264,7 +264,7 @@ def test_every_rung_of_verify_holds(compiled: Path) -> None:
 def test_towers_in_eight_bits(compiled: Path, tmp_path: Path) -> None:
     """A tower has a precision of its own; a remembered frame has the bits that it would have again."""
     ttscompile.compile_denoiser(*cameras.policy("shared", told=True), tmp_path / "int8", precision="int8")
-    policy, exact = ttscompile.load(tmp_path / "int8"), ttscompile.load(tmp_path / "int8", precision="fp32")
+    policy, exact = ttscompile.load(tmp_path / "int8"), ttscompile.load(tmp_path / "int8", plan="dense")
     record = load_artifact(tmp_path / "int8").manifest.precision
     assert record is not None
     assert set(record.kept) == {"blocks", "frame_00"}  # the convolutions of these cameras are too small

@@ -200,7 +200,7 @@ def test_a_seed_that_is_none_is_refused_before_anything_is_done(toy_artifact: Ar
 
 
 def test_load_takes_a_name_of_a_plan_and_no_matrix(toy_artifact: Artifact) -> None:
-    with pytest.raises(IllegalPlanError, match=r"name of a plan, one of \['dense'.*found a ndarray.*predict_action"):
+    with pytest.raises(IllegalPlanError, match=r"name of one, \['dense'.*found a ndarray.*predict_action"):
         load(toy_artifact.path, plan=np.zeros((5, 5), np.int8))  # type: ignore[arg-type]
 
 

@@ -71,10 +71,12 @@ def frame(*streams: tuple[Array, Array]) -> dict[str, Array]:
     return {**seen, "state": np.zeros((len(streams), 4), np.float32)}
 
 
-def act(policy: CompiledPolicy, before: dict[str, Array], newest: dict[str, Array]) -> Array:
+def act(
+    policy: CompiledPolicy, before: dict[str, Array], newest: dict[str, Array], plan: str | Plan | None = None
+) -> Array:
     noise = ttscompile.Noise(np.ones((len(newest["state"]), cameras.HORIZON, cameras.ACTIONS), np.float32))
     window = {key: np.stack([before[key], value], 1) for key, value in newest.items()}
-    return np.asarray(policy.predict_action(window, noise=noise)["action_pred"])
+    return np.asarray(policy.predict_action(window, noise=noise, plan=plan)["action_pred"])
 
 
 def counted(policy: CompiledPolicy) -> tuple[int, int]:
@@ -142,7 +144,7 @@ def test_a_plan_says_whether_tokens_are_reused(compiled: Path, tmp_path: Path) -
         assert tokens(runtime=runtime, plan="some@fp32") == (0, 0)
     whole = open_policy(load_artifact(folder), "reference", plan="dense")
     with pytest.raises(RuntimeUnavailableError, match="the plan reuses some"):
-        act(whole, first, other, plan="some")
+        act(whole, first, other, whole.plans["some"])
 
 
 def test_cameras_and_streams_share_nothing(policy: CompiledPolicy) -> None:

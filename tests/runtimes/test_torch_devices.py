@@ -10,10 +10,11 @@ import pytest
 import torch
 
 from ttscompile.artifact import Artifact
+from ttscompile.artifact.view import view_of
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.core.plan import Plan
 from ttscompile.runtimes import open_runtime
-from ttscompile.runtimes.torch.backend import TorchBackend
+from ttscompile.runtimes.torch.backend import TorchBackends
 from ttscompile.runtimes.torch.capture import cuda_graphs
 from ttscompile.runtimes.torch.devices import device_of, exact_arithmetic
 
@@ -30,9 +31,8 @@ def test_what_a_caller_told_torch_about_precision_changes_no_action(
     obs, noise = random_inputs(artifact, np.random.default_rng(0), 2)
 
     def actions() -> np.ndarray:
-        return open_runtime(artifact, "torch", precision=precision).predict(
-            obs, noise, Plan(cells=uniform_plan(5, 5, 3))
-        )[0]
+        plan = Plan(cells=uniform_plan(5, 5, 3), precision={} if precision == "fp32" else {"blocks": precision})
+        return open_runtime(artifact, "torch").predict(obs, noise, plan)[0]
 
     expected = actions()
     with torch.autocast("cpu", torch.bfloat16):
@@ -86,7 +86,7 @@ def test_a_call_on_another_gpu_makes_it_the_current_one(
     toy_artifact: Artifact, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     entered: list[torch.device] = []
-    backend = TorchBackend(toy_artifact)
+    backend = TorchBackends()(view_of(toy_artifact))
     monkeypatch.setattr(torch.cuda, "device", lambda device: entered.append(device) or nullcontext())
     with backend._settings():
         assert entered == []

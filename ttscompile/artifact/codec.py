@@ -76,6 +76,17 @@ def decode(content: bytes, where: str = MANIFEST) -> Manifest:
     return replace(manifest, identity=identity, model_identity=model_identity)
 
 
+def is_as_written(manifest: Manifest, content: bytes) -> bool:
+    """Whether these bytes are how ttscompile writes a manifest, or wrote it in the schema before, which says the same.
+
+    Args:
+        manifest: what ``decode`` made of the bytes.
+        content: of ``manifest.json``.
+    """
+    document = {key: member.data for key, member in parse(content, MANIFEST, MAX_MANIFEST_BYTES).members().items()}
+    return content == (encode(manifest) if document["schema_version"] == SCHEMA_VERSION else dump(document))
+
+
 def to_json(manifest: Manifest) -> dict[str, Any]:
     """The manifest as JSON, without the checksum."""
     document = typed_json.to_json(manifest)

@@ -130,7 +130,8 @@ class Artifact:
             IllegalPlanError: there is none of this name.
         """
         if not isinstance(name, str):
-            raise IllegalPlanError(f"expected a ttscompile.Plan, or the name of one; found a {type(name).__name__}.")
+            found = f"found a {type(name).__name__}. A matrix is for predict_action(plan=...), call by call"
+            raise IllegalPlanError(f"expected a ttscompile.Plan, or the name of one, {list(self.plans)}; {found}.")
         own, _, precision = name.partition("@")
         if own not in self.plans or precision not in ("", *PRECISIONS):
             remedy = "Use one of these, NAME@PRECISION for one in another precision, or dataclasses.replace"

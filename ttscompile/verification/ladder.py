@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..artifact.archive import is_checkpoint
-from ..artifact.codec import encode
+from ..artifact.codec import is_as_written
 from ..artifact.files import check_file
 from ..artifact.golden import load_golden, load_golden_plans
 from ..artifact.load import Artifact, load_artifact, read_manifest, require_artifact_path
@@ -107,7 +107,7 @@ def check_integrity(path: Path) -> tuple[Rung, Artifact | None]:
         artifact = load_artifact(path)
         # Two spellings of one document have one checksum.
         with artifact.reading(MANIFEST):
-            if encode(artifact.manifest) != (artifact.files / MANIFEST).read_bytes():
+            if not is_as_written(artifact.manifest, (artifact.files / MANIFEST).read_bytes()):
                 wrong = [f"{path / MANIFEST}: is written otherwise than ttscompile writes it; the file was changed."]
     except ArtifactChangedError:
         raise  # nothing is wrong with it
