@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from ttscompile import legalize
 from ttscompile.artifact import Artifact
+from ttscompile.artifact.view import View
 from ttscompile.core.correction import HIDDEN, HISTORY, Correction, jumps_of, no_correction
 from ttscompile.core.lattice import BoolArray, PlanArray
 
@@ -27,9 +28,10 @@ def random_plan(
     return legalize(plan, groups, written)[0]
 
 
-def random_correction(artifact: Artifact, rng: np.random.Generator) -> Correction:
+def random_correction(artifact: Artifact | View, rng: np.random.Generator) -> Correction:
     manifest = artifact.manifest
-    like = no_correction(manifest.steps, manifest.spec.sample)
+    groups = artifact.groups if isinstance(artifact, View) else None
+    like = no_correction(manifest.steps, manifest.spec.sample, groups)
     scale = 0.3 / np.sqrt(like.weights.shape[2])
     anchors = rng.random(manifest.steps) < 0.5
     if len(anchors) > 2:
