@@ -11,7 +11,6 @@ from torch import nn
 import ttscompile
 from tests.once import Once
 from ttscompile import Affine, ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
-from ttscompile.calibration.pipeline import calibrate
 
 STEPS, HORIZON, CHANNELS, WIDTH, LAYERS = 10, 8, 2, 32, 3
 
@@ -88,5 +87,5 @@ def record(path: Path, episodes: int = 6, seed: int = 0) -> Path:
 
 def whole_steps(directory: Path, recording: Path) -> Path:
     """The artifact with a schedule that computes two of its ten steps."""
-    calibrate(directory, [recording], 0.8, "interval", progress=False)
+    ttscompile.calibrate(directory, [recording], 0.8, "interval", progress=False)
     return directory
