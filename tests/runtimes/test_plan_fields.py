@@ -19,6 +19,7 @@ from tests.rounding import bound
 from ttscompile import Plan
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.block_weights import BlockWeights
+from ttscompile.artifact.codec import to_json
 from ttscompile.artifact.manifest import StartRecord
 from ttscompile.artifact.view import view_of
 from ttscompile.artifact.write import update_plans
@@ -102,6 +103,7 @@ def test_any_combination_runs_in_every_runtime_that_can_do_its_parts(artifact: A
     record = artifact.manifest.precision
     assert record is not None
     ran, drawn = set[tuple[str, str, bool]](), list[dict[str, Any]]()
+    carried = set[str]()  # runtimes whose last chunk has something of eight bits in it
     while len(drawn) < 3:  # apart from their precision, too: the reference has them all in fp32
         one = random_fields(rng)
         if all((one["loop"], one["weights"]) != (each["loop"], each["weights"]) for each in drawn):
@@ -120,7 +122,11 @@ def test_any_combination_runs_in_every_runtime_that_can_do_its_parts(artifact: A
                 plan_here = plan
             found, report = runtimes[name].predict(obs, noise, plan_here)
             eight = bool(plan_here.precision)
-            allowed = 0.3 if eight else 50 * bound(call_terms(artifact))
+            off = eight or (
+                plan.otherwise is not None and name in carried
+            )  # what it begins with was made in eight bits
+            carried = carried | {name} if eight else carried - {name}
+            allowed = 0.3 if off else 50 * bound(call_terms(artifact))
             assert np.abs(found - expected).max() / scale < allowed, (name, call, plan.variant)
             if not eight:
                 np.testing.assert_array_equal(report.plan, wanted.plan)
@@ -166,7 +172,7 @@ def test_a_copy_is_the_same(artifact: Artifact, tmp_path: Path) -> None:
     """Plans, loops and weights come back from disk as they were."""
     shutil.copytree(artifact.path, tmp_path / "copy")
     again = load_artifact(tmp_path / "copy")
-    assert again.manifest == artifact.manifest
+    assert to_json(again.manifest) == to_json(artifact.manifest)
     manifest = update_plans(tmp_path / "copy", again.plans, "four")
     assert manifest.plans == artifact.manifest.plans
     assert manifest.identity != artifact.manifest.identity
