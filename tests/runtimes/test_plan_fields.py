@@ -122,10 +122,8 @@ def test_any_combination_runs_in_every_runtime_that_can_do_its_parts(artifact: A
                 plan_here = plan
             found, report = runtimes[name].predict(obs, noise, plan_here)
             eight = bool(plan_here.precision)
-            off = eight or (
-                plan.otherwise is not None and name in carried
-            )  # what it begins with was made in eight bits
-            carried = carried | {name} if eight else carried - {name}
+            off = eight or (plan.otherwise is not None and name in carried)
+            carried = carried | {name} if off else carried - {name}
             allowed = 0.3 if off else 50 * bound(call_terms(artifact))
             assert np.abs(found - expected).max() / scale < allowed, (name, call, plan.variant)
             if not eight:
