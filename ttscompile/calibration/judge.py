@@ -152,6 +152,15 @@ def _loop_spec(trials: Trials, plan: Plan) -> Any:
     return trials.view(plan.otherwise or plan).manifest.spec
 
 
+def other_noise(trials: Trials) -> float:
+    """How far two answers of the original to one held-out observation are apart, in the units of the actions."""
+    spec, answers = trials.artifact.manifest.spec, trials.held_out.answers.astype(np.float64)
+    part = answers[..., spec.chunk.start : spec.chunk.stop, : spec.chunk.action_dim]
+    scale = 1.0 if spec.chunk.normalizer is None else np.abs(spec.chunk.normalizer.scale)
+    apart = [np.abs(part[:, i] - part[:, j]) / scale for i, j in combinations(range(DRAWS), 2)]
+    return float(np.mean(apart))
+
+
 class _Answers:
     """What a plan answers to the calls of a sample.
 
