@@ -100,7 +100,7 @@ class Kept:
         return f"is too far off: {told} {best.distance:.4g}: {limit:.4g} more at worst, and {margin:.4g} is allowed."
 
     def _share(self, proposal: Proposal) -> None:
-        """Give the fields that a proposal shares to all other plans but ``dense``, also where another falls back on one."""
+        """Give the fields that a proposal shares to all plans but ``dense``, also where one falls back on another."""
         old, new = dict(self.plans), dict[int, Plan]()
         for name, plan in old.items():
             fields = {} if name in (DENSE, proposal.name) else proposal.shared
