@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -103,8 +104,8 @@ class Trials:
     base: Plan
     executor: Executor
     state: StateFile
-    clock: Clock
-    bar: Bar
+    clock: Clock = field(default_factory=Clock)
+    bar: Bar = field(default_factory=partial(Bar, shown=False))
     pool: Pool = field(default_factory=Here)
     device: torch.device | None = None
     fresh: bool = False
@@ -122,19 +123,13 @@ class Trials:
         *,
         seed: int = 0,
         fraction: float = FRACTION,
-        clock: Clock | None = None,
-        bar: Bar | None = None,
-        pool: Pool | None = None,
-        device: torch.device | None = None,
-        limits: tuple[int, int] = (FEWEST_CALLS, FEWEST_CALLS),
+        **others: Any,
     ) -> Trials:
-        """Divide the episodes, and open the policy."""
+        """Divide the episodes, and open the policy; ``others`` are further fields."""
         base = base_of(artifact)
-        executor = Executor(view_of(artifact, base.exact), device)
+        executor = Executor(view_of(artifact, base.exact), others.get("device"))
         split = split_episodes(len(episodes), fraction, seed)
-        clock, bar, pool = clock or Clock(), bar or Bar(shown=False), pool or Here()
-        opened = executor, state, clock, bar, pool, device
-        return cls(artifact, episodes, split, seed, base, *opened, limits=limits)
+        return cls(artifact, episodes, split, seed, base, executor, state, **others)
 
     @property
     def calls(self) -> Calls:
