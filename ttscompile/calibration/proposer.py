@@ -147,10 +147,10 @@ class Row:
 PROPOSERS = (
     Row("schedule", "which steps are computed, with corrections and jumps", "calibration.schedule:Schedule", True),
     Row("pruner", "gates for each observation", "calibration.pruner.proposer:Pruner", consecutive=True),
-    Row("precision", "which parts compute in the artifact's other precision", "calibration.precision:Precision"),
-    Row("tokens", "when a token of an image encoder is computed anew", "calibration.tokens:Tokens"),
-    Row("weights", "low-rank updates of the weights of later steps", "calibration.weights:Weights", True, True),
-    Row("start", "how many steps a call needs that begins with the chunk before", "calibration.start:Start"),
+    Row("precision", "which parts compute in the other precision", "calibration.proposers.precision:Precision"),
+    Row("tokens", "when a token of an image encoder is computed anew", "calibration.proposers.tokens:Tokens"),
+    Row("weights", "low-rank updates of later steps' weights", "calibration.proposers.weights:Weights", True, True),
+    Row("start", "how many steps a call needs that begins with the chunk before", "calibration.proposers.start:Start"),
 )
 """In the order in which they propose, whatever the order in which they are asked for."""
 

@@ -1,0 +1,119 @@
+"""Weights of its own for a plan that computes very few steps: the last resort, where no correction helps.
+
+The original's stay in the artifact, and all other plans compute with them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ...artifact.block_weights import BlockWeights
+from ...artifact.load import Artifact
+from ...core.lattice import Source, whole_steps_plan
+from ...core.plan import ORIGINAL, Plan
+from ...errors import CalibrationError, CalibrationFailedError
+from ...ir.pieces import is_block
+from ...lower.precision import quantize_model
+from ..clock import Clock
+from ..execute import Executor
+from ..fit_correction import fit_correction
+from ..proposer import Proposal, Proposals, Request
+from ..trials import Trials
+from .student import Student, trainable
+
+NAME = "distilled"
+"""Of the plan, and of its weights."""
+
+SAVED = 20
+"""Updates from one saving of the state to the next."""
+
+TRAINING = 0.95
+"""Share of the time limit after which the weights stay as they are: what follows takes the rest."""
+
+
+class Weights:
+    """Trains low-rank changes of the blocks' matrices until the plan answers as the dense policy does."""
+
+    def __init__(self, request: Request) -> None:
+        self._rank, self._updates = request.rank, request.updates
+        self.told = ""
+
+    def applies(self, artifact: Artifact) -> str | None:
+        """Whether blocks have matrices of their own that are large enough."""
+        try:
+            trainable(artifact, self._rank)
+        except CalibrationError as error:
+            return str(error)
+        return None
+
+    def propose(self, trials: Trials, plan: Plan, clock: Clock) -> Proposals:
+        """The plan with trained weights, and a correction of what these predict."""
+        _require_whole_steps(trials, plan)
+        cells, calls = np.asarray(plan.cells), trials.calls
+        reads = plan.correction is None or plan.correction.reads > 0
+        names = trainable(trials.artifact, self._rank)
+
+        def proposed(executor: Executor, weights: Mapping[str, Any], notes: Mapping[str, Any]) -> Proposal:
+            correction = fit_correction(executor, cells, calls, reads)
+            own = BlockWeights(weights, _in_precision(trials.artifact, weights))
+            return Proposal(NAME, replace(plan, correction=correction, weights=NAME), notes, weights={NAME: own})
+
+        first = proposed(trials.executor, {name: trials.artifact.weights[name] for name in names}, {})
+        executor = Executor(trials.holding(first).view(first.plan.exact), trials.device)
+        student = Student(executor, first.plan, self._rank, trials.seed, self._updates)
+        self._train(student, trials, clock.until(TRAINING))
+        self.told = f"{len(names)} matrices of blocks were trained in {student.done} updates"
+        notes = {"rank": self._rank, "matrices": len(names), "updates": student.done}
+        # What the trained weights predict is corrected anew; what they were trained with they only began from.
+        yield proposed(student.executor, student.weights(), notes)
+
+    def _train(self, student: Student, trials: Trials, clock: Clock) -> None:
+        """All updates, or as many as there is time for; the state is saved on the way."""
+        state, lesson = trials.state, student.lesson(trials.calls)
+        done = int(state.progress.get("updates", 0))
+        if done:
+            with state.reading():
+                student.restore(state.get("weights"), done)
+        trials.bar.stage("distil", self._updates, done)
+        # The rate falls with what training has taken.
+        first = float(state.progress.setdefault("training began", clock.elapsed()))
+        for _ in clock.in_time(range(done, self._updates)):
+            loss = student.update(lesson, (clock.elapsed() - first) / max(clock.limit - first, 1e-9))
+            trials.bar.update(student.done, f"loss {loss:.2e}", clock.left())
+            if student.done % SAVED == 0:
+                state.put("weights", student.state())
+                state.progress |= {"updates": student.done, "seconds": clock.elapsed()}
+                state.save()
+
+
+def _require_whole_steps(trials: Trials, plan: Plan) -> None:
+    """Raise unless a plan can be distilled.
+
+    Raises:
+        CalibrationFailedError: it cannot.
+    """
+    cells = plan.cells
+    if cells is not None and plan.loop == trials.base.loop and plan.weights == ORIGINAL:
+        steps = np.flatnonzero((cells == Source.COMPUTE).all(axis=1)).tolist()
+        if len(steps) > 1 and np.array_equal(cells, whole_steps_plan(len(cells), cells.shape[1], steps)):
+            return
+    raise CalibrationFailedError(
+        "weights are trained for a schedule of whole steps, at least two of them computed and TIMESTEP elsewhere, that"
+        " begins with noise and has the original's weights; found another plan. Learn 'schedule' with strategy 'tts',"
+        " which makes such plans."
+    )
+
+
+def _in_precision(artifact: Artifact, weights: Mapping[str, Any]) -> dict[str, Any]:
+    """The constants that the artifact's other precision makes of these weights, by name; none where it has none."""
+    import onnx
+
+    record, known, made = artifact.manifest.precision, {**artifact.weights, **weights}, dict[str, Any]()
+    for name in filter(is_block, () if record is None else record.models):
+        model = onnx.load(artifact.files / artifact.manifest.pieces[name].file, load_external_data=False)
+        made |= quantize_model(model, known)[1]
+    return made
