@@ -19,7 +19,7 @@ from ...errors import CalibrationFailedError, SpecError
 from ..clock import Clock
 from ..judge import further, judge
 from ..proposer import Proposal, Proposals, Request
-from ..trials import LEARNED, Trials
+from ..trials import LEARNED, Trials, base_of
 
 NAME = "warm"
 """Of the plan."""
@@ -39,10 +39,11 @@ class Start:
 
     def applies(self, artifact: Artifact) -> str | None:
         """Whether the sampler's table tells what such a call begins with."""
-        if (steps := artifact.manifest.steps) < 2:
-            return f"a loop of {steps} step has no half"
+        table = artifact.manifest.sampler_of(base_of(artifact).loop)
+        if table.steps < 2:
+            return f"a loop of {table.steps} step has no half"
         try:
-            rest_of(artifact.manifest.spec.sampler, 1)
+            rest_of(table, 1)
         except SpecError as error:
             return str(error)
         return None
@@ -50,21 +51,22 @@ class Start:
     def propose(self, trials: Trials, plan: Plan, clock: Clock) -> Proposals:
         """The plan of the fewest computed cells that is within the margin."""
         whole = plan.otherwise or plan
-        score, off = judge(trials, whole, LEARNED), dict[int, float]()
+        score, limits = judge(trials, whole, LEARNED), dict[int, float]()
         found = candidates(trials.artifact, whole)
         trials.bar.stage("numbers of steps", len(found))
         for number, one in enumerate(found):
             (steps,) = (record.steps for record in one.starts.values())
-            off[steps], limit = further(judge(trials.holding(one), one.plan, LEARNED), score)
-            trials.bar.update(number + 1, f"{steps} steps: {off[steps]:.3g} further", clock.left())
-            if limit <= self._margin:
+            off, limits[steps] = further(judge(trials.holding(one), one.plan, LEARNED), score)
+            trials.bar.update(number + 1, f"{steps} steps: {off:.3g} further", clock.left())
+            if limits[steps] <= self._margin:
                 self.told = (
                     f"calls after the first of an episode begin with the chunk before, in the last {steps} steps"
                 )
                 yield replace(one, notes={"steps": steps, "further": off}, margin=self._margin)
                 return
-        told = f"the last {min(off, key=off.__getitem__)} steps are {min(off.values()):.3g} further off"
-        raise CalibrationFailedError(f"no call that begins with the chunk before is near: {told}.")
+        least = min(limits, key=limits.__getitem__)
+        told = f"the last {least} steps are {limits[least]:.3g} further off at worst, and {self._margin:g} is allowed"
+        raise CalibrationFailedError(f"no call that begins with the chunk before is near enough: {told}.")
 
 
 def candidates(artifact: Artifact, plan: Plan) -> list[Proposal]:
