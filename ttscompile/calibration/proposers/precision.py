@@ -43,14 +43,15 @@ class Precision:
 
         kept, left = list(record.kept), list[str]()
         trials.bar.stage("parts in another precision", len(kept))
-        alone = {part: off([part])[0] for part in kept} if len(kept) > 1 else dict.fromkeys(kept, 0.0)
+        alone = {part: off([part])[0] for part in kept} if len(kept) > 1 else {}
         while kept and off(kept)[1] > self._margin:
-            left.append(max(kept, key=alone.__getitem__))
+            left.append(max(kept, key=lambda part: alone.get(part, 0.0)))
             kept.remove(left[-1])
             trials.bar.update(len(left), f"{left[-1]} stays fp32", clock.left())
         best = lowered(kept)
-        self.told = f"{record.name} in {' and '.join(kept)}" if kept else "all parts stay fp32"
+        more = f"{record.name} changes the actions more than {self._margin:g} allows"
+        self.told = f"{record.name} in {' and '.join(kept)}" if kept else f"all parts stay fp32: {more}"
         if left and kept:
-            self.told += f"; {' and '.join(left)} stay fp32: they change the actions more than {self._margin:g} allows"
+            self.told += f"; {' and '.join(left)} stay{'s' * (len(left) == 1)} fp32: there {more}"
         notes = {"parts": kept, "alone": alone}
         yield Proposal(trials.name, best, notes, margin=self._margin, shared={"precision": best.precision})

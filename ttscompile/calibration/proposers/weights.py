@@ -57,19 +57,22 @@ class Weights:
         reads = plan.correction is None or plan.correction.reads > 0
         names = trainable(trials.artifact, self._rank)
 
-        def proposed(executor: Executor, weights: Mapping[str, Any], notes: Mapping[str, Any]) -> Proposal:
-            correction = fit_correction(executor, cells, calls, reads)
-            own = BlockWeights(weights, _in_precision(trials.artifact, weights))
-            return Proposal(NAME, replace(plan, correction=correction, weights=NAME), notes, weights={NAME: own})
+        def corrected(executor: Executor) -> Plan:
+            return replace(plan, correction=fit_correction(executor, cells, calls, reads), weights=NAME)
 
-        first = proposed(trials.executor, {name: trials.artifact.weights[name] for name in names}, {})
-        executor = Executor(trials.holding(first).view(first.plan.exact), trials.device)
-        student = Student(executor, first.plan, self._rank, trials.seed, self._updates)
+        first, original = corrected(trials.executor), {name: trials.artifact.weights[name] for name in names}
+        if plan.correction is None and first.correction is not None:  # what that alone does is no merit of the weights
+            yield Proposal(trials.name, replace(plan, correction=first.correction))
+        held = trials.holding(Proposal(NAME, first, weights={NAME: BlockWeights(original, {})}))
+        student = Student(
+            Executor(held.view(first.exact), trials.device), first, self._rank, trials.seed, self._updates
+        )
         self._train(student, trials, clock.until(TRAINING))
         self.told = f"{len(names)} matrices of blocks were trained in {student.done} updates"
-        notes = {"rank": self._rank, "matrices": len(names), "updates": student.done}
+        notes, weights = {"rank": self._rank, "matrices": len(names), "updates": student.done}, student.weights()
+        own = BlockWeights(weights, _in_precision(trials.artifact, weights))
         # What the trained weights predict is corrected anew; what they were trained with they only began from.
-        yield proposed(student.executor, student.weights(), notes)
+        yield Proposal(NAME, corrected(student.executor), notes, weights={NAME: own})
 
     def _train(self, student: Student, trials: Trials, clock: Clock) -> None:
         """All updates, or as many as there is time for; the state is saved on the way."""
@@ -99,12 +102,13 @@ def _require_whole_steps(trials: Trials, plan: Plan) -> None:
     cells = plan.cells
     if cells is not None and plan.loop == trials.base.loop and plan.weights == ORIGINAL:
         steps = np.flatnonzero((cells == Source.COMPUTE).all(axis=1)).tolist()
-        if len(steps) > 1 and np.array_equal(cells, whole_steps_plan(len(cells), cells.shape[1], steps)):
+        whole = whole_steps_plan(len(cells), cells.shape[1], steps)
+        if 1 < len(steps) < len(cells) and np.array_equal(cells, whole):
             return
     raise CalibrationFailedError(
-        "weights are trained for a schedule of whole steps, at least two of them computed and TIMESTEP elsewhere, that"
-        " begins with noise and has the original's weights; found another plan. Learn 'schedule' with strategy 'tts',"
-        " which makes such plans."
+        "weights are trained for a schedule of whole steps, two of them computed at least and TIMESTEP elsewhere, that"
+        f" begins with noise and has the original's weights; plan {trials.name!r} is another one. Learn 'schedule' with"
+        " strategy 'tts', which makes such plans."
     )
 
 
