@@ -13,12 +13,7 @@ from typing import TYPE_CHECKING, Any
 from .measure.versions import VERSION as __version__
 
 if TYPE_CHECKING:
-    from .calibration.distill import distill as distill
     from .calibration.pipeline import calibrate as calibrate
-    from .calibration.tokens import TokenCalibration as TokenCalibration
-    from .calibration.tokens import reuse_tokens as reuse_tokens
-    from .calibration.warm_start import WarmCalibration as WarmCalibration
-    from .calibration.warm_start import warm_start as warm_start
     from .core.lattice import Source as Source
     from .core.lattice import legalize as legalize
     from .core.plan import Plan as Plan
@@ -50,10 +45,7 @@ if TYPE_CHECKING:
 _HOMES = {
     name: home
     for home, names in {
-        "calibration.distill": ("distill",),
         "calibration.pipeline": ("calibrate",),
-        "calibration.tokens": ("TokenCalibration", "reuse_tokens"),
-        "calibration.warm_start": ("WarmCalibration", "warm_start"),
         "core.lattice": ("Source", "legalize"),
         "core.plan": ("Plan", "TokenReuse"),
         "core.spec": ("Affine", "ChunkSpec", "Noise", "ObservationSpec", "PolicySpec", "SamplerTable"),

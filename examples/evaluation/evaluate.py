@@ -239,7 +239,7 @@ def main(  # noqa: C901  # checks each option in turn
 ) -> None:
     """Compare artifacts and plans: DIR takes the artifact's own plan, DIR:dense computes everything.
 
-    DIR:dense:warm=3 is ttscompile.load(DIR, warm=3). With DIR:dense:pinned all calls of an episode share noise.
+    With DIR:dense:pinned all calls of an episode share noise.
     """
     if (jobs > 1 or ray) and no_cache:
         raise click.UsageError("--jobs and --ray hand episodes over through the cache: leave out --no-cache.")

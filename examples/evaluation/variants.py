@@ -16,9 +16,8 @@ from ttscompile.cli.output import results_console as results_console
 from ttscompile.cli.output import run as run
 from ttscompile.runtimes.info import PolicyInfo
 
-PINNED, WARM = "pinned", "warm="
-"""What may stand after a directory beside a plan: the noise of an episode's first call in all of its calls; and calls
-that begin with the chunk of the call before (``ttscompile.load(warm=)``)."""
+PINNED = "pinned"
+"""What may stand after a directory beside a plan: the noise of an episode's first call in all of its calls."""
 
 Plan: TypeAlias = str | npt.NDArray[np.int8]
 """``dense``, the name of a plan in the artifact, or a matrix ``[K, blocks]``."""
@@ -84,8 +83,7 @@ def open_variant(text: str, runtime: str, threads: int) -> Variant:
 
     Args:
         text: ``DIR`` for the artifact's default plan, ``DIR:dense``, or ``DIR:NAME`` for a plan that it holds.
-            With ``:pinned`` after it all calls of an episode have the same noise, and with ``:warm=N`` calls begin with
-            the chunk of the call before.
+            With ``:pinned`` after it all calls of an episode have the same noise.
         runtime: of ``ttscompile.load``.
         threads: of ``ttscompile.load``.
 
@@ -93,13 +91,15 @@ def open_variant(text: str, runtime: str, threads: int) -> Variant:
         The variant, its label being the text.
     """
     directory, *words = text.split(":")
-    warm = [int(word.removeprefix(WARM)) for word in words if word.startswith(WARM)]
-    plans = [word for word in words if word != PINNED and not word.startswith(WARM)]
-    if max(len(plans), len(warm)) > 1:
-        raise click.BadParameter(f"{text}: expected one plan, and one {WARM}N; found {':'.join(words)}.")
-    policy = ttscompile.load(Path(directory), runtime=runtime, threads=threads, warm=warm[0] if warm else None)
-    noise = replace(noise_shape(policy.info), pinned=PINNED in words)
-    return Variant(text, policy, plans[0] if plans else None, noise)
+    plans = [word for word in words if word != PINNED]
+    if len(plans) > 1:
+        raise click.BadParameter(f"{text}: expected one plan; found {':'.join(words)}.")
+    policy = ttscompile.load(Path(directory), runtime=runtime, threads=threads, plan=plans[0] if plans else None)
+    whole = policy.plans[policy.info.default_plan].otherwise  # the noise of its calls is for the whole loop
+    shape = noise_shape(policy.info)
+    if whole is not None and whole.cells is not None:
+        shape = replace(shape, steps=len(whole.cells))
+    return Variant(text, policy, plans[0] if plans else None, replace(shape, pinned=PINNED in words))
 
 
 def seeded_noise(shape: NoiseShape, seeds: Sequence[int], call: int) -> ttscompile.Noise:

@@ -58,7 +58,7 @@ def test_help_has_a_whole_line_for_each_command_in_the_order_of_use(
     listed = [line.split(maxsplit=1) for line in told.partition("Commands:\n")[2].partition("\n\n")[0].splitlines()]
     assert {name for name, _ in listed} == set(main.commands)
     assert all(what.endswith((".", "?")) and not what.endswith("...") for _, what in listed), "cut off"
-    assert [name for name, _ in listed][:4] == ["doctor", "convert", "calibrate", "distill"]
+    assert [name for name, _ in listed][:4] == ["doctor", "convert", "calibrate", "inspect"]
 
 
 def test_convert_says_what_it_made_and_explains_on_standard_error(one_layer_checkpoint: Path, tmp_path: Path) -> None:

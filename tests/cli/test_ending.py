@@ -88,7 +88,7 @@ def test_an_interruption_of_the_imports_is_one_too(monkeypatch: pytest.MonkeyPat
         start()
 
 
-@pytest.mark.parametrize("command", ["calibrate", "distill", "compare"])
+@pytest.mark.parametrize("command", ["calibrate", "compare"])
 @pytest.mark.parametrize("before", [[], ["--traceback"]])
 def test_what_can_go_on_says_so(command: str, before: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(_: Path) -> None:

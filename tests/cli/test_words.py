@@ -43,18 +43,15 @@ NEEDED = {
     "calibrate": [("A", "-t", "calls.npz", "--max-minutes", "0.001")],
     "compare": [("A", "-t", "calls.npz", "--strategies", "", "--calls", "1")],
     "convert": [("policy.ckpt", "-o", "out")],
-    "distill": [("A", "-t", "calls.npz", "--updates", "1", "--max-minutes", "0.001")],
     "doctor": [("A",)],
     "inspect": [("A",), ("A", "--output", "out.html"), ("A", "--plot", "plan.png")],
     "push": [("A", "org/name", "--dry-run", "--runs", "1")],
     "realtime": [("A", "--control-hz", "1", "--runs", "1")],
-    "reuse-tokens": [("A", "-t", "calls.npz", "--calls", "2")],
     "serve": [
         ("A", "--control-hz", "1", "--port", "0", "--margin-ticks", "0"),
         ("A", "--copies", "1", "--port", "0"),
     ],
     "verify": [("A", "--calls", "1")],
-    "warm-start": [("A", "-t", "calls.npz", "--calls", "2")],
 }
 """Command lines of each command that can be run, and end soon: one for each section of its options."""
 

@@ -14,16 +14,17 @@ import numpy as np
 
 from ..artifact.ceiling import TYPICAL_SPARSITY
 from ..artifact.load import Artifact
-from ..artifact.manifest import Manifest, PlanRecord
+from ..artifact.manifest import Manifest
+from ..artifact.view import view_of
 from ..core.coercion import integer
-from ..core.lattice import dense_plan, sparsity, uniform_plan
+from ..core.lattice import dense_plan, uniform_plan
+from ..core.plan import Plan
 from ..core.spec import Noise
 from ..errors import CalibrationError
 from ..measure.timer import Timer
 from ..runtimes.open import open_runtime
 from ..runtimes.policy import CompiledPolicy
 from ..runtimes.runtime import Runtime
-from .task import Found
 
 SPARSITY, FLOPS, LATENCY, ERROR = "target_sparsity", "target_flops", "latency_ms", "max_action_error"
 """The ways to ask for a plan: the names of the arguments of ``calibrate``."""
@@ -149,41 +150,31 @@ def cells_of(goal: Goal, manifest: Manifest, pruned: bool) -> int:
     return cells
 
 
-def with_plans(artifact: Artifact, plans: Mapping[str, Found]) -> Artifact:
-    """The artifact, in memory, with more schedules: a runtime treats them as it does those of the file."""
-    records = {name: PlanRecord("schedule", sparsity(one.schedule), None) for name, one in plans.items()}
-    corrections = {name: one.correction for name, one in plans.items() if one.correction is not None}
-    return replace(
-        artifact,
-        manifest=replace(artifact.manifest, plans={**artifact.manifest.plans, **records}),
-        schedules={**artifact.schedules, **{name: one.schedule for name, one in plans.items()}},
-        corrections={**artifact.corrections, **corrections},
-    )
-
-
-def measure_budget(artifact: Artifact, goal: Goal, pruned: bool) -> Budget:
+def measure_budget(artifact: Artifact, base: Plan, goal: Goal, pruned: bool) -> Budget:
     """The largest number of computed cells, in whole steps, whose calls fit.
 
     Bisection over the number of steps; each candidate is the median of some calls on one stream. Where the pruner may
-    run (``pruned``), what the loop waits for it is added. The goal is of kind ``latency_ms``.
+    run (``pruned``), what the loop waits for it is added. The goal is of kind ``latency_ms``; ``base`` is a plan of the
+    loop, in the precision that calls will have.
 
     Raises:
         CalibrationError: not even a call of one computed step fits, or a dense one does.
     """
     assert goal.kind == LATENCY
-    steps, blocks = artifact.manifest.steps, len(artifact.manifest.blocks)
-    names = {full: f"{full} steps" for full in range(1, steps + 1)}
-    whole = with_plans(artifact, {name: Found(uniform_plan(steps, blocks, full)) for full, name in names.items()})
-    runtime = open_runtime(whole, "onnxruntime", goal.threads)
-    policy = CompiledPolicy(whole, runtime, seed=0)
-    obs = {key: np.zeros((1, *one.shape), one.dtype) for key, one in artifact.manifest.spec.observations.items()}
-    waited = _pruner_ms(artifact, runtime) if pruned else 0.0
+    manifest = view_of(artifact, base).manifest
+    steps, blocks = manifest.steps, len(manifest.blocks)
+    runtime = open_runtime(artifact, "onnxruntime", goal.threads, plan=base)
+    policy = CompiledPolicy(artifact, runtime, seed=0, plan=base)
+    obs = {key: np.zeros((1, *one.shape), one.dtype) for key, one in manifest.spec.observations.items()}
+    waited = _pruner_ms(manifest, runtime, base) if pruned else 0.0
     measured: dict[int, float] = {}
 
     def fits(full: int) -> bool:
+        plan = replace(base, cells=uniform_plan(steps, blocks, full))
+
         def call() -> None:
             policy.forget_frames()  # a call may have to compute them all
-            policy.predict_action(obs, plan=names[full])
+            policy.predict_action(obs, plan=plan)
 
         measured[full] = waited + median_ms(call)
         return measured[full] <= goal.value
@@ -215,9 +206,9 @@ def median_ms(call: Callable[[], object]) -> float:
     return timer.times[0].median
 
 
-def _pruner_ms(artifact: Artifact, runtime: Runtime) -> float:
+def _pruner_ms(manifest: Manifest, runtime: Runtime, base: Plan) -> float:
     """For how long the loop waits for the pruner's plan, in milliseconds; whatever the plan is."""
-    spec = artifact.manifest.spec
+    spec, plan = manifest.spec, replace(base, cells=None, repair=True)
     obs = {
         key: np.zeros((1, *one.shape), one.dtype if one.normalizer is None else np.float32)
         for key, one in spec.observations.items()
@@ -225,6 +216,6 @@ def _pruner_ms(artifact: Artifact, runtime: Runtime) -> float:
     noise = Noise(np.zeros((1, *spec.sample), np.float32), np.zeros((spec.sampler.steps, 1, *spec.sample), np.float32))
     waits = []
     for _ in range(WARM_UP + FEWEST):
-        waits.append(runtime.predict(obs, noise)[1].timings.wait_pruner)
+        waits.append(runtime.predict(obs, noise, plan)[1].timings.wait_pruner)
         runtime.reset()
     return float(np.median(waits[WARM_UP:]))

@@ -1,14 +1,14 @@
 """How far what a plan answers is from what the original answers: the one yardstick for plans of every kind.
 
-The energy distance (Szekely and Rizzo, 2013) of the executed actions, normalised. For draws i < j of noise of one
-observation, with x the plan's answers and y the original's,
+The energy distance (Szekely and Rizzo, 2013) of the executed actions, normalised, with their root mean square as norm.
+For draws i < j of noise of one observation, with x the plan's answers and y the original's,
 
     h = |x_i - y_j| + |x_j - y_i| - |x_i - x_j| - |y_i - y_j|
 
 has the energy distance of the two distributions of answers as its mean, whether or not draw i of the plan has the noise
-of draw i of the original; where it has, x_i is near y_i, the terms nearly cancel, and h varies little. ``distance`` is
-the root of the mean of h over the mean of |y_i - y_j|: 0 if nothing can be told apart, and 1 where answers are as far
-off as ones that have a shift of about their own spread (``docs/decisions.md`` says why the root).
+of draw i of the original. Where it has, x_i is near y_i, the terms nearly cancel, and h varies little. ``distance`` is
+the root of the mean of h over the mean of |y_i - y_j|: 0 where nothing can be told apart; the root grows as the error
+does. ``docs/decisions.md`` has the measurements behind norm and root.
 """
 
 from __future__ import annotations
@@ -150,6 +150,15 @@ def _filed(trials: Trials, plan: Plan) -> Plan:
 def _loop_spec(trials: Trials, plan: Plan) -> Any:
     """The specification with the whole loop that the noise of a plan's calls is for."""
     return trials.view(plan.otherwise or plan).manifest.spec
+
+
+def other_noise(trials: Trials) -> float:
+    """How far two answers of the original to one held-out observation are apart, in the units of the actions."""
+    spec, answers = trials.artifact.manifest.spec, trials.held_out.answers.astype(np.float64)
+    part = answers[..., spec.chunk.start : spec.chunk.stop, : spec.chunk.action_dim]
+    scale = 1.0 if spec.chunk.normalizer is None else np.abs(spec.chunk.normalizer.scale)
+    apart = [np.abs(part[:, i] - part[:, j]) / scale for i, j in combinations(range(DRAWS), 2)]
+    return float(np.mean(apart))
 
 
 class _Answers:
@@ -311,7 +320,7 @@ def pairs(x: Numbers, y: Numbers) -> tuple[Numbers, Numbers]:
 
 
 def _far(one: Numbers, other: Numbers) -> Numbers:
-    return np.asarray(np.abs(one - other).mean(-1))
+    return np.asarray(np.sqrt(np.square(one - other).mean(-1)))
 
 
 def rooted(gap: float, apart: float) -> float:

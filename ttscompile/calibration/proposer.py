@@ -7,9 +7,9 @@ Members as those of the algorithms of NNCF: whether it applies, what it does, an
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy.typing as npt
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from ..core.plan import Plan
     from .budget import Goal
     from .clock import Clock
+    from .judge import Score
     from .trials import Trials
 
 
@@ -39,7 +40,9 @@ class Proposal:
         margin: by how much further from the original than the plan that it was made from it may be: the upper limit of
             the difference over episodes counts (``judge.further``). For plans that cost less. None: it has to be
             nearer.
-        beside: kept under its name whatever its score, and not a candidate for the default.
+        beside: kept under its name, and not a candidate for the default.
+        refusal: says of its score, and of the scores of what was kept so far by name, why it is not what was asked for;
+            None if it is. Asked whether or not it is ``beside``.
         shared: fields that the other plans of this calibration get too, if it is kept: of ``Plan``, by name.
     """
 
@@ -51,6 +54,7 @@ class Proposal:
     starts: Mapping[str, StartRecord] = field(default_factory=dict)
     margin: float | None = None
     beside: bool = False
+    refusal: Callable[[Score, Mapping[str, Score]], str | None] = lambda score, others: None
     shared: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -65,7 +69,6 @@ class Request:
         intervals: of a search, at most; None for its own number.
         rank: of the low-rank update to each weight matrix.
         updates: of the weights.
-        margin: in place of ``Proposal.margin`` wherever that is a number; None leaves it.
     """
 
     goal: Goal
@@ -74,7 +77,10 @@ class Request:
     intervals: int | None = None
     rank: int = 16
     updates: int = 600
-    margin: float | None = None
+
+
+Proposals: TypeAlias = Generator[Proposal, bool, None]
+"""Each is sent whether the proposal before was kept."""
 
 
 class Proposer(Protocol):
@@ -89,11 +95,11 @@ class Proposer(Protocol):
     def applies(self, artifact: Artifact) -> str | None:
         """Why it can do nothing for this policy; None if it can. Asked before any work."""
 
-    def propose(self, trials: Trials, plan: Plan, clock: Clock) -> Iterator[Proposal]:
+    def propose(self, trials: Trials, plan: Plan, clock: Clock) -> Proposals:
         """Propose plans made from a plan, the best so far, the most wished for first.
 
-        The first of a name that is kept ends the wish: others of this name are not judged. Proposals of other names,
-        and those ``beside``, are.
+        ``kept = yield Proposal(...)`` tells whether it holds on episodes that nothing was learned from. One that holds
+        takes the place of another of its name.
 
         Args:
             trials: to learn from (``calls``) and to choose on (``learned``); never ``held_out``.
@@ -141,10 +147,10 @@ class Row:
 PROPOSERS = (
     Row("schedule", "which steps are computed, with corrections and jumps", "calibration.schedule:Schedule", True),
     Row("pruner", "gates for each observation", "calibration.pruner.proposer:Pruner", consecutive=True),
-    Row("weights", "low-rank updates of the weights of later steps", "calibration.weights:Weights", True, True),
-    Row("precision", "which parts compute in the artifact's other precision", "calibration.precision:Precision"),
-    Row("tokens", "when a token of an image encoder is computed anew", "calibration.tokens:Tokens"),
-    Row("start", "how many steps a call needs that begins with the chunk before", "calibration.start:Start"),
+    Row("precision", "which parts compute in the other precision", "calibration.proposers.precision:Precision"),
+    Row("tokens", "when a token of an image encoder is computed anew", "calibration.proposers.tokens:Tokens"),
+    Row("weights", "low-rank updates of later steps' weights", "calibration.proposers.weights:Weights", True, True),
+    Row("start", "how many steps a call needs that begins with the chunk before", "calibration.proposers.start:Start"),
 )
 """In the order in which they propose, whatever the order in which they are asked for."""
 

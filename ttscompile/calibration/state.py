@@ -165,7 +165,8 @@ def _check_progress(progress: Value) -> None:
     for name in {"seconds", "training began"} & set(members):
         if members[name].number() < 0:
             members[name].fail("a time that is not negative")
-    for name in {"calls", "intervals", "updates", "calibration targets", "validation targets"} & set(members):
+    counts = ("calls", "updates", "intervals", "targets")
+    for name in (name for name in members if name.endswith(counts)):
         members[name].integer()
     if "latency" in members:
         fields = members["latency"].keys("cells", "measured")

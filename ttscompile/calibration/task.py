@@ -10,7 +10,6 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from ..artifact.load import Artifact
 from ..core.correction import Correction
 from ..core.lattice import PlanArray, Source
 from ..errors import CalibrationError
@@ -72,13 +71,12 @@ class Task:
     clock: Clock = field(default_factory=Clock)
 
     @classmethod
-    def of(
-        cls, artifact: Artifact, executor: Executor, calls: Calls, budget: int, seed: int, pool: Pool | None = None
-    ) -> Task:
-        """The task of finding a plan for an artifact; schedules of whole steps are compared in the pool."""
-        actions, kinds = Actions(artifact.manifest.spec), tuple(block.kind for block in artifact.manifest.blocks)
+    def of(cls, executor: Executor, calls: Calls, budget: int, seed: int, pool: Pool | None = None) -> Task:
+        """The task of finding a plan; schedules of whole steps are compared in the pool."""
+        view = executor.view
+        actions, kinds = Actions(view.manifest.spec), tuple(block.kind for block in view.manifest.blocks)
         whole = WholeSteps(executor, actions, calls, seed, pool)
-        return cls(executor, actions, calls, budget, seed, artifact.pruner, kinds, whole)
+        return cls(executor, actions, calls, budget, seed, view.pruner, kinds, whole)
 
     def draw(self, *stage: int) -> np.random.Generator:
         """Random numbers that belong to a stage, whatever was drawn before: so that going on equals not stopping."""

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -24,7 +25,7 @@ from ..runtimes.random_calls import Observation, normalized
 from ..runtimes.reference.model import noise_tensors
 from ..trajectories.episodes import Episode
 from .arguments import FEWEST_CALLS
-from .calls import Calls, IntArray, Split, calls_at, observed, split_episodes, window_of
+from .calls import FRACTION, Calls, IntArray, Split, calls_at, observed, split_episodes, window_of
 from .clock import Clock
 from .execute import Executor
 from .progress import Bar
@@ -33,9 +34,6 @@ from .targets import dense_rounds, draw_calls, with_targets
 
 if TYPE_CHECKING:
     from .proposer import Proposal
-
-FRACTION = 0.25
-"""Share of the episodes that are held out, if nothing else is said."""
 
 DRAWS = 2
 """Of noise for each observation."""
@@ -90,6 +88,7 @@ class Trials:
         base: what a calibration begins with: every cell of its loop, in its precision and with its tokens.
         executor: runs plans of the base's loop on many calls at once, in fp32.
         limits: of the calls to learn from: how many there are whatever the time, and if there is enough.
+        name: of the best plan so far.
         fresh: whether the artifact holds in memory what it has not in its files.
         state: of the calibration; what the original answers is kept there.
         clock: of all work.
@@ -105,12 +104,13 @@ class Trials:
     base: Plan
     executor: Executor
     state: StateFile
-    clock: Clock
-    bar: Bar
+    clock: Clock = field(default_factory=Clock)
+    bar: Bar = field(default_factory=partial(Bar, shown=False))
     pool: Pool = field(default_factory=Here)
     device: torch.device | None = None
     fresh: bool = False
     limits: tuple[int, int] = (FEWEST_CALLS, FEWEST_CALLS)
+    name: str = DENSE
     _calls: dict[int, Calls] = field(default_factory=dict)
     _samples: dict[str, Sample] = field(default_factory=dict)
 
@@ -123,19 +123,13 @@ class Trials:
         *,
         seed: int = 0,
         fraction: float = FRACTION,
-        clock: Clock | None = None,
-        bar: Bar | None = None,
-        pool: Pool | None = None,
-        device: torch.device | None = None,
-        limits: tuple[int, int] = (FEWEST_CALLS, FEWEST_CALLS),
+        **others: Any,
     ) -> Trials:
-        """Divide the episodes, and open the policy."""
-        base = artifact.plans.get(FULL, artifact.plans[DENSE])
-        executor = Executor(view_of(artifact, base.exact), device)
+        """Divide the episodes, and open the policy; ``others`` are further fields."""
+        base = base_of(artifact)
+        executor = Executor(view_of(artifact, base.exact), others.get("device"))
         split = split_episodes(len(episodes), fraction, seed)
-        clock, bar, pool = clock or Clock(), bar or Bar(shown=False), pool or Here()
-        opened = executor, state, clock, bar, pool, device
-        return cls(artifact, episodes, split, seed, base, *opened, limits=limits)
+        return cls(artifact, episodes, split, seed, base, executor, state, **others)
 
     @property
     def calls(self) -> Calls:
@@ -156,6 +150,11 @@ class Trials:
                 self.executor, name, calls, fewest, self.state, self.clock, self.bar, self.pool
             )
         return self._calls[window]
+
+    @property
+    def used(self) -> int:
+        """How many calls were learned from."""
+        return sum(calls.count for calls in self._calls.values())
 
     @property
     def threads(self) -> int:
@@ -251,6 +250,11 @@ class Trials:
                 self.state.save()
                 self.bar.update(len(known), "", self.clock.left())
         return known.reshape(len(calls), DRAWS, *spec.sample)
+
+
+def base_of(artifact: Artifact) -> Plan:
+    """What a calibration begins with: plan ``full``, or ``dense`` where there is none."""
+    return artifact.plans.get(FULL, artifact.plans[DENSE])
 
 
 def _draw(spec: PolicySpec, seed: tuple[int, ...]) -> tuple[FloatArray, FloatArray | None]:

@@ -13,16 +13,13 @@ from ttscompile.cli.bench import bench
 from ttscompile.cli.calibrate import calibrate
 from ttscompile.cli.compare import compare
 from ttscompile.cli.convert import convert
-from ttscompile.cli.distill import distill
 from ttscompile.cli.doctor import doctor
 from ttscompile.cli.ending import TRACEBACK, Commands
 from ttscompile.cli.inspect import inspect
 from ttscompile.cli.push import push
 from ttscompile.cli.realtime import realtime
-from ttscompile.cli.reuse_tokens import reuse_tokens
 from ttscompile.cli.serve import serve
 from ttscompile.cli.verify import verify
-from ttscompile.cli.warm_start import warm_start
 
 
 @click.group(
@@ -42,9 +39,6 @@ for _command, _what in (
     (doctor, "What stands in the way on this machine."),
     (convert, "Compile a checkpoint into an artifact."),
     (calibrate, "Learn from recorded episodes what an artifact may leave out."),
-    (distill, "Train weights for a plan of very few steps, as a last resort."),
-    (reuse_tokens, "Compute of new pictures the parts that changed."),
-    (warm_start, "Begin calls with the chunk of the call before."),
     (inspect, "What is in an artifact: tables, a picture, a page."),
     (verify, "Does it do what the original did, and do its plans engage?"),
     (bench, "Time calls, beside what they replace."),

@@ -4,32 +4,49 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from ttscompile.artifact.load import Artifact, load_artifact
+from tests.calibration import policies
+from ttscompile.artifact.block_weights import BlockWeights
+from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.calls import prepare_calls
-from ttscompile.calibration.distill import _train
+from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.execute import Executor
-from ttscompile.calibration.progress import Bar
-from ttscompile.calibration.state import StateFile
-from ttscompile.calibration.student import Student, trainable
-from ttscompile.calibration.task import Clock
+from ttscompile.calibration.proposer import Proposal
+from ttscompile.calibration.proposers.student import Array, Lesson, Student, trainable
+from ttscompile.calibration.proposers.weights import NAME, Weights
+from ttscompile.calibration.trials import Trials
+from ttscompile.core.lattice import whole_steps_plan
+from ttscompile.core.plan import Plan
 from ttscompile.trajectories.episodes import Episode
 
-from . import policies
+from .trying import request, trials_of
 
 
-def _student(artifact: Artifact) -> tuple[Student, Any]:
-    spec, executor = artifact.manifest.spec, Executor(artifact)
+@pytest.fixture
+def trials(artifact: Path, recording: Path) -> Trials:
+    return trials_of(artifact, [recording])
+
+
+PLAN = Plan(cells=whole_steps_plan(policies.STEPS, 2 * policies.LAYERS, [0, 5]), weights=NAME)
+
+
+def with_weights(trials: Trials, weights: dict[str, Array]) -> Executor:
+    held = trials.holding(Proposal(NAME, PLAN, weights={NAME: BlockWeights(weights, {})}))
+    return Executor(held.view(PLAN))
+
+
+def _student(trials: Trials) -> tuple[Student, Lesson]:
+    artifact, executor = trials.artifact, trials.executor
     draw = np.random.default_rng(0)
     episode = Episode("test", {"obs": draw.standard_normal((8, 2, 3)).astype(np.float32)})
-    calls = prepare_calls(executor.model, spec, [episode], [(0, i) for i in range(8)], (0,))
+    calls = prepare_calls(executor.model, artifact.manifest.spec, [episode], [(0, i) for i in range(8)], (0,))
     calls = replace(calls, path=executor.run_dense(calls))
-    one = Student(artifact, artifact.schedule("schedule"), None, 4, 0, 100)
+    own = with_weights(trials, {name: artifact.weights[name] for name in trainable(artifact, 4)})
+    one = Student(own, PLAN, 4, 0, 100)
     return one, one.lesson(calls)
 
 
@@ -41,30 +58,28 @@ def test_a_change_touches_blocks_alone(compiled: Path) -> None:
     assert not elsewhere & set(names)
 
 
-def test_training_learns_its_lesson(scheduled: Path) -> None:
+def test_training_learns_its_lesson(trials: Trials) -> None:
     """Eight calls by heart: what it is judged on otherwise is other calls, of a network that nobody trained."""
-    one, lesson = _student(load_artifact(scheduled))
+    one, lesson = _student(trials)
     losses = [one.update(lesson, 0.0) for _ in range(80)]
     assert losses[-1] < 0.5 * losses[0]
 
 
-def test_what_is_judged_is_what_is_written(scheduled: Path) -> None:
+def test_what_is_judged_is_what_is_written(trials: Trials) -> None:
     """The whole loop of the student, step 0 with the original's weights: before training and after it."""
-    artifact = load_artifact(scheduled)
-    one, lesson = _student(artifact)
-    plan, calls = artifact.schedule("schedule"), lesson.calls
+    assert PLAN.cells is not None
+    one, lesson = _student(trials)
     for updates in (0, 40):
         for _ in range(updates):
             one.update(lesson, 0.0)
-        written = Executor(artifact.with_weights(one.weights())).run(plan, calls)
-        torch.testing.assert_close(one.executor.run(plan, calls), written, rtol=0, atol=1e-5)
-    assert not torch.allclose(written, Executor(artifact).run(plan, calls), atol=1e-2)
+        written = with_weights(trials, one.weights()).run(PLAN.cells, lesson.calls)
+        torch.testing.assert_close(one.executor.run(PLAN.cells, lesson.calls), written, rtol=0, atol=1e-5)
+    assert not torch.allclose(written, trials.executor.run(PLAN.cells, lesson.calls), atol=1e-2)
 
 
-def test_an_update_follows_the_gradient_of_the_loss(scheduled: Path) -> None:
+def test_an_update_follows_the_gradient_of_the_loss(trials: Trials) -> None:
     """Gradients of the factors are those of the changes that they make, by finite differences of the loss."""
-    artifact = load_artifact(scheduled)
-    one, lesson = _student(artifact)
+    one, lesson = _student(trials)
     for _ in range(3):
         one.update(lesson, 0.0)
     numbers = np.arange(8)
@@ -83,7 +98,7 @@ def test_an_update_follows_the_gradient_of_the_loss(scheduled: Path) -> None:
     assert loss < losses[0]
 
 
-def test_the_time_limit_ends_training(scheduled: Path, tmp_path: Path) -> None:
-    one, lesson = _student(load_artifact(scheduled))
-    _train(one, lesson.calls, StateFile(tmp_path, {}), Clock(0.0), Bar(False), 100)
+def test_the_time_limit_ends_training(trials: Trials) -> None:
+    one, _ = _student(trials)
+    Weights(request(updates=100))._train(one, trials, Clock(0.0))
     assert one.done == 1  # the first update is not asked how long it will take

@@ -20,14 +20,14 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from ..artifact.load import Artifact
-from ..core.correction import Correction
-from ..core.lattice import PlanArray, Source
-from ..errors import CalibrationError
-from ..pool import workers
-from ..runtimes.reference.sampler import Carried
-from .calls import Actions, Calls, IntArray
-from .execute import Executor, State, last
+from ...artifact.load import Artifact
+from ...core.lattice import Source
+from ...core.plan import Plan
+from ...errors import CalibrationError
+from ...pool import workers
+from ...runtimes.reference.sampler import Carried
+from ..calls import Actions, Calls, IntArray
+from ..execute import Executor, State, last
 
 Array = npt.NDArray[Any]
 
@@ -101,39 +101,26 @@ class Student:
     """A policy whose blocks change by low-rank matrices after step 0.
 
     Args:
-        artifact: the original.
-        plan: a schedule of whole steps ``[K, blocks]``, at least two of them computed.
-        correction: of the schedule.
+        executor: of a view with weights beside the original's, which this changes in place.
+        plan: cells of whole steps, at least two of them computed, and their correction.
         rank: of the changes.
         seed: of the first changes, and of the order of the calls.
         updates: how many there are to be.
-        device: where it computes; None for the CPU.
 
     Attributes:
-        begin: the first step that is trained: the second that the schedule computes.
+        executor: with the plan's correction.
+        begin: the first step that is trained: the second that the plan computes.
         done: number of updates so far.
-
-    Raises:
-        CalibrationError: see ``trainable``.
     """
 
-    def __init__(
-        self,
-        artifact: Artifact,
-        plan: PlanArray,
-        correction: Correction | None,
-        rank: int,
-        seed: int,
-        updates: int,
-        device: torch.device | None = None,
-    ) -> None:
-        names = trainable(artifact, rank)
-        self._executor = Executor(artifact.with_weights({n: artifact.weights[n] for n in names}), device)
-        self._plan, self._correction, self._seed, self._updates = plan, correction, seed, updates
-        self._computed = (plan == Source.COMPUTE).all(axis=1)
+    def __init__(self, executor: Executor, plan: Plan, rank: int, seed: int, updates: int) -> None:
+        assert plan.cells is not None
+        self.executor = executor.corrected(plan.correction)
+        self._cells, self._correction, self._seed, self._updates = plan.cells, plan.correction, seed, updates
+        self._computed = (plan.cells == Source.COMPUTE).all(axis=1)
         self.begin = int(np.flatnonzero(self._computed)[1])
-        self._actions = Actions(artifact.manifest.spec)
-        self._weights = {n: self._executor.model.weights[n].requires_grad_() for n in names}
+        self._actions = Actions(executor.view.manifest.spec)
+        self._weights = {n: executor.model.weights[n].requires_grad_() for n in sorted(executor.view.first_weights)}
         self._original = {n: value.detach().clone() for n, value in self._weights.items()}
         draw = torch.Generator().manual_seed(seed)
         self._factors: dict[str, Tensor] = {}
@@ -145,16 +132,11 @@ class Student:
         self._adam = torch.optim.Adam(list(self._factors.values()), lr=RATE)
         self.done = 0
 
-    @property
-    def executor(self) -> Executor:
-        """Runs the student, with the correction."""
-        return self._executor.corrected(self._correction)
-
     def lesson(self, calls: Calls) -> Lesson:
         """The calls as far as nothing of them is trained."""
         parts = [np.arange(i, min(i + PART, calls.count)) for i in range(0, calls.count, PART)]
         with workers() as pool:
-            carried = list(pool.map(self._until, [self._executor.select(calls, part) for part in parts]))
+            carried = list(pool.map(self._until, [self.executor.select(calls, part) for part in parts]))
         return Lesson(calls, Carried(*(torch.cat(each) for each in zip(*carried, strict=True))))
 
     def update(self, lesson: Lesson, passed: float) -> float:
@@ -219,7 +201,7 @@ class Student:
 
     def _gradients(self, lesson: Lesson, size: int, numbers: IntArray) -> tuple[float, dict[str, Tensor]]:
         """Loss of some calls of a batch, as their share of it, and its gradients by factor."""
-        calls, index = self._executor.select(lesson.calls, numbers), torch.from_numpy(numbers)
+        calls, index = self.executor.select(lesson.calls, numbers), torch.from_numpy(numbers)
         carried = Carried(*(value[index] for value in lesson.carried))
         with torch.enable_grad():
             sample = last(one.sample for one in self._loop(calls, (self.begin, carried)))
@@ -242,11 +224,11 @@ class Student:
             nonlocal total
             if not self._computed[k]:
                 return stem + total
-            stream = self._executor.step(self._plan[k][None], k, stem, calls, state)
+            stream = self.executor.step(self._cells[k][None], k, stem, calls, state)
             total = stream - stem
             return stream
 
-        model = self._executor.model
+        model = self.executor.model
         return model.steps_of(calls.contexts, calls.initial, calls.noise, blocks, self._correction, since=since)
 
     @torch.no_grad()

@@ -1,4 +1,4 @@
-"""Distillation from end to end on a small policy: what the plan ``distilled`` is, and what it leaves as it was."""
+"""Weights of their own, from end to end on a small policy: what plan ``distilled`` is, and what it leaves as it was."""
 
 from __future__ import annotations
 
@@ -11,24 +11,29 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from click.testing import CliRunner
 
 import ttscompile
+from tests.calibration import policies
+from tests.calibration.killed import killed
 from tests.once import Once
 from tests.plans import store_schedules
 from ttscompile.artifact import codec, tensors
 from ttscompile.artifact.files import describe
-from ttscompile.artifact.load import Artifact, load_artifact
-from ttscompile.artifact.manifest import DENSE, DISTILLED, MANIFEST
-from ttscompile.calibration import student
-from ttscompile.calibration.distill import SAVED, Distilled, distill
+from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.manifest import MANIFEST
+from ttscompile.artifact.view import View, view_of
+from ttscompile.calibration.fit_correction import fit_correction
+from ttscompile.calibration.kept import Kept
 from ttscompile.calibration.pipeline import calibrate
+from ttscompile.calibration.proposers import student
+from ttscompile.calibration.proposers.weights import NAME, SAVED, Weights
+from ttscompile.calibration.result import CalibrationResult
 from ttscompile.calibration.state import FILE
-from ttscompile.cli import main
+from ttscompile.calibration.trials import Trials
 from ttscompile.core.correction import no_correction
+from ttscompile.core.lattice import whole_steps_plan
+from ttscompile.core.plan import DENSE, Plan
 from ttscompile.errors import ArtifactError, CalibrationError, CalibrationFailedError
-from ttscompile.report import facts
-from ttscompile.report.card import card
 from ttscompile.runtimes.open import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.runtimes.reference.model import ReferenceModel
@@ -36,19 +41,19 @@ from ttscompile.verification import verify
 from ttscompile.verification.engaged import ENGAGED
 from ttscompile.verification.record_golden import record_plans
 
-from . import policies
-from .killed import killed
+from .trying import proposed, request, trials_of
 
-Noise = ttscompile.Noise
+Noise, Trained = ttscompile.Noise, tuple[Path, CalibrationResult]
 UPDATES = 24
 
 
-def train(directory: Path, recording: Path, **changes: Any) -> Distilled:
-    return distill(directory, [recording], **{"rank": 4, "updates": UPDATES, "progress": False, **changes})
+def train(directory: Path, recording: Path, **changes: Any) -> CalibrationResult:
+    learned = {"learn": ("weights",), "rank": 4, "updates": UPDATES, "progress": False}
+    return calibrate(directory, [recording], **{**learned, **changes})
 
 
 @pytest.fixture(scope="module")
-def distilled(scheduled: Path, recording: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Distilled]:
+def distilled(scheduled: Path, recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Trained:
     """A distilled artifact and the result; not to be changed."""
     directory = Path(shutil.copytree(scheduled, tmp_path_factory.mktemp("distilled") / "compiled"))
     return directory, train(directory, recording)
@@ -76,84 +81,58 @@ def actions(policy: CompiledPolicy, plan: str, seed: int = 0) -> Any:
     return policy.predict_action(obs, noise=noise, plan=plan)["action_pred"]
 
 
-def test_the_artifact_gets_a_plan_that_is_nearer_to_the_dense_policy(distilled: tuple[Path, Distilled]) -> None:
+def test_the_artifact_gets_a_plan_that_is_nearer_to_the_dense_policy(distilled: Trained, scheduled: Path) -> None:
     directory, result = distilled
     artifact = load_artifact(directory)
-    assert result.after.error < result.before.error
-    assert (result.updates, result.stopped) == (UPDATES, "finished")
-    assert artifact.manifest.default_plan == DISTILLED
-    np.testing.assert_array_equal(artifact.schedule(DISTILLED), artifact.schedule("schedule"))
+    assert result.plans[NAME].distance < result.plans["schedule"].distance
+    assert f"9 matrices of blocks were trained in {UPDATES} updates" in result.told["weights"]
+    assert result.stopped == "finished"
+    assert artifact.manifest.default_plan == NAME
+    np.testing.assert_array_equal(artifact.plans[NAME].cells, load_artifact(scheduled).plans["schedule"].cells)
+    assert artifact.plans[NAME].weights == NAME and artifact.plans["schedule"].weights == "original"
     record = artifact.manifest.calibration
     assert record is not None
-    assert record["distilled"] == json.loads(json.dumps(result.record()))
-    assert record["plans"][DISTILLED]["error"] == result.after.error
+    assert record["plans"][NAME]["distance"] == result.plans[NAME].distance
 
 
-def test_the_command_says_what_it_did(copied: Path, recording: Path) -> None:
-    options = ["--rank", "4", "--updates", str(UPDATES), "--max-minutes", "5"]
-    done = CliRunner().invoke(main, ["distill", str(copied), "--trajectories", str(recording), *options])
-    assert done.exit_code == 0, done.stderr
-    assert "weights of its own: 9 matrices of blocks were trained" in " ".join(done.stdout.split())
-    again = CliRunner().invoke(main, ["distill", str(copied), "--trajectories", str(recording), "--plan", "other"])
-    assert again.exit_code == 2
-    assert "has no schedule 'other' that could be distilled. Give one of ['" in again.stderr
-
-
-def test_people_are_told_that_it_is_another_network(distilled: tuple[Path, Distilled]) -> None:
-    artifact, result = load_artifact(distilled[0]), distilled[1]
-    record = artifact.manifest.calibration
-    assert record is not None and record["default_plan"] == DISTILLED
-    (remark,) = [one for one in facts.remarks(record) if "'distilled'" in one]
-    assert "the schedule of plan 'schedule' and weights of its own: 9 matrices" in remark
-    assert f"from {result.before.error:.4g} to {result.after.error:.4g}" in remark
-    steps = card(artifact, "org/name", [], [], None)
-    assert f"`ttscompile distill DIR --trajectories CALLS --plan schedule --rank 4 --updates {UPDATES}`" in steps
-    assert (
-        "distill"
-        not in card(
-            replace(artifact, manifest=replace(artifact.manifest, distilled=None)), "o/n", [], [], None
-        ).partition("How it was made")[2]
-    )
-
-
-def test_all_other_plans_are_what_they_were(scheduled: Path, distilled: tuple[Path, Distilled]) -> None:
+def test_all_other_plans_are_what_they_were(scheduled: Path, distilled: Trained) -> None:
     before, after = ttscompile.load(scheduled), ttscompile.load(distilled[0])
-    assert after.info.default_plan == DISTILLED
+    assert after.info.default_plan == NAME
     assert after.info.model_identity == before.info.model_identity
     assert after.info.identity != before.info.identity
-    actions(after, DISTILLED)
-    for plan in (DENSE, "schedule", "uniform"):
+    actions(after, NAME)
+    for plan in (DENSE, "uniform"):
         np.testing.assert_array_equal(actions(after, plan), actions(before, plan))
 
 
 @pytest.mark.parametrize(("runtime", "threads"), [("onnxruntime", 1), ("onnxruntime", 2), ("torch", 1)])
-def test_runtimes_give_the_references_answer(distilled: tuple[Path, Distilled], runtime: str, threads: int) -> None:
+def test_runtimes_give_the_references_answer(distilled: Trained, runtime: str, threads: int) -> None:
     reference = ttscompile.load(distilled[0], runtime="reference")
     policy = ttscompile.load(distilled[0], runtime, threads)
-    wanted = actions(reference, DISTILLED)
-    np.testing.assert_allclose(actions(policy, DISTILLED), wanted, atol=2e-5)
+    wanted = actions(reference, NAME)
+    np.testing.assert_allclose(actions(policy, NAME), wanted, atol=2e-5)
     assert np.abs(wanted - actions(reference, "schedule")).max() > 1e-2
 
 
-def test_the_module_of_torch_gives_the_references_answer(distilled: tuple[Path, Distilled]) -> None:
+def test_the_module_of_torch_gives_the_references_answer(distilled: Trained) -> None:
     obs, noise = call(0)
     assert noise.steps is not None
     given = {"obs": torch.from_numpy(obs["obs"])}
     made = ttscompile.to_module(distilled[0])(given, torch.from_numpy(noise.initial), torch.from_numpy(noise.steps))
-    wanted = actions(ttscompile.load(distilled[0], runtime="reference"), DISTILLED)
+    wanted = actions(ttscompile.load(distilled[0], runtime="reference"), NAME)
     np.testing.assert_allclose(made.numpy(), wanted, atol=2e-5)
 
 
-def test_step_0_has_the_originals_weights_and_later_steps_have_not(distilled: tuple[Path, Distilled]) -> None:
+def test_step_0_has_the_originals_weights_and_later_steps_have_not(distilled: Trained) -> None:
     artifact = load_artifact(distilled[0])
-    original, own = (ReferenceModel.from_artifact(artifact.with_weights_of(plan)) for plan in (None, DISTILLED))
+    original, own = (ReferenceModel.from_view(view_of(artifact, plan)) for plan in (DENSE, NAME))
     obs = {"obs": torch.from_numpy(call(1)[0]["obs"])}
     contexts, stream = original.prologue(obs), torch.randn(3, policies.HORIZON, policies.WIDTH)
     assert torch.equal(own.block(1, 0, stream, contexts), original.block(1, 0, stream, contexts))
     assert not torch.equal(own.block(1, 1, stream, contexts), original.block(1, 1, stream, contexts))
 
 
-def test_nothing_is_reused_between_calls_with_different_weights(distilled: tuple[Path, Distilled]) -> None:
+def test_nothing_is_reused_between_calls_with_different_weights(distilled: Trained) -> None:
     artifact = load_artifact(distilled[0])
     policy = CompiledPolicy(artifact, open_runtime(artifact), seed=0)
     everything = np.zeros((policies.STEPS, len(artifact.manifest.blocks)), np.int8)
@@ -163,14 +142,14 @@ def test_nothing_is_reused_between_calls_with_different_weights(distilled: tuple
     policy.predict_action(obs, noise=noise, plan=everything)
     policy.predict_action(obs, noise=noise, plan=rollout)  # reads what the call before computed
     with pytest.raises(ttscompile.TtscompileError, match="noise"):
-        policy.predict_action(obs, noise=Noise(noise.initial), plan=DISTILLED)
+        policy.predict_action(obs, noise=Noise(noise.initial), plan=NAME)
     policy.predict_action(obs, noise=noise, plan=rollout)  # a refused call changes nothing
-    policy.predict_action(obs, noise=noise, plan=DISTILLED)
+    policy.predict_action(obs, noise=noise, plan=NAME)
     with pytest.raises(ttscompile.TtscompileError, match="ROLLOUT"):
         policy.predict_action(obs, noise=noise, plan=rollout)
 
 
-def test_verify_knows_both_sets_of_weights(distilled: tuple[Path, Distilled], recording: Path, tmp_path: Path) -> None:
+def test_verify_knows_both_sets_of_weights(distilled: Trained, recording: Path, tmp_path: Path) -> None:
     found = verify(distilled[0], [recording], calls=8)
     others = [rung for rung in found.rungs if rung.name != ENGAGED]  # which times calls
     assert {rung.status for rung in others} == {"passed"}, others
@@ -187,8 +166,7 @@ def exchange_weights(directory: Path) -> None:
     """Weights of another distillation, in an artifact that hashes say is whole."""
 
     manifest = codec.decode((directory / MANIFEST).read_bytes())
-    assert manifest.distilled is not None
-    path = directory / manifest.distilled.weights
+    path = directory / manifest.weights[NAME].weights
     arrays = {name: np.array(value) * 1.1 for name, value in tensors.read(path).items()}
     path.write_bytes(tensors.serialize({name: value.astype(np.float32) for name, value in arrays.items()}))
     manifest = replace(manifest, files={**manifest.files, path.name: describe(path)})
@@ -198,7 +176,7 @@ def exchange_weights(directory: Path) -> None:
 
 @pytest.mark.parametrize("saves", [1, 4])
 def test_a_distillation_that_was_killed_goes_on_to_the_same_bytes(
-    distilled: tuple[Path, Distilled], copied: Path, recording: Path, saves: int
+    distilled: Trained, copied: Path, recording: Path, saves: int
 ) -> None:
     before = load_artifact(copied).manifest.identity
     with killed(saves):
@@ -228,22 +206,20 @@ def test_the_rate_of_a_distillation_that_goes_on_is_not_what_it_began_with(
     assert passed[0] < saved < went_on[0]
 
 
-def test_an_interrupted_calibration_and_an_interrupted_distillation_do_not_know_each_other(
-    copied: Path, recording: Path
-) -> None:
+def test_what_was_interrupted_is_not_taken_for_something_else(copied: Path, recording: Path) -> None:
     with killed():
         calibrate(copied, [recording], 0.8, "interval", progress=False)
-    with killed():
-        train(copied, recording, resume=True)  # there is nothing of its own to resume
     assert (copied / FILE).exists()
-    with pytest.raises(
-        CalibrationError, match="the distillation that was interrupted had other settings: rank was 4, now 2"
-    ):
+    with pytest.raises(CalibrationError, match=r"had other settings: .*learn was \['schedule'\], now \['weights'\]"):
+        train(copied, recording, resume=True)
+    with killed():
+        train(copied, recording)
+    with pytest.raises(CalibrationError, match="that was interrupted had other settings: rank was 4, now 2"):
         train(copied, recording, rank=2, resume=True)
 
 
 def test_the_outcome_does_not_depend_on_the_number_of_threads(
-    distilled: tuple[Path, Distilled], copied: Path, recording: Path
+    distilled: Trained, copied: Path, recording: Path
 ) -> None:
     threads = torch.get_num_threads()
     torch.set_num_threads(1 if threads > 1 else 2)
@@ -254,67 +230,88 @@ def test_the_outcome_does_not_depend_on_the_number_of_threads(
     assert contents(copied) == contents(distilled[0])
 
 
-def test_what_is_no_better_is_not_kept(copied: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = contents(copied)
+def corrected(trials: Trials) -> Plan:
+    """The plan of two steps, with what a correction does."""
+    cells = whole_steps_plan(policies.STEPS, len(trials.artifact.manifest.blocks), [0, 5])
+    return replace(trials.base, cells=cells, correction=fit_correction(trials.executor, cells, trials.calls, True))
+
+
+def held(trials: Trials, plan: Plan) -> Kept:
+    """What is kept of what is proposed from a plan."""
+    kept = Kept(trials, anew=False)
+    kept.plans["schedule"], kept.default = plan, "schedule"
+    (proposal,) = proposed(Weights(request(rank=4, updates=1)), trials, plan)
+    kept.consider(proposal)
+    return kept
+
+
+def test_what_is_no_better_is_not_kept(artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trials = trials_of(artifact, [recording])
     monkeypatch.setattr(student, "RATE", 0.0)
-    with pytest.raises(CalibrationFailedError, match="after 1 updates. The artifact is as it was"):
-        train(copied, recording, updates=1)
-    assert {name: one for name, one in contents(copied).items() if name in before} == before
+    kept = held(trials, corrected(trials))
+    assert not kept.learned and "is no better" in kept.refused[NAME]
 
 
 def test_a_correction_that_does_harm_is_no_excuse(
-    copied: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
+    artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Training mends some of it; the plan as it is, without one, is better all the same."""
-    harm = no_correction(policies.STEPS, (policies.HORIZON, policies.CHANNELS))
-    monkeypatch.setattr("ttscompile.calibration.distill.fit_correction", lambda *_: replace(harm, bias=harm.bias + 1))
-    with pytest.raises(CalibrationFailedError, match="The artifact is as it was"):
-        train(copied, recording, updates=4)
+    """Training mends some of it; the plan as it is is better all the same."""
+    trials = trials_of(artifact, [recording])
+    plan, harm = corrected(trials), no_correction(policies.STEPS, (policies.HORIZON, policies.CHANNELS))
+    name = "ttscompile.calibration.proposers.weights.fit_correction"
+    monkeypatch.setattr(name, lambda *_: replace(harm, bias=harm.bias + 1))
+    assert "is no better" in held(trials, plan).refused[NAME]
 
 
-def test_calibrating_again_drops_it(distilled: tuple[Path, Distilled], recording: Path, tmp_path: Path) -> None:
+def test_what_a_correction_alone_does_is_no_merit_of_the_weights(
+    artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A plan without one is proposed with one before its weights are."""
+    trials = trials_of(artifact, [recording])
+    plan = corrected(trials)
+    first, _ = proposed(Weights(request(rank=4, updates=1)), trials, replace(plan, correction=None))
+    assert first.name == trials.name and not first.weights
+    assert first.plan.correction is not None and plan.correction is not None
+    np.testing.assert_array_equal(first.plan.correction.weights, plan.correction.weights)
+
+
+def test_calibrating_again_drops_it(distilled: Trained, recording: Path, tmp_path: Path) -> None:
     directory = policies.whole_steps(Path(shutil.copytree(distilled[0], tmp_path / "compiled")), recording)
     artifact = load_artifact(directory)
-    assert artifact.manifest.distilled is None and DISTILLED not in artifact.manifest.plans
-    assert not list(directory.glob("distilled*"))
+    assert not artifact.manifest.weights and NAME not in artifact.manifest.plans
+    assert not list(directory.glob("blocks-*"))
 
 
 def test_in_eight_bits(once: Once, recording: Path, tmp_path: Path) -> None:
     directory = Path(shutil.copytree(policies.compiled(once, "int8"), tmp_path / "compiled"))
     train(policies.whole_steps(directory, recording), recording)
     assert {rung.status for rung in verify(directory).rungs if rung.name != ENGAGED} <= {"passed", "skipped"}
-    exact, own = ttscompile.load(directory, precision="fp32"), ttscompile.load(directory)
-    wanted, found = actions(exact, DISTILLED), actions(own, DISTILLED)
-    between = np.abs(wanted - actions(exact, "schedule")).max()
+    artifact = load_artifact(directory)
+    plan = artifact.plans[NAME]
+    assert dict(plan.precision) == {"blocks": "int8"}
+    exact, own = (ttscompile.load(directory, plan=one) for one in (plan.exact, plan))
+    obs, noise = call(0)
+    wanted, found = (one.predict_action(obs, noise=noise)["action_pred"] for one in (exact, own))
+    with_original = replace(plan.exact, weights="original")
+    between = np.abs(wanted - exact.predict_action(obs, noise=noise, plan=with_original)["action_pred"]).max()
     assert 0 < np.abs(found - wanted).max() < 0.5 * between
-    view = load_artifact(directory).with_weights_of(DISTILLED)
-    for plain in (view.at_precision("fp32"), view.with_parts([])):
-        assert plain.first_step is not None and plain.first_step.manifest.precision is None
 
 
-@pytest.mark.parametrize(
-    ("plan", "message"),
-    [
-        ("pruner", r"no schedule 'pruner' that could be distilled. Give one of \['schedule', 'uniform'\]"),
-        (DISTILLED, r"no schedule 'distilled' that could be distilled. Give one of \['schedule', 'uniform'\]"),
-    ],
-)
-def test_a_plan_that_cannot_be_distilled(scheduled: Path, recording: Path, plan: str, message: str) -> None:
-    with pytest.raises(CalibrationError, match=message):
-        train(scheduled, recording, plan=plan)
+@pytest.mark.parametrize("changes", [{"cells": None}, {"weights": NAME}, {"loop": "other"}])
+def test_a_plan_that_cannot_be_distilled(artifact: Path, recording: Path, changes: dict[str, Any]) -> None:
+    trials = trials_of(artifact, [recording])
+    plan = replace(trials.base, cells=whole_steps_plan(policies.STEPS, 6, [0, 5]))
+    with pytest.raises(CalibrationFailedError, match="is another one. Learn 'schedule' with strategy 'tts'"):
+        proposed(Weights(request(rank=4)), trials, replace(plan, **changes))
 
 
-def test_a_schedule_of_single_cells_is_refused(artifact: Path, recording: Path) -> None:
-    plan = np.full((policies.STEPS, len(load_artifact(artifact).manifest.blocks)), 2, np.int8)
-    plan[0] = plan[4, 1] = 0
-    store_schedules(artifact, None, {"schedule": plan}, "schedule", {})
-    with pytest.raises(CalibrationError, match="expected whole steps, at least two of them computed"):
-        train(artifact, recording)
-
-
-def test_an_artifact_that_is_not_calibrated_is_refused(compiled: Path, recording: Path) -> None:
-    with pytest.raises(CalibrationError, match="Calibrate the artifact first"):
-        train(compiled, recording)
+def test_a_schedule_of_single_cells_and_one_that_computes_all_are_refused(artifact: Path, recording: Path) -> None:
+    cells = np.full((policies.STEPS, len(load_artifact(artifact).manifest.blocks)), 2, np.int8)
+    cells[0] = cells[4, 1] = 0
+    for some in (cells, 0 * cells):
+        store_schedules(artifact, None, {"schedule": some}, "schedule", {})
+        with pytest.raises(CalibrationFailedError, match="of whole steps, two of them computed at least"):
+            train(artifact, recording)
 
 
 def test_a_rank_for_which_nothing_is_large_enough_is_refused(scheduled: Path, recording: Path) -> None:
@@ -325,19 +322,19 @@ def test_a_rank_for_which_nothing_is_large_enough_is_refused(scheduled: Path, re
 
 
 def test_a_model_of_the_reference_is_there_for_weights_that_are_used(
-    scheduled: Path, distilled: tuple[Path, Distilled], monkeypatch: pytest.MonkeyPatch
+    scheduled: Path, distilled: Trained, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    opened: list[Artifact] = []
-    from_artifact = ReferenceModel.from_artifact
+    opened: list[View] = []
+    from_view = ReferenceModel.from_view
 
-    def counted(artifact: Artifact) -> ReferenceModel:
-        opened.append(artifact)
-        return from_artifact(artifact)
+    def counted(view: View) -> ReferenceModel:
+        opened.append(view)
+        return from_view(view)
 
-    monkeypatch.setattr(ReferenceModel, "from_artifact", counted)
+    monkeypatch.setattr(ReferenceModel, "from_view", counted)
     assert set(record_plans(load_artifact(scheduled))) == {"schedule", "uniform"}
     assert len(opened) == 1
-    assert set(record_plans(load_artifact(distilled[0]))) == {"schedule", "uniform", DISTILLED}
+    assert set(record_plans(load_artifact(distilled[0]))) == {"schedule", "uniform", NAME}
     assert len(opened) == 3
 
 
@@ -347,9 +344,9 @@ def test_arguments_that_cannot_be(scheduled: Path, recording: Path, change: dict
         train(scheduled, recording, **change)
 
 
-def test_a_record_that_does_not_fit_is_refused(distilled: tuple[Path, Distilled]) -> None:
+def test_a_record_that_does_not_fit_is_refused(distilled: Trained) -> None:
     document = json.loads((distilled[0] / MANIFEST).read_bytes())
-    del document["checksum"], document["distilled"]["models"]["block_00"]
+    del document["checksum"], document["weights"][NAME]["models"]["block_00"]
     document["checksum"] = codec._checksum(document)
-    with pytest.raises(ArtifactError, match="distilled: expected a model of each of"):
+    with pytest.raises(ArtifactError, match="expected a model of each of"):
         codec.decode(json.dumps(document).encode())

@@ -1,0 +1,151 @@
+"""From which step a call goes on with the chunk of the call before: chosen on recorded episodes."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ttscompile
+from tests.once import Once
+from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.manifest import StartRecord
+from ttscompile.artifact.write import update_plans
+from ttscompile.calibration.judge import Score, judge
+from ttscompile.calibration.proposer import Proposal
+from ttscompile.calibration.proposers import start
+from ttscompile.calibration.proposers.start import NAME, Start, begun, candidates
+from ttscompile.calibration.trials import LEARNED, Trials
+from ttscompile.core.lattice import Source, dense_plan, whole_steps_plan
+from ttscompile.core.plan import FULL, Plan
+from ttscompile.errors import CalibrationError, CalibrationFailedError
+
+from .trying import proposed, request, trials_of
+
+STEPS, LOOP = 8, "ddim-8"
+
+
+@pytest.fixture
+def folder(one_layer_checkpoint: Path, once: Once, tmp_path: Path) -> Path:
+    def convert(path: Path) -> None:
+        ttscompile.convert(one_layer_checkpoint, path, sampler="ddim", steps=STEPS)
+
+    compiled, _ = once.compiled("warm start", convert)
+    return Path(shutil.copytree(compiled, tmp_path / "artifact"))
+
+
+def recorded(path: Path, episodes: int = 3, calls: int = 4) -> list[Path]:
+    rng = np.random.default_rng(0)
+    ends = calls * np.arange(1, episodes + 1)
+    np.savez(path, obs=rng.uniform(100, 400, (ends[-1], 2, 20)).astype(np.float32), episode_ends=ends)
+    return [path]
+
+
+@pytest.fixture
+def trials(folder: Path, tmp_path: Path) -> Trials:
+    return trials_of(folder, recorded(tmp_path / "calls.npz"))
+
+
+def scheduled(trials: Trials, *steps: int) -> Plan:
+    blocks = len(trials.artifact.manifest.blocks)
+    return replace(trials.base, cells=whole_steps_plan(STEPS, blocks, (0, *steps)))
+
+
+def described(proposal: Proposal) -> tuple[int, list[int]]:
+    """How many steps there are, and which are computed."""
+    cells = proposal.plan.cells
+    assert cells is not None
+    return len(cells), np.flatnonzero((cells == Source.COMPUTE).all(axis=1)).tolist()
+
+
+def test_candidates_are_dense_rests_and_those_of_the_schedule_by_what_they_compute(trials: Trials) -> None:
+    """By hand: of the steps 0, 4 and 6 of 8 the last 2, 3 and 5 have 6, and of half of the loop all is tried."""
+    dense = [(1, [0]), (2, [0, 1]), (3, [0, 1, 2])]
+    assert [described(one) for one in candidates(trials.artifact, trials.base)] == dense
+    found = [described(one) for one in candidates(trials.artifact, scheduled(trials, 4, 6))]
+    assert found == [(1, [0]), (2, [0]), (2, [0, 1]), (3, [0, 1]), (3, [0, 1, 2])]
+    assert candidates(trials.artifact, replace(trials.base, cells=None))[0].plan.cells is not None, "of a pruner's plan"
+
+
+def test_a_candidate_falls_back_on_the_plan_that_it_was_made_of(trials: Trials) -> None:
+    plan = replace(scheduled(trials, 4), precision={"blocks": "int8"})
+    for one in candidates(trials.artifact, plan):
+        steps = described(one)[0]
+        assert one.plan.otherwise is plan and one.plan.correction is None
+        assert (one.plan.loop, one.plan.precision) == (f"{LOOP}-last-{steps}", plan.precision)
+        assert one.starts == {one.plan.loop: StartRecord(LOOP, steps)}
+
+
+def test_the_fewest_cells_within_the_margin_are_taken(trials: Trials, monkeypatch: pytest.MonkeyPatch) -> None:
+    limits = {(1, 1): 1.5, (2, 1): 1.4, (2, 2): 1.3, (3, 2): 1.2, (3, 3): 1.0}
+
+    def scored(_: Trials, plan: Plan, part: str) -> Score:
+        assert part == "learned" and plan.cells is not None
+        computed = int((plan.cells == Source.COMPUTE).all(axis=1).sum())
+        limit = limits[len(plan.cells), computed] if plan.otherwise is not None else 0.0
+        return Score(limit, (0, 0), None, None, 0, 0, 0, 1)
+
+    monkeypatch.setattr(start, "judge", scored)
+    monkeypatch.setattr(start, "further", lambda one, _: (one.distance / 2, one.distance))
+    plan = scheduled(trials, 4, 6)
+    for margin, expected in ((1.45, (2, [0])), (1.35, (2, [0, 1])), (1.1, (3, [0, 1, 2]))):
+        (found,) = proposed(Start(request(), margin), trials, plan)
+        assert described(found) == expected
+        assert (found.name, found.margin, found.notes["steps"]) == (NAME, margin, expected[0])
+    with pytest.raises(CalibrationFailedError, match="the last 3 steps are 1 further off at worst, and 0.9 is allowed"):
+        proposed(Start(request(), 0.9), trials, plan)
+
+
+def test_a_later_start_keeps_more_of_the_chunk(trials: Trials) -> None:
+    few, many = (begun(trials.base, n, dense_plan(n, len(trials.artifact.manifest.blocks))) for n in (1, 4))
+    scores = [judge(trials.holding(one), one.plan, LEARNED) for one in (few, many)]
+    assert scores[0].distance > max(scores[1].distance, 0.1)
+
+
+def test_a_plan_that_begins_so_already_is_made_anew(trials: Trials) -> None:
+    warm = begun(trials.base, 3, dense_plan(3, len(trials.artifact.manifest.blocks)))
+    (found,) = proposed(Start(request(), 1e6), trials.holding(warm), warm.plan)
+    assert found.plan.otherwise is trials.base
+    assert described(found) == (1, [0])
+
+
+def test_what_is_proposed_can_be_written_and_loaded(trials: Trials, folder: Path) -> None:
+    (found,) = proposed(Start(request(), 1e6), trials, trials.base)
+    artifact = load_artifact(folder)
+    plans = {**artifact.plans, NAME: replace(found.plan, otherwise=artifact.plans[FULL])}
+    update_plans(folder, plans, FULL, starts=found.starts)
+    policy = ttscompile.load(folder, plan=NAME)
+    policy.reset()
+    obs = np.random.default_rng(1).uniform(100, 400, (1, 2, 20)).astype(np.float32)
+    loops = []
+    for _ in range(2):
+        policy.predict_action({"obs": obs})
+        assert policy.last_report is not None
+        loops.append(policy.last_report.loop)
+    assert loops == [LOOP, f"{LOOP}-last-1"]
+
+
+def test_too_little_is_refused(folder: Path, tmp_path: Path) -> None:
+    trials = trials_of(folder, recorded(tmp_path / "calls.npz", 3, 1))
+    with pytest.raises(CalibrationError, match="judged on episodes of two calls at least"):
+        proposed(Start(request()), trials, trials.base)
+
+
+def test_a_loop_of_two_steps_has_half(one_layer_checkpoint: Path, tmp_path: Path) -> None:
+    ttscompile.convert(one_layer_checkpoint, tmp_path / "two", sampler="ddim", steps=2)
+    artifact = load_artifact(tmp_path / "two")
+    assert Start(request()).applies(artifact) is None
+    assert [described(one) for one in candidates(artifact, artifact.default)] == [(1, [0])]
+
+
+def test_a_loop_of_one_step_and_one_whose_table_does_not_tell_are_refused(
+    compiled: Path, one_layer_checkpoint: Path, tmp_path: Path
+) -> None:
+    assert "'toy' does not tell what part of its sample is noise" in str(
+        Start(request()).applies(load_artifact(compiled))
+    )
+    ttscompile.convert(one_layer_checkpoint, tmp_path / "one", sampler="ddim", steps=1)
+    assert Start(request()).applies(load_artifact(tmp_path / "one")) == "a loop of 1 step has no half"

@@ -1,0 +1,123 @@
+"""When tokens are reused is chosen by what it does to the actions."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from tests.families import cameras
+from tests.once import Once
+from ttscompile.artifact.load import load_artifact
+from ttscompile.calibration.judge import Score, further, judge
+from ttscompile.calibration.proposer import Proposal
+from ttscompile.calibration.proposers import tokens
+from ttscompile.calibration.proposers.tokens import MARGIN, MOST_COMPUTED, Tokens
+from ttscompile.calibration.trials import HELD_OUT, Trials
+from ttscompile.core.plan import Plan, TokenReuse
+from ttscompile.errors import CalibrationFailedError
+
+from .trying import proposed, request, trials_of
+
+SIDE = cameras.SIDE
+
+
+@pytest.fixture
+def folder(once: Once, tmp_path: Path) -> Path:
+    """An artifact of its own for each test."""
+    return shutil.copytree(cameras.compiled_tokens(once) / "artifact", tmp_path / "own")
+
+
+def recorded(path: Path, shaking: float = 0.0) -> list[Path]:
+    """Four episodes of six calls: a spot wanders over a fixed picture."""
+    rng, calls = np.random.default_rng(0), 24
+    still = 0.1 + 0.5 * rng.random((2, 3, SIDE, SIDE), dtype=np.float32)
+    frames = np.tile(still, (calls + 1, 1, 1, 1, 1))  # [N, camera, ...]
+    for i, frame in enumerate(frames):
+        frame[:, :, 4 * (i % 6) : 4 * (i % 6) + 4, 8:12] += 0.3
+    frames = np.clip(frames + (shaking * rng.standard_normal(frames.shape)).astype(np.float32), 0, 1)
+    windows = np.stack([frames[:-1], frames[1:]], 1)
+    views: dict[str, npt.NDArray[np.float32]] = {key: windows[:, :, i] for i, key in enumerate(cameras.CAMERAS)}
+    state = rng.random((calls, 2, 4), dtype=np.float32)
+    np.savez(path, state=state, episode_ends=np.array([6, 12, 18, 24]), **views)  # type: ignore[arg-type]
+    return [path]
+
+
+def tried(folder: Path, recordings: list[Path], **fields: float) -> tuple[Trials, Proposal]:
+    trials = trials_of(folder, recordings)
+    (found,) = proposed(Tokens(request(**fields)), trials, trials.base)
+    return trials, found
+
+
+def test_what_is_proposed_saves_and_is_near_on_other_episodes(folder: Path, tmp_path: Path) -> None:
+    trials, found = tried(folder, recorded(tmp_path / "calls.npz"))
+    assert found.plan.tokens is not None and found.shared == {"tokens": found.plan.tokens}
+    assert found.plan.tokens.refresh == 6, "that of 64 was never seen in episodes of six calls"
+    assert (found.name, found.margin) == (trials.name, MARGIN)
+    whole, score = judge(trials, trials.base, HELD_OUT), judge(trials, found.plan, HELD_OUT)
+    assert 5 / 37 <= score.tokens < 0.5
+    assert whole.tokens == 1
+    assert further(score, whole)[0] < 2 * MARGIN
+    assert found.plan.cells is trials.base.cells and found.plan.precision == trials.base.precision
+
+
+def test_what_does_not_pay_is_refused(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(CalibrationFailedError, match=r"does not pay: \d+% of the tokens would be computed"):
+        tried(folder, recorded(tmp_path / "calls.npz", shaking=0.5))
+    with pytest.raises(CalibrationFailedError, match="does not pay: the actions are .* further off at least, and -1"):
+        tried(folder, recorded(tmp_path / "calls.npz"), margin=-1.0)
+
+
+def test_what_computes_too_much_on_other_episodes_is_refused_there(folder: Path, tmp_path: Path) -> None:
+    trials, found = tried(folder, recorded(tmp_path / "calls.npz"))
+    score = judge(trials, found.plan, HELD_OUT)
+    assert found.refusal(score, {}) is None
+    assert "80% of the tokens" in str(found.refusal(replace(score, tokens=0.8), {}))
+    assert found.refusal(replace(score, tokens=MOST_COMPUTED), {}) is None
+
+
+def scripted(monkeypatch: pytest.MonkeyPatch, limits: dict[TokenReuse, tuple[float, float]]) -> None:
+    """Each setting computes a share of the tokens, and is so much further off at most; others are far off."""
+
+    def scored(trials: object, plan: Plan, part: str) -> Score:
+        assert part == "learned"
+        computed, limit = (1.0, 0.0) if plan.tokens is None else limits.get(plan.tokens, (0.0, 9.0))
+        return Score(limit, (0, 0), None, None, 0, 0, 0, 1, tokens=computed)
+
+    monkeypatch.setattr(tokens, "judge", scored)
+    monkeypatch.setattr(tokens, "further", lambda one, _: (one.distance / 2, one.distance))
+    monkeypatch.setattr(tokens, "THRESHOLDS", (0.0, 0.1, 0.2))
+
+
+def test_the_fewest_tokens_within_the_upper_limit_are_taken(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A setting whose mean is within the margin, and whose limit over episodes is not, was lucky."""
+    near, lucky = 0.9 * MARGIN, 1.9 * MARGIN
+    limits = {TokenReuse(0.0, 6): (0.6, 0.0), TokenReuse(0.1, 6): (0.3, near), TokenReuse(0.2, 6): (0.1, lucky)}
+    scripted(monkeypatch, {**limits, TokenReuse(0.0, 4): (0.5, 0.0)})
+    _, found = tried(folder, recorded(tmp_path / "calls.npz"))
+    assert found.plan.tokens == TokenReuse(0.1, 6)
+    scripted(monkeypatch, {**limits, TokenReuse(0.0, 4): (0.29, 0.0)})
+    assert tried(folder, recorded(tmp_path / "calls.npz"))[1].plan.tokens == TokenReuse(0.0, 4)
+
+
+def test_a_larger_threshold_than_one_that_is_far_off_is_not_tried(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scripted(monkeypatch, {TokenReuse(0.0, 6): (0.6, 0.0), TokenReuse(0.2, 6): (0.1, 0.0)})
+    assert tried(folder, recorded(tmp_path / "calls.npz"))[1].plan.tokens == TokenReuse(0.0, 6)
+
+
+def test_an_encoder_without_tokens_is_refused(once: Once) -> None:
+    folder = once.folder("seeing", cameras.compile_seeing) / "artifact"
+    told = Tokens(request()).applies(load_artifact(folder))
+    assert "no image encoder of this policy is a vision transformer" in str(told)
+
+
+def test_an_encoder_with_tokens_is_not(folder: Path) -> None:
+    assert Tokens(request()).applies(load_artifact(folder)) is None

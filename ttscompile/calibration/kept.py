@@ -1,0 +1,112 @@
+"""The plans of a calibration so far: what was proposed, held on held-out episodes, and will be written."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy.typing as npt
+
+from ..artifact.block_weights import BlockWeights
+from ..artifact.manifest import StartRecord
+from ..core.plan import DENSE, FULL, Plan
+from .judge import Score, further, judge
+from .proposer import Proposal
+from .trials import Trials
+
+
+class Kept:
+    """See the module.
+
+    Args:
+        trials: of the artifact as it is.
+        anew: whether to begin with the base of the calibration. Else with the artifact's plans, to which others come.
+
+    Attributes:
+        trials: of the artifact with all that is kept.
+        default: name of the best plan.
+        plans: by name.
+        scores: of those that were judged, by name.
+        notes: on those that were proposed, by name.
+        weights: of blocks, that came with them.
+        starts: loops, that came with them.
+        pruner: constants, and the loop whose pruner has them; None where they stay.
+        refused: why plans are left out, by name.
+        learned: whether any proposal but those ``beside`` was kept.
+    """
+
+    def __init__(self, trials: Trials, anew: bool) -> None:
+        artifact = trials.artifact
+        self.plans: dict[str, Plan] = {n: p for n, p in artifact.plans.items() if not anew or n in (DENSE, FULL)}
+        first = next(n for n in (FULL, DENSE) if n in self.plans) if anew else artifact.manifest.default_plan
+        self.default, self.trials = first, replace(trials, name=first)
+        self.scores: dict[str, Score] = {}
+        self.notes: dict[str, Mapping[str, Any]] = {}
+        self.weights: dict[str, BlockWeights] = {}
+        self.starts: dict[str, StartRecord] = {}
+        self.pruner: tuple[Mapping[str, npt.NDArray[Any]], str] | None = None
+        self.refused: dict[str, str] = {}
+        self.learned = False
+
+    @property
+    def plan(self) -> Plan:
+        """The best so far."""
+        return self.plans[self.default]
+
+    def consider(self, proposal: Proposal, margin: float | None = None) -> bool:
+        """Judge a proposal on held-out episodes, and keep it if it holds.
+
+        Args:
+            proposal: see ``Proposal``.
+            margin: in place of the proposal's, if that is a number.
+        """
+        trials = self.trials.holding(proposal)
+        score = judge(trials, proposal.plan)
+        reason = proposal.refusal(score, self.scores)
+        if reason is None and not proposal.beside:
+            allowed = proposal.margin if proposal.margin is None or margin is None else margin
+            reason = self._no_better(trials, score, allowed)
+        if reason is not None:
+            self.refused[proposal.name] = reason
+            return False
+        self.refused.pop(proposal.name, None)
+        self.plans[proposal.name], self.scores[proposal.name] = proposal.plan, score
+        self.notes[proposal.name] = proposal.notes
+        self.weights |= proposal.weights
+        self.starts |= proposal.starts
+        if proposal.pruner is not None:
+            self.pruner = proposal.pruner, proposal.plan.loop
+        if proposal.shared:
+            self._share(proposal)
+        if not proposal.beside:
+            self.default, self.learned = proposal.name, True
+        self.trials = replace(trials, name=self.default)
+        return True
+
+    def _no_better(self, trials: Trials, score: Score, margin: float | None) -> str | None:
+        """Why a plan does not take the place of the best one so far."""
+        if margin == float("inf"):
+            return None
+        if self.default not in self.scores:
+            self.scores[self.default] = judge(self.trials, self.plan)
+        best = judge(trials, self.plan) if trials.fresh else self.scores[self.default]
+        difference, limit = further(score, best)
+        told = f"its distance from the original is {score.distance:.4g} on held-out calls, and that of {self.default!r}"
+        if margin is None:
+            return None if difference < 0 else f"is no better: {told} {best.distance:.4g}."
+        if limit <= margin:
+            return None
+        return f"is too far off: {told} {best.distance:.4g}: {limit:.4g} more at worst, and {margin:.4g} is allowed."
+
+    def _share(self, proposal: Proposal) -> None:
+        """Give the fields that a proposal shares to all plans but ``dense``, also where one falls back on another."""
+        old, new = dict(self.plans), dict[int, Plan]()
+        for name, plan in old.items():
+            fields = {} if name in (DENSE, proposal.name) else proposal.shared
+            new[id(plan)] = replace(plan, **fields) if fields else plan
+        for name, plan in old.items():
+            made = new[id(plan)]
+            if made.otherwise is not None:
+                made = replace(made, otherwise=new.get(id(made.otherwise), made.otherwise))
+            self.plans[name] = made

@@ -1,0 +1,1 @@
+"""What learns: each module proposes plans, and the judge says how good they are (``calibration.proposer``)."""

@@ -1,0 +1,81 @@
+"""When a token of an image encoder is computed anew: the setting that computes the fewest, of those that are near."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+
+from ...artifact.load import Artifact
+from ...core.plan import Plan, TokenReuse
+from ...errors import CalibrationFailedError
+from ..clock import Clock
+from ..judge import Score, further, judge
+from ..proposer import Proposal, Proposals, Request
+from ..trials import LEARNED, Trials
+
+THRESHOLDS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2)
+"""Differences that are tried, ascending. Encoders read pixels with a deviation of about one."""
+REFRESHES = (32, 16, 12, 8, 4)
+"""Of so many new frames one is whole; never of more than follow each other where plans are judged."""
+MARGIN = 0.1
+"""Of what other noise changes."""
+MOST_COMPUTED = 0.75
+"""Share of the tokens: where more are computed, looking for changes costs about what it saves."""
+
+
+class Tokens:
+    """Tries thresholds and refreshes on consecutive calls.
+
+    The best of many settings is one that was lucky, so the upper limit of its difference over episodes has to be within
+    the margin already where it is chosen.
+    """
+
+    def __init__(self, request: Request, margin: float = MARGIN) -> None:
+        self._margin = margin
+        self.told = ""
+
+    def applies(self, artifact: Artifact) -> str | None:
+        """Whether an encoder has tokens."""
+        if artifact.manifest.tokens:
+            return None
+        problem = "no image encoder of this policy is a vision transformer, whose tokens could be reused"
+        return f"{problem}; 'ttscompile convert --explain' says of each encoder why"
+
+    def propose(self, trials: Trials, plan: Plan, clock: Clock) -> Proposals:
+        """The plan, with the setting that computes the fewest tokens."""
+        whole = judge(trials, replace(plan, tokens=None), LEARNED)
+        tried = list[tuple[float, Score, Plan]]()
+        seen = max(last - first + 1 for _, first, last in trials.learned.stretches.tolist())
+        refreshes = sorted({min(refresh, seen) for refresh in REFRESHES}, reverse=True)
+        trials.bar.stage("settings of tokens", len(refreshes) * len(THRESHOLDS))
+        for number, refresh in enumerate(refreshes):
+            for more, threshold in enumerate(THRESHOLDS):
+                one = replace(plan, tokens=TokenReuse(threshold, refresh))
+                score = judge(trials, one, LEARNED)
+                off, limit = further(score, whole)
+                tried.append((limit, score, one))
+                trials.bar.update(number * len(THRESHOLDS) + more + 1, f"{score.tokens:.0%} computed", clock.left())
+                if off > self._margin:
+                    break  # a larger threshold changes more
+        good = [(score, one) for limit, score, one in tried if limit <= self._margin]
+        if not good:
+            least = min(limit for limit, _, _ in tried)
+            raise _refused(f"the actions are {least:.3g} further off at least, and {self._margin:g} is allowed")
+        score, best = min(good, key=lambda one: one[0].tokens)  # of equals the smallest threshold, the rarest refresh
+        if (told := _too_many(score, {})) is not None:
+            raise _refused(told)
+        assert best.tokens is not None
+        self.told = f"{score.tokens:.0%} of the tokens of new frames are computed"
+        notes, shared = {**asdict(best.tokens), "computed": score.tokens}, {"tokens": best.tokens}
+        yield Proposal(trials.name, best, notes, margin=self._margin, shared=shared, refusal=_too_many)
+
+
+def _too_many(score: Score, others: Mapping[str, Score]) -> str | None:
+    if score.tokens <= MOST_COMPUTED:
+        return None
+    return f"{score.tokens:.0%} of the tokens would be computed all the same"
+
+
+def _refused(why: str) -> CalibrationFailedError:
+    remedy = "Record with a camera that stands still, or allow more."
+    return CalibrationFailedError(f"reusing tokens does not pay: {why}. {remedy}")

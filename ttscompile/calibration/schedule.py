@@ -1,0 +1,215 @@
+"""The proposer of schedules: what a strategy finds for a budget, the baseline, and plans beside the target."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from ..artifact.load import Artifact
+from ..artifact.view import View, view_of
+from ..core.lattice import PlanArray, sparsity, uniform_plan
+from ..core.plan import UNIFORM, Plan
+from ..errors import CalibrationError
+from ..ir.pieces import PRUNER
+from .budget import ERROR, FLOPS, LATENCY, Budget, cells_of, measure_budget
+from .clock import Clock
+from .judge import Score
+from .proposer import Proposal, Proposals, Request
+from .pruner.head import has_head
+from .search import open_search, search_plan
+from .step_counts import SAFE, SHARE, SpacedSchedules, budget_of_error, named_plans
+from .strategies import FITTED, strategy_of
+from .task import Found, Search, Task
+from .trials import Trials, base_of
+
+SCHEDULE = "schedule"
+"""Name in the artifact of the best plan that does not depend on the observation."""
+
+NO_NUMBERS = 1e9
+"""A distance above this is the mean of calls of which one is ``LARGEST`` off."""
+
+BETTER = 0.9
+"""A plan has to bring the distance below this share of the uniform schedule's."""
+
+
+class Schedule:
+    """Plans of whole steps, corrected; or what another strategy finds. See ``Proposer``.
+
+    Args:
+        request: see ``Request``.
+
+    Attributes:
+        told: see ``Proposer``.
+        budget: what was asked for, once it is known what it comes to.
+        intervals: how many the search took.
+        stopped: why it ended: ``finished`` or ``time limit``.
+        skipped: why there is no plan of a name that there might be.
+    """
+
+    def __init__(self, request: Request) -> None:
+        self._request, self._strategy = request, strategy_of(request.strategy)
+        self.told, self.budget, self.intervals, self.stopped = "", Budget(request.goal, 0), 0, ""
+        self.skipped: dict[str, str] = {}
+
+    def applies(self, artifact: Artifact) -> str | None:
+        """See ``Proposer``."""
+        view, goal = view_of(artifact, base_of(artifact)), self._request.goal
+        if view.manifest.steps == 1:
+            told = "the policy has one denoising step, which every plan computes: nothing can be reused"
+            return f"{told}. Convert with more denoising steps, or use plan='dense'."
+        if goal.kind == ERROR and not self._strategy.fits_correction:
+            return (
+                f"max_action_error needs strategy {' or '.join(map(repr, FITTED))}; found {self._strategy.name!r}. Give"
+                " this strategy a target_sparsity, a target_flops or a latency_ms."
+            )
+        if self._request.correct and self._strategy.fits_correction:
+            return f"strategy {self._strategy.name!r} fits a correction of its own. Leave --correct out."
+        try:
+            if goal.kind not in (LATENCY, ERROR):
+                cells = cells_of(goal, view.manifest, self._may_prune(view))
+                self._strategy.require_reach(view.manifest.steps, len(view.manifest.blocks), cells)
+        except CalibrationError as error:
+            return str(error)
+        return None
+
+    def propose(self, trials: Trials, plan: Plan, clock: Clock) -> Proposals:
+        """See ``Proposer``."""
+        view, request = trials.executor.view, self._request
+        self._manifest = view.manifest
+        steps, blocks = view.manifest.steps, len(view.manifest.blocks)
+        budget = self._budget(trials, view, clock)
+        calls = trials.windows if self._strategy.consecutive else trials.calls
+        task = Task.of(trials.executor, calls, 0, trials.seed, trials.pool)
+        crowded = SpacedSchedules(task.whole, trials.state, clock, trials.bar)
+        if budget is None:
+            budget = budget_of_error(crowded, request.goal, steps, blocks)
+        share = 1 - SHARE if self._strategy.fits_correction else 1.0
+        task = replace(task, budget=budget.cells, clock=clock.until(share))
+        search = open_search(request.strategy, task)
+        found, self.intervals, self.stopped = searched(trials, search, task.clock, request.intervals)
+        if request.correct:
+            found = task.corrected(found)
+        while True:
+            self.budget, kept = budget, False
+            baseline = replace(plan, cells=uniform_of(steps, blocks, budget.cells))
+            yield Proposal(UNIFORM, baseline, beside=True)
+            made = replace(plan, cells=found.schedule, correction=found.correction)
+            kept = yield Proposal(SCHEDULE, made, found.notes, margin=float("inf"), refusal=self._refusal)
+            full = budget.cells // blocks
+            more = full + max(1, full // 4)
+            if kept or request.goal.kind != ERROR or more > steps // 2:
+                break
+            best = crowded.best(more, f"{more} steps")
+            if best is None:
+                break
+            found, budget = task.whole_steps(best.steps), replace(budget, cells=more * blocks)
+        if not kept:
+            return
+        if found.pruner is not None:
+            yield self._of_pruner(plan, found)
+        named, self.skipped = named_plans(crowded, task, self._strategy, budget.cells)
+        for name, one in named.items():
+            made = replace(plan, cells=one.schedule, correction=one.correction)
+            refusal = {"refusal": _no_safer} if name == SAFE else {}
+            yield Proposal(name, made, {"steps": one.notes["steps"]}, beside=True, **refusal)
+
+    def _budget(self, trials: Trials, view: View, clock: Clock) -> Budget | None:
+        """The budget; None where it is found on the calls to learn from."""
+        goal, manifest = self._request.goal, view.manifest
+        if goal.kind == ERROR:
+            return None
+        if goal.kind != LATENCY:
+            return Budget(goal, cells_of(goal, manifest, self._may_prune(view)))
+        known = trials.state.progress.get("latency")
+        if known is None:
+            budget = measure_budget(trials.artifact, trials.base, goal, self._may_prune(view))
+            known = {"cells": budget.cells, "measured": budget.measured}
+            trials.state.progress.update(latency=known, seconds=clock.elapsed())
+            trials.state.save()
+        budget = Budget(goal, known["cells"], known["measured"])
+        self._strategy.require_reach(manifest.steps, len(manifest.blocks), budget.cells)
+        return budget
+
+    def _may_prune(self, view: View) -> bool:
+        """Whether plans may be made by the pruner, whose cost then counts."""
+        return self._strategy.uses_pruner and has_head(view.pruner)
+
+    def _of_pruner(self, plan: Plan, found: Found) -> Proposal:
+        """The plans that the pruner makes, if they are nearer than the schedule."""
+        made = replace(plan, cells=None, correction=found.pruner_correction)
+        return Proposal(PRUNER, made, found.notes, pruner=found.pruner, refusal=self._refusal_of_head)
+
+    def _refusal_of_head(self, score: Score, others: Mapping[str, Score]) -> str | None:
+        return one_plan(score, self.intervals) or self._refusal(score, others)
+
+    def _refusal(self, score: Score, others: Mapping[str, Score]) -> str | None:
+        """Which of the budget's promises a score breaks."""
+        goal, uniform, manifest = self._request.goal, others[UNIFORM], self._manifest
+        wished = goal.sparsity(self.budget.cells, manifest)
+        if not score.distance <= NO_NUMBERS:
+            return "gives actions that are not numbers."
+        if score.sparsity < wished - 1e-9:
+            return (
+                f"reaches a sparsity of {score.sparsity:.4f} on held-out calls; the target is {wished:g}. Calibrate"
+                " with more episodes or more time."
+            )
+        if goal.kind == FLOPS and score.flops_saved < goal.value - 1e-9:
+            return (
+                f"saves {score.flops_saved:.4f} of the FLOPs of a dense call; the target is {goal.value:g}: its blocks"
+                " cost more than the average. Raise the target a little, or take strategy"
+                f" {' or '.join(map(repr, FITTED))}, which computes whole steps."
+            )
+        if goal.kind == ERROR and score.error is not None and not score.error <= goal.value:
+            return (
+                f"computes {self.budget.cells} cells, and is {score.error:.4g} off on average on held-out calls; at"
+                f" most {goal.value:g} was asked for. Allow a larger error, more time, or calibrate with more episodes."
+            )
+        if not (self._strategy.baseline or score.distance < BETTER * uniform.distance):
+            return (
+                f"is no better than the uniform schedule: on held-out calls its distance from the original is"
+                f" {score.distance:.4g}, the uniform schedule's {uniform.distance:.4g} (expected below {BETTER:.0%} of"
+                " that). Calibrate with more episodes or more time, or lower the target."
+            )
+        return None
+
+
+def one_plan(score: Score, intervals: int) -> str | None:
+    """Why a head is left out that makes the same plan for every observation: it has learned nothing."""
+    if score.plans > 1:
+        return None
+    counted = f"{intervals} update{'s' * (intervals != 1)}"
+    return f"has learned nothing in {counted}: it makes one and the same plan for all held-out calls."
+
+
+def _no_safer(score: Score, others: Mapping[str, Score]) -> str | None:
+    """Why the plan that computes twice as much is left out."""
+    if score.distance < others[SCHEDULE].distance:
+        return None
+    return f"{score.distance:.4g} from the original, no safer than {SCHEDULE}: its search was cut short"
+
+
+def uniform_of(steps: int, blocks: int, cells: int) -> PlanArray:
+    """The baseline: whole steps, evenly spaced; the last cells of the budget are rounded up to one, in its favour."""
+    return uniform_plan(steps, blocks, -(-cells // blocks))
+
+
+def searched(
+    trials: Trials, search: Search, clock: Clock, most: int | None, name: str = "search"
+) -> tuple[Found, int, str]:
+    """``search_plan`` from where the state is; saved after every interval, under a name."""
+    state, bar, done_so_far = trials.state, trials.bar, f"{name} intervals"
+    first = int(state.progress.get(done_so_far, 0))
+    count = search.intervals if most is None else min(most, search.intervals)
+    if first:
+        with state.reading():
+            search.restore(state.get(name))
+    bar.stage(name, count, first)
+
+    def save(done: int, longest: float) -> None:
+        state.put(name, search.state())
+        state.progress.update({done_so_far: done, "seconds": clock.elapsed()})
+        state.save()
+        left = min(clock.left(), (count - done) * longest)
+        bar.update(done, f"error {search.loss:.4f}, sparsity {sparsity(search.plan):.2%}", left)
+
+    return search_plan(search, clock, most, first, save)
