@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -46,7 +47,7 @@ def readable_rollout(view: View) -> BoolArray:
     for schedule in view.schedules.values():
         readable |= schedule == Source.ROLLOUT
     if view.pruned:
-        readable |= _pruner_can_read(view)
+        readable |= sources_of_pruner(view)[..., Source.ROLLOUT]
     return readable
 
 
@@ -54,21 +55,20 @@ def reading_earlier_calls(view: View) -> set[str]:
     """Names of the plans that can read what an earlier call of the episode computed."""
     reading = {name for name, schedule in view.schedules.items() if (schedule == Source.ROLLOUT).any()}
     pruned = {name for name, plan in view.plans.items() if plan.pruned}
-    return reading | pruned if pruned and _pruner_can_read(view).any() else reading
+    return reading | pruned if pruned and sources_of_pruner(view)[..., Source.ROLLOUT].any() else reading
 
 
-def _pruner_can_read(view: View) -> BoolArray:
-    """Cells in which the ROLLOUT logit can be the largest; every cell of a pruner that is not the head we know."""
+def sources_of_pruner(view: View) -> BoolArray:
+    """Sources whose logit can be the largest: bool ``[K, blocks, 4]``; all of a pruner that is not the head we know."""
     shape = (view.manifest.steps, len(view.manifest.blocks), len(Source))
-    head = view.pruner
+    head, possible = view.pruner, np.ones(shape, dtype=np.bool_)
     if not set(HEAD) <= set(head) or head["pruner.base"].shape != shape:
-        return np.ones(shape[:2], dtype=np.bool_)
+        return possible
     fixed = head["pruner.base"].astype(np.float64) + head["pruner.mask"]
     by_step = np.abs(head["pruner.step"].astype(np.float64))
     by_cell = head["pruner.block"].astype(np.float64).reshape(by_step.shape[1], *shape[1:])
-    possible = np.ones(shape[:2], dtype=np.bool_)
-    for other in Source:
-        lead = fixed[..., Source.ROLLOUT] - fixed[..., other]
-        swing = by_step @ np.abs(by_cell[..., Source.ROLLOUT] - by_cell[..., other])
-        possible &= lead + swing >= -1e-4 * (1 + np.abs(lead) + swing)  # the pruner computes in float32
+    for source, other in itertools.permutations(Source, 2):
+        lead = fixed[..., source] - fixed[..., other]
+        swing = by_step @ np.abs(by_cell[..., source] - by_cell[..., other])
+        possible[..., source] &= lead + swing >= -1e-4 * (1 + np.abs(lead) + swing)  # it computes in float32
     return possible

@@ -1,0 +1,48 @@
+"""What a plan of an artifact wants as inputs of its single ONNX file; needs numpy alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.view import view_of
+from ttscompile.core.lattice import dense_plan
+from ttscompile.core.spec import ORIGINAL
+from ttscompile.errors import IllegalPlanError
+from ttscompile.ir.pieces import USE_PRUNER
+
+from .liveness import readable_rollout
+
+
+def inputs_of(path: str | Path, plan: str | None = None) -> dict[str, npt.NDArray[Any]]:
+    """The inputs of a single ONNX file that are the same in every call with a plan.
+
+    Beside these it wants the observation, the noise, and of the rollout cache what the call before gave
+    (``ttscompile.lower.single_file``).
+
+    Args:
+        path: the artifact that was written beside the file, or the same zipped; it may have been calibrated since.
+        plan: the name of a plan of the artifact, in the loop that the file was written for; None for its default plan.
+
+    Raises:
+        ArtifactError: the artifact is missing, damaged or of another version.
+        IllegalPlanError: there is no plan of this name; or it has weights of its own or begins with the chunk of the
+            call before, which a file cannot.
+    """
+    artifact = load_artifact(path)
+    name = artifact.manifest.default_plan if plan is None else plan
+    own = artifact.plan(name)
+    for field, there in (("weights of its own", own.weights != ORIGINAL), ("a chunk to begin with", own.otherwise)):
+        if there:
+            problem = f"plan {name!r} has {field}, and a single file has the original's weights and begins with noise"
+            raise IllegalPlanError(f"{problem}. Give another plan, or use ttscompile.load.")
+    view = view_of(artifact, own)
+    cells = dense_plan(view.manifest.steps, len(view.manifest.blocks)) if own.cells is None else own.cells
+    inputs: dict[str, npt.NDArray[Any]] = {"plan": cells[None], "rollout_keep": readable_rollout(view)}
+    if own.pruned:
+        inputs |= {USE_PRUNER: np.array(True), **view.pruner}
+    return inputs if own.correction is None else inputs | own.correction.inputs()

@@ -1,0 +1,115 @@
+"""Which heads, branches and tables of an artifact its plans use."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..artifact.load import Artifact
+from ..artifact.view import view_of
+from ..core.lattice import BoolArray, Source
+from ..core.spec import ORIGINAL
+from ..ir.pieces import IDLE, PRUNER, of_loop, of_tokens
+from ..ir.program import Binding
+from ..runtimes.liveness import sources_of_pruner
+from .facts import of_blocks
+from .page import Table
+
+HEAD, BRANCH, TABLE = "head", "branch", "table"
+CONTEXTS = "what the loop reads at each step"
+
+
+@dataclass(frozen=True)
+class Use:
+    """Something that an artifact holds for the sake of plans.
+
+    Attributes:
+        kind: ``head``, which makes plans; ``branch``, one way to go on of several; or ``table``, numbers.
+        name: what it is, for people.
+        plans: names of the plans that use it, ``dense`` among them.
+        of: the block whose branch it is, or the context whose values are in the table; None of what is alone.
+    """
+
+    kind: str
+    name: str
+    plans: tuple[str, ...]
+    of: int | str | None = None
+
+
+def uses(artifact: Artifact) -> tuple[Use, ...]:
+    """Everything that only some plans use, and by which plans it is used.
+
+    Of each block that is the branch that evaluates it, and one for each source of a residual. A plan that falls back to
+    TIMESTEP in the first call of an episode uses both. What a pruner can choose follows from its weights.
+    """
+    manifest, found = artifact.manifest, list[Use]()
+    sources = _sources(artifact)
+    for loop in (ORIGINAL, *manifest.spec.loops):
+        if (loop == ORIGINAL and PRUNER in manifest.pieces) or of_loop(PRUNER, loop) in manifest.pieces:
+            deciding = (name for name, plan in manifest.plans.items() if plan.pruned and plan.loop == loop)
+            found.append(Use(HEAD, f"the pruner of loop {loop!r}", tuple(deciding)))
+    for source in Source:
+        for b in range(len(manifest.blocks)):
+            plans = tuple(name for name, cells in sources.items() if cells[:, b, source].any())
+            found.append(Use(BRANCH, source.name, plans, b))
+    if IDLE in manifest.pieces:
+        idle = (name for name, cells in sources.items() if np.all(cells[..., 1:].any(axis=2), axis=1).any())
+        found.append(Use(BRANCH, "steps without a computed block", tuple(idle)))
+    reusing = tuple(name for name, plan in manifest.plans.items() if plan.tokens is not None)
+    found += [
+        Use(BRANCH, f"piece {name}, for some tokens", reusing) for name in sorted(manifest.pieces) if of_tokens(name)
+    ]
+    read = {name for piece in manifest.pieces.values() for name in piece.contexts}
+    tables = (name for name, context in manifest.contexts.items() if context.binding is Binding.TABLE)
+    found += [Use(TABLE, CONTEXTS, tuple(sources) if name in read else (), name) for name in tables]
+    for name, plan in artifact.plans.items():
+        if (correction := plan.correction) is None:
+            continue
+        found += [
+            Use(TABLE, f"{what} of {name}", (name,)) for what in ("correction", "jumps")[: 1 + bool(correction.jumps)]
+        ]
+    return tuple(found)
+
+
+def unused(found: tuple[Use, ...]) -> int:
+    """How many of them no plan uses."""
+    return sum(not use.plans for use in found)
+
+
+def usage_table(artifact: Artifact) -> Table:
+    """Of every head, branch and table the plans that use it; blocks of one use are one row."""
+    alike: dict[tuple[str, str, tuple[str, ...]], list[Use]] = {}
+    for use in uses(artifact):
+        alike.setdefault((use.kind, use.name, use.plans), []).append(use)
+    rows = []
+    for (kind, name, plans), group in alike.items():
+        blocks = [use.of for use in group if isinstance(use.of, int)]
+        of = f" of blocks {of_blocks(blocks)}" if blocks else f" ({len(group)})" if len(group) > 1 else ""
+        rows.append((f"{kind}: {name}{of}", ", ".join(plans) or "no plan: unused"))
+    return Table(("part", "used by"), tuple(rows), prose=True)
+
+
+def told_unused(artifact: Artifact) -> str:
+    """How much is unused, in words."""
+    found = uses(artifact)
+    count = unused(found)
+    if not count:
+        return f"Each of the {len(found)} heads, branches and tables is used by a plan."
+    verb = "is" if count == 1 else "are"
+    return f"{count} of {len(found)} heads, branches and tables {verb} used by no plan of the artifact."
+
+
+def _sources(artifact: Artifact) -> Mapping[str, BoolArray]:
+    """By plan, the sources that its cells can have when they are executed: bool ``[K, blocks, 4]``."""
+    found: dict[str, BoolArray] = {}
+    for name, plan in artifact.plans.items():
+        if plan.cells is None:
+            cells = sources_of_pruner(view_of(artifact, plan))
+        else:
+            cells = plan.cells[..., None] == np.arange(len(Source))
+        cells[0] = np.arange(len(Source)) == Source.COMPUTE
+        cells[..., Source.TIMESTEP] |= cells[..., Source.ROLLOUT]
+        found[name] = cells
+    return found
