@@ -237,9 +237,9 @@ def main(  # noqa: C901  # checks each option in turn
     picture: Path | None,
     as_json: bool,
 ) -> None:
-    """Compare artifacts and plans: DIR takes the artifact's own plan, DIR:dense computes everything.
+    """Compare artifacts and plans: DIR takes the artifact's own plan, DIR:dense is the original policy.
 
-    DIR:dense:warm=3 is ttscompile.load(DIR, warm=3). With DIR:dense:pinned all calls of an episode share noise.
+    With DIR:dense:pinned all calls of an episode share noise.
     """
     if (jobs > 1 or ray) and no_cache:
         raise click.UsageError("--jobs and --ray hand episodes over through the cache: leave out --no-cache.")

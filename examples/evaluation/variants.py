@@ -12,16 +12,17 @@ import numpy as np
 import numpy.typing as npt
 
 import ttscompile
+from ttscompile.artifact.load import read_manifest
 from ttscompile.cli.output import results_console as results_console
 from ttscompile.cli.output import run as run
+from ttscompile.core.plan import DENSE, FULL
 from ttscompile.runtimes.info import PolicyInfo
 
-PINNED, WARM = "pinned", "warm="
-"""What may stand after a directory beside a plan: the noise of an episode's first call in all of its calls; and calls
-that begin with the chunk of the call before (``ttscompile.load(warm=)``)."""
+PINNED = "pinned"
+"""What may stand after a directory beside a plan: the noise of an episode's first call in all of its calls."""
 
 Plan: TypeAlias = str | npt.NDArray[np.int8]
-"""``dense``, the name of a plan in the artifact, or a matrix ``[K, blocks]``."""
+"""The name of a plan in the artifact, or a matrix ``[K, blocks]``."""
 
 
 class Policy(Protocol):
@@ -45,7 +46,7 @@ class NoiseShape:
     """Sizes of the random numbers of one call of one stream.
 
     Attributes:
-        steps: K.
+        steps: K of the loop that the noise is for.
         sample: ``(T, D)``.
         stochastic: whether the sampler draws noise at its steps.
         pinned: whether all calls of an episode have the noise of its first.
@@ -76,7 +77,15 @@ class Variant:
 
 def noise_shape(info: PolicyInfo) -> NoiseShape:
     """Sizes of the noise that a compiled policy takes."""
-    return NoiseShape(info.K, info.original_sample, info.stochastic)
+    return NoiseShape(info.noise_steps, info.original_sample, info.stochastic)
+
+
+def full_plan(directory: str | Path) -> str:
+    """The name of the plan that computes every cell of what an artifact was converted to.
+
+    That is the original policy, ``dense``, unless another sampler or precision was asked for.
+    """
+    return FULL if FULL in read_manifest(Path(directory)).plans else DENSE
 
 
 def open_variant(text: str, runtime: str, threads: int) -> Variant:
@@ -84,8 +93,7 @@ def open_variant(text: str, runtime: str, threads: int) -> Variant:
 
     Args:
         text: ``DIR`` for the artifact's default plan, ``DIR:dense``, or ``DIR:NAME`` for a plan that it holds.
-            With ``:pinned`` after it all calls of an episode have the same noise, and with ``:warm=N`` calls begin with
-            the chunk of the call before.
+            With ``:pinned`` after it all calls of an episode have the same noise.
         runtime: of ``ttscompile.load``.
         threads: of ``ttscompile.load``.
 
@@ -93,13 +101,12 @@ def open_variant(text: str, runtime: str, threads: int) -> Variant:
         The variant, its label being the text.
     """
     directory, *words = text.split(":")
-    warm = [int(word.removeprefix(WARM)) for word in words if word.startswith(WARM)]
-    plans = [word for word in words if word != PINNED and not word.startswith(WARM)]
-    if max(len(plans), len(warm)) > 1:
-        raise click.BadParameter(f"{text}: expected one plan, and one {WARM}N; found {':'.join(words)}.")
-    policy = ttscompile.load(Path(directory), runtime=runtime, threads=threads, warm=warm[0] if warm else None)
-    noise = replace(noise_shape(policy.info), pinned=PINNED in words)
-    return Variant(text, policy, plans[0] if plans else None, noise)
+    plans = [word for word in words if word != PINNED]
+    if len(plans) > 1:
+        raise click.BadParameter(f"{text}: expected one plan; found {':'.join(words)}.")
+    plan = plans[0] if plans else None
+    policy = ttscompile.load(Path(directory), runtime=runtime, threads=threads, plan=plan)
+    return Variant(text, policy, plan, replace(noise_shape(policy.info), pinned=PINNED in words))
 
 
 def seeded_noise(shape: NoiseShape, seeds: Sequence[int], call: int) -> ttscompile.Noise:

@@ -113,7 +113,7 @@ def test_all_of_it_runs(tiny: Subject, capsys: pytest.CaptureFixture[str]) -> No
 
 
 def test_the_plan_is_the_one_that_a_warm_call_executes(tiny: Subject) -> None:
-    np.testing.assert_array_equal(tiny.plan, tiny.artifact.plans["reuse-50%"].cells
+    np.testing.assert_array_equal(tiny.plan, tiny.artifact.plans["reuse-50%"].cells)
     dense = subject_of(tiny.directory, tiny.network, "dense")
     assert dense.plan.sum() == 0
 
