@@ -2,9 +2,9 @@
 
     python examples/evaluation/drift.py DIR DIR:uniform --episodes 100 --picture drift.png
 
-Each variant drives numbered seeds. Then the dense policy of its artifact answers its calls, on what it observed and
-with the same noise: the difference is the action error of the first call, of the second, and so on. Beside it stands
-the score after as many calls, of the variant and of the dense policy on the same seeds.
+Each variant drives numbered seeds. Then its artifact answers its calls with every block of its loop computed, on what
+it observed and with the same noise: the difference is the action error of the first call, of the second, and so on.
+Beside it stands the score after as many calls, of the variant and with every block computed on the same seeds.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from variants import (
     batch_option,
     cache_folder,
     first_seed_option,
+    full_plan,
     json_option,
     open_variant,
     picture_option,
@@ -67,7 +68,7 @@ class Drift:
 
 
 def measured(label: str, dense: Variant, episodes: Sequence[Episode], exact: Sequence[Episode]) -> Drift:
-    """Errors and scores by the number of the call, of a variant's episodes and of the dense policy's."""
+    """Errors and scores by the number of the call, of a variant's episodes and of those with every block computed."""
     errors = action_errors(dense, episodes)
     running = np.isfinite(errors).mean(axis=0)
     reached = int((running >= REACHED).sum())
@@ -92,7 +93,9 @@ def draw(found: Sequence[Drift], path: Path, title: str) -> None:
         )
         right.plot(calls, one.scores, color=colour, label=one.label)
     for artifact, one in {one.label.partition(":")[0]: one for one in found}.items():
-        right.plot(np.arange(len(one.dense)), one.dense, color="#888888", linestyle=":", label=f"{artifact}:dense")
+        right.plot(
+            np.arange(len(one.dense)), one.dense, color="#888888", linestyle=":", label=f"{artifact}, all computed"
+        )
     left.set_ylim(bottom=0)
     left.set_ylabel("action error, 95 % interval")
     right.set_ylabel("score so far")
@@ -141,7 +144,7 @@ def main(
     picture: Path | None,
     as_json: bool,
 ) -> None:
-    """Compare each call of the variants with the dense one, by its number in the episode."""
+    """Compare each call of the variants with one that computes every block, by its number in the episode."""
     if picture is not None:
         require_picture_name(picture)
     make, cache = environment_class(environment), cache_folder(environment)
@@ -149,9 +152,9 @@ def main(
     found = list[Drift]()
     with Progress(console=Console(stderr=True)) as progress:
         for text in variants:
-            variant, dense = (
-                open_variant(name, "onnxruntime", 1) for name in (text, f"{text.partition(':')[0]}:dense")
-            )
+            directory = text.partition(":")[0]
+            whole = f"{directory}:{full_plan(directory)}"
+            variant, dense = (open_variant(name, "onnxruntime", 1) for name in (text, whole))
             rollouts = []
             for each in (variant, dense):
                 task = progress.add_task(each.label, total=episodes)

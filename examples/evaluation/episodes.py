@@ -14,6 +14,8 @@ import numpy as np
 from rollout import Episode
 from variants import PINNED, Variant
 
+from ttscompile.core.plan import DENSE, FULL
+
 FORMAT = "2"
 """Part of every key: a changed environment or another way to draw noise needs another."""
 PLAIN, WINDOWS = "plain", "windows/"
@@ -23,9 +25,9 @@ PLAIN, WINDOWS = "plain", "windows/"
 class Episodes:
     """Episodes of one variant in one environment, a file each.
 
-    The key is the environment and what the variant computes: for the dense plan weights, sampler and normalisers, which
-    calibration does not touch; for any other plan, and where tokens are reused, the artifact's whole identity; and the
-    runtime, whose sums are ordered differently.
+    The key is the environment and what the variant computes: for the plans that a conversion makes weights, samplers and
+    normalisers, which calibration does not touch; for any other plan, and where tokens are reused, the artifact's whole
+    identity; and the runtime, whose sums are ordered differently.
 
     Args:
         root: folder of all variants.
@@ -37,7 +39,7 @@ class Episodes:
     def __init__(self, root: Path, environment: str, variant: Variant, runtime: str) -> None:
         info = variant.policy.info
         plan = variant.plan or info.default_plan
-        as_converted = plan == "dense" and not info.reuses_tokens and info.warm_steps is None
+        as_converted = plan in (DENSE, FULL) and not info.reuses_tokens and not info.follows
         identity = info.model_identity if as_converted else info.identity
         key = "\n".join(
             (FORMAT, environment, identity, info.precision, plan, runtime) + (PINNED,) * variant.noise.pinned

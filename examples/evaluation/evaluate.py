@@ -237,7 +237,7 @@ def main(  # noqa: C901  # checks each option in turn
     picture: Path | None,
     as_json: bool,
 ) -> None:
-    """Compare artifacts and plans: DIR takes the artifact's own plan, DIR:dense computes everything.
+    """Compare artifacts and plans: DIR takes the artifact's own plan, DIR:dense is the original policy.
 
     With DIR:dense:pinned all calls of an episode share noise.
     """

@@ -1,4 +1,4 @@
-"""Record calls for calibration: drive the robot with the dense policy and keep what it observed.
+"""Record calls for calibration: drive the robot with every block computed, and keep what it observed.
 
     python examples/evaluation/record.py build/pusht/compiled -o build/pusht/calls.npz --episodes 16
 
@@ -17,7 +17,7 @@ from environments import Array, environment_class, environment_option
 from rich.console import Console
 from rich.progress import Progress
 from rollout import run_episodes
-from variants import open_variant, run, runtime_option, threads_option
+from variants import full_plan, open_variant, run, runtime_option, threads_option
 
 
 def save_trajectories(path: Path, episodes: Sequence[Mapping[str, Array]]) -> None:
@@ -53,9 +53,9 @@ def main(
     runtime: str,
     threads: int,
 ) -> None:
-    """Drive the robot with the dense policy of ARTIFACT and write its observations."""
+    """Drive the robot with the policy in ARTIFACT, in the loop that it was converted to, and write its observations."""
     make = environment_class(environment)
-    variant = open_variant(f"{artifact}:dense", runtime, threads)
+    variant = open_variant(f"{artifact}:{full_plan(artifact)}", runtime, threads)
     seeds = range(first_seed, first_seed + episodes)
     with Progress(console=Console(stderr=True)) as progress:
         task = progress.add_task("recording episodes", total=episodes)

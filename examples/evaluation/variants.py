@@ -12,15 +12,17 @@ import numpy as np
 import numpy.typing as npt
 
 import ttscompile
+from ttscompile.artifact.load import read_manifest
 from ttscompile.cli.output import results_console as results_console
 from ttscompile.cli.output import run as run
+from ttscompile.core.plan import DENSE, FULL
 from ttscompile.runtimes.info import PolicyInfo
 
 PINNED = "pinned"
 """What may stand after a directory beside a plan: the noise of an episode's first call in all of its calls."""
 
 Plan: TypeAlias = str | npt.NDArray[np.int8]
-"""``dense``, the name of a plan in the artifact, or a matrix ``[K, blocks]``."""
+"""The name of a plan in the artifact, or a matrix ``[K, blocks]``."""
 
 
 class Policy(Protocol):
@@ -44,7 +46,7 @@ class NoiseShape:
     """Sizes of the random numbers of one call of one stream.
 
     Attributes:
-        steps: K.
+        steps: K of the loop that the noise is for.
         sample: ``(T, D)``.
         stochastic: whether the sampler draws noise at its steps.
         pinned: whether all calls of an episode have the noise of its first.
@@ -75,7 +77,15 @@ class Variant:
 
 def noise_shape(info: PolicyInfo) -> NoiseShape:
     """Sizes of the noise that a compiled policy takes."""
-    return NoiseShape(info.K, info.original_sample, info.stochastic)
+    return NoiseShape(info.noise_steps, info.original_sample, info.stochastic)
+
+
+def full_plan(directory: str | Path) -> str:
+    """The name of the plan that computes every cell of what an artifact was converted to.
+
+    That is the original policy, ``dense``, unless another sampler or precision was asked for.
+    """
+    return FULL if FULL in read_manifest(Path(directory)).plans else DENSE
 
 
 def open_variant(text: str, runtime: str, threads: int) -> Variant:

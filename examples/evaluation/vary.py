@@ -4,9 +4,10 @@
         --target-sparsity 0.8125 --max-minutes 5 --picture episodes.png
 
 What may differ is the number of recorded ``episodes``, the ``minutes`` of calibration, or the ``seed``. A calibration
-is judged by the score of numbered seeds, as ``evaluate.py`` does it, and by how far its actions are from the dense
-policy's on what that observed in these episodes, which are the same for all. Calibrations that were finished are kept
-in ``--output``, so that an interrupted command goes on where it was, and more values can be added.
+is judged by the score of numbered seeds, as ``evaluate.py`` does it, and by how far its actions are from those of the
+same loop with every block computed, on what that observed in these episodes, which are the same for all. Calibrations
+that were finished are kept in ``--output``, so that an interrupted command goes on where it was, and more values can be
+added.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from variants import (
     batch_option,
     cache_folder,
     first_seed_option,
+    full_plan,
     json_option,
     open_variant,
     picture_option,
@@ -223,7 +225,7 @@ def main(
         calibrated(artifact, folder, trajectories, what, value, options)
         for folder, value in zip(folders, values, strict=True)
     ]
-    dense = open_variant(f"{artifact}:dense", "onnxruntime", 1)
+    dense = open_variant(f"{artifact}:{full_plan(artifact)}", "onnxruntime", 1)
     variants = [dense, *(open_variant(str(folder), "onnxruntime", 1) for folder in folders)]
     seeds, cache = range(first_seed, first_seed + episodes), cache_folder(environment)
     with Progress(console=Console(stderr=True)) as progress:
@@ -241,8 +243,9 @@ def main(
     for value, folder, took, variant, one in zip(values, folders, minutes, variants[1:], found[1:], strict=True):
         error = estimate(np.nanmean(action_errors(variant, seen), axis=1).tolist())
         compiled = load_artifact(folder)
-        plan = compiled.schedule(compiled.manifest.default_plan)
-        computed = tuple(np.flatnonzero((plan == ttscompile.Source.COMPUTE).any(axis=1)).tolist())
+        cells = compiled.default.cells
+        assert cells is not None, "the default strategy leaves the pruner alone"
+        computed = tuple(np.flatnonzero((cells == ttscompile.Source.COMPUTE).any(axis=1)).tolist())
         assert one.score_difference is not None, "the dense policy is the first"
         rows.append(Varied(value, computed, took, error, one.score, one.score_difference, one.success))
     if picture is not None:

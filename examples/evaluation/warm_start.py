@@ -2,13 +2,13 @@
 
     python examples/evaluation/warm_start.py CHECKPOINT --sampler dpmsolver++ --steps 16 --evaluations 8 --evaluations 5
 
-A warm call begins with the chunk of the call before and computes the last steps of the loop, dense
-(``ttscompile.load(warm=)``). Each number of steps is compared, on paired episodes, with the whole loop and with a loop
-of so few steps that begins with noise.
+A warm call begins with the chunk of the call before and computes every block of the last steps of the loop; each
+number of them is a plan of the artifact. Each is compared, on paired episodes, with the whole loop and with a loop of
+so few steps that begins with noise.
 
 A warm call must react to what it sees. So each also continues a chunk with the observation of another episode, as if
-the world had changed between two calls. The distance of its actions from a dense answer is divided by that between two
-dense answers with different noise: 1 where the chunk of before has left no trace.
+the world had changed between two calls. The distance of its actions from an answer of the whole loop is divided by that
+between two such answers with different noise: 1 where the chunk of before has left no trace.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from variants import (
     Variant,
     batch_option,
     first_seed_option,
+    full_plan,
     json_option,
     open_variant,
     results_console,
@@ -41,6 +42,13 @@ from variants import (
 )
 
 import ttscompile
+from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.manifest import StartRecord
+from ttscompile.artifact.write import update_plans
+from ttscompile.core.lattice import dense_plan
+
+WARM = "warm"
+"""What plans are called that begin with the chunk of the call before, with the number of their steps."""
 
 OTHER = 1_000_000
 """Added to a seed for other noise."""
@@ -48,7 +56,7 @@ OTHER = 1_000_000
 
 @dataclass(frozen=True)
 class Reaction:
-    """How far warm calls are from dense ones, over how far dense ones with different noise are apart.
+    """How far warm calls are from those of the whole loop, over how far these are apart with different noise.
 
     Attributes:
         same: with the chunk of the call before.
@@ -89,10 +97,22 @@ def reaction(warm: Policy, cold: Variant, episodes: Sequence[Episode]) -> Reacti
             warm.reset()
             warm.predict_action(windows(call - 1, own), noise=seeded_noise(cold.noise, seeds, call - 1))
             made = warm.predict_action(windows(call), noise=noises[0])["action"]
-            dense = [cold.policy.predict_action(windows(call), noise=one, plan="dense")["action"] for one in noises]
-            distances[row] += [np.abs(one - dense[1]).mean() for one in (made, dense[0])]
+            whole = [cold.policy.predict_action(windows(call), noise=one, plan=cold.plan)["action"] for one in noises]
+            distances[row] += [np.abs(one - whole[1]).mean() for one in (made, whole[0])]
     same, changed = distances[:, 0] / distances[:, 1]
     return Reaction(float(same), float(changed))
+
+
+def add_warm_plans(directory: Path, evaluations: Sequence[int]) -> None:
+    """Give an artifact a plan ``warm-N`` for each number of last steps, in which every block is computed."""
+    artifact = load_artifact(directory)
+    base, blocks = artifact.default, len(artifact.manifest.blocks)
+    plans, starts = dict(artifact.plans), dict[str, StartRecord]()
+    for number in evaluations:
+        loop = f"{base.loop}-last-{number}"
+        starts[loop] = StartRecord(base.loop, number)
+        plans[f"{WARM}-{number}"] = replace(base, loop=loop, cells=dense_plan(number, blocks), otherwise=base)
+    update_plans(directory, plans, artifact.manifest.default_plan, starts=starts)
 
 
 def drawn(evaluations: Sequence[Evaluation], reactions: Mapping[str, Reaction]) -> Table:
@@ -146,18 +166,20 @@ def main(
     make = environment_class(environment)
     with TemporaryDirectory() as folder, Progress(console=Console(stderr=True)) as progress:
 
-        def compiled(name: str, steps: int | None) -> str:
+        def compiled(name: str, steps: int | None) -> Path:
             ttscompile.convert(checkpoint, Path(folder, name), sampler=sampler, steps=steps, task=task)
-            return str(Path(folder, name))
+            return Path(folder, name)
 
-        def opened(label: str, text: str, warm: str = "") -> Variant:
-            return replace(open_variant(f"{text}:dense{warm}", "onnxruntime", threads), label=label)
+        def opened(label: str, directory: Path, plan: str | None = None) -> Variant:
+            text = f"{directory}:{plan or full_plan(directory)}"
+            return replace(open_variant(text, "onnxruntime", threads), label=label)
 
         whole = compiled("whole", steps)
+        add_warm_plans(whole, evaluations)
         cold = opened("the whole loop", whole)
         variants, warm = [cold], dict[str, Policy]()
         for number in evaluations:
-            variants.append(opened(f"its last {number} steps, warm", whole, f":warm={number}"))
+            variants.append(opened(f"its last {number} steps, warm", whole, f"{WARM}-{number}"))
             warm[variants[-1].label] = variants[-1].policy
             variants.append(opened(f"{number} steps", compiled(f"few-{number}", number)))
         bar = progress.add_task("episodes", total=count * len(variants))

@@ -14,7 +14,7 @@ from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import Source
 from ttscompile.errors import ObservationError
 from ttscompile.runtimes.instructions import Instructions, instructions_of
-from ttscompile.runtimes.settle import LoweringCache, pruner_plan, repair_plan
+from ttscompile.runtimes.plans import LoweringCache, pruner_plan, repair_plan
 
 from .call_module import CPU, CallModule
 from .loop import denoise

@@ -16,7 +16,7 @@ from ttscompile import ChunkSpec, ObservationSpec
 
 class Info:
     model_identity, identity, precision, default_plan = "m" * 64, "i" * 64, "fp32", "schedule"
-    reuses_tokens, warm_steps = False, None
+    reuses_tokens, follows = False, False
     observation, action = {"obs": ObservationSpec((2, 20))}, ChunkSpec(2, 1, 9)
 
 
@@ -101,12 +101,14 @@ def test_only_what_computes_the_same_finds_it(
     assert cached(tmp_path, variant(plan, **changes), runtime="reference").read(7) is None
 
 
-def test_calibration_does_not_change_the_dense_policy(tmp_path: Path) -> None:
-    cached(tmp_path, variant("dense")).write(episode())
-    assert cached(tmp_path, variant("dense", identity="j" * 64)).read(7) is not None
-    assert cached(tmp_path, variant("dense", model_identity="n" * 64)).read(7) is None
-    assert cached(tmp_path, variant("dense", reuses_tokens=True)).read(7) is None, "it may act otherwise"
-    assert cached(tmp_path, variant("dense", warm_steps=3)).read(7) is None, "its calls begin otherwise"
+@pytest.mark.parametrize("plan", ["dense", "full"])
+def test_calibration_does_not_change_what_a_conversion_makes(tmp_path: Path, plan: str) -> None:
+    cached(tmp_path, variant(plan)).write(episode())
+    assert cached(tmp_path, variant(plan, identity="j" * 64)).read(7) is not None
+    assert cached(tmp_path, variant(plan, model_identity="n" * 64)).read(7) is None
+    assert cached(tmp_path, variant("full" if plan == "dense" else "dense")).read(7) is None
+    assert cached(tmp_path, variant(plan, reuses_tokens=True)).read(7) is None, "it may act otherwise"
+    assert cached(tmp_path, variant(plan, follows=True)).read(7) is None, "its calls begin otherwise"
 
 
 def test_pinned_noise_has_episodes_of_its_own(tmp_path: Path) -> None:
