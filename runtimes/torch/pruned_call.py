@@ -43,7 +43,7 @@ class PrunedCall(CallModule):
     def __init__(self, view: View, correction: Correction | None) -> None:
         manifest = view.manifest
         advance = SteppedAdvance(manifest.spec, correction, CPU)
-        super().__init__(artifact, {**view.weights, **view.pruner}, advance, correction)
+        super().__init__(view, {**view.weights, **view.pruner}, advance, correction)
         self._type = manifest.blocks[0].type
         numbers = {group: number for number, group in enumerate(dict.fromkeys(manifest.groups))}
         self._groups = tuple(numbers[group] for group in manifest.groups)

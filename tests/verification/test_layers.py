@@ -1,7 +1,6 @@
 """A network that is one block: its layers are recorded, and the first that differs is named."""
 
 import shutil
-from collections.abc import Iterable
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,8 @@ from tests.passes.specs import toy_spec
 from ttscompile.artifact import tensors
 from ttscompile.artifact.bind import EMBEDDED_BYTES
 from ttscompile.artifact.golden import load_golden, probe_stream, project
-from ttscompile.artifact.load import Artifact, load_artifact, read_manifest
+from ttscompile.artifact.load import load_artifact, read_manifest
+from ttscompile.artifact.view import View, view_of
 from ttscompile.core.spec import PolicySpec
 from ttscompile.errors import ArtifactError
 from ttscompile.ir.layers import layers, layers_graph
@@ -72,7 +72,7 @@ def test_every_layer_of_the_network_is_recorded(made: tuple[Path, Program]) -> N
     artifact = load_artifact(directory)
     golden = load_golden(artifact)
     assert golden.layers is not None and golden.layers.shape[1] == len(found)
-    probe = Probe(artifact, golden.network_observations(artifact.manifest.spec))
+    probe = Probe(view_of(artifact, "dense"), golden.network_observations(artifact.manifest.spec))
     stream = probe_stream(0, artifact.manifest.blocks[0].type, golden.streams, float(golden.scales[0]))
     for k, expected in zip(golden.evaluated.tolist(), golden.layers, strict=True):
         results = probe.layers(k, stream)
@@ -125,15 +125,15 @@ def test_a_record_of_other_layers_is_refused(artifact: Path) -> None:
 
 def test_no_call_opens_the_layers(artifact: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opened: set[str] = set()
-    original = sessions._open
+    original = sessions._open_file
 
-    def watched(artifact: Artifact, pieces: Iterable[str], threads: int) -> dict[str, Any]:
-        opened.update(pieces := set(pieces))
-        return original(artifact, pieces, threads)
+    def watched(view: View, file: str, *options: Any) -> Any:
+        opened.add(file)
+        return original(view, file, *options)
 
-    monkeypatch.setattr(sessions, "_open", watched)
+    monkeypatch.setattr(sessions, "_open_file", watched)
     ttscompile.load(artifact)
-    assert "advance" in opened and "layers" not in opened
+    assert "advance.onnx" in opened and "layers.onnx" not in opened
 
 
 def test_a_policy_of_several_blocks_has_no_layers() -> None:

@@ -233,8 +233,8 @@ def load_golden_plans(artifact: Artifact, streams: int) -> dict[str, GoldenPlan]
         arrays = tensors.read(artifact.files / manifest.stores.golden_plans)
     wanted, names = dict[str, tuple[str, tuple[int, ...]]](), set[str]()
     for name, plan in manifest.plans.items():
-        if f"{name}/plan" not in arrays and not is_sparse(plan):
-            continue  # whose cells are all computed, as those of the original
+        if f"{name}/plan" not in arrays and (not is_sparse(plan) or plan.otherwise is not None):
+            continue  # it computes all cells; or the schema before had it, which recorded none that begins with a chunk
         names.add(name)
         steps = manifest.steps_of(plan.loop)
         wanted[f"{name}/plan"] = "int8", (2, streams, steps, len(manifest.blocks))

@@ -14,7 +14,7 @@ from ..artifact.golden import Golden, GoldenPlan, project
 from ..artifact.load import Artifact
 from ..artifact.view import view_of
 from ..core.lattice import PlanArray, Source, dense_plan
-from ..core.plan import DENSE, ORIGINAL, Plan
+from ..core.plan import DENSE, FULL, ORIGINAL, Plan
 from ..core.spec import Noise
 from ..core.update import bounded
 from ..errors import RuntimeUnavailableError
@@ -145,7 +145,7 @@ def check_plans(
         The rung; and by plan the cells ``[K, blocks]`` that differ, where some do.
     """
     plans = artifact.manifest.plans
-    if all(plan.kind == "all" and plan.otherwise is None for plan in plans.values()):
+    if plans.keys() <= {FULL}:
         return Rung(PLANS, SKIPPED, "the artifact is not calibrated: every call computes all cells"), {}
     if not recorded:
         told = f"no record of {', '.join(plans)}: they were written by other means than 'ttscompile calibrate'"

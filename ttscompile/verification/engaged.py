@@ -9,8 +9,9 @@ from time import perf_counter
 
 from ..artifact.golden import Golden
 from ..artifact.load import Artifact
+from ..artifact.manifest import PlanRecord
 from ..core.lattice import sparsity
-from ..core.plan import DENSE
+from ..core.plan import DENSE, FULL
 from ..core.spec import Noise
 from ..measure.timer import Timer
 from ..runtimes.policy import CompiledPolicy
@@ -70,15 +71,13 @@ def check_engaged(
 ) -> Rung:
     """Planned against executed cells, FLOPs and time of every plan; one that saves nothing fails."""
     manifest = artifact.manifest
-    if all(plan.kind == "all" for plan in manifest.plans.values()):
+    if manifest.plans.keys() <= {FULL}:
         told = "the artifact is not calibrated: every call computes all cells, and nothing is saved"
         return Rung(ENGAGED, SKIPPED, told, remedy="Run 'ttscompile calibrate' to give it a plan.")
     found = _measure(artifact, golden, policy, clock)
     details = {name: asdict(one) for name, one in found.items()}
     judged = {
-        name: _fault(
-            manifest.plans[name].kind, one, manifest.steps_of(manifest.plans[name].loop) * len(manifest.blocks)
-        )
+        name: _fault(plan := manifest.plans[name], one, manifest.steps_of(plan.loop) * len(manifest.blocks))
         for name, one in found.items()
     }
     faults = [f"plan {name!r} {fault}" for name, fault in judged.items() if fault]
@@ -136,16 +135,19 @@ def _measure(
             time_saved=1 - medians[name] / medians[DENSE],
         )
         for name, plan in manifest.plans.items()
-        if plan.kind != "all"
+        if name != FULL
     }
 
 
-def _fault(kind: str, one: Engagement, cells: int) -> str:
+def _fault(plan: PlanRecord, one: Engagement, cells: int) -> str:
     """Why a plan is inert; empty if it is not."""
     shown = f"{one.executed:.2%} of the cells"
+    if plan.kind == "all":
+        alike = one.flops_saved <= 0 and not plan.precision and plan.tokens is None
+        return "computes every cell: it is dense in disguise" if alike else ""
     if one.executed <= 0:
         return "computes every cell: it is dense in disguise"
-    if one.planned is not None and one.executed < one.planned - SHORT[kind]:
+    if one.planned is not None and one.executed < one.planned - SHORT[plan.kind]:
         return f"was to reuse {one.planned:.2%} of the cells and reuses {shown}, {one.legalised} being legalised"
     if one.legalised > LEGALISED * one.executed * cells:
         return f"has to be legalised in {one.legalised} cells of a second call: it reads what is never computed"

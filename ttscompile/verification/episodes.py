@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from ..artifact.golden import Golden
 from ..artifact.load import Artifact
-from ..core.plan import DENSE
+from ..core.plan import DENSE, FULL
 from ..core.spec import Noise, PolicySpec
 from ..runtimes.policy import CompiledPolicy
 from ..runtimes.random_calls import random_noise
@@ -60,7 +60,7 @@ def check_episodes(
     nothing is judged.
     """
     manifest = artifact.manifest
-    if all(plan.kind == "all" for plan in manifest.plans.values()):
+    if manifest.plans.keys() <= {FULL}:
         return Rung(SPARSITY, SKIPPED, "the artifact is not calibrated: every call computes all cells")
     spec, draw = manifest.spec, np.random.default_rng(0)
     errors: Errors = {name: [] for name in (*manifest.plans, None)}
