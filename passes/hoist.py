@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from ttscompile.core.spec import SamplerTable
+from ttscompile.core.spec import ORIGINAL, SamplerTable
 from ttscompile.ir.binding import bindings, input_bindings, numbering
 from ttscompile.ir.evaluate import evaluator
 from ttscompile.ir.flops import graph_flops
@@ -33,7 +33,7 @@ class Hoist(Pass[Cut, Program]):
 
     After::
 
-        tables[%k.part0]   [K, ...]                         # evaluated here, once for each timestep
+        tables[%k.part0]   [K, ...]                         # evaluated here, once for each timestep of a loop
         %k.part1 = condition(obs)                           # once a call
         block(stream, %k.part0, %k.part1)                   # concatenates: a copy, no arithmetic
         step(...)                                           # what needs both, all K steps in one batch
@@ -53,16 +53,18 @@ class Hoist(Pass[Cut, Program]):
         conditions = list(dict.fromkeys(at[Binding.CONDITION] + early[Binding.CONDITION]))
         tables = list(dict.fromkeys(at[Binding.TABLE] + at[Binding.CONSTANT] + early[Binding.TABLE]))
         condition = backward_slice(prologue, tuple(conditions), {})
+        evaluated = _evaluate_tables(prologue, tables, program)
         pieces = Pieces(
             **vars(loop),
             condition=replace(condition, inputs={k: types[k] for k in spec.observations}),
             step=step,
-            tables=_evaluate_tables(prologue, tables, program.weights, spec.sampler, spec.timestep_argument),
+            tables=evaluated.pop(ORIGINAL),
             bindings={
                 **dict.fromkeys(tables, Binding.TABLE),
                 **dict.fromkeys(conditions, Binding.CONDITION),
                 **dict.fromkeys(at[Binding.STEP], Binding.STEP),
             },
+            loop_tables=evaluated,
         )
         new = Program(
             spec,
@@ -71,6 +73,7 @@ class Hoist(Pass[Cut, Program]):
             program.blocks,
             pieces,
             dense_flops=program.dense_flops,
+            once_flops=program.once_flops,
             unmoved=program.unmoved,
         )
         return PassResult(new, _notes(new))
@@ -144,22 +147,22 @@ def _step_graph(
     return step, list(step.inputs), prologue
 
 
-def _evaluate_tables(
-    prologue: Graph, names: list[str], weights: Mapping[str, Any], sampler: SamplerTable, timestep: str
-) -> dict[str, npt.NDArray[Any]]:
-    """Rows of every table value, ``[K, *shape at a batch of one]``."""
+def _evaluate_tables(prologue: Graph, names: list[str], program: Cut) -> dict[str, dict[str, npt.NDArray[Any]]]:
+    """By loop, rows of every table value, ``[K, *shape at a batch of one]``."""
+    loops, timestep = program.spec.all_loops, program.spec.timestep_argument
     if not names:
-        return {}
+        return {loop: {} for loop in loops}
     graph = backward_slice(prologue, tuple(names), {})
     graph = replace(graph, inputs={timestep: prologue.inputs[timestep]})  # which says that the batch is one
-    run = evaluator(graph, weights)
-    rows: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in names}
+    run = evaluator(graph, program.weights)
+
+    def rows_of(sampler: SamplerTable) -> dict[str, npt.NDArray[Any]]:
+        steps = [run({timestep: t[None]}) for t in torch.from_numpy(sampler.timesteps)]
+        by_name = zip(names, zip(*steps, strict=True), strict=True)
+        return {name: np.stack([row.contiguous().numpy() for row in rows]) for name, rows in by_name}
+
     with torch.no_grad():
-        for t in torch.from_numpy(sampler.timesteps):
-            values = run({timestep: t[None]})
-            for name, value in zip(names, values, strict=True):
-                rows[name].append(value.contiguous().numpy().copy())
-    return {name: np.stack(values) for name, values in rows.items()}
+        return {loop: rows_of(sampler) for loop, sampler in loops.items()}
 
 
 def _notes(program: Program) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from ttscompile.core.spec import ORIGINAL
 from ttscompile.ir.dataflow import dominators, reaching
 from ttscompile.ir.flops import graph_flops, node_flops
 from ttscompile.ir.graph import Argument, Batch, Enum, Graph, Node, Ref, TensorType
@@ -36,7 +37,8 @@ class InsertPruner(Pass[Program, Program]):
         logits   = pruner.base + (code * pruner.step) @ pruner.block + mask       # [B, K, blocks, 4]
 
     What depends on step and block alone is a constant; only ``code`` depends on the observation. The plan is the
-    argmax over the sources. Before calibration it is dense.
+    argmax over the sources. Before calibration it is dense. A loop of another number of steps than the original's has a
+    head of its own.
 
     Attributes:
         rank: number of observation-dependent directions in the space of plans.
@@ -49,36 +51,45 @@ class InsertPruner(Pass[Program, Program]):
     def call(self, program: Program) -> PassResult[Program]:
         """Build the head and choose its features."""
         condition, features = _features(program)
-        types = condition.types()
-        steps, blocks = program.spec.sampler.steps, len(program.blocks)
-        inputs = sum(math.prod(_read(types[f])) for f in features)
-        head = self._fitted(inputs, steps, blocks, program.dense_flops)
-        parameters = first_numbers(inputs, head.width, head.rank, steps, blocks)
+        read = {f: condition.types()[f] for f in features}
+        loops = program.spec.all_loops
+        own = [name for name, table in loops.items() if name == ORIGINAL or table.steps != loops[ORIGINAL].steps]
+        made = {name: self._fitted(read, program, name) for name in own}
+        head, graph, parameters = made.pop(ORIGINAL)
         if taken := sorted(parameters.keys() & program.weights.keys()):
             raise self.fail(
                 f"the module has weights of its own called {', '.join(taken)}, as those of the plan head are."
                 " Rename the submodule 'pruner'."
             )
-        graph = head._head({f: types[f] for f in features}, parameters, steps, blocks)
-        pieces = replace(program.pieces, condition=condition, pruner=graph, features=features)
+        pruners = {name: each for name, (_, each, _) in made.items()}
+        pieces = replace(program.pieces, condition=condition, pruner=graph, features=features, loop_pruners=pruners)
         pieces = replace(pieces, bindings={**pieces.bindings, **dict.fromkeys(features, Binding.CONDITION)})
-        new = replace(program, pieces=pieces, weights={**program.weights, **parameters})
-        where = ", ".join(f"%{f} {types[f]}" for f in features)
+        weights = {name: numbers for name, (_, _, numbers) in made.items()}
+        new = replace(program, pieces=pieces, weights={**program.weights, **parameters}, loop_weights=weights)
+        where = ", ".join(f"%{f} {type_}" for f, type_ in read.items())
         share = graph_flops(graph) / max(program.dense_flops, 1)
         notes = [f"reads {where}", f"rank {head.rank}, {graph_flops(graph):,} FLOPs, {share:.4%} of a dense call"]
         if share > MAX_SHARE:
             notes.append(f"more than {MAX_SHARE:.0%} even at its smallest: on a policy this small sparsity hardly pays")
         return PassResult(new, tuple(notes))
 
-    def _fitted(self, inputs: int, steps: int, blocks: int, dense: int) -> InsertPruner:
-        """This head, halved until it costs at most ``MAX_SHARE`` of a dense call or cannot shrink."""
+    def _fitted(
+        self, features: dict[str, TensorType], program: Program, loop: str
+    ) -> tuple[InsertPruner, Graph, Parameters]:
+        """The head of a loop: this one, halved until it costs at most ``MAX_SHARE`` of a dense call or cannot shrink.
+
+        With it come its graph and its first numbers.
+        """
+        steps, blocks = program.spec.all_loops[loop].steps, len(program.blocks)
+        inputs, dense = sum(math.prod(_read(type_)) for type_ in features.values()), program.flops_of(loop)
         head = self
         while head.rank > 1:
             contractions = inputs * head.width + head.width * head.rank + steps * head.rank * blocks * SOURCES
             if 2 * contractions <= MAX_SHARE * dense:
                 break
             head = InsertPruner(rank=head.rank // 2, width=max(head.width // 2, 4))
-        return head
+        parameters = first_numbers(inputs, head.width, head.rank, steps, blocks)
+        return head, head._head(features, parameters, steps, blocks), parameters
 
     def _head(self, features: dict[str, TensorType], parameters: Parameters, steps: int, blocks: int) -> Graph:
         nodes: list[Node] = []

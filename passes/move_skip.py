@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from ttscompile.core.spec import PolicySpec
 from ttscompile.ir.graph import Graph, Ref
 from ttscompile.ir.program import Captured
 
@@ -25,11 +26,11 @@ class MoveSkip(Pass[Captured, Captured]):
         %f          = network(%sample)                        # its residual stream is inside
         %prediction = aten.add.Tensor(%sample, %f)            # a path around all of it
 
-    After, with a sampler whose table adds the sample (``SamplerTable.with_skip``)::
+    After, with samplers whose tables add the sample (``SamplerTable.with_skip``), in every loop::
 
         %f          = network(%sample)                        # the prediction
 
-    The sampler is linear in the prediction, so no sample changes by more than rounding.
+    A sampler is linear in the prediction, so no sample changes by more than rounding.
     """
 
     def call(self, program: Captured) -> PassResult[Captured]:
@@ -40,9 +41,13 @@ class MoveSkip(Pass[Captured, Captured]):
             raise self.fail("the prediction is not the sample plus something of its type.")
         nodes = tuple(node for node in graph.nodes if node.name not in graph.outputs)
         moved = replace(graph, nodes=nodes, outputs=(inside,))
-        table = replace(spec, sampler=spec.sampler.with_skip())
         note = f"the sampler's table adds %{spec.sample_argument} to the prediction, which is %{inside} now"
-        return PassResult(replace(program, denoiser=moved, spec=table, unmoved=spec.sampler), (note,))
+        return PassResult(replace(program, denoiser=moved, spec=_with_skips(spec), unmoved=spec), (note,))
+
+
+def _with_skips(spec: PolicySpec) -> PolicySpec:
+    loops = {name: table.with_skip() for name, table in spec.loops.items()}
+    return replace(spec, sampler=spec.sampler.with_skip(), loops=loops)
 
 
 def _network(graph: Graph, sample: str) -> str | None:

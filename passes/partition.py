@@ -76,6 +76,7 @@ class Partition(Pass[Captured, Cut]):
             prologue,
             loop,
             dense_flops=program.dense_flops,
+            once_flops=program.once_flops,
             unmoved=program.unmoved,
         )
         return PassResult(cut, (note,))

@@ -102,7 +102,7 @@ class CompiledPolicy:
             observation=manifest.spec.observations,
             action=manifest.spec.chunk,
             sample=manifest.spec.sample,
-            original_sample=manifest.spec.original.sample,
+            original_sample=manifest.spec.whole_horizon.sample,
             stochastic=manifest.spec.sampler.stochastic,
             identity=manifest.identity,
             model_identity=manifest.model_identity,
@@ -320,7 +320,7 @@ class CompiledPolicy:
 
     def _draw(self, streams: int) -> Noise:
         """Noise of all steps of the original's horizon: a seed means the same however many are predicted."""
-        spec = self._manifest.spec.original
+        spec = self._manifest.spec.whole_horizon
         shape, predicted = (streams, *spec.sample), self._manifest.spec.sample[0]
         initial = self._rng.standard_normal(shape, dtype=np.float32)[:, :predicted]
         if not spec.sampler.stochastic:

@@ -19,7 +19,7 @@ from .capture.export import capture
 from .capture.narrow import narrow, unneeded
 from .core.coercion import integer
 from .core.paths import on_hub, require_free_or_path
-from .core.spec import AUTO, FP32, INT8, PolicySpec
+from .core.spec import AUTO, FP32, INT8, ORIGINAL, PolicySpec
 from .errors import ArtifactError, LoweringError, NoResidualBlocksError, PassError, SpecError
 from .frontends import files_beside, load_checkpoint_policy
 from .frontends.copies import own_copy
@@ -29,7 +29,7 @@ from .hub import fetch_checkpoint
 from .ir.dataflow import reachable_from
 from .ir.flops import graph_flops, node_flops
 from .ir.graph import Graph
-from .ir.pieces import is_block
+from .ir.pieces import is_block, is_of_loop, of_loop
 from .ir.program import Captured, Cut, Program
 from .ir.verify import verify
 from .lower.joint import lower_all_blocks
@@ -92,10 +92,10 @@ def convert(
             ``huggingface_hub`` downloads, once. The artifact says from which commit it is, and under which licence.
         directory: where the artifact goes; an artifact that is there is replaced, anything else is left alone.
         format: name of the policy's family, ``diffusion_policy`` or ``lerobot``; ``auto`` tells by what is there.
-        sampler: ``ddpm``, ``ddim`` or ``dpmsolver++`` in place of a diffusion policy's own, ``euler`` or ``rk4`` in
-            place of a flow-matching policy's; None keeps it.
-        steps: number of denoising or integration steps; None keeps the checkpoint's. ``rk4`` evaluates the network four
-            times a step: K = 4 ``steps``.
+        sampler: ``ddpm``, ``ddim`` or ``dpmsolver++`` of a policy that was trained with diffusion, ``euler`` or ``rk4``
+            of one that was trained with flow matching: a loop beside the policy's own. None: its own sampler.
+        steps: number of denoising or integration steps of that loop; None: as many as the checkpoint's own has.
+            ``rk4`` evaluates the network four times a step: K = 4 ``steps``.
         spacing: ``leading``, ``trailing`` or ``linspace``: the timesteps that fewer steps visit. None: the checkpoint's
             own, or diffusers' default (``leading`` of DDIM); of ``dpmsolver++`` in place of another sampler
             ``trailing``, or ``leading`` for a policy that predicts noise without a bound on the sample.
@@ -108,8 +108,9 @@ def convert(
         prediction_horizon: predict only the first so many steps of the policy's horizon; see ``compile_denoiser``.
         precision: of the weights: ``fp32``, ``int8`` or ``auto``; see ``compile_denoiser``.
         keep_fp32: what stays in fp32 beside another precision; see ``compile_denoiser``.
-        single_file: where one ONNX file of the whole call goes too, for programs without ttscompile; None for none.
-            ``ttscompile.lower.single_file`` describes its inputs and outputs.
+        single_file: where one ONNX file of the whole call goes too, for programs without ttscompile; None for none. It
+            is of the loop that is asked for, or else of the policy's own. ``ttscompile.lower.single_file`` describes
+            its inputs and outputs.
         explain: told what each stage did.
 
     Raises:
@@ -129,7 +130,10 @@ def convert(
     beside = files_beside(checkpoint, spec)
     if spec.source.get("format") == "lerobot" and not beside:
         explain("files_beside", ("none for LeRobot: the instruction holds the state",))
-    return _compile(module, spec, directory, prediction_horizon, precision, keep_fp32, single_file, explain, beside)
+    loop = next(iter(spec.loops), ORIGINAL)
+    return _compile(
+        module, spec, directory, prediction_horizon, precision, keep_fp32, single_file, explain, beside, loop
+    )
 
 
 def compile_denoiser(
@@ -158,7 +162,7 @@ def compile_denoiser(
             tenth of what other noise does.
         keep_fp32: parts that stay in fp32 whatever the precision: ``blocks``; ``prologue``, or a piece of it by name,
             ``frame_00``, ``condition`` or ``step``.
-        single_file: see ``convert``.
+        single_file: see ``convert``; of the policy's own loop.
         explain: told what each stage did.
 
     Returns:
@@ -168,7 +172,9 @@ def compile_denoiser(
         TtscompileError: it cannot be captured, it has no residual blocks, or the artifact cannot be written.
     """
     module = own_copy(module)  # the program, which is returned, shares memory with it
-    return _compile(module, spec, directory, prediction_horizon, precision, keep_fp32, single_file, explain, {})
+    return _compile(
+        module, spec, directory, prediction_horizon, precision, keep_fp32, single_file, explain, {}, ORIGINAL
+    )
 
 
 def _compile(
@@ -181,8 +187,9 @@ def _compile(
     single_file: str | os.PathLike[str] | None,
     explain: Explain,
     beside: Mapping[str, bytes],
+    loop: str,
 ) -> Program:
-    """See ``compile_denoiser``; ``beside`` goes into the directory, for other programs.
+    """See ``compile_denoiser``; ``beside`` goes into the directory, for other programs. The single file is of ``loop``.
 
     Nobody else may change the module: the program shares memory with it.
     """
@@ -193,8 +200,8 @@ def _compile(
         _require_apart(single_file, directory)
     if prediction_horizon is not None or spec.left_out:
         kept = spec.sample[0] if prediction_horizon is None else prediction_horizon
-        spec, changed = narrow(module, spec.original, kept)
-        told = f"{kept} of {spec.original.sample[0]} steps are predicted"
+        spec, changed = narrow(module, spec.whole_horizon, kept)
+        told = f"{kept} of {spec.whole_horizon.sample[0]} steps are predicted"
         explain("narrow", (f"{told}; they differ from the original's by {changed:.1g} of their deviation",))
     program = transform(module, spec, explain=explain)
     if prediction_horizon is None and (hint := unneeded(module, spec)) is not None:
@@ -203,21 +210,31 @@ def _compile(
         return program
     models = lower_program(program)
     explain("lower", (f"{len(models)} ONNX models",))
-    lowered = None if precision == FP32 else _lower_pieces(program, models, precision, keep_fp32, explain)
+    written, own_models = _of_one_loop(program, models, loop)
+    lowered = None if precision == FP32 else _lower_pieces(written, own_models, precision, keep_fp32, explain)
     whole: bytes | None = None
     if single_file is not None:  # made before anything is written: without one there is no artifact either
         own, weights = ({}, {}) if lowered is None else (lowered.models, lowered.weights)
-        model = lower_single_file(program, {**models, **own}, {**program.weights, **weights})
+        model = lower_single_file(program, {**models, **own}, {**program.weights, **weights}, loop)
         whole = model.SerializeToString(deterministic=True)
     if directory is not None:
         golden = record_original(module, program)
-        explain("record_original", (f"{len(golden.steps)} of {spec.sampler.steps} steps, {golden.streams} streams",))
-        manifest = write_artifact(program, models, directory, lowered, golden, beside)
+        told = f"{len(golden.steps)} of {spec.sampler.steps} steps, {golden.streams} streams"
+        further = (f"{name}: {len(golden.loops[name].steps)} of {table.steps}" for name, table in spec.loops.items())
+        explain("record_original", (told, *further))
+        manifest = write_artifact(written, own_models, directory, lowered, golden.in_loop(loop), beside)
         explain("write", (f"identity {manifest.short_identity}",))
     if whole is not None and single_file is not None:
         _write(Path(single_file), whole)
         explain("write_single_file", (f"{len(whole) / 1e6:.1f} MB",))
     return program
+
+
+# To be removed, with all that calls it, when an artifact holds several loops.
+def _of_one_loop(program: Program, models: Models, loop: str) -> tuple[Program, Models]:
+    """Program and models that have this loop alone, in place of the original: what ``write_artifact`` takes so far."""
+    models = {**models, **{each: models[of_loop(each, loop)] for each in models if of_loop(each, loop) in models}}
+    return program.in_loop(loop), {name: model for name, model in models.items() if not is_of_loop(name)}
 
 
 def _require_apart(single_file: str | os.PathLike[str], directory: str | os.PathLike[str] | None) -> None:
@@ -281,8 +298,10 @@ def transform(module: nn.Module, spec: PolicySpec, *, explain: Explain = _silent
     graph, weights = capture(module, spec)
     megabytes = sum(w.nbytes for w in weights.values()) / 1e6
     explain("capture", (f"{len(graph.nodes)} operations, {megabytes:.1f} MB of weights",))
-    whole = capture(module, spec.original)[0] if spec.left_out else graph
-    captured = Captured(spec, graph, weights, dense_flops=_dense_flops(module, whole, spec))
+    whole = capture(module, spec.whole_horizon)[0] if spec.left_out else graph
+    once = _encoder_flops(module, whole, spec)
+    dense = (graph_flops(whole) - once) * spec.sampler.steps + once
+    captured = Captured(spec, graph, weights, dense_flops=dense, once_flops=once)
     verify(captured)
     for simplify in (CleanUp[Captured](), CutCopies(), WidenAttention(), RegroupSums()):
         captured = _run(simplify, captured, explain)
@@ -322,13 +341,12 @@ def _finer_inside(captured: Captured) -> bool:
     return whole == 1 < inside
 
 
-def _dense_flops(module: nn.Module, graph: Graph, spec: PolicySpec) -> int:
-    """FLOPs of a call as the original makes it: the whole graph at every step, but an observation encoder once."""
-    once = 0
-    if parts(module).encoder is not None:
-        types, loop = graph.types(), reachable_from(graph, [spec.sample_argument, spec.timestep_argument])
-        once = sum(node_flops(node, types) for node in graph.nodes if node.name not in loop)
-    return (graph_flops(graph) - once) * spec.sampler.steps + once
+def _encoder_flops(module: nn.Module, graph: Graph, spec: PolicySpec) -> int:
+    """FLOPs of what the original evaluates once a call, and not at every step: its observation encoder."""
+    if parts(module).encoder is None:
+        return 0
+    types, loop = graph.types(), reachable_from(graph, [spec.sample_argument, spec.timestep_argument])
+    return sum(node_flops(node, types) for node in graph.nodes if node.name not in loop)
 
 
 def _run(each: Pass[Before, After], program: Before, explain: Explain) -> After:

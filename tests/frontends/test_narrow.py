@@ -36,7 +36,7 @@ def test_steps_can_be_left_out_of_causal_networks_only(
             narrowed, difference = narrow(module, spec, KEPT)
         assert difference < 5 * bound(counted.terms, counted.angle)  # of the deviation; the largest number is no five
         assert (narrowed.sample, narrowed.left_out) == ((KEPT, spec.sample[1]), HORIZON - KEPT)
-        assert narrowed.original == spec
+        assert narrowed.whole_horizon == spec
         assert "of 6 predicted steps 1 to 3 are executed" in (unneeded(module, spec) or "")
     else:
         with pytest.raises(SpecError, match=r"is 4, but these steps depend on the 2 after them: .*predict all 6"):
@@ -105,7 +105,7 @@ def test_the_rest_of_the_prediction_is_the_original(payload: Build, save: Save, 
     folder = tmp_path / "narrow"
     program = ttscompile.convert(checkpoint, folder, prediction_horizon=KEPT)
     artifact = load_artifact(folder)
-    assert to_json(artifact.manifest.spec.original) == to_json(original)
+    assert to_json(artifact.manifest.spec.whole_horizon) == to_json(original)
     # Of the original's FLOPs two thirds are left, and less where more than tokens counts.
     assert artifact.manifest.flops.call(artifact.schedule("dense"), pruned=False) < 0.7 * program.dense_flops
 

@@ -10,14 +10,14 @@ are a pattern that repeats. Whoever checks needs numpy alone.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..core.spec import FloatArray, Noise, PolicySpec
+from ..core.spec import ORIGINAL, FloatArray, Noise, PolicySpec
 from ..errors import ArtifactError
 from ..ir.graph import TensorType
 from ..ir.pieces import LAYERS
@@ -26,6 +26,7 @@ from .strict_json import REMEDY
 
 if TYPE_CHECKING:
     from .load import Artifact
+    from .manifest import Manifest
 
 Array = npt.NDArray[Any]
 
@@ -36,11 +37,13 @@ PATTERN = 16384
 """Numbers of one stream's observation that are stored; a larger observation repeats them."""
 
 _PREFIXES = {"observations": "observation/", "normalized": "normalized/"}
+_COMMON = ("observations", "normalized", "initial", "scales", "loops")
+"""What the records of all loops have in common, and what is of the original alone."""
 
 
 @dataclass(frozen=True, eq=False)
 class Golden:
-    """Inputs of one call of B streams, and what the original module made of them in eager PyTorch.
+    """Inputs of one call of B streams, and what the original module made of them in eager PyTorch, in one loop.
 
     Residuals are those of the captured graph before any pass of the compiler changed it.
 
@@ -62,6 +65,7 @@ class Golden:
         sample: float32 ``[B, T, D]``, the denoised sample.
         actions: float32 ``[B, T, Da]``, the same as ``action_pred``.
         executed: float32 ``[B, Ta, Da]``, the same as ``action``.
+        loops: by further loop, the record of a call in it; with the same observations, initial sample and scales.
     """
 
     observations: Mapping[str, Array]
@@ -80,6 +84,11 @@ class Golden:
     sample: FloatArray
     actions: FloatArray
     executed: FloatArray
+    loops: Mapping[str, Golden] = field(default_factory=dict)
+
+    def in_loop(self, name: str) -> Golden:
+        """The record of one loop alone."""
+        return replace(self, loops={}) if name == ORIGINAL else self.loops[name]
 
     @property
     def streams(self) -> int:
@@ -92,13 +101,13 @@ class Golden:
         return Noise(self.initial, self.draws)
 
     def arrays(self) -> dict[str, Array]:
-        """All of it by name, for a file."""
-        found: dict[str, Array] = {}
-        for name, value in vars(self).items():
-            if name in _PREFIXES:
-                found |= {_PREFIXES[name] + key: array for key, array in value.items()}
-            elif value is not None:
-                found[name] = value
+        """All of it by name, for a file: what is of a further loop as ``loop/NAME/path``."""
+        found: dict[str, Array] = {"initial": self.initial, "scales": self.scales}
+        for name, prefix in _PREFIXES.items():
+            found |= {prefix + key: array for key, array in getattr(self, name).items()}
+        for loop, record in {ORIGINAL: self, **self.loops}.items():
+            own = {name: value for name, value in vars(record).items() if name not in _COMMON and value is not None}
+            found |= {_start(loop) + name: value for name, value in own.items()}
         return found
 
     def raw_observations(self, spec: PolicySpec) -> dict[str, Array]:
@@ -138,7 +147,7 @@ def load_golden(artifact: Artifact) -> Golden:
     Raises:
         ArtifactError: it has none, or one that does not fit.
     """
-    manifest, spec, steps = artifact.manifest, artifact.manifest.spec, artifact.manifest.steps
+    manifest, spec = artifact.manifest, artifact.manifest.spec
     if manifest.stores.golden is None:
         raise ArtifactError(
             f"{artifact.path}: expected a golden record of the original network; found none: it was written by"
@@ -146,12 +155,53 @@ def load_golden(artifact: Artifact) -> Golden:
         )
     with artifact.reading(manifest.stores.golden):
         arrays, where = tensors.read(artifact.files / manifest.stores.golden), f"{artifact.path}: golden record"
-    kept = {name: arrays.get(name, np.zeros(0)) for name in ("initial", "steps", "evaluated")}
-    streams, anchors, evaluated = (len(array) if array.ndim else 0 for array in kept.values())
-    sample, projected = (streams, *spec.sample), (steps, streams, DIGITS)
+    streams = _length(arrays, "initial")
+    wanted: dict[str, tuple[str, tuple[int, ...]]] = {
+        "initial": ("float32", (streams, *spec.sample)),
+        "scales": ("float32", (len(manifest.blocks),)),
+    }
+    for key, one in spec.observations.items():
+        shape = (streams, pattern_size(one.shape))
+        wanted[_PREFIXES["observations"] + key] = (one.dtype, shape)
+        wanted[_PREFIXES["normalized"] + key] = (one.dtype if one.normalizer is None else "float32", shape)
+    for loop in spec.all_loops:
+        wanted |= _wanted_of(loop, manifest, arrays, streams)
+    tensors.check_arrays("array", arrays, wanted, where)
+    for loop, sampler in spec.all_loops.items():
+        kept = [arrays[_start(loop) + name] for name in ("steps", "evaluated")]
+        at = np.concatenate(kept)
+        if not (streams and all(map(len, kept)) and ((at >= 0) & (at < sampler.steps)).all()):
+            told = f"expected streams, and steps of 0..{sampler.steps - 1} of the loop {loop}"
+            raise ArtifactError(f"{where}: {told}; found none, or others. {REMEDY}")
+    mappings = {name: {key: arrays[start + key] for key in spec.observations} for name, start in _PREFIXES.items()}
+    common = {**mappings, "initial": arrays["initial"], "scales": arrays["scales"]}
+    own = [each.name for each in fields(Golden) if each.name not in _COMMON]
+    records = {
+        loop: Golden(**common, **{name: arrays.get(_start(loop) + name) for name in own})  # type: ignore[arg-type]
+        for loop in spec.all_loops
+    }
+    return replace(records.pop(ORIGINAL), loops=records)
+
+
+def _start(loop: str) -> str:
+    """Before the names of arrays that are of a loop; nothing for the original."""
+    return "" if loop == ORIGINAL else f"loop/{loop}/"
+
+
+def _length(arrays: Mapping[str, Array], name: str) -> int:
+    """Of the first axis of an array that may be missing."""
+    return len(arrays[name]) if name in arrays and arrays[name].ndim else 0
+
+
+def _wanted_of(
+    loop: str, manifest: Manifest, arrays: Mapping[str, Array], streams: int
+) -> dict[str, tuple[str, tuple[int, ...]]]:
+    """Dtype and shape of every array that is of one loop, by its name."""
+    spec, start = manifest.spec.in_loop(loop), _start(loop)
+    anchors, evaluated = (_length(arrays, start + name) for name in ("steps", "evaluated"))
+    steps, sample = spec.sampler.steps, (streams, *spec.sample)
+    projected = (steps, streams, DIGITS)
     float32: dict[str, tuple[int, ...]] = {
-        "initial": sample,
-        "scales": (len(manifest.blocks),),
         "residuals": (anchors, len(manifest.blocks), streams, DIGITS),
         "inputs": (evaluated, *sample),
         "outputs": (evaluated, *sample),
@@ -165,19 +215,8 @@ def load_golden(artifact: Artifact) -> Golden:
         float32["draws"] = (steps, *sample)
     if LAYERS in manifest.pieces:
         float32["layers"] = (evaluated, len(manifest.pieces[LAYERS].outputs), DIGITS)
-    wanted = {name: ("float32", shape) for name, shape in float32.items()}
-    wanted |= {"steps": ("int64", (anchors,)), "evaluated": ("int64", (evaluated,))}
-    for key, one in spec.observations.items():
-        shape = (streams, pattern_size(one.shape))
-        wanted[_PREFIXES["observations"] + key] = (one.dtype, shape)
-        wanted[_PREFIXES["normalized"] + key] = (one.dtype if one.normalizer is None else "float32", shape)
-    tensors.check_arrays("array", arrays, wanted, where)
-    at = np.concatenate([kept["steps"], kept["evaluated"]])
-    if not (streams and anchors and evaluated and ((at >= 0) & (at < steps)).all()):
-        raise ArtifactError(f"{where}: expected streams, and steps of 0..{steps - 1}; found none, or others. {REMEDY}")
-    mappings = {name: {key: arrays[start + key] for key in spec.observations} for name, start in _PREFIXES.items()}
-    single = {each.name: arrays.get(each.name) for each in fields(Golden) if each.name not in mappings}
-    return Golden(**mappings, **single)  # type: ignore[arg-type]
+    wanted = {start + name: ("float32", shape) for name, shape in float32.items()}
+    return wanted | {f"{start}steps": ("int64", (anchors,)), f"{start}evaluated": ("int64", (evaluated,))}
 
 
 def load_golden_plans(artifact: Artifact, streams: int) -> dict[str, GoldenPlan]:

@@ -274,7 +274,8 @@ def _require_same_policy(artifact: Artifact, other: Artifact, name: str) -> None
     """Refuse an artifact that was made from another checkpoint; says what differs."""
     specs = artifact.manifest.spec, other.manifest.spec
     ours, theirs = (
-        (s.original.sample, {k: o.shape for k, o in s.observations.items()}, s.chunk.start, s.chunk.stop) for s in specs
+        (s.whole_horizon.sample, {k: o.shape for k, o in s.observations.items()}, s.chunk.start, s.chunk.stop)
+        for s in specs
     )
     # Masks and position tables are shorter where fewer steps are predicted; the weights proper are not.
     narrower = specs[0].sample != specs[1].sample
@@ -315,7 +316,7 @@ def _measure(
     ``chosen`` has the number of the episode, and the row in it, of each call.
     """
     # Noise of the original's shape fits every artifact of the policy, however many steps it predicts.
-    spec, draw = artifact.manifest.spec.original, np.random.default_rng((seed, 4))
+    spec, draw = artifact.manifest.spec.whole_horizon, np.random.default_rng((seed, 4))
     exact = artifact.at_precision(FP32).with_reuse(None)
     truth = CompiledPolicy(exact, open_runtime(exact, "onnxruntime", threads))
     errors: list[list[float]] = [[] for _ in entrants]

@@ -227,7 +227,7 @@ def _eager(checkpoint: Path, encoders: Path | None, threads: int, manifest: Mani
     torch.set_num_threads(threads)
     dense, sampler = manifest.flops.dense, original.sampler
     if not as_saved:
-        whole = manifest.spec.original
+        whole = manifest.spec.whole_horizon
         return network_contestant("eager PyTorch", eager_policy(module, whole), whole, dense)
     # An encoder runs once a call, whatever the sampler: what it takes is not known apart.
     flops = dense / manifest.steps * sampler.steps if parts(module).encoder is None else None
@@ -272,7 +272,7 @@ def network_contestant(label: str, run: EagerPolicy, spec: PolicySpec, dense_flo
 
 def _interface(spec: PolicySpec) -> str:
     observations = ", ".join(f"{key} {observation.shape}" for key, observation in spec.observations.items())
-    return f"sample {spec.original.sample}, observations {observations}"
+    return f"sample {spec.whole_horizon.sample}, observations {observations}"
 
 
 def _different_statistics(found: PolicySpec, expected: PolicySpec) -> list[str]:

@@ -27,6 +27,8 @@ class Rule:
 _DTYPES = ("float32", "float64", "float16", "int64", "int32", "int16", "int8", "uint8", "bool")
 
 DType = Annotated[str, Rule(f"one of {', '.join(_DTYPES)}", _DTYPES.__contains__)]
+LOOP_NAME = Rule("a name of lower-case letters, digits and + . -", re.compile(r"[a-z0-9][a-z0-9+.-]{0,63}").fullmatch)
+LoopName = Annotated[str, LOOP_NAME]
 NotNegative = Annotated[float, Rule("a number that is not negative", lambda x: x >= 0)]
 Positive = Annotated[int, Rule("a 64-bit integer of at least 1", lambda n: n >= 1)]
 Sha256 = Annotated[str, Rule("64 hexadecimal digits", re.compile(r"[0-9a-f]{64}").fullmatch)]

@@ -1,4 +1,4 @@
-"""What a policy is beside its network: sampler tables, normaliser, chunking, observations. Frozen and checked.
+"""What a policy is beside its network: denoising loops, normaliser, chunking, observations. Frozen and checked.
 
 Nothing here imports torch; the same records are written to the artifact and read on the robot.
 """
@@ -14,16 +14,19 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import SpecError
-from .coercion import integer, listed, numbers
-from .rules import DType, Positive
-
-FloatArray = npt.NDArray[np.float32]
+from .coercion import integer, numbers
+from .rules import LOOP_NAME, DType, LoopName, Positive
+from .sampler import FloatArray as FloatArray
+from .sampler import SamplerTable as SamplerTable
 
 FP32, INT8, BF16, FP16 = "fp32", "int8", "bf16", "fp16"
 PRECISIONS = (FP32, INT8)
 """Names of what an artifact can hold its weights in."""
 AUTO = "auto"
 """In place of a precision: int8 in the parts that it changes little, as measured in actions."""
+
+ORIGINAL = "original"
+"""The loop that a policy was trained to run in: ``PolicySpec.sampler``."""
 
 WITHOUT = "without"
 """In ``PolicySpec.source``: the cameras of the checkpoint that were left out, with commas between."""
@@ -69,113 +72,6 @@ class Affine:
     def unnormalize(self, x: npt.NDArray[np.float32]) -> FloatArray:
         """``(x - offset) / scale`` over the last axis."""
         return np.asarray((x - self.offset) / self.scale, dtype=np.float32)
-
-
-@dataclass(frozen=True)
-class SamplerTable:
-    """One denoising loop as numbers: row k takes the sample from step k to k + 1.
-
-    With network output ``out``, and S memories of the sample's shape that are zeros before step 0::
-
-        x0        = clip(sample_to_x0[k] * x + out_to_x0[k] * out, -clip, clip)
-        next      = x0_to_next[k] * x0 + sample_to_next[k] * x + out_to_next[k] * out + noise_to_next[k] * noise
-                    + sum over s: memory_to_next[k, s] * memory[s]
-        memory[s] = to_memory[k, s] . [x0, x, out, memory[0], ..., memory[S - 1]]       all s at once, after ``next``
-
-    The tables are computed at compile time: from diffusers' scheduler (``ttscompile.samplers``), or for flow matching
-    from the method's definition (``ttscompile.samplers.flow``). Columns are float32 ``[K]``. A multistep solver keeps
-    earlier predictions in memories; a Runge-Kutta method, of which each evaluation is a step of its own here, what its
-    stages have in common.
-
-    Attributes:
-        name: ``ddpm``, ``ddim``, ``dpmsolver++``, ``euler``, ``rk4`` or ``edm``, for people.
-        timesteps: float32 ``[K]`` or int64 ``[K]``: what the network is given, in order of execution.
-        clip: bound on the predicted sample; None for no bound.
-        memory_to_next: float32 ``[K, S]``; empty where S = 0.
-        to_memory: float32 ``[K, S, 3 + S]``; empty where S = 0.
-    """
-
-    name: str
-    timesteps: npt.NDArray[np.int64] | FloatArray
-    sample_to_x0: FloatArray
-    out_to_x0: FloatArray
-    x0_to_next: FloatArray
-    sample_to_next: FloatArray
-    out_to_next: FloatArray
-    noise_to_next: FloatArray
-    clip: float | None
-    memory_to_next: FloatArray = field(default_factory=lambda: np.zeros((0, 0), np.float32))
-    to_memory: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 3), np.float32))
-
-    COLUMNS = ("sample_to_x0", "out_to_x0", "x0_to_next", "sample_to_next", "out_to_next", "noise_to_next")
-
-    def __post_init__(self) -> None:
-        timesteps = listed(self.timesteps, "sampler timesteps", SpecError, "float32")
-        kind = "int64" if timesteps.dtype.kind in "iu" else "float32"
-        object.__setattr__(self, "timesteps", numbers(timesteps, "sampler timesteps", SpecError, kind))
-        if timesteps.ndim != 1 or len(timesteps) == 0:
-            raise SpecError(f"sampler timesteps must be a non-empty vector; found shape {timesteps.shape}.")
-        for name in self.COLUMNS:
-            column = numbers(getattr(self, name), f"sampler column {name}", SpecError)
-            if column.shape != timesteps.shape or not np.isfinite(column).all():
-                raise SpecError(f"sampler column {name} must hold {len(timesteps)} finite numbers; found {column}.")
-            object.__setattr__(self, name, column)
-        memory_to_next, to_memory = (numbers(getattr(self, n), n, SpecError) for n in ("memory_to_next", "to_memory"))
-        if not memory_to_next.size and not to_memory.size:
-            memory_to_next, to_memory = (np.zeros((len(timesteps), 0, *rest), np.float32) for rest in ((), (3,)))
-        count = memory_to_next.shape[-1]
-        expected = ((len(timesteps), count), (len(timesteps), count, 3 + count))
-        if (memory_to_next.shape, to_memory.shape) != expected:
-            raise SpecError(
-                f"a sampler of {len(timesteps)} steps with S memories has memory_to_next [K, S] and to_memory"
-                f" [K, S, 3 + S]; found {memory_to_next.shape} and {to_memory.shape}."
-            )
-        if not (np.isfinite(memory_to_next).all() and np.isfinite(to_memory).all()):
-            raise SpecError("sampler memories must have finite coefficients.")
-        object.__setattr__(self, "memory_to_next", memory_to_next)
-        object.__setattr__(self, "to_memory", to_memory)
-
-    def with_skip(self) -> SamplerTable:
-        """The table for a network that predicts ``out - x``: it adds the sample itself, wherever ``out`` is read."""
-        return self._moved(1)
-
-    def without_skip(self) -> SamplerTable:
-        """The table of which ``with_skip`` makes this one."""
-        return self._moved(-1)
-
-    def _moved(self, times: int) -> SamplerTable:
-        to_memory = self.to_memory.copy()
-        to_memory[..., 1] += times * to_memory[..., 2]
-        return replace(
-            self,
-            sample_to_x0=self.sample_to_x0 + times * self.out_to_x0,
-            sample_to_next=self.sample_to_next + times * self.out_to_next,
-            to_memory=to_memory,
-        )
-
-    @property
-    def memories(self) -> int:
-        """S, how many arrays of the sample's shape are carried from step to step beside it."""
-        return int(self.memory_to_next.shape[1])
-
-    @property
-    def steps(self) -> int:
-        """K, the number of denoising steps."""
-        return len(self.timesteps)
-
-    @property
-    def bound(self) -> float | None:
-        """What no number of the denoised sample exceeds, either way; None if there is nothing that would see to that.
-
-        It is ``clip`` where the last step gives the clipped x0 and nothing beside.
-        """
-        beside = (self.sample_to_next[-1], self.out_to_next[-1], self.noise_to_next[-1], *self.memory_to_next[-1])
-        return self.clip if self.x0_to_next[-1] == 1 and not any(beside) else None
-
-    @property
-    def stochastic(self) -> bool:
-        """Whether any step adds noise, so that a call needs ``Noise.steps``."""
-        return bool((self.noise_to_next != 0).any())
 
 
 @dataclass(frozen=True)
@@ -319,13 +215,15 @@ class PolicySpec:
         sample: shape ``(T, D)`` of one stream's noisy sample.
         observations: condition inputs in the order of the module's keyword arguments; the keys are the keys of the
             observation dictionary that ``predict_action`` takes. Dots in a key are underscores in its argument's name.
-        sampler: the denoising loop.
+        sampler: the denoising loop that the policy was trained to run in, ``original``.
         chunk: from sample to actions.
         sample_argument: name of the module's sample argument.
         timestep_argument: name of the module's timestep argument (a ``[B]`` tensor).
         source: what this was compiled from, for people: format and variant, no path.
         left_out: steps that the original predicts after the last one of the sample (``ttscompile.capture.narrow``).
         instruction: of a policy that is told its task in words, which a text alone gives; None for all others.
+        loops: further denoising loops of the same network, by name: lower-case letters, digits, ``+ . -``. Sample,
+            observations and chunk are common to all.
     """
 
     sample: tuple[Positive, Positive]
@@ -337,6 +235,7 @@ class PolicySpec:
     source: Mapping[str, str] = field(default_factory=dict)
     left_out: int = 0
     instruction: Instruction | None = None
+    loops: Mapping[LoopName, SamplerTable] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         sizes = tuple(integer(n, "a size in the sample's shape", SpecError, 1) for n in self.sample)
@@ -365,6 +264,14 @@ class PolicySpec:
         if normalizer is not None and len(normalizer.scale) != self.chunk.action_dim:
             found = len(normalizer.scale)
             raise SpecError(f"action normaliser has {found} entries for {self.chunk.action_dim} channels.")
+        for name, table in self.loops.items():
+            if not isinstance(name, str) or name == ORIGINAL or not LOOP_NAME.holds(name):
+                told = f"expected {LOOP_NAME.expected}, and not {ORIGINAL!r}, which is the policy's own sampler"
+                raise SpecError(f"loop {name!r:.80}: {told}.")
+            kind, own = table.timesteps.dtype, self.sampler.timesteps.dtype
+            if kind != own:
+                told = f"its timesteps are {kind}, and those of the policy's own sampler {own}"
+                raise SpecError(f"loop {name!r}: {told}: one network takes one kind. Convert them.")
 
     @property
     def arguments(self) -> Mapping[str, str]:
@@ -372,9 +279,24 @@ class PolicySpec:
         return {key: key.replace(".", "_") for key in self.observations}
 
     @property
-    def original(self) -> PolicySpec:
+    def whole_horizon(self) -> PolicySpec:
         """The same with all steps that the original predicts."""
         return replace(self, sample=(self.sample[0] + self.left_out, self.sample[1]), left_out=0)
+
+    @property
+    def all_loops(self) -> dict[str, SamplerTable]:
+        """Every loop by name, ``original`` first."""
+        return {ORIGINAL: self.sampler, **self.loops}
+
+    def in_loop(self, name: str) -> PolicySpec:
+        """The policy that has this loop alone, as its own.
+
+        Raises:
+            SpecError: there is no such loop.
+        """
+        if name not in self.all_loops:
+            raise SpecError(f"loop {name!r:.80}: expected one of {', '.join(self.all_loops)}.")
+        return replace(self, sampler=self.all_loops[name], loops={})
 
 
 @dataclass(frozen=True)

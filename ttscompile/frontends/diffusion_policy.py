@@ -24,7 +24,7 @@ from .diffusion_policy_weights import affine, choose_weights
 from .families import LoadOptions
 from .interpolation import Config
 from .refusals import refuse_file, refuse_payload, refuse_policy
-from .scheduler import configured_sampler
+from .scheduler import configured_loops
 from .settings import Settings
 
 _POLICIES: Mapping[str, Callable[[Saved], Rebuilt]] = {
@@ -72,16 +72,19 @@ def build(payload: Mapping[str, Any], options: LoadOptions) -> tuple[nn.Module, 
     stop = min(rebuilt.start + saved.settings.number("n_action_steps"), rebuilt.sample[0])
     step_arguments = {key: policy[key] for key in policy if key not in COMMON_KEYS | rebuilt.known}
     scheduler, steps = policy["noise_scheduler"], policy.get("num_inference_steps")
+    loops = configured_loops(scheduler, steps, options, step_arguments=step_arguments)
+    source = {"format": "diffusion_policy", "policy": name, "variant": rebuilt.variant, "weights": which}
     spec = PolicySpec(
         sample=rebuilt.sample,
         observations=rebuilt.observations,
-        sampler=configured_sampler(scheduler, steps, options, step_arguments=step_arguments),
+        sampler=loops.original,
+        loops=loops.others,
         chunk=ChunkSpec(
             action_dim=rebuilt.action_dim,
             start=rebuilt.start,
             stop=stop,
             normalizer=affine(weights, "action", rebuilt.action_dim),
         ),
-        source={"format": "diffusion_policy", "policy": name, "variant": rebuilt.variant, "weights": which},
+        source={**source, **loops.source},
     )
     return rebuilt.module.eval(), spec

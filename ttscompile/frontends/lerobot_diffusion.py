@@ -25,7 +25,7 @@ from .encoded import EncodedDenoiser
 from .families import LoadOptions
 from .image_geometry import ResizeCrop
 from .lerobot_config import ENVIRONMENT, MOST, MOST_PIXELS, STATE, LeRobotConfig, read_lerobot_config
-from .lerobot_policy import Measured, diffusion_sampler, policy_spec, read_weights
+from .lerobot_policy import Measured, diffusion_loops, policy_spec, read_weights
 from .lerobot_processors import Processors, read_processors
 from .resnet import DEPTHS, SHRINKS, Norm, group_norm, resnet
 from .robomimic_encoder import SpatialSoftmax
@@ -160,7 +160,7 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
         raise CheckpointError(f"{directory}: {error}") from error
     module = EncodedDenoiser(encoder, network.unet)
     source = {"policy": "diffusion"} | ({"encoder": config.vision_backbone} if config.cameras else {})
-    return module.eval(), policy_spec(config, processors, diffusion_sampler(config, options), source)
+    return module.eval(), policy_spec(config, processors, diffusion_loops(config, options), source)
 
 
 def as_saved(network: Network) -> dict[str, torch.Tensor]:

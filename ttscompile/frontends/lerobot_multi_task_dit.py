@@ -24,8 +24,9 @@ from .encoded import EncodedDenoiser
 from .families import LoadOptions
 from .image_geometry import ResizeCrop
 from .lerobot_config import CONFIG, MOST, MOST_PIXELS, STATE, LeRobotConfig, read_lerobot_config
-from .lerobot_policy import Measured, diffusion_sampler, policy_spec, read_weights
+from .lerobot_policy import Measured, diffusion_loops, policy_spec, read_weights
 from .lerobot_processors import PREPROCESSOR, Processors, read_processors
+from .loops import Loops, loops_of
 from .multi_task_dit import DiffusionTransformer, DiTConfig, ObservationEncoder
 from .saved_weights import require_weights
 from .scheduler import MOST_STEPS
@@ -154,7 +155,7 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
         **({} if options.task is None else {"task": options.task}),
     }
     language = _language(config, text) if compiled_in is None else {}
-    return module.eval(), policy_spec(config, processors, _sampler(config, options), source, language)
+    return module.eval(), policy_spec(config, processors, _loops(config, options), source, language)
 
 
 def _language(config: MultiTaskDiTConfig, text: TextConfig) -> dict[str, ObservationSpec]:
@@ -188,10 +189,15 @@ def with_inputs(
     return EncodedDenoiser(condition, network.noise_predictor)
 
 
-def _sampler(config: MultiTaskDiTConfig, options: LoadOptions) -> SamplerTable:
-    """The denoising loop of the policy's objective."""
+def _loops(config: MultiTaskDiTConfig, options: LoadOptions) -> Loops:
+    """The denoising loops of the policy's objective."""
     if not config.flow:
-        return diffusion_sampler(config, options)
+        return diffusion_loops(config, options)
+    return loops_of(lambda each: _flow(config, each), options, "its own integration")
+
+
+def _flow(config: MultiTaskDiTConfig, options: LoadOptions) -> SamplerTable:
+    """The integration that is configured, or asked for in its place."""
     settings = config.settings
     if options.spacing is not None:
         raise SpecError("spacing is of the timesteps of diffusion; this policy's objective is flow matching.")

@@ -7,13 +7,14 @@ from collections.abc import Mapping
 import torch
 from torch import nn
 
-from ..core.spec import ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
+from ..core.spec import ChunkSpec, ObservationSpec, PolicySpec
 from .families import LoadOptions
 from .image_geometry import ResizeCrop
 from .lerobot_config import ACTION, CONFIG, WEIGHTS, LeRobotConfig
 from .lerobot_processors import Normalizer, Processors
+from .loops import Loops
 from .saved_weights import as_float32, read_tensors, require_memory
-from .scheduler import configured_sampler
+from .scheduler import configured_loops
 
 _SCHEDULER_SETTINGS = {
     "num_train_timesteps": 100,
@@ -57,7 +58,7 @@ class Measured(nn.Module):
 def policy_spec(
     config: LeRobotConfig,
     processors: Processors,
-    sampler: SamplerTable,
+    loops: Loops,
     source: Mapping[str, str],
     more: Mapping[str, ObservationSpec] | None = None,
 ) -> PolicySpec:
@@ -66,7 +67,7 @@ def policy_spec(
     Args:
         config: of the policy.
         processors: its normalisers, and the robot's names of the observations.
-        sampler: its denoising loop.
+        loops: its denoising loops.
         source: what distinguishes it, beside the format.
         more: observations beside those that ``Measured`` takes.
     """
@@ -74,7 +75,8 @@ def policy_spec(
     return PolicySpec(
         sample=(config.horizon, config.action_dim),
         observations=_observations(config, processors) | dict(more or {}),
-        sampler=sampler,
+        sampler=loops.original,
+        loops=loops.others,
         chunk=ChunkSpec(
             action_dim=config.action_dim,
             start=start,
@@ -82,7 +84,7 @@ def policy_spec(
             normalizer=None if processors.action is None else processors.action.inverse(),
             ranged=processors.action is not None and processors.action.mode == "MIN_MAX",
         ),
-        source={"format": "lerobot", **source},
+        source={"format": "lerobot", **source, **loops.source},
     )
 
 
@@ -99,8 +101,8 @@ def _observations(config: LeRobotConfig, processors: Processors) -> dict[str, Ob
     return specs
 
 
-def diffusion_sampler(config: LeRobotConfig, options: LoadOptions) -> SamplerTable:
-    """The denoising loop of a policy that was trained with diffusion; the defaults are lerobot's.
+def diffusion_loops(config: LeRobotConfig, options: LoadOptions) -> Loops:
+    """The denoising loops of a policy that was trained with diffusion; the defaults are lerobot's.
 
     Raises:
         CheckpointError: settings that are not possible.
@@ -111,7 +113,7 @@ def diffusion_sampler(config: LeRobotConfig, options: LoadOptions) -> SamplerTab
     scheduler["_target_"] = f"{config.settings.choice('noise_scheduler_type', 'DDPM', 'DDIM')}Scheduler"
     scheduler["prediction_type"] = config.settings.choice("prediction_type", "epsilon", "sample")
     where = str(config.directory / CONFIG)
-    return configured_sampler(scheduler, settings.get("num_inference_steps"), options, where=where)
+    return configured_loops(scheduler, settings.get("num_inference_steps"), options, where=where)
 
 
 def read_weights(config: LeRobotConfig, *without: str) -> dict[str, torch.Tensor]:

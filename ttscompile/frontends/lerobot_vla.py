@@ -6,6 +6,7 @@ Sources: ``lerobot.policies.common`` of huggingface/lerobot 0.6, and openpi, whe
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,6 +21,7 @@ from .families import LoadOptions
 from .lerobot_config import MOST, STATE, LeRobotConfig, read_lerobot_config
 from .lerobot_policy import policy_spec
 from .lerobot_processors import Normalizer, Processors, read_processors
+from .loops import loops_of
 from .scheduler import MOST_STEPS
 from .settings import Settings
 
@@ -99,7 +101,8 @@ def vla_spec(
     source = {"policy": str(config.settings.values["type"])}
     source |= {} if options.task is None else {"task": options.task}
     source |= {WITHOUT: ", ".join(options.without_cameras)} if options.without_cameras else {}
-    spec = policy_spec(config, processors, _sampler(config.settings, options), source, language)
+    loops = loops_of(lambda each: _sampler(config.settings, each), options, "its own integration")
+    spec = policy_spec(config, processors, loops, source, language)
     observations = dict(spec.observations)
     if image is not None:
         resized = ObservationSpec((1, 3, *image), bounds=(0.0, 1.0), fit=fit)
@@ -108,7 +111,7 @@ def vla_spec(
     plain = language and not processors.state_in_prompt
     told = Instruction(TOKENS, MASK, processors.new_line) if plain else None
     sample = (config.horizon, sizes["actions"])
-    return PolicySpec(sample, observations, spec.sampler, spec.chunk, source=spec.source, instruction=told)
+    return replace(spec, sample=sample, observations=observations, instruction=told)
 
 
 def _sampler(settings: Settings, options: LoadOptions) -> SamplerTable:

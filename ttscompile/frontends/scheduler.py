@@ -27,6 +27,7 @@ from ..errors import CheckpointError, SpecError, TtscompileError
 from ..samplers.flow import METHODS
 from ..samplers.table import sampler_table
 from .families import DIFFUSION_SAMPLERS, SPACINGS, LoadOptions
+from .loops import Loops, loops_of
 from .settings import Settings
 
 MOST_TIMESTEPS = 10_000
@@ -42,6 +43,15 @@ _NAMES = {each.__name__: name for name, each in _CLASSES.items()}
 _SETTINGS = {name: frozenset(inspect.signature(each).parameters) for name, each in _CLASSES.items()}
 
 
+def configured_loops(settings: Mapping[str, Any], own_steps: int | None, options: LoadOptions, **more: Any) -> Loops:
+    """The denoising loop that a checkpoint's ``noise_scheduler`` describes, and the one that is asked for.
+
+    The arguments and errors are those of ``configured_sampler``, and of ``loops_of``.
+    """
+    own = _own_class(settings)
+    return loops_of(lambda each: configured_sampler(settings, own_steps, each, **more), options, own or "no scheduler")
+
+
 def configured_sampler(  # noqa: C901, PLR0912  # each setting can be wrong in its own way
     settings: Mapping[str, Any],
     own_steps: int | None,
@@ -50,7 +60,7 @@ def configured_sampler(  # noqa: C901, PLR0912  # each setting can be wrong in i
     step_arguments: Mapping[str, Any] | None = None,
     where: str = "cfg.policy.noise_scheduler",
 ) -> SamplerTable:
-    """The denoising loop that a checkpoint's ``noise_scheduler`` describes.
+    """The denoising loop that a checkpoint's ``noise_scheduler`` describes, or the one that is asked for in its place.
 
     Args:
         settings: of the scheduler, with its class in ``_target_``.
@@ -68,7 +78,7 @@ def configured_sampler(  # noqa: C901, PLR0912  # each setting can be wrong in i
     """
     sampler, spacing = options.sampler, options.spacing
     steps = own_steps if options.steps is None else options.steps
-    own = str(settings.get("_target_", "")).rpartition(".")[2]
+    own = _own_class(settings)
     own_name = _NAMES.get(own)
     if sampler is not None and sampler not in DIFFUSION_SAMPLERS:
         raise SpecError(
@@ -125,6 +135,11 @@ def configured_sampler(  # noqa: C901, PLR0912  # each setting can be wrong in i
     except Exception as error:  # settings of a wrong type fail wherever diffusers first uses them
         refused = f"{given!s:.300}: {type(error).__name__}: {error!s:.200}"
         raise CheckpointError(f"{where}: diffusers refuses the settings {refused}") from error
+
+
+def _own_class(settings: Mapping[str, Any]) -> str:
+    """Name of the scheduler's class, without its module; empty where there is none."""
+    return str(settings.get("_target_", "")).rpartition(".")[2]
 
 
 def _for_dpm_solver(settings: Mapping[str, Any], where: str) -> dict[str, Any]:

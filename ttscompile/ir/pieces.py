@@ -35,6 +35,22 @@ TAIL = "tail"
 ADVANCE = "advance"
 """Tail, sampler update and the next step's stem in one (``lower.advance``)."""
 
+_OF_LOOP = "@"
+
+
+def of_loop(piece: str, loop: str) -> str:
+    """``advance@ddim-16``: a piece of a further loop that differs from that of the original loop, which has its name.
+
+    ``advance`` and the pruner may differ: of their samplers, and of their numbers of steps.
+    """
+    return f"{piece}{_OF_LOOP}{loop}"
+
+
+def is_of_loop(piece: str) -> bool:
+    """Whether a piece is of a further loop."""
+    return _OF_LOOP in piece
+
+
 JOINT = "blocks"
 """Any one of the blocks, chosen at each run (``ir.joint``)."""
 
@@ -123,7 +139,7 @@ def part_of(piece: str) -> str | None:
         return BLOCKS
     if of_tokens(piece):
         return _FRAME + piece.removeprefix(_TOKENS) if is_tokens(piece) else None
-    return None if piece in _SMALL else piece
+    return None if piece.partition(_OF_LOOP)[0] in _SMALL else piece
 
 
 # Values that several pieces of the loop have.

@@ -10,7 +10,7 @@ from typing import Any, Self, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from ..core.spec import PolicySpec, SamplerTable
+from ..core.spec import PolicySpec
 from .graph import Graph, TensorType
 from .pieces import CONDITION, FRAMES, PRUNER, STEM, STEP, TAIL, LoopPiece, block_name, frame_name
 
@@ -102,7 +102,8 @@ class Pieces(Loop):
         step: condition values and table rows -> step values; run with a batch of K*B, step-major. None if there are
             no step values.
         pruner: condition values -> logits ``[B, K, blocks, 4]``; None before ``InsertPruner``.
-        tables: value of each TABLE context for every step, ``[K, ...]`` with a batch of one in its batch axis.
+        tables: value of each TABLE context for every step of the original loop, ``[K, ...]`` with a batch of one in its
+            batch axis.
         bindings: binding of every context of the loop pieces and of ``step``.
         features: condition values that the pruner reads.
         frames: observations -> the rows of each tower ``[m * B, ...]``, in their order; None without towers.
@@ -110,6 +111,9 @@ class Pieces(Loop):
             are inputs of ``condition``.
         tokens: for towers that have tokens, by name: ``pixels_00``, row -> what patches are cut from; and
             ``tokens_00``, the tower for some of its tokens, of one row. There the symbolic size is their number.
+        loop_tables: by further loop, what ``tables`` has for the original.
+        loop_pruners: by further loop, the pruner of a loop that has another number of steps; the constants have the
+            names that those of ``pruner`` have.
     """
 
     condition: Graph
@@ -121,6 +125,8 @@ class Pieces(Loop):
     frames: Graph | None = None
     towers: tuple[Graph, ...] = ()
     tokens: Mapping[str, Graph] = field(default_factory=dict)
+    loop_tables: Mapping[str, Mapping[str, npt.NDArray[Any]]] = field(default_factory=dict)
+    loop_pruners: Mapping[str, Graph] = field(default_factory=dict)
 
     @property
     def rows(self) -> tuple[int, ...]:
@@ -150,7 +156,13 @@ class Pieces(Loop):
             frames=None if self.frames is None else function(self.frames),
             towers=tuple(map(function, self.towers)),
             tokens={name: function(graph) for name, graph in self.tokens.items()},
+            loop_pruners={name: function(graph) for name, graph in self.loop_pruners.items()},
         )
+
+    def in_loop(self, name: str) -> Self:
+        """Those of one loop alone, as of the original."""
+        tables, pruner = self.loop_tables.get(name, self.tables), self.loop_pruners.get(name, self.pruner)
+        return replace(self, tables=tables, pruner=pruner, loop_tables={}, loop_pruners={})
 
 
 def frame_values(
@@ -181,16 +193,18 @@ class Phase:
         spec: the policy beside its network.
         denoiser: graph of one evaluation: inputs sample, timestep, observations; output the prediction.
         weights: value of every constant of every graph.
-        dense_flops: of one call as the module makes it: K evaluations, one stream.
-        unmoved: the sampler's table for what the module predicts, where that is the sample plus what the denoiser
-            predicts (``MoveSkip``); None where both predict the same, and ``spec`` has this table.
+        dense_flops: of one call in the original loop as the module makes it: K evaluations, one stream.
+        once_flops: those of them that are of an observation encoder, which the module evaluates once a call.
+        unmoved: ``spec`` with the samplers' tables for what the module predicts, where that is the sample plus what the
+            denoiser predicts (``MoveSkip``); None where both predict the same, and ``spec`` has these tables.
     """
 
     spec: PolicySpec
     denoiser: Graph
     weights: Mapping[str, npt.NDArray[np.generic]]
     dense_flops: int = field(default=0, kw_only=True)
-    unmoved: SamplerTable | None = field(default=None, kw_only=True)
+    once_flops: int = field(default=0, kw_only=True)
+    unmoved: PolicySpec | None = field(default=None, kw_only=True)
 
     def graphs(self) -> dict[str, Graph]:
         """Every graph by name."""
@@ -199,6 +213,11 @@ class Phase:
     def mapped(self, function: Callable[[Graph], Graph]) -> Self:
         """With another graph in place of every one, of the same names of inputs and outputs."""
         return replace(self, denoiser=function(self.denoiser))
+
+    def flops_of(self, loop: str) -> int:
+        """``dense_flops`` of a call in this loop."""
+        own, steps = self.spec.sampler.steps, self.spec.all_loops[loop].steps
+        return (self.dense_flops - self.once_flops) * steps // own + self.once_flops
 
 
 @dataclass(frozen=True)
@@ -236,10 +255,12 @@ class Program(Phase):
     Attributes:
         blocks: block table.
         pieces: the denoiser cut up.
+        loop_weights: by further loop, values of the constants of its pruner, where it has one of its own.
     """
 
     blocks: tuple[Block, ...]
     pieces: Pieces
+    loop_weights: Mapping[str, Mapping[str, npt.NDArray[np.generic]]] = field(default_factory=dict)
 
     def graphs(self) -> dict[str, Graph]:
         """Every graph by name."""
@@ -248,3 +269,19 @@ class Program(Phase):
     def mapped(self, function: Callable[[Graph], Graph]) -> Self:
         """With another graph in place of every one, of the same names of inputs and outputs."""
         return replace(super().mapped(function), pieces=self.pieces.mapped(function))
+
+    def in_loop(self, name: str) -> Program:
+        """The program of one loop alone, as if it were the original.
+
+        Raises:
+            SpecError: there is no such loop.
+        """
+        return replace(
+            self,
+            spec=self.spec.in_loop(name),
+            pieces=self.pieces.in_loop(name),
+            weights={**self.weights, **self.loop_weights.get(name, {})},
+            loop_weights={},
+            dense_flops=self.flops_of(name),
+            unmoved=None if self.unmoved is None else self.unmoved.in_loop(name),
+        )

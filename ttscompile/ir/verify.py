@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable, Mapping
 
+import numpy as np
+
 from ..errors import PassError
 from .graph import Graph, Node, TensorType
-from .pieces import STEM, STEP, TAIL
+from .pieces import PRUNER, STEM, STEP, TAIL, of_loop
 from .program import Binding, Block, Cut, Loop, Phase, Pieces, Program
 
 
@@ -46,13 +48,7 @@ def verify(program: Phase) -> None:
         raise PassError(f"denoiser: inputs {list(denoiser.inputs)}; expected {expected}.")
     for what, graph in program.graphs().items():
         verify_graph(graph, what)
-        for name, type_ in graph.constants.items():
-            weight = program.weights.get(name)
-            if weight is None:
-                raise PassError(f"{what}: constant %{name} has no value in the program's weights.")
-            if weight.shape != type_.shape or str(weight.dtype) != type_.dtype:
-                found = f"{weight.dtype}{list(weight.shape)}"
-                raise PassError(f"{what}: constant %{name} is {found}; its type says {type_}.")
+        _verify_constants(graph, what, program)
     match program:
         case Cut(blocks=blocks, loop=loop):
             _verify_loop(loop, blocks, denoiser.inputs[spec.sample_argument])
@@ -61,6 +57,17 @@ def verify(program: Phase) -> None:
             _verify_loop(pieces, blocks, denoiser.inputs[spec.sample_argument])
             _verify_bindings(pieces)
             _verify_frames(pieces)
+            _verify_loops(program)
+
+
+def _verify_constants(graph: Graph, what: str, program: Phase) -> None:
+    for name, type_ in graph.constants.items():
+        weight = program.weights.get(name)
+        if weight is None:
+            raise PassError(f"{what}: constant %{name} has no value in the program's weights.")
+        if weight.shape != type_.shape or str(weight.dtype) != type_.dtype:
+            found = f"{weight.dtype}{list(weight.shape)}"
+            raise PassError(f"{what}: constant %{name} is {found}; its type says {type_}.")
 
 
 def _verify_loop(loop: Loop, blocks: tuple[Block, ...], sample: TensorType) -> None:
@@ -103,6 +110,27 @@ def _verify_bindings(pieces: Pieces) -> None:
             raise PassError(f"pruner: its feature %{name} is not an output of the condition graph.")
     if pieces.pruner is not None and tuple(pieces.pruner.inputs) != pieces.features:
         raise PassError(f"pruner: reads {list(pieces.pruner.inputs)}; its features are {list(pieces.features)}.")
+
+
+def _verify_loops(program: Program) -> None:
+    """Every further loop has the tables that the original has, and a pruner of as many steps."""
+    spec, pieces = program.spec, program.pieces
+    if pieces.loop_tables.keys() != spec.loops.keys():
+        raise PassError(f"tables of the loops {list(pieces.loop_tables)}; the policy has {list(spec.loops)}.")
+    for loop, sampler in spec.loops.items():
+        own = program.in_loop(loop)
+        for name, table in pieces.tables.items():
+            found = own.pieces.tables.get(name, np.zeros(0))
+            if (found.dtype, found.shape) != (table.dtype, (sampler.steps, *table.shape[1:])):
+                raise PassError(f"loop {loop}: the table of %{name} is {found.dtype}{list(found.shape)}.")
+        if (pruner := own.pieces.pruner) is not None:
+            what = of_loop(PRUNER, loop)
+            verify_graph(pruner, what)
+            _verify_constants(pruner, what, own)
+            steps = pruner.types()[pruner.outputs[0]].shape[1]
+            if (tuple(pruner.inputs), steps) != (pieces.features, sampler.steps):
+                told = f"of {steps} steps reads {list(pruner.inputs)}; expected {sampler.steps} steps"
+                raise PassError(f"{what}: {told} and the features {list(pieces.features)}.")
 
 
 def _verify_frames(pieces: Pieces) -> None:

@@ -19,6 +19,7 @@ from ..core.update import clips, columns, rows
 from ..errors import LoweringError
 from ..ir.graph import Argument, Batch, Graph, Node, Ref, TensorType
 from ..ir.pieces import (
+    ADVANCE,
     HISTORY,
     MEMORY,
     MEMORY_NEXT,
@@ -35,7 +36,17 @@ from ..ir.pieces import (
     LoopPiece,
     advance_context,
     advance_outputs,
+    of_loop,
 )
+from ..ir.program import Program
+
+
+def advances(program: Program) -> dict[str, Graph]:
+    """``advance`` of the original loop, and ``advance@NAME`` of each further loop whose own is another graph."""
+    pieces, spec = program.pieces, program.spec
+    own = fuse_advance(pieces.tail, pieces.stem, spec)
+    others = {of_loop(ADVANCE, name): fuse_advance(pieces.tail, pieces.stem, spec.in_loop(name)) for name in spec.loops}
+    return {ADVANCE: own, **{name: graph for name, graph in others.items() if graph != own}}
 
 
 def fuse_advance(tail: LoopPiece, stem: LoopPiece, spec: PolicySpec) -> Graph:

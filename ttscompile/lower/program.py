@@ -23,9 +23,9 @@ from ..errors import LoweringError
 from ..ir.evaluate import resolve_op, without_stack_traces
 from ..ir.graph import Argument, Batch, Enum, Graph, Node, Ref, TensorType
 from ..ir.layers import layers_graph
-from ..ir.pieces import ADVANCE, IDLE, LAYERS, TAIL
+from ..ir.pieces import IDLE, LAYERS, PRUNER, TAIL, of_loop
 from ..ir.program import Program
-from .advance import fuse_advance
+from .advance import advances
 from .idle import lower_idle
 from .joint import lower_all_blocks
 from .layout import sink_layout
@@ -62,7 +62,8 @@ def lower_program(program: Program) -> dict[str, onnx.ModelProto]:
         By name: ``condition``, ``step`` (if any), ``pruner`` (if any), ``stem``, ``block_00``, ``block_01``..,
         ``advance`` (tail, sampler update and stem in one; see ``lower.advance``), ``blocks`` and ``dense_step`` (all
         blocks in one; see ``ir.joint``), if stem and tail allow it ``idle`` (see ``lower.idle``), and of one block
-        alone ``layers`` (see ``ir.layers``). Graphs of one structure are exported once.
+        alone ``layers`` (see ``ir.layers``). ``advance@NAME`` and ``pruner@NAME`` are those of a further loop, where
+        they differ from the original's. Graphs of one structure are exported once.
 
     Raises:
         LoweringError: as ``lower_graph``.
@@ -70,7 +71,8 @@ def lower_program(program: Program) -> dict[str, onnx.ModelProto]:
     pieces = program.pieces
     graphs = {name: graph for name, graph in pieces.graphs().items() if name != TAIL}
     inside = layers_graph(program)
-    own = {ADVANCE: fuse_advance(pieces.tail, pieces.stem, program.spec)} | ({} if inside is None else {LAYERS: inside})
+    own = advances(program) | ({} if inside is None else {LAYERS: inside})
+    own |= {of_loop(PRUNER, loop): graph for loop, graph in pieces.loop_pruners.items()}
     models = _lower({**graphs, **own})
     idle, _ = lower_idle(pieces, program.weights, OPSET)
     return {**models, **lower_all_blocks(pieces.blocks, models), **({} if idle is None else {IDLE: idle})}

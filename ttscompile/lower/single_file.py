@@ -59,10 +59,11 @@ from ..core.correction import (
     no_correction,
     numbers_of,
 )
-from ..core.spec import PolicySpec
+from ..core.spec import ORIGINAL, PolicySpec
 from ..core.update import columns, diagonals, rows
 from ..errors import LoweringError
 from ..ir.graph import TensorType
+from ..ir.pieces import ADVANCE, of_loop
 from ..ir.program import Program
 from .contexts import Contexts
 from .graph_writer import GraphWriter, Weights, tensor
@@ -74,18 +75,24 @@ LARGEST = 2**31 - 1
 """Bytes of a file that protobuf reads."""
 
 
-def lower_single_file(program: Program, models: Mapping[str, ModelProto], weights: Weights) -> ModelProto:
-    """The model of the whole call, with its weights inside.
+def lower_single_file(
+    program: Program, models: Mapping[str, ModelProto], weights: Weights, loop: str = ORIGINAL
+) -> ModelProto:
+    """The model of the whole call in one of the program's loops, with its weights inside.
 
     Args:
         program: after all passes.
         models: from ``lower_program``; blocks may be of another precision.
         weights: values of the constants of these models.
+        loop: name of the loop.
 
     Raises:
+        SpecError: there is no such loop.
         LoweringError: an observation has the name of another input or output; the residual stream changes its type; a
             context cannot be repeated for a batch; or the file would have 2 GB.
     """
+    program = program.in_loop(loop)
+    models = {**models, ADVANCE: models.get(of_loop(ADVANCE, loop), models[ADVANCE])}
     spec, types = program.spec, sorted({str(block.type) for block in program.blocks})
     if len(types) != 1 or program.blocks[0].type.dtype != "float32":
         raise LoweringError(f"the residual stream changes its type, or is not float32: {types}. Convert without it.")
@@ -114,9 +121,9 @@ def lower_single_file(program: Program, models: Mapping[str, ModelProto], weight
         jumps = Jumps(JUMPS, INNER, MIDDLE, OUTER, condition)
     history, memories = _zeros(main, spec, streams, HISTORY), spec.sampler.memories
     memory = _zeros(main, spec, streams, memories) if memories else None
-    loop = DenoisingLoop(main, program, models, weights, contexts)
+    writer = DenoisingLoop(main, program, models, weights, contexts)
     values = LoopInputs("initial_noise", offset, update, ANCHORS, history, memory, stored, "rollout_index", jumps)
-    sample, residuals = loop.write(plan, values)
+    sample, residuals = writer.write(plan, values)
     if (bound := spec.sampler.bound) is not None:  # without a correction no number is beyond it
         sample = main.op("Clip", sample, *(main.constant(end, np.float32) for end in (-bound, bound)))
     _write_actions(main, sample, spec)

@@ -16,6 +16,8 @@ from ..core.spec import SamplerTable
 from ..errors import SpecError
 
 METHODS = ("euler", "rk4")
+EVALUATIONS = {"euler": 1, "rk4": 4}
+"""Of the network in each step, by method; each is a row of the table."""
 
 
 def flow_matching_table(

@@ -17,7 +17,7 @@ from torch import nn
 from ..artifact.golden import DIGITS, Golden, GoldenPlan, load_golden, pattern, probe_stream, project
 from ..artifact.load import Artifact
 from ..artifact.manifest import DISTILLED
-from ..core.spec import FloatArray, Noise
+from ..core.spec import ORIGINAL, FloatArray, Noise, PolicySpec
 from ..errors import CaptureError
 from ..frontends.copies import sharing_copy
 from ..frontends.eager import eager_policy
@@ -48,7 +48,7 @@ PROBE = "probe."
 
 
 def record_original(module: nn.Module, program: Program) -> Golden:
-    """Run the original module, a whole call and single evaluations, and the captured graph block by block.
+    """Run the original module, a whole call and single evaluations, and the captured graph block by block; every loop.
 
     On one thread: the record does not depend on how many there are, nor on what else the machine does.
 
@@ -62,75 +62,92 @@ def record_original(module: nn.Module, program: Program) -> Golden:
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        return _record_original(module, program)
+        recorder = _Recorder(module, program)
+        original = recorder.record(ORIGINAL)
+        return replace(original, loops={name: recorder.record(name, original.scales) for name in program.spec.loops})
     finally:
         torch.set_num_threads(threads)
 
 
-def _record_original(module: nn.Module, program: Program) -> Golden:
-    spec = program.spec
-    steps, small = spec.sampler.steps, program.dense_flops <= EFFORT
-    streams = STREAMS if small and 4 * steps * np.prod(spec.sample) <= ROOM else 1
-    # The sequences of numpy's distributions may change with its version: what they give is stored.
-    draw = np.random.default_rng(7)
-    observations, normalized = {}, {}
-    for key, one in spec.observations.items():
-        raw = np.concatenate([one.draw(draw) for _ in range(streams)])
-        observations[key] = np.stack([np.resize(each, one.shape) for each in pattern(raw, one.shape)])
-        normalized[key] = one.normalized(observations[key])
-    original, kept = spec.original, spec.sample[0]
-    if program.unmoved is not None:
-        original = replace(original, sampler=program.unmoved)
-    shape = (streams, *original.sample)
-    initial = draw.standard_normal(shape, dtype=np.float32)
-    draws = draw.standard_normal((steps, *shape), dtype=np.float32) if spec.sampler.stochastic else None
+class _Recorder:
+    """Runs one loop after the other, with the same observations and the same initial noise."""
 
-    copied = sharing_copy(module)
-    evaluations: list[tuple[FloatArray, FloatArray]] = []
+    def __init__(self, module: nn.Module, program: Program) -> None:
+        spec = program.spec
+        small = program.dense_flops <= EFFORT and 4 * spec.sampler.steps * np.prod(spec.sample) <= ROOM
+        streams = STREAMS if small else 1
+        # The sequences of numpy's distributions may change with its version: what they give is stored.
+        self._draw = np.random.default_rng(7)
+        self._observations, self._normalized, self._tensors = {}, {}, {}
+        for key, one in spec.observations.items():
+            raw = np.concatenate([one.draw(self._draw) for _ in range(streams)])
+            whole = np.stack([np.resize(each, one.shape) for each in pattern(raw, one.shape)])
+            normalized = one.normalized(whole)
+            self._observations[key], self._normalized[key] = (pattern(each, one.shape) for each in (whole, normalized))
+            self._tensors[key] = torch.from_numpy(normalized)
+        self._initial = self._draw.standard_normal((streams, *spec.whole_horizon.sample), dtype=np.float32)
+        self._program, self._module = program, sharing_copy(module)
+        self._inside = _Inside(program, self._tensors, streams)
 
-    def watch(_: nn.Module, args: tuple[Any, ...], kwargs: dict[str, Any], output: torch.Tensor) -> None:
-        given = args[0] if args else kwargs[original.sample_argument]
-        evaluations.append((given.numpy().copy(), output.numpy().copy()))
-
-    parts(copied).denoiser.register_forward_hook(watch, with_kwargs=True)
-    tensors = {key: torch.from_numpy(value) for key, value in normalized.items()}
-    sample = eager_policy(copied, original)(tensors, Noise(initial, draws)).numpy()
-    given, predicted = (np.stack(each) for each in zip(*evaluations, strict=True))
-    if program.unmoved is not None:
-        predicted = predicted - given
-    # What the artifact predicts of it: the original has all steps, and says what those that are kept should be.
-    initial, sample, given, predicted = (each[..., :kept, :] for each in (initial, sample, given, predicted))
-    draws = None if draws is None else draws[..., :kept, :]
-    if not (np.isfinite(predicted).all() and np.isfinite(sample).all()):
-        raise CaptureError(
-            "the module's prediction on a random observation within the range of its normaliser is not a number."
-            " Look for NaN in its weights, and check normaliser and sampler."
+    def record(self, loop: str, scales: FloatArray | None = None) -> Golden:
+        """The record of a loop; ``scales`` are taken from its middle if they are not given."""
+        program = self._program.in_loop(loop)
+        spec, kept, timesteps = program.spec, program.spec.sample[0], program.spec.sampler.timesteps
+        steps, initial, draws = spec.sampler.steps, self._initial, None
+        if spec.sampler.stochastic:
+            draws = self._draw.standard_normal((steps, *initial.shape), dtype=np.float32)
+        sample, given, predicted = self._run((program.unmoved or spec).whole_horizon, Noise(initial, draws))
+        if program.unmoved is not None:
+            predicted = predicted - given
+        # What the artifact predicts of it: the original has all steps, and says what those that are kept should be.
+        initial, sample, given, predicted = (each[..., :kept, :] for each in (initial, sample, given, predicted))
+        draws = None if draws is None else draws[..., :kept, :]
+        if not (np.isfinite(predicted).all() and np.isfinite(sample).all()):
+            raise CaptureError(
+                "the module's prediction on a random observation within the range of its normaliser is not a number."
+                " Look for NaN in its weights, and check normaliser and sampler."
+            )
+        actions, flops = spec.chunk.unnormalized(sample), program.dense_flops
+        evaluated = _spread(steps, EVALUATIONS)
+        anchors = _spread(steps, steps if flops <= EFFORT else max(3, int(steps * EFFORT / flops)))
+        if scales is None:
+            scales = self._inside.scales(given[steps // 2], timesteps[steps // 2])
+        residuals, _ = self._inside.alone(timesteps[anchors], scales)
+        _, layers = self._inside.alone(timesteps[evaluated], scales)
+        return Golden(
+            observations=self._observations,
+            normalized=self._normalized,
+            initial=initial,
+            draws=draws,
+            steps=anchors,
+            scales=scales,
+            residuals=residuals,
+            layers=layers if layers.size else None,
+            evaluated=evaluated,
+            inputs=given[evaluated],
+            outputs=predicted[evaluated],
+            predictions=np.stack([project(one, 0) for one in predicted]),
+            path=np.stack([project(one, 0) for one in (*given[1:], sample)]),
+            sample=sample,
+            actions=actions,
+            executed=actions[:, spec.chunk.start : spec.chunk.stop],
         )
-    actions = spec.chunk.unnormalized(sample)
-    evaluated = _spread(steps, EVALUATIONS)
-    anchors = _spread(steps, steps if small else max(3, int(steps * EFFORT / program.dense_flops)))
-    inside = _Inside(program, tensors, streams)
-    scales = inside.scales(given[steps // 2], steps // 2)
-    residuals, _ = inside.alone(anchors, scales)
-    _, layers = inside.alone(evaluated, scales)
-    return Golden(
-        observations={key: pattern(value, spec.observations[key].shape) for key, value in observations.items()},
-        normalized={key: pattern(value, spec.observations[key].shape) for key, value in normalized.items()},
-        initial=initial,
-        draws=draws,
-        steps=anchors,
-        scales=scales,
-        residuals=residuals,
-        layers=layers if layers.size else None,
-        evaluated=evaluated,
-        inputs=given[evaluated],
-        outputs=predicted[evaluated],
-        predictions=np.stack([project(one, 0) for one in predicted]),
-        path=np.stack([project(one, 0) for one in (*given[1:], sample)]),
-        sample=sample,
-        actions=actions,
-        executed=actions[:, spec.chunk.start : spec.chunk.stop],
-    )
+
+    def _run(self, spec: PolicySpec, noise: Noise) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The denoised sample of a call ``[B, T, D]``; and what the network was given and gave, ``[K, B, T, D]``."""
+        evaluations: list[tuple[FloatArray, FloatArray]] = []
+
+        def watch(_: nn.Module, args: tuple[Any, ...], kwargs: dict[str, Any], output: torch.Tensor) -> None:
+            given = args[0] if args else kwargs[spec.sample_argument]
+            evaluations.append((given.numpy().copy(), output.numpy().copy()))
+
+        hook = parts(self._module).denoiser.register_forward_hook(watch, with_kwargs=True)
+        try:
+            sample = eager_policy(self._module, spec)(self._tensors, noise).numpy()
+        finally:
+            hook.remove()
+        given, predicted = (np.stack(each) for each in zip(*evaluations, strict=True))
+        return sample, given, predicted
 
 
 def record_plans(artifact: Artifact) -> dict[str, GoldenPlan]:
@@ -188,15 +205,15 @@ class _Inside:
         self._open = replace(opened, outputs=(*opened.outputs, *layers(program).values()))
         self._condition, self._loop = _split(self._open, [program.spec.sample_argument, program.spec.timestep_argument])
 
-    def scales(self, sample: FloatArray, k: int) -> FloatArray:
-        """Standard deviation of the stream before each block, in the evaluation of this sample at step k."""
-        inputs = {self._spec.sample_argument: torch.from_numpy(sample), **self._at(k)}
+    def scales(self, sample: FloatArray, timestep: np.generic) -> FloatArray:
+        """Standard deviation of the stream before each block, in the evaluation of this sample at this timestep."""
+        inputs = {self._spec.sample_argument: torch.from_numpy(sample), **self._at(timestep)}
         with torch.inference_mode():
             streams = evaluator(self._closed, self._weights)(inputs)
         return np.array([max(float(stream.std()), 1e-3) for stream in streams], np.float32)
 
-    def alone(self, steps: npt.NDArray[np.int64], scales: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Projections of what each block, and each layer, gives on ``probe_stream`` at these A steps.
+    def alone(self, timesteps: npt.NDArray[Any], scales: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Projections of what each block, and each layer, gives on ``probe_stream`` at these A timesteps.
 
         Returns:
             Of residuals ``[A, blocks, B, DIGITS]``, and of layers ``[A, L, DIGITS]``.
@@ -211,11 +228,11 @@ class _Inside:
         fixed = dict(zip(self._condition.outputs, values, strict=True))
         given = dict(zip(list(self._open.inputs)[-len(probes) :], probes, strict=True))
         blocks, layers = len(self._blocks), len(self._open.outputs) - len(self._blocks)
-        found = np.zeros((len(steps), blocks, self._streams, DIGITS), np.float32)
-        inside = np.zeros((len(steps), layers, DIGITS), np.float32)
-        for i, k in enumerate(steps.tolist()):
+        found = np.zeros((len(timesteps), blocks, self._streams, DIGITS), np.float32)
+        inside = np.zeros((len(timesteps), layers, DIGITS), np.float32)
+        for i, timestep in enumerate(timesteps):
             with torch.inference_mode():
-                results = run({**fixed, **given, **self._at(k)})
+                results = run({**fixed, **given, **self._at(timestep)})
             for b, (block, result) in enumerate(zip(self._blocks, results[:blocks], strict=True)):
                 residual = result if block.residual is not None else result - probes[b]
                 found[i, b] = project(residual.numpy(), block.type.batch_axis)
@@ -223,10 +240,10 @@ class _Inside:
                 (inside[i, layer],) = project(result.numpy(), None)
         return found, inside
 
-    def _at(self, k: int) -> dict[str, torch.Tensor]:
-        """Timestep and observations at step k."""
-        timestep = torch.from_numpy(self._spec.sampler.timesteps)[k].expand(self._streams)
-        return {self._spec.timestep_argument: timestep, **self._observations}
+    def _at(self, timestep: np.generic) -> dict[str, torch.Tensor]:
+        """This timestep of every stream, and the observations."""
+        timesteps = torch.from_numpy(np.full(self._streams, timestep))
+        return {self._spec.timestep_argument: timesteps, **self._observations}
 
 
 def _opened(graph: Graph, blocks: tuple[Block, ...]) -> Graph:

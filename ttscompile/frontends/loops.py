@@ -1,0 +1,64 @@
+"""The denoising loops of a checkpoint: the one that it was trained to run in, and the one that was asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+from ..core.spec import SamplerTable
+from ..errors import CheckpointError, SpecError
+from ..samplers.flow import EVALUATIONS
+from .families import AS_SAVED, LoadOptions
+
+Make = Callable[[LoadOptions], SamplerTable]
+"""The loop that options ask for, or that the checkpoint describes where they ask for none."""
+
+
+@dataclass(frozen=True)
+class Loops:
+    """What a ``PolicySpec`` has of its loops.
+
+    Attributes:
+        original: for ``PolicySpec.sampler``.
+        others: for ``PolicySpec.loops``.
+        source: what ``PolicySpec.source`` says of them.
+    """
+
+    original: SamplerTable
+    others: Mapping[str, SamplerTable] = field(default_factory=dict)
+    source: Mapping[str, str] = field(default_factory=dict)
+
+
+def loops_of(make: Make, options: LoadOptions, own: str) -> Loops:
+    """The checkpoint's own loop, and beside it the one that is asked for, if that is another.
+
+    Some checkpoints name a scheduler of which there is no table, of another class, say. What is asked for then is the
+    original, and the source says in place of what.
+
+    Args:
+        make: of the checkpoint.
+        options: of the caller; without sampler, steps and spacing nothing is asked for.
+        own: class of the checkpoint's scheduler, for the source.
+
+    Raises:
+        CheckpointError: the checkpoint describes no loop that is known, and nothing was asked for; or as ``make``.
+        SpecError: what is asked for is not possible.
+    """
+    if options.sampler is None and options.steps is None and options.spacing is None:
+        return Loops(make(AS_SAVED))
+    asked = make(options)
+    name = loop_name(asked, options.spacing)
+    try:
+        original = make(AS_SAVED)
+    except (CheckpointError, SpecError):
+        return Loops(asked, source={"sampler": f"{name} in place of {own}"})
+    return Loops(original, {} if asked.same_as(original) else {name: asked})
+
+
+def loop_name(table: SamplerTable, spacing: str | None = None) -> str:
+    """``dpmsolver++-16``, or ``ddim-16-trailing`` where a spacing is asked for: what ``PolicySpec.loops`` calls it.
+
+    The number is that of steps, as people count them: one of ``rk4`` has four rows of the table.
+    """
+    steps = table.steps // EVALUATIONS.get(table.name, 1)
+    return "-".join([table.name, str(steps), *([] if spacing is None else [spacing])])
