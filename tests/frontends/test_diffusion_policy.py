@@ -288,7 +288,8 @@ def test_the_checkpoints_own_sampler(payload: Build, save: Save) -> None:
     assert load_checkpoint_policy(save(built))[1].sampler.timesteps.tolist() == [19, 14, 9, 4]
     built["cfg"]["policy"]["eta"] = 0.5
     assert load_checkpoint_policy(save(built))[1].sampler.stochastic
-    assert not load_checkpoint_policy(save(built), options=LoadOptions(sampler="ddpm"))[1].sampler.out_to_next.any()
+    loops = load_checkpoint_policy(save(built), options=LoadOptions(sampler="ddpm"))[1].loops
+    assert not loops["ddpm-4"].out_to_next.any()
 
 
 def test_settings_of_old_schedulers(payload: Build, save: Save) -> None:
@@ -312,17 +313,23 @@ def test_sample_prediction(payload: Build, save: Save) -> None:
     assert (table.out_to_x0 == 1).all()
 
 
-def test_sampler_override_keeps_the_betas(payload: Build, save: Save) -> None:
-    """DDIM on the checkpoint's own betas, with both spacings."""
+def test_another_sampler_keeps_the_betas(payload: Build, save: Save) -> None:
+    """DDIM on the checkpoint's own betas, with both spacings; the original's table is what it is without it."""
     path = save(payload())
+    original = load_checkpoint_policy(path)[1].sampler
     betas = {"num_train_timesteps": 20, "beta_schedule": "squaredcos_cap_v2"}
-    for spacing, timesteps in ((None, [15, 10, 5, 0]), ("trailing", [19, 14, 9, 4])):
-        found = load_checkpoint_policy(path, options=LoadOptions(sampler="ddim", steps=4, spacing=spacing))[1].sampler
+    for spacing, name, timesteps in (
+        (None, "ddim-4", [15, 10, 5, 0]),
+        ("trailing", "ddim-4-trailing", [19, 14, 9, 4]),
+    ):
+        spec = load_checkpoint_policy(path, options=LoadOptions(sampler="ddim", steps=4, spacing=spacing))[1]
+        assert list(spec.loops) == [name] and spec.sampler.same_as(original)
+        found = spec.loops[name]
         expected = sampler_table(DDIMScheduler(**betas, timestep_spacing=spacing or "leading"), 4)
         assert found.timesteps.tolist() == timesteps
         for column in found.COLUMNS:
             np.testing.assert_array_equal(getattr(found, column), getattr(expected, column))
-    assert load_checkpoint_policy(path, options=LoadOptions(steps=5))[1].sampler.stochastic
+    assert load_checkpoint_policy(path, options=LoadOptions(steps=5))[1].loops["ddpm-5"].stochastic
 
 
 @pytest.mark.parametrize(
@@ -342,10 +349,13 @@ def test_impossible_samplers(payload: Build, save: Save, arguments: dict[str, An
 
 
 def test_another_schedulers_betas(payload: Build, save: Save) -> None:
-    """A policy trained with a sampler that is not supported runs on its betas when one is asked for."""
+    """A policy trained with another sampler runs on its betas in the one that is asked for, and in its own."""
     built = payload()
     built["cfg"]["policy"]["noise_scheduler"] |= {
         "_target_": "diffusers.DPMSolverMultistepScheduler",
         "solver_order": 2,
     }
-    assert load_checkpoint_policy(save(built), options=LoadOptions(sampler="ddim", steps=5))[1].sampler.name == "ddim"
+    built["cfg"]["policy"]["num_inference_steps"] = 10
+    spec = load_checkpoint_policy(save(built), options=LoadOptions(sampler="ddim", steps=5))[1]
+    found = {name: (table.name, table.steps) for name, table in spec.all_loops.items()}
+    assert found == {"original": ("dpmsolver++", 10), "ddim-5": ("ddim", 5)}

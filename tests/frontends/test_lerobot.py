@@ -202,7 +202,11 @@ def test_samplers_against_plain_loops(tmp_path: Path, objective: str, options: d
     changes: dict[str, Any] = (
         {"objective": "flow_matching", "integration_method": objective} if flow else {"prediction_type": "sample"}
     )
-    module, spec = load(save_policy(tmp_path, **PLAIN, **changes), **options)
+    module, whole = load(save_policy(tmp_path, **PLAIN, **changes), **options)
+    assert list(whole.loops) == ["rk4-2"] * bool(options)
+    if flow:
+        assert (whole.sampler.name, whole.sampler.steps) == (objective, 12 if objective == "rk4" else 3)
+    spec = whole.in_loop("rk4-2") if options else whole
     obs, x = observe(spec), torch.randn(2, 8, DA, generator=torch.Generator().manual_seed(0))
     noise = x.numpy().copy()
     found = eager_policy(module, spec)(obs, Noise(noise))

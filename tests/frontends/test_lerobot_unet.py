@@ -276,13 +276,14 @@ def test_the_command_line_says_what_is_wrong(changed: Callable[..., Path], tmp_p
 
 
 def test_defaults_are_lerobots(changed: Callable[..., Path]) -> None:
-    """Of what a file leaves out; the sampler of a policy can be another than its own."""
+    """Of what a file leaves out; beside its own a policy can have another sampler."""
     directory = changed(crop_ratio=1.0)
     config = lerobot_unets.read(directory)
     assert (config.crop, config.resize, config.image_size) == ((36, 33), None, (36, 33))
     assert list(config.features) == [STATE, WRIST, TOP, ENVIRONMENT, "action"]
     _, spec = load_checkpoint_policy(directory, options=LoadOptions(sampler="ddim", steps=3))
-    assert (spec.sampler.name, spec.sampler.steps) == ("ddim", 3)
+    found = {name: (one.name, one.steps) for name, one in spec.all_loops.items()}
+    assert found == {"original": ("ddpm", lerobot_unets.STEPS), "ddim-3": ("ddim", 3)}
     assert (spec.chunk.start, spec.chunk.stop, spec.source["policy"]) == (0, 4, "diffusion")
 
 

@@ -12,7 +12,7 @@ from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultist
 
 from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile import Noise
-from ttscompile.errors import SpecError
+from ttscompile.errors import CheckpointError, SpecError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.families import LoadOptions
@@ -29,7 +29,12 @@ SOLVER = "diffusers.schedulers.scheduling_dpmsolver_multistep.DPMSolverMultistep
     ("own", "arguments", "settings", "steps"),
     [
         ({}, {"sampler": "dpmsolver++", "steps": 8}, {"thresholding": True, "timestep_spacing": "trailing"}, 8),
-        ({"_target_": SOLVER, "prediction_type": "sample"}, {"steps": 5}, {"prediction_type": "sample"}, 5),
+        (
+            {"_target_": SOLVER, "prediction_type": "sample", "timestep_spacing": "trailing"},
+            {"steps": 5},
+            {"prediction_type": "sample", "timestep_spacing": "trailing"},
+            5,
+        ),
     ],
 )
 def test_it_gives_what_diffusers_gives(
@@ -47,7 +52,11 @@ def test_it_gives_what_diffusers_gives(
         for name in ("variance_type", "clip_sample"):
             del scheduler_config[name]
     scheduler_config |= own
-    module, spec = load_checkpoint_policy(save(built), options=LoadOptions(**arguments))
+    path = save(built)
+    module, whole = load_checkpoint_policy(path, options=LoadOptions(**arguments))
+    assert list(whole.loops) == [f"dpmsolver++-{steps}"]
+    assert whole.sampler.same_as(load_checkpoint_policy(path)[1].sampler)
+    spec = whole.in_loop(f"dpmsolver++-{steps}")
     assert (spec.sampler.name, spec.sampler.steps, spec.sampler.memories) == ("dpmsolver++", steps, 1)
     draw = np.random.default_rng(0)
     obs = {key: draw.standard_normal((2, *one.shape)).astype(np.float32) for key, one in spec.observations.items()}
@@ -76,12 +85,14 @@ def test_the_bound_on_the_sample_is_kept_or_refused(payload: Build, save: Save) 
         ({"prediction_type": "sample"}, None, 19),  # unless the network predicts it itself
     ):
         options = LoadOptions(sampler="dpmsolver++", steps=4)
-        table = load_checkpoint_policy(save(payload_with(built, changes)), options=options)[1].sampler
+        loops = load_checkpoint_policy(save(payload_with(built, changes)), options=options)[1].loops
+        table = loops["dpmsolver++-4"]
         assert (table.clip, table.timesteps[0]) == (bound, first)
     scheduler |= {"clip_sample": True, "clip_sample_range": 2.0}
     with pytest.raises(SpecError, match="clip_sample_range is 2.0; sampler dpmsolver"):
         load_checkpoint_policy(save(built), options=LoadOptions(sampler="dpmsolver++", steps=8))
-    assert load_checkpoint_policy(save(built), options=LoadOptions(sampler="ddim", steps=8))[1].sampler.clip == 2
+    spec = load_checkpoint_policy(save(built), options=LoadOptions(sampler="ddim", steps=8))[1]
+    assert (spec.sampler.clip, spec.loops["ddim-8"].clip) == (2, 2)
 
 
 def payload_with(built: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
@@ -95,15 +106,80 @@ def test_spacings_of_the_solver(payload: Build, save: Save) -> None:
     built = payload()
     built["cfg"]["policy"]["noise_scheduler"]["timestep_spacing"] = "leading"  # of DDPM, that is trained on all of them
     path, options = save(built), LoadOptions(sampler="dpmsolver++", steps=4)
-    found = {
-        spacing: load_checkpoint_policy(path, options=replace(options, spacing=spacing))[1].sampler.timesteps
-        for spacing in (None, "leading", "trailing", "linspace")
-    }
-    assert {spacing: one.tolist() for spacing, one in found.items()} == {
-        None: [19, 14, 9, 4],
-        "leading": [16, 12, 8, 4],
-        "trailing": [19, 14, 9, 4],
-        "linspace": [19, 14, 10, 5],
+    found = {}
+    for spacing in (None, "leading", "trailing", "linspace"):
+        spec = load_checkpoint_policy(path, options=replace(options, spacing=spacing))[1]
+        assert spec.sampler.timesteps.tolist() == list(range(19, -1, -1))
+        found |= {name: table.timesteps.tolist() for name, table in spec.loops.items()}
+    assert found == {
+        "dpmsolver++-4": [19, 14, 9, 4],
+        "dpmsolver++-4-leading": [16, 12, 8, 4],
+        "dpmsolver++-4-trailing": [19, 14, 9, 4],
+        "dpmsolver++-4-linspace": [19, 14, 10, 5],
     }
     with pytest.raises(SpecError, match="'leading' timestep spacing gives 20 steps only 1 different noise level"):
         load_checkpoint_policy(path, options=LoadOptions(sampler="dpmsolver++", steps=20, spacing="leading"))
+
+
+@pytest.mark.parametrize(
+    ("options", "names"),
+    [
+        ({}, []),
+        ({"steps": 20}, []),
+        ({"sampler": "ddpm"}, []),
+        ({"sampler": "ddpm", "steps": 20, "spacing": "leading"}, []),  # which is diffusers' default
+        ({"steps": 19}, ["ddpm-19"]),
+        ({"sampler": "ddim"}, ["ddim-20"]),
+        ({"spacing": "trailing"}, []),  # all of the timesteps, whatever the spacing
+        ({"steps": 5, "spacing": "trailing"}, ["ddpm-5-trailing"]),
+        ({"sampler": "dpmsolver++", "steps": 16}, ["dpmsolver++-16"]),
+    ],
+)
+def test_the_loop_that_is_asked_for_stands_beside_the_policys_own(
+    payload: Build, save: Save, options: dict[str, Any], names: list[str]
+) -> None:
+    """It has a name that says what it is, unless it is the original's."""
+    path = save(payload())
+    original, spec = (load_checkpoint_policy(path, options=each)[1] for each in (LoadOptions(), LoadOptions(**options)))
+    assert list(spec.loops) == names
+    assert (spec.sampler.name, spec.sampler.steps) == ("ddpm", 20)
+    assert spec.sampler.same_as(original.sampler) and spec.source == original.source
+    for name, table in spec.loops.items():
+        assert not table.same_as(spec.sampler) and name.startswith(f"{table.name}-{table.steps}")
+
+
+def test_eta_is_of_the_original_loop(payload: Build, save: Save) -> None:
+    """DDIM of 20 steps with noise is not DDIM of 20 steps without."""
+    built = payload()
+    built["cfg"]["policy"]["eta"] = 0.5
+    built["cfg"]["policy"]["noise_scheduler"]["_target_"] = "diffusers.DDIMScheduler"
+    path = save(built)
+    fewer = load_checkpoint_policy(path, options=LoadOptions(steps=4))[1]
+    assert fewer.sampler.stochastic and fewer.loops["ddim-4"].stochastic
+    other = load_checkpoint_policy(path, options=LoadOptions(sampler="ddpm"))[1]
+    assert other.sampler.stochastic and not other.loops["ddpm-20"].out_to_next.any()
+
+
+@pytest.mark.parametrize(
+    ("scheduler", "own"),
+    [
+        ({"_target_": "diffusers.PNDMScheduler"}, "PNDMScheduler"),
+        ({"_target_": ""}, "no scheduler"),
+        ({"skip_prk_steps": True}, "DDPMScheduler"),  # which does not know that setting
+        ({"num_train_timesteps": 4000}, "DDPMScheduler"),  # more than a call may have
+    ],
+)
+def test_where_the_own_loop_has_no_table_the_one_asked_for_is_the_original(
+    payload: Build, save: Save, scheduler: dict[str, Any], own: str
+) -> None:
+    """The source says so; and without anything asked for there is no policy."""
+    built = payload()
+    built["cfg"]["policy"]["num_inference_steps"] = None
+    path = save(payload_with(built, scheduler))
+    spec = load_checkpoint_policy(path, options=LoadOptions(sampler="ddim", steps=4))[1]
+    assert (spec.sampler.name, spec.sampler.steps, dict(spec.loops)) == ("ddim", 4, {})
+    assert spec.source["sampler"] == f"ddim-4 in place of {own}"
+    with pytest.raises(CheckpointError, match="noise_scheduler"):
+        load_checkpoint_policy(path)
+    with pytest.raises(SpecError, match="'even' is not known"):
+        load_checkpoint_policy(path, options=LoadOptions(spacing="even"))

@@ -55,6 +55,18 @@ class TokenDecoder(nn.Module):
         return self.head(h)
 
 
+class Skipping(nn.Module):
+    """A transformer that predicts how its prediction differs from the sample."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.net = TokenDecoder()
+
+    def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
+        return sample + self.net(sample, timestep, obs)
+
+
 class AdaLN(nn.Module):
     """Gated blocks modulated by time + observation: step work, all of it outside the loop."""
 

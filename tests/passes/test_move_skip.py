@@ -14,7 +14,7 @@ from torch import nn
 
 import ttscompile
 from tests.passes.graphs import B, Builder
-from tests.passes.modules import TokenDecoder
+from tests.passes.modules import Skipping
 from tests.passes.specs import toy_spec
 from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile import Noise, PolicySpec, SamplerTable
@@ -29,18 +29,6 @@ from ttscompile.samplers.table import sampler_table
 STEPS = 4
 BETAS = {"num_train_timesteps": 40, "beta_schedule": "squaredcos_cap_v2"}
 SHAPE = (B, 4, 2)
-
-
-class Skipping(nn.Module):
-    """A transformer that predicts how its prediction differs from the sample."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        torch.manual_seed(0)
-        self.net = TokenDecoder()
-
-    def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
-        return sample + self.net(sample, timestep, obs)
 
 
 class Flat(nn.Module):

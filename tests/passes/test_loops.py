@@ -1,0 +1,175 @@
+"""Several loops in one program, against programs that have one of them each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from diffusers import DDIMScheduler, DDPMScheduler, DPMSolverMultistepScheduler
+from onnx import ModelProto
+from torch import nn
+
+from tests.passes.modules import MODULES, Skipping
+from tests.passes.specs import toy_spec
+from ttscompile import PolicySpec, SamplerTable
+from ttscompile.driver import transform
+from ttscompile.errors import PassError
+from ttscompile.frontends.encoded import EncodedDenoiser
+from ttscompile.ir.pieces import is_of_loop, part_of
+from ttscompile.ir.program import Program
+from ttscompile.ir.verify import verify
+from ttscompile.lower.program import lower_program
+from ttscompile.samplers.table import sampler_table
+
+BETAS = {"num_train_timesteps": 40, "beta_schedule": "squaredcos_cap_v2"}
+
+
+def table(scheduler: Callable[..., object], steps: int, **settings: object) -> SamplerTable:
+    return sampler_table(scheduler(**BETAS, **settings), steps)
+
+
+LOOPS = {
+    "ddpm-4": table(DDPMScheduler, 4),
+    "ddim-6-trailing": table(DDIMScheduler, 6, timestep_spacing="trailing"),
+    "ddim-3": table(DDIMScheduler, 3, clip_sample=False),
+    "dpmsolver++-4": table(DPMSolverMultistepScheduler, 4),
+}
+
+
+def spec() -> PolicySpec:
+    made = toy_spec(sample=(4, 2), obs=(3, 7))
+    return replace(made, sampler=table(DDPMScheduler, 6), loops=LOOPS)
+
+
+class Encoder(nn.Module):
+    """A condition that the original computes once a call."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.net = nn.Linear(7, 7)
+
+    def forward(self, observations: dict[str, torch.Tensor]) -> torch.Tensor:
+        return self.net(observations["obs"])  # type: ignore[no-any-return]
+
+
+def encoded() -> nn.Module:
+    return EncodedDenoiser(Encoder(), MODULES["tokens"]())
+
+
+BUILT = {"tokens": MODULES["tokens"], "adaLN": MODULES["adaLN"], "skip": Skipping, "encoder": encoded}
+
+
+@cache
+def program_of(kind: str, loop: str | None = None) -> Program:
+    """The program of all loops, or that of one alone."""
+    torch.manual_seed(0)
+    return transform(BUILT[kind]().eval(), spec() if loop is None else spec().in_loop(loop))
+
+
+@cache
+def models_of(loop: str | None = None) -> dict[str, ModelProto]:
+    return lower_program(program_of("tokens", loop))
+
+
+@pytest.mark.parametrize("kind", list(BUILT))
+@pytest.mark.parametrize("loop", ["original", "ddim-3"])
+def test_a_loop_is_what_it_is_in_a_program_of_its_own(kind: str, loop: str) -> None:
+    """Tables, plan head and FLOPs; the rest is common."""
+    whole, alone = program_of(kind), program_of(kind, loop)
+    found = whole.in_loop(loop)
+    assert found.spec.sampler.same_as(alone.spec.sampler) and not found.spec.loops
+    assert found.pieces.tables.keys() == alone.pieces.tables.keys()
+    for name, rows in alone.pieces.tables.items():
+        np.testing.assert_array_equal(found.pieces.tables[name], rows)
+    assert found.pieces.graphs() == alone.pieces.graphs() == whole.pieces.graphs() | found.pieces.graphs()
+    assert found.weights.keys() == alone.weights.keys()
+    for name, value in alone.weights.items():
+        np.testing.assert_array_equal(found.weights[name], value)
+    assert (found.dense_flops, found.once_flops) == (alone.dense_flops, alone.once_flops)
+    assert (found.unmoved is None) == (alone.unmoved is None) == (kind != "skip")
+    if found.unmoved is not None and alone.unmoved is not None:
+        assert found.unmoved.sampler.same_as(alone.unmoved.sampler)
+
+
+def test_an_encoder_runs_once_a_call_in_every_loop() -> None:
+    """Its FLOPs, and those of what follows from it alone, are not multiplied by the steps."""
+    whole = program_of("encoder")
+    assert whole.once_flops == 2 * 3 * 7 * 7 + 2 * 3 * 7 * 16  # 3 frames of 7 numbers, and their embedding
+    assert program_of("tokens").once_flops == 0
+    of_a_step = (whole.dense_flops - whole.once_flops) // 6
+    assert of_a_step * 6 + whole.once_flops == whole.flops_of("original") == whole.dense_flops
+    assert whole.flops_of("ddim-3") == of_a_step * 3 + whole.once_flops
+
+
+def test_the_original_has_the_names_that_it_has_alone() -> None:
+    whole, alone = program_of("tokens"), program_of("tokens", "original")
+    assert whole.graphs() == alone.graphs()
+    assert list(whole.pieces.loop_tables) == list(LOOPS)
+    assert {rows.shape[0] for rows in whole.pieces.loop_tables["ddim-3"].values()} == {3}
+    # The loop of as many steps has the original's plan head.
+    assert list(whole.pieces.loop_pruners) == list(whole.loop_weights) == ["ddpm-4", "ddim-3", "dpmsolver++-4"]
+
+
+def test_the_skip_is_moved_into_the_tables_of_all_loops() -> None:
+    whole, given = program_of("skip"), spec()
+    assert whole.unmoved is not None
+    for name, before in given.all_loops.items():
+        assert whole.unmoved.all_loops[name].same_as(before)
+        assert whole.spec.all_loops[name].same_as(before.with_skip())
+        assert not before.with_skip().same_as(before)
+
+
+def test_models_that_differ_between_loops_have_the_loops_name() -> None:
+    """A loop that clips, draws and remembers as the original does, in as many steps, has none of its own."""
+    further = {name for name in models_of() if is_of_loop(name)}
+    assert set(models_of()) - further == set(models_of("original")) == set(models_of("ddim-3"))
+    assert further == {
+        "pruner@ddpm-4",
+        "advance@ddim-3",  # it does not clip
+        "pruner@ddim-3",
+        "advance@dpmsolver++-4",  # it remembers
+        "pruner@dpmsolver++-4",
+    }
+    assert {part_of(name) for name in further} == {None}
+
+
+@pytest.mark.parametrize("loop", ["ddim-3", "ddim-6-trailing"])
+def test_a_model_of_a_loop_is_that_of_its_own_program(loop: str) -> None:
+    whole, alone = models_of(), models_of(loop)
+    for piece in ("advance", "pruner"):
+        found, expected = whole.get(f"{piece}@{loop}", whole[piece]), alone[piece]
+        assert [node.SerializeToString() for node in found.graph.node] == [
+            node.SerializeToString() for node in expected.graph.node
+        ]
+        for values in ("input", "output", "initializer"):
+            mine, its = (
+                [value.SerializeToString() for value in getattr(model.graph, values)] for model in (found, expected)
+            )
+            assert mine == its
+
+
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        (lambda p: {"loop_tables": {n: t for n, t in p.loop_tables.items() if n != "ddim-3"}}, "tables of the loops"),
+        (lambda p: {"loop_tables": {**p.loop_tables, "ddim-3": {}}}, "loop ddim-3: the table of"),
+        (lambda p: {"loop_tables": {**p.loop_tables, "ddim-3": p.tables}}, "loop ddim-3: the table of"),
+        (lambda p: {"loop_pruners": {}}, "pruner@ddpm-4: .* 6 steps .* expected 4 steps"),
+    ],
+)
+def test_what_does_not_fit_is_refused(broken: Callable[..., dict[str, object]], message: str) -> None:
+    program = program_of("tokens")
+    verify(program)
+    with pytest.raises(PassError, match=message):
+        verify(replace(program, pieces=replace(program.pieces, **broken(program.pieces))))  # type: ignore[arg-type]
+
+
+def test_constants_of_a_loops_plan_head_are_checked() -> None:
+    program = program_of("tokens")
+    weights = {**program.loop_weights, "ddim-3": program.loop_weights["ddpm-4"]}
+    with pytest.raises(PassError, match=r"pruner@ddim-3: constant %pruner.* is float32\[4"):
+        verify(replace(program, loop_weights=weights))
