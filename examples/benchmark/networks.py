@@ -14,7 +14,7 @@ import ttscompile
 from ttscompile import Source
 from ttscompile.artifact.write import update_calibration
 from ttscompile.core.lattice import PlanArray, uniform_plan
-from ttscompile.core.spec import ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
+from ttscompile.core.spec import ORIGINAL, ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.conditioning import TokensDenoiser
 from ttscompile.frontends.families import LoadOptions
@@ -51,7 +51,7 @@ class Network:
 def pusht_network(sampler: str, steps: int) -> Network:
     """The policy of ``examples/pusht``."""
     module, spec = load_checkpoint_policy(PUSHT, options=LoadOptions(sampler=sampler, steps=steps))
-    return Network("Push-T", PUSHT_WIDTH, module, spec)
+    return Network("Push-T", PUSHT_WIDTH, module, spec.in_loop(next(iter(spec.loops), ORIGINAL)))
 
 
 def random_network(width: int, sampler: str, steps: int, layers: int = 8) -> Network:

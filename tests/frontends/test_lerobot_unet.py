@@ -283,7 +283,7 @@ def test_defaults_are_lerobots(changed: Callable[..., Path]) -> None:
     assert list(config.features) == [STATE, WRIST, TOP, ENVIRONMENT, "action"]
     _, spec = load_checkpoint_policy(directory, options=LoadOptions(sampler="ddim", steps=3))
     found = {name: (one.name, one.steps) for name, one in spec.all_loops.items()}
-    assert found == {"original": ("ddpm", lerobot_unets.STEPS), "ddim-3": ("ddim", 3)}
+    assert found == {"original": ("ddim", lerobot_unets.STEPS), "ddim-3": ("ddim", 3)}
     assert (spec.chunk.start, spec.chunk.stop, spec.source["policy"]) == (0, 4, "diffusion")
 
 

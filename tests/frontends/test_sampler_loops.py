@@ -6,10 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnxruntime
 import pytest
 import torch
 from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultistepScheduler
 
+import ttscompile
 from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile import Noise
 from ttscompile.errors import CheckpointError, SpecError
@@ -183,3 +185,18 @@ def test_where_the_own_loop_has_no_table_the_one_asked_for_is_the_original(
         load_checkpoint_policy(path)
     with pytest.raises(SpecError, match="'even' is not known"):
         load_checkpoint_policy(path, options=LoadOptions(spacing="even"))
+
+
+def test_converting_keeps_the_original_beside_the_loop_that_is_asked_for(
+    payload: Build, save: Save, tmp_path: Path
+) -> None:
+    """The program has both; the single file is of the one asked for."""
+    options = {"sampler": "ddim", "steps": 4, "single_file": tmp_path / "policy.onnx"}
+    told: dict[str, tuple[str, ...]] = {}
+    program = ttscompile.convert(save(payload()), tmp_path / "compiled", explain=told.__setitem__, **options)
+    assert {name: one.steps for name, one in program.spec.all_loops.items()} == {"original": 20, "ddim-4": 4}
+    assert told["record_original"] == ("20 of 20 steps, 2 streams", "ddim-4: 4 of 4")
+    session = onnxruntime.InferenceSession(options["single_file"], providers=["CPUExecutionProvider"])
+    shapes = {value.name: value.shape for value in session.get_inputs()}
+    assert shapes["plan"] == [4, len(program.blocks)] and "step_noise" not in shapes
+    assert ttscompile.verify(tmp_path / "compiled").passed

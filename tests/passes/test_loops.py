@@ -4,75 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
-import torch
-from diffusers import DDIMScheduler, DDPMScheduler, DPMSolverMultistepScheduler
-from onnx import ModelProto
-from torch import nn
 
-from tests.passes.modules import MODULES, Skipping
-from tests.passes.specs import toy_spec
-from ttscompile import PolicySpec, SamplerTable
-from ttscompile.driver import transform
+from tests.passes.loops import BUILT, LOOPS, program_of, spec
 from ttscompile.errors import PassError
-from ttscompile.frontends.encoded import EncodedDenoiser
-from ttscompile.ir.pieces import is_of_loop, part_of
-from ttscompile.ir.program import Program
 from ttscompile.ir.verify import verify
-from ttscompile.lower.program import lower_program
-from ttscompile.samplers.table import sampler_table
-
-BETAS = {"num_train_timesteps": 40, "beta_schedule": "squaredcos_cap_v2"}
-
-
-def table(scheduler: Callable[..., object], steps: int, **settings: object) -> SamplerTable:
-    return sampler_table(scheduler(**BETAS, **settings), steps)
-
-
-LOOPS = {
-    "ddpm-4": table(DDPMScheduler, 4),
-    "ddim-6-trailing": table(DDIMScheduler, 6, timestep_spacing="trailing"),
-    "ddim-3": table(DDIMScheduler, 3, clip_sample=False),
-    "dpmsolver++-4": table(DPMSolverMultistepScheduler, 4),
-}
-
-
-def spec() -> PolicySpec:
-    made = toy_spec(sample=(4, 2), obs=(3, 7))
-    return replace(made, sampler=table(DDPMScheduler, 6), loops=LOOPS)
-
-
-class Encoder(nn.Module):
-    """A condition that the original computes once a call."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.net = nn.Linear(7, 7)
-
-    def forward(self, observations: dict[str, torch.Tensor]) -> torch.Tensor:
-        return self.net(observations["obs"])  # type: ignore[no-any-return]
-
-
-def encoded() -> nn.Module:
-    return EncodedDenoiser(Encoder(), MODULES["tokens"]())
-
-
-BUILT = {"tokens": MODULES["tokens"], "adaLN": MODULES["adaLN"], "skip": Skipping, "encoder": encoded}
-
-
-@cache
-def program_of(kind: str, loop: str | None = None) -> Program:
-    """The program of all loops, or that of one alone."""
-    torch.manual_seed(0)
-    return transform(BUILT[kind]().eval(), spec() if loop is None else spec().in_loop(loop))
-
-
-@cache
-def models_of(loop: str | None = None) -> dict[str, ModelProto]:
-    return lower_program(program_of("tokens", loop))
 
 
 @pytest.mark.parametrize("kind", list(BUILT))
@@ -121,35 +59,6 @@ def test_the_skip_is_moved_into_the_tables_of_all_loops() -> None:
         assert whole.unmoved.all_loops[name].same_as(before)
         assert whole.spec.all_loops[name].same_as(before.with_skip())
         assert not before.with_skip().same_as(before)
-
-
-def test_models_that_differ_between_loops_have_the_loops_name() -> None:
-    """A loop that clips, draws and remembers as the original does, in as many steps, has none of its own."""
-    further = {name for name in models_of() if is_of_loop(name)}
-    assert set(models_of()) - further == set(models_of("original")) == set(models_of("ddim-3"))
-    assert further == {
-        "pruner@ddpm-4",
-        "advance@ddim-3",  # it does not clip
-        "pruner@ddim-3",
-        "advance@dpmsolver++-4",  # it remembers
-        "pruner@dpmsolver++-4",
-    }
-    assert {part_of(name) for name in further} == {None}
-
-
-@pytest.mark.parametrize("loop", ["ddim-3", "ddim-6-trailing"])
-def test_a_model_of_a_loop_is_that_of_its_own_program(loop: str) -> None:
-    whole, alone = models_of(), models_of(loop)
-    for piece in ("advance", "pruner"):
-        found, expected = whole.get(f"{piece}@{loop}", whole[piece]), alone[piece]
-        assert [node.SerializeToString() for node in found.graph.node] == [
-            node.SerializeToString() for node in expected.graph.node
-        ]
-        for values in ("input", "output", "initializer"):
-            mine, its = (
-                [value.SerializeToString() for value in getattr(model.graph, values)] for model in (found, expected)
-            )
-            assert mine == its
 
 
 @pytest.mark.parametrize(
