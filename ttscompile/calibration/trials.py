@@ -35,10 +35,10 @@ from .targets import dense_rounds, draw_calls, with_targets
 if TYPE_CHECKING:
     from .proposer import Proposal
 
-DRAWS = 2
+DRAWS = 4
 """Of noise for each observation."""
 
-OBSERVATIONS = 64
+OBSERVATIONS = 32
 """That the original answers, at most, of either part."""
 
 EPISODES = 16
