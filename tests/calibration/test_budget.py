@@ -19,7 +19,7 @@ from ttscompile.calibration.progress import Bar
 from ttscompile.calibration.result import CalibrationResult
 from ttscompile.calibration.state import FILE, StateFile
 from ttscompile.calibration.step_counts import SpacedSchedules, budget_of_error
-from ttscompile.calibration.task import Clock
+from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.whole_steps import Errors, WholeSteps
 from ttscompile.core.lattice import Source
 from ttscompile.errors import CalibrationError, CalibrationFailedError

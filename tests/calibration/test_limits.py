@@ -29,7 +29,7 @@ from ttscompile.calibration.state import FILE, StateFile
 from ttscompile.calibration.step_counts import SpacedSchedules
 from ttscompile.calibration.strategies import FITTED, NAMES, strategy_of
 from ttscompile.calibration.targets import draw_calls, with_targets
-from ttscompile.calibration.task import Clock
+from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.tts import Tts
 from ttscompile.core.lattice import PlanArray, Source, uniform_plan
 from ttscompile.errors import CalibrationError, CalibrationFailedError
@@ -122,7 +122,7 @@ def test_when_half_of_the_time_is_over_no_more_targets_are_made_than_needed(
 ) -> None:
     monkeypatch.setattr(targets, "TARGETS_AT_ONCE", 2)
     artifact = load_artifact(compiled)
-    executor, spec = Executor(artifact), artifact.manifest.spec
+    executor, spec = Executor(view_of(artifact, "dense")), artifact.manifest.spec
     episodes = load_trajectories([recording], spec.observations, 4)
     calls = draw_calls(executor, spec, episodes, split_episodes(6, 0.25, 0), 16, 4, 0)["calibration"]
     state, fresh, clock = StateFile(tmp_path, {}), StateFile(tmp_path, {}), _Hand(100.0)

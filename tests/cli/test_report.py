@@ -101,7 +101,7 @@ def page(calibrated: Path, calls: Path, tmp_path_factory: pytest.TempPathFactory
     output = tmp_path_factory.mktemp("page") / "report.html"
     point = {"series": HOSTILE, "name": "0.9", "error": 2.0, "latency_ms": 12.5}
     comparison = calls.with_name("comparison.json")
-    comparison.write_text(json.dumps({"points": [point], "yardsticks": {"all": 9.0}}))
+    comparison.write_text(json.dumps({"points": [point]}))
     options = ("--verify", "--comparison", comparison)
     result = run(calibrated, "-o", output, "--trajectories", calls, *options)
     assert result.exit_code == 0, result.stderr
