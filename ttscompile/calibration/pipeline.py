@@ -139,7 +139,7 @@ def calibrate(
         artifact = load_artifact(Path(path))
         view = view_of(artifact, base_of(artifact))
         goal = goal_of(*asked, usual=usual_sparsity(view.manifest.steps))
-        request = Request(goal, strategy, correct, max_intervals, rank, updates)
+        request = Request(goal, strategy, correct, max_intervals, rank, updates, max_distance)
         made = [(row, row.make(request)) for row in rows]
         for _, proposer in made:
             if (reason := proposer.applies(artifact)) is not None:
@@ -174,7 +174,7 @@ def calibrate(
             _warn(trials, rows, chosen, corrects)
             kept, told = Kept(trials, anew=SCHEDULE in learn), dict[str, str]()
             for number, (row, proposer) in enumerate(made, 1):
-                _propose(row, proposer, kept, clock.until(number / len(made)), max_distance)
+                _propose(row, proposer, kept, clock.until(number / len(made)))
                 told[row.name] = proposer.told
             if not kept.learned:
                 why = " ".join(f"plan {name!r} {reason}" for name, reason in kept.refused.items())
@@ -204,7 +204,7 @@ def calibrate(
         return result
 
 
-def _propose(row: Row, proposer: Proposer, kept: Kept, clock: Clock, max_distance: float | None) -> None:
+def _propose(row: Row, proposer: Proposer, kept: Kept, clock: Clock) -> None:
     """Judge what a proposer proposes, one plan after the other.
 
     Raises:
@@ -214,7 +214,7 @@ def _propose(row: Row, proposer: Proposer, kept: Kept, clock: Clock, max_distanc
     try:
         proposal = next(proposals)
         while True:
-            held = kept.consider(proposal, max_distance)
+            held = kept.consider(proposal)
             proposal = proposals.send(held)
     except StopIteration:
         return

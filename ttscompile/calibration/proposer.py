@@ -69,6 +69,7 @@ class Request:
         intervals: of a search, at most; None for its own number.
         rank: of the low-rank update to each weight matrix.
         updates: of the weights.
+        margin: in place of what a proposer allows (``Proposal.margin``), where that is a number; None leaves it.
     """
 
     goal: Goal
@@ -77,6 +78,7 @@ class Request:
     intervals: int | None = None
     rank: int = 16
     updates: int = 600
+    margin: float | None = None
 
 
 Proposals: TypeAlias = Generator[Proposal, bool, None]
