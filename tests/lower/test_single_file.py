@@ -71,10 +71,11 @@ def test_random_plans_of_all_sources(tmp_path: Path, options: dict[str, Any]) ->
             rounding = allowed(expected["action_pred"], terms)
             for name in ("action", "action_pred"):
                 np.testing.assert_allclose(found[name], expected[name], rtol=0, atol=rounding)
-            np.testing.assert_array_equal(found["executed_plan"], plan)
+            np.testing.assert_array_equal(found["executed_plan"], np.stack([plan] * streams))
             written |= plan == Source.COMPUTE
-            np.testing.assert_array_equal(episode.index >= 0, written)
-            assert len(episode.rows) == written.sum()
+            np.testing.assert_array_equal(episode.index >= 0, np.stack([written] * streams))
+            assert len(episode.rows) == written.sum() * streams
+            assert sorted(episode.index[episode.index >= 0]) == list(range(len(episode.rows)))
             reads += np.bincount(plan.ravel(), minlength=4)
     if len(program.blocks) > 2 and program.spec.sampler.steps > 1:
         assert (reads > 0).all()
@@ -142,7 +143,8 @@ def test_it_repairs_what_legalize_repairs(tmp_path: Path) -> None:
         legal, _ = legalize(np.where(np.arange(5)[:, None] == 0, 0, plan).astype(np.int8), groups(program), written)
         obs, noise = inputs(policy, rng, 1)
         out = episode.call(obs, noise, plan)
-        np.testing.assert_array_equal(out["executed_plan"], legal)
+        np.testing.assert_array_equal(out["executed_plan"], legal[None])
+        assert out["legalised"].tolist() == [int((legal != plan).sum())]
         repaired += int((legal != plan).sum())
         expected = policy.predict_action(obs, noise=noise, plan=legal)["action"]
         assert_equal_but_for_rounding(out["action"], expected, terms)
@@ -162,7 +164,7 @@ def test_what_is_not_kept_is_not_there(tmp_path: Path) -> None:
     reads = np.full((5, 5), Source.ROLLOUT, np.int8)
     reads[0] = 0
     again = episode.call(obs, noise, reads)
-    assert (again["executed_plan"][1:] == Source.TIMESTEP).all()
+    assert (again["executed_plan"][:, 1:] == Source.TIMESTEP).all()
     assert np.abs(again["action"] - out["action"]).max() > 1e-3
 
 
@@ -251,7 +253,7 @@ def test_the_compiler_writes_it(name: str, compiled_module: Callable[[str], tupl
     policy = ttscompile.load(folder / "artifact")
     rng = np.random.default_rng(0)
     episode = Episode(str(folder / "new" / "call.onnx"), 2)
-    written = np.zeros(episode.index.shape, np.bool_)
+    written = np.zeros(episode.index.shape[1:], np.bool_)
     terms = call_terms(load_artifact(folder / "artifact"))
     for _ in range(3):
         plan = random_plan(rng, *written.shape[:1], policy_groups(folder / "artifact"), written, 0.3)
@@ -276,9 +278,9 @@ PLAIN = textwrap.dedent(
     given = dict(np.load(sys.argv[2]))
     session = onnxruntime.InferenceSession(sys.argv[1], providers=["CPUExecutionProvider"])
     shapes = {value.name: value.shape for value in session.get_inputs()}
-    rows = np.zeros((0, *(given["obs"].shape[1] if n == "B" else n for n in shapes["rollout_rows"][1:])), np.float32)
-    index = np.full(shapes["rollout_index"], -1, np.int64)
-    keep = np.full(shapes["rollout_index"], True)
+    rows = np.zeros((0, *shapes["rollout_rows"][1:]), np.float32)
+    index = np.full((given["obs"].shape[1], *shapes["rollout_index"][1:]), -1, np.int64)
+    keep = np.full(shapes["rollout_keep"], True)
     actions = []
     for r in range(len(given["plan"])):
         feeds = {name: given[name][r] for name in ("obs", "initial_noise", "step_noise", "plan")}
@@ -324,6 +326,6 @@ def recorded_episode(policy: CompiledPolicy, streams: int) -> tuple[Arrays, np.n
         obs = rng.uniform(100, 400, (streams, 2, 20)).astype(np.float32)
         actions.append(policy.predict_action({"obs": obs}, noise=noise, plan=plan)["action"])
         for name, value in zip(rows, (obs, noise.initial, noise.steps, plan), strict=True):
-            rows[name].append(np.asarray(value))
+            rows[name].append(value[None] if name == "plan" else np.asarray(value))
         written |= plan == Source.COMPUTE
     return {name: np.stack(values) for name, values in rows.items()}, np.stack(actions)

@@ -4,26 +4,35 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
 from onnx import ModelProto
 
 from ..errors import LoweringError
 from ..ir.graph import TensorType
-from ..ir.pieces import CONDITION, STEP
+from ..ir.pieces import CONDITION, PRUNER, STEP
 from ..ir.program import Binding, Pieces, frame_values
 from .graph_writer import GraphWriter, Weights
 
 
 class Contexts:
-    """Writes the prologue into the main graph; then hands out the value of a context at a step.
+    """Writes the prologue of all streams into the main graph.
 
     Args:
         main: writer of the main graph.
         pieces: of the program.
-        models: of ``condition`` and, if the program has them, ``frames``, frame pieces and ``step``.
+        models: of ``condition`` and, if the program has them, ``frames``, frame pieces, ``step`` and ``pruner``.
         weights: values of their constants.
         observations: normalised, by name.
         streams: value of B, int64 ``[1]``.
         steps: K.
+
+    Attributes:
+        pieces: of the program.
+        streams: value of B, int64 ``[1]``.
+        steps: K.
+        conditions: condition values by name.
+        rows: tables ``[K, ...]`` by name.
+        by_step: step values ``[K * B, ...]`` by name, step-major, whatever their axis of streams is.
     """
 
     def __init__(
@@ -36,79 +45,108 @@ class Contexts:
         streams: str,
         steps: int,
     ) -> None:
-        self._main, self._pieces, self._streams, self._steps = main, pieces, streams, steps
-        self._models, self._weights = models, weights
-        self._sizes: dict[str, str] = {}
+        self._main, self._models, self._weights = main, models, weights
+        self.pieces, self.streams, self.steps = pieces, streams, steps
         condition = models[CONDITION]
         given = {**observations, **frame_values(pieces, self._inline, observations)}
         made = self._inline(CONDITION, given)
-        self._conditions: dict[str, str] = dict(zip([v.name for v in condition.graph.output], made, strict=True))
-        self._rows = {name: main.constant(table, table.dtype) for name, table in pieces.tables.items()}
-        if pieces.step is not None:
-            self._rows.update(self._step_values(models[STEP], weights))
+        self.conditions: dict[str, str] = dict(zip([v.name for v in condition.graph.output], made, strict=True))
+        self.rows = {name: main.constant(table, table.dtype) for name, table in pieces.tables.items()}
+        self.by_step = {} if pieces.step is None else self._step_values(models[STEP])
 
     def _inline(self, name: str, values: Mapping[str, str]) -> list[str]:
         """The outputs of a piece on values by the name of its input."""
         model = self._models[name]
         return self._main.inline(model, {v.name: values[v.name] for v in model.graph.input}, self._weights)
 
+    def logits(self, w: GraphWriter) -> str:
+        """The pruner's, ``[B, K, N, 4]``; its constants have to be inputs of the whole model."""
+        model, head = self._models[PRUNER], self.pieces.graphs()[PRUNER]
+        reads = {value.name: self.conditions[value.name] for value in model.graph.input}
+        return w.inline(model, {**reads, **{name: name for name in head.constants}}, {})[0]
+
     def condition(self) -> str:
         """What a correction reads: the pruner's features, one row of numbers a stream, ``[B, N]``."""
-        types, rows = self._pieces.condition.types(), []
-        for name in self._pieces.features:
-            axis, value = types[name].batch_axis or 0, self._conditions[name]
+        types, rows = self.pieces.condition.types(), []
+        for name in self.pieces.features:
+            axis, value = types[name].batch_axis or 0, self.conditions[name]
             order = [axis, *(i for i in range(len(types[name].shape)) if i != axis)]
             rows.append(self._main.op("Flatten", self._main.op("Transpose", value, perm=order), axis=1))
         return rows[0] if len(rows) == 1 else self._main.op("Concat", *rows, axis=1)
 
-    def value(self, w: GraphWriter, name: str, k: str, type_: TensorType) -> str:
-        """A context at the step whose index is the value ``k``; ``w`` writes where it is read."""
-        binding = self._pieces.bindings[name]
-        if binding is Binding.CONDITION:
-            return self._conditions[name]
-        row = w.op("Gather", self._rows[name], k)
-        return row if binding is Binding.STEP else self._repeated(w, row, name, type_, whole=False)
-
-    def _step_values(self, model: ModelProto, weights: Weights) -> dict[str, str]:
-        """Step values ``[K, ...]``, made for all steps in one batch of K * B, step-major."""
-        step, main = self._pieces.step, self._main
+    def _step_values(self, model: ModelProto) -> dict[str, str]:
+        """Step values, made for all steps in one batch of K * B."""
+        step, main = self.pieces.step, self._main
         assert step is not None
         feeds = {}
         for name, type_ in step.inputs.items():
             axis = _batch_axis(name, type_)
-            if self._pieces.bindings[name] is Binding.CONDITION:
-                repeats = [self._steps if i == axis else 1 for i in range(len(type_.shape))]
-                feeds[name] = main.op("Tile", self._conditions[name], main.constant(repeats))
+            if self.pieces.bindings[name] is Binding.CONDITION:
+                repeats = [self.steps if i == axis else 1 for i in range(len(type_.shape))]
+                feeds[name] = main.op("Tile", self.conditions[name], main.constant(repeats))
                 continue
-            rows = self._repeated(main, self._rows[name], name, type_, whole=True)
-            before, after = range(1, axis + 1), range(axis + 1, len(type_.shape) + 1)
-            by_step = main.op("Transpose", rows, perm=[*before, 0, *after])
-            feeds[name] = main.op("Reshape", by_step, main.constant([-1 if i == axis else n for i, n in _sizes(type_)]))
-        made = main.inline(model, feeds, weights)
+            sizes = _sizes(main, self.streams, type_, axis)
+            whole = main.op("Expand", self.rows[name], main.op("Concat", main.constant([self.steps]), *sizes, axis=0))
+            rank = len(type_.shape)
+            by_step = main.op("Transpose", whole, perm=[*range(1, axis + 1), 0, *range(axis + 1, rank + 1)])
+            shape = [-1 if i == axis else n for i, n in enumerate(type_.at(1))]
+            feeds[name] = main.op("Reshape", by_step, main.constant(shape))
+        made = main.inline(model, feeds, self._weights)
         types, found = step.types(), {}
         for name, value in zip([v.name for v in model.graph.output], made, strict=True):
             axis = _batch_axis(name, types[name])
-            split = [part for i, n in _sizes(types[name]) for part in ([self._steps, -1] if i == axis else [n])]
-            order = [axis, *(i for i in range(len(split)) if i != axis)]
-            found[name] = main.op("Transpose", main.op("Reshape", value, main.constant(split)), perm=order)
+            order = [axis, *(i for i in range(len(types[name].shape)) if i != axis)]
+            found[name] = value if axis == 0 else main.op("Transpose", value, perm=order)
         return found
 
-    def _repeated(self, w: GraphWriter, rows: str, name: str, type_: TensorType, whole: bool) -> str:
-        """A row of a table, or the whole of it, repeated to B streams."""
+
+class StreamContexts:
+    """Hands out the value of a context at a step, of some of the streams.
+
+    Args:
+        w: of a graph inside of the main one; what does not change from step to step is written there.
+        contexts: of all streams.
+        members: numbers of the streams, int64 ``[S]``.
+    """
+
+    def __init__(self, w: GraphWriter, contexts: Contexts, members: str) -> None:
+        self._w, self._contexts, self._members = w, contexts, members
+        self._streams = w.op("Shape", members)
+        first = w.op("Mul", w.constant(np.arange(contexts.steps)[:, None]), contexts.streams)
+        self._index = w.op("Add", first, members)  # [K, S], rows of ``by_step``
+        self._sizes: dict[str, str] = {}
+        self._conditions: dict[str, str] = {}
+
+    def value(self, w: GraphWriter, name: str, k: str, type_: TensorType) -> str:
+        """A context at the step whose index is the value ``k``; ``w`` writes where it is read."""
+        binding = self._contexts.pieces.bindings[name]
+        if binding is Binding.CONDITION:
+            return self._condition(name, type_)
+        if binding is Binding.STEP:
+            rows = w.op("Gather", self._contexts.by_step[name], w.op("Gather", self._index, k))
+            axis, rank = _batch_axis(name, type_), len(type_.shape)
+            return rows if axis == 0 else w.op("Transpose", rows, perm=[*range(1, axis + 1), 0, *range(axis + 1, rank)])
+        row = w.op("Gather", self._contexts.rows[name], k)
         if type_.batch_axis is None:
-            return rows
-        axis, key = _batch_axis(name, type_), f"{type_} {whole}"
-        if key not in self._sizes:
-            parts = [self._streams if i == axis else self._main.constant([n]) for i, n in _sizes(type_)]
-            if whole:
-                parts.insert(0, self._main.constant([self._steps]))
-            self._sizes[key] = self._main.op("Concat", *parts, axis=0)
-        return w.op("Expand", rows, self._sizes[key])
+            return row
+        if str(type_) not in self._sizes:
+            sizes = _sizes(self._w, self._streams, type_, _batch_axis(name, type_))
+            self._sizes[str(type_)] = self._w.op("Concat", *sizes, axis=0)
+        return w.op("Expand", row, self._sizes[str(type_)])
+
+    def _condition(self, name: str, type_: TensorType) -> str:
+        value = self._contexts.conditions[name]
+        if all(isinstance(n, int) for n in type_.shape):
+            return value
+        if name not in self._conditions:
+            gathered = self._w.op("Gather", value, self._members, axis=_batch_axis(name, type_))
+            self._conditions[name] = gathered
+        return self._conditions[name]
 
 
-def _sizes(type_: TensorType) -> list[tuple[int, int]]:
-    """Axes and their sizes for one stream."""
-    return list(enumerate(type_.at(1)))
+def _sizes(w: GraphWriter, streams: str, type_: TensorType, axis: int) -> list[str]:
+    """The size of each axis, for as many streams as there are."""
+    return [streams if i == axis else w.constant([n]) for i, n in enumerate(type_.at(1))]
 
 
 def _batch_axis(name: str, type_: TensorType) -> int:

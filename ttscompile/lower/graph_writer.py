@@ -76,7 +76,7 @@ class GraphWriter:
 
         Args:
             model: from ``lower_program``; initializers without data are constants of the program.
-            inputs: a value for each of its inputs.
+            inputs: a value for each of its inputs, and for constants that are no weights here.
             weights: values of the constants.
 
         Returns:
@@ -85,7 +85,8 @@ class GraphWriter:
         graph = model.graph
         names = dict(inputs)
         for tensor in graph.initializer:
-            names[tensor.name] = self._weight(tensor, weights)
+            if tensor.name not in inputs:
+                names[tensor.name] = self._weight(tensor, weights)
         for node in graph.node:
             for output in node.output:
                 names[output] = self.fresh("value") if output else ""
@@ -123,6 +124,6 @@ def tensor(name: str, dtype: npt.DTypeLike, shape: Sequence[int | str] | None = 
     return helper.make_tensor_value_info(name, helper.np_dtype_to_tensor_dtype(np.dtype(dtype)), shape)
 
 
-def sequence(name: str) -> ValueInfoProto:
-    """A sequence of float32 tensors."""
-    return helper.make_tensor_sequence_value_info(name, TensorProto.FLOAT, None)
+def sequence(name: str, dtype: npt.DTypeLike = np.float32) -> ValueInfoProto:
+    """A sequence of tensors."""
+    return helper.make_tensor_sequence_value_info(name, helper.np_dtype_to_tensor_dtype(np.dtype(dtype)), None)

@@ -38,7 +38,7 @@ from ..ir.pieces import (
     block_name,
 )
 from ..ir.program import Program
-from .contexts import Contexts
+from .contexts import StreamContexts
 from .graph_writer import GraphWriter, Weights, sequence, tensor
 from .plan import LoweredPlan
 
@@ -67,7 +67,7 @@ class Jumps:
 
 @dataclass(frozen=True)
 class LoopInputs:
-    """Names of values that the loop reads.
+    """Names of values that the loop reads; of all B streams, or of the S that follow one plan.
 
     Attributes:
         initial: sample at step 0, [B, T, D].
@@ -76,8 +76,9 @@ class LoopInputs:
         anchors: bool [K]; after these steps sample and prediction enter the history.
         history: before step 0, [D, B, 4 T].
         memory: of the sampler, before step 0: [D, B, S T]; None if it has none.
-        rows: rollout cache [R, E], with a residual as a row of E numbers.
-        index: int64 [K, N]; which row is the residual of a cell.
+        rows: rollout cache of all streams [R, A, C]; a row is the residual of one stream: A and C are the sizes before
+            and after the axis of streams.
+        index: int64 [K, N, B]; which row is the residual of a cell.
         jumps: of the correction; None where it cannot have any.
     """
 
@@ -119,10 +120,10 @@ class _Step:
 
 
 class DenoisingLoop:
-    """Writes the loop.
+    """Writes the loop of streams that follow one plan.
 
     Args:
-        main: writer of the main graph.
+        main: writer of the graph that the loop is in.
         program: after all passes.
         models: from ``lower_program``.
         weights: values of their constants.
@@ -135,7 +136,7 @@ class DenoisingLoop:
         program: Program,
         models: Mapping[str, ModelProto],
         weights: Weights,
-        contexts: Contexts,
+        contexts: StreamContexts,
     ) -> None:
         self._main, self._models, self._weights, self._contexts = main, models, weights, contexts
         self._pieces, self._sampler = program.pieces, program.spec.sampler
@@ -232,9 +233,10 @@ class DenoisingLoop:
         coefficients = w.op("Slice", plan.from_table, *bounds)
         total = plain.op("MatMul", coefficients, table)
         reads = mixed.op("Gather", plan.rollout, k)
-        cells = mixed.op("Compress", mixed.op("Gather", self._inputs.index, k), reads)
+        cells = mixed.op("Compress", mixed.op("Gather", self._inputs.index, k), reads, axis=0)  # [read, S]
         share = mixed.op("Compress", mixed.op("Slice", plan.from_rollout, *bounds), reads, axis=1)
-        older = mixed.op("MatMul", share, mixed.op("Gather", self._inputs.rows, cells))
+        of_streams = mixed.op("Transpose", mixed.op("Gather", self._inputs.rows, cells), perm=[0, 2, 1, 3])
+        older = mixed.op("MatMul", share, mixed.op("Reshape", of_streams, mixed.constant([0, -1])))
         both = mixed.op("Add", mixed.op("MatMul", coefficients, table), older)
         any_rollout = w.op("Gather", plan.any_rollout, k)
         return w.choose(any_rollout, mixed.body("mixed", both), plain.body("plain", total))[0]

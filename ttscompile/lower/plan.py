@@ -11,11 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from onnx import TensorProto
 
 from .graph_writer import GraphWriter
 
-INT64, INT8 = 7, 3
-"""ONNX's numbers of these dtypes."""
+INT64 = TensorProto.INT64
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,6 @@ class LoweredPlan:
     """Names of values; K steps, N blocks, G gaps.
 
     Attributes:
-        executed: int8 [K, N]; the plan after making step 0 dense and ROLLOUT of the never computed TIMESTEP.
         computed: bool [K, N].
         position: int64 [K, N + 1]; how many blocks of the step are computed before this one.
         computed_steps: int64 scalar; S, how many steps have a computed block.
@@ -41,7 +40,6 @@ class LoweredPlan:
         any_of_group: bool [K, groups of blocks]; any block of it is computed.
     """
 
-    executed: str
     computed: str
     position: str
     computed_steps: str
@@ -60,24 +58,19 @@ class LoweredPlan:
 
 
 # PLR0915: a node a line
-def lower_plan(w: GraphWriter, plan: str, index: str, groups: Sequence[int], steps: int, together: int) -> LoweredPlan:  # noqa: PLR0915
+def lower_plan(w: GraphWriter, plan: str, groups: Sequence[int], steps: int, together: int) -> LoweredPlan:  # noqa: PLR0915
     """Write the nodes that lower a plan.
 
     Args:
-        w: of the main graph.
-        plan: int8 [K, N].
-        index: int64 [K, N]; negative where the rollout cache has no residual of the cell.
+        w: of the graph that the loop is in.
+        plan: int8 [K, N], legal.
         groups: FORWARD group of each block.
         steps: K.
         together: how many neighbouring blocks make a group of ``any_of_group``.
     """
     count = len(groups)
     # Which cells are what. Booleans and int64 throughout: onnxruntime has kernels for all of these.
-    after_first = np.ones((steps, 1), np.int64)
-    after_first[0] = 0
-    source = w.op("Mul", w.op("Cast", plan, to=INT64), w.constant(after_first))
-    missing = w.op("And", w.op("Equal", source, w.constant(3)), w.op("Less", index, w.constant(0)))
-    source = w.op("Where", missing, w.constant(2), source)
+    source = w.op("Cast", plan, to=INT64)
     computed = w.op("Equal", source, w.constant(0))
     ones = w.op("Cast", computed, to=INT64)
     per_step = w.op("ReduceSum", ones, w.constant([1]), keepdims=0)
@@ -132,7 +125,6 @@ def lower_plan(w: GraphWriter, plan: str, index: str, groups: Sequence[int], ste
     padded = w.op("Pad", ones, w.constant([0, 0, 0, groups_of * together - count]))
     folded = w.op("Reshape", padded, w.constant([steps, groups_of, together]))
     return LoweredPlan(
-        executed=w.op("Cast", source, to=INT8),
         computed=computed,
         position=position,
         computed_steps=w.op("Reshape", number, w.constant(np.zeros(0))),

@@ -1,53 +1,59 @@
 """One ONNX model that is the whole sparse call, for programs that have onnxruntime and nothing of ours.
 
     observation -> normalise -> condition and step values -.
-    plan, rollout_index -> coefficients --------------------+-> loop over steps -> unnormalise -> action, action_pred
+    plan, or the pruner's -> repair -> coefficients --------+-> loop over steps -> unnormalise -> action, action_pred
     initial_noise, step_noise, rollout_rows ----------------'                  '-> rollout_rows_next, .._index_next
 
-All B streams of a batch follow one plan. For K steps and N blocks the inputs are, with the shapes of the policy:
+Each stream of a batch may follow a plan of its own; those that follow one go through the loop together. For B streams,
+K steps and N blocks the inputs are, with the shapes of the policy:
 
 ======================= =================== ==========================================================================
 (keys of observations)  ``[B, ...]``        as the policy's user has them, not normalised
 ``initial_noise``       float32 [B,T,D]     the sample at step 0
 ``step_noise``          float32 [K,B,T,D]   only if the sampler is stochastic
-``plan``                int8 [K,N]          0 COMPUTE, 1 FORWARD, 2 TIMESTEP, 3 ROLLOUT; a plan that is no schedule of
-                                            the artifact's comes from its pruner, which is not in the file
-``rollout_rows``        float32 [R,...]     residuals of earlier calls of the episode; R = 0 in its first call
-``rollout_index``       int64 [K,N]         which row is the residual of a cell; -1 where there is none
+``plan``                int8 [P,K,N]        0 COMPUTE, 1 FORWARD, 2 TIMESTEP, 3 ROLLOUT; P is 1 for all streams, or B
+``rollout_rows``        float32 [R,...]     residuals of earlier calls of the episode, one of one stream in each row;
+                                            R = 0 in its first call
+``rollout_index``       int64 [B,K,N]       which row is the residual of a cell; -1 where there is none
 ``rollout_keep``        bool [K,N]          residuals that later calls of the episode may read; none for plans without
                                             ROLLOUT, and the cache stays empty
+``use_pruner``          bool []             whether the plan is what the pruner makes of the observation, and not
+                                            ``plan``, which is not looked at then. False if left out. Only if the
+                                            policy has a pruner
+``pruner. ...``         float32             weights of the pruner, as ``Artifact.pruner`` names them. Those left out are
+                                            as they were at the time of ``convert``: not calibrated, which is dense
 ======================= =================== ==========================================================================
 
-A schedule that has a correction wants it as further inputs, which ``Correction.inputs`` gives: ``correction``,
+A plan that has a correction wants it as further inputs, which ``Correction.inputs`` gives: ``correction``,
 ``correction_bias`` and ``correction_anchors``, if it reads the observation ``correction_reading`` and
 ``correction_observed``, and if it has jumps ``correction_jumps``, ``correction_inner``, ``correction_middle`` and
 ``correction_outer``. Inputs that are left out correct nothing. onnxruntime warns, when it loads the file, that these
-have values and can be overridden. The outputs are
+have values and can be overridden. ``runtimes.single_file.inputs_of`` gives all that belongs to a plan of an artifact.
+The outputs are
 
 ======================= =================== ==========================================================================
-``action``              float32 [B,Ta,Da]   what to execute
+``action``              float32 [B,Ta,Da]   what to execute; NaN where the pruner's weights are broken
 ``action_pred``         float32 [B,T,Da]    the whole chunk
-``executed_plan``       int8 [K,N]          the plan with a dense step 0, and with TIMESTEP for every ROLLOUT of what
+``executed_plan``       int8 [B,K,N]        the plan with a dense step 0, and with TIMESTEP for every ROLLOUT of what
                                             the cache does not have: ``legalize`` in ONNX
+``legalised``           int64 [B]           how many cells that has changed
 ``rollout_rows_next``   float32 [R',...]    the next call's ``rollout_rows``
-``rollout_index_next``  int64 [K,N]         the next call's ``rollout_index``
+``rollout_index_next``  int64 [B,K,N]       the next call's ``rollout_index``
 ======================= =================== ==========================================================================
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
 import numpy as np
-from onnx import ModelProto, ValueInfoProto, helper
+from onnx import ModelProto, helper
 
 from ..core.correction import (
     ANCHORS,
     CORRECTION,
     CORRECTION_BIAS,
     FEATURES,
-    HIDDEN,
     HISTORY,
     INNER,
     JUMPS,
@@ -56,19 +62,19 @@ from ..core.correction import (
     OUTER,
     READING,
     may_jump,
-    no_correction,
-    numbers_of,
 )
+from ..core.lattice import Source
 from ..core.spec import PolicySpec
 from ..core.update import columns, diagonals, rows
 from ..errors import LoweringError
-from ..ir.graph import TensorType
 from ..ir.program import Program
+from .call_interface import USE_PRUNER, condition_numbers, write_interface
 from .contexts import Contexts
-from .graph_writer import GraphWriter, Weights, tensor
-from .loop import GROUP, DenoisingLoop, Jumps, LoopInputs
+from .executed_plan import ExecutedPlans, write_executed_plans
+from .graph_writer import GraphWriter, Weights
+from .loop import Jumps, LoopInputs
 from .onnx_model import opsets, own_model
-from .plan import LoweredPlan, lower_plan
+from .streams import Denoised, residual_sizes, write_streams
 
 LARGEST = 2**31 - 1
 """Bytes of a file that protobuf reads."""
@@ -87,73 +93,55 @@ def lower_single_file(program: Program, models: Mapping[str, ModelProto], weight
             context cannot be repeated for a batch; or the file would have 2 GB.
     """
     spec, types = program.spec, sorted({str(block.type) for block in program.blocks})
-    if len(types) != 1 or program.blocks[0].type.dtype != "float32":
-        raise LoweringError(f"the residual stream changes its type, or is not float32: {types}. Convert without it.")
-    inputs, outputs = _interface(spec, program.blocks[0].type, len(program.blocks))
+    stream = program.blocks[0].type
+    if len(types) != 1 or stream.dtype != "float32" or stream.batch_axis is None:
+        problem = f"the residual stream changes its type, or is not float32, or has no axis of streams: {types}"
+        raise LoweringError(f"{problem}. Convert without it.")
     main = GraphWriter()
+    inputs, outputs = write_interface(main, program, weights)
     streams = main.op("Shape", "initial_noise", start=0, end=1)
     observations = {key: _normalized(main, key, spec) for key in spec.observations}
     contexts = Contexts(main, program.pieces, models, weights, observations, streams, spec.sampler.steps)
-    groups = [block.group for block in program.blocks]
-    plan = lower_plan(main, "plan", "rollout_index", groups, spec.sampler.steps, GROUP)
-    one = main.op("Concat", main.op("Shape", "rollout_rows", start=0, end=1), _width(main), axis=0)
-    stored = main.op("Reshape", "rollout_rows", one, allowzero=1)
-    given = no_correction(spec.sampler.steps, spec.sample)
-    for name, array in ((ANCHORS, given.anchors), (CORRECTION, given.weights), (CORRECTION_BIAS, given.bias)):
-        inputs.append(tensor(name, array.dtype, array.shape))
-        main.default(name, array)
+    lattice, pruner = (spec.sampler.steps, len(program.blocks)), None
+    if program.pieces.pruner is not None:
+        pruner = USE_PRUNER, contexts.logits
+    plans = write_executed_plans(main, "plan", "rollout_index", streams, lattice, pruner)
     update, offset = _update(main, spec, streams)
     condition = None
-    if numbers := numbers_of(program.pieces.condition.types()[name].at(1) for name in program.pieces.features):
+    if condition_numbers(program):
         condition = contexts.condition()
-        inputs += _condition_inputs(main, spec, numbers)
         offset = main.op("Add", offset, _observed(main, spec, condition))
-    jumps = None
-    if may_jump(spec.sample):
-        inputs += _jump_inputs(main, spec, numbers)
-        jumps = Jumps(JUMPS, INNER, MIDDLE, OUTER, condition)
+    jumps = Jumps(JUMPS, INNER, MIDDLE, OUTER, condition) if may_jump(spec.sample) else None
     history, memories = _zeros(main, spec, streams, HISTORY), spec.sampler.memories
     memory = _zeros(main, spec, streams, memories) if memories else None
-    loop = DenoisingLoop(main, program, models, weights, contexts)
-    values = LoopInputs("initial_noise", offset, update, ANCHORS, history, memory, stored, "rollout_index", jumps)
-    sample, residuals = loop.write(plan, values)
-    if (bound := spec.sampler.bound) is not None:  # without a correction no number is beyond it
+    count = main.op("Shape", "rollout_rows", start=0, end=1)
+    rows = main.op("Concat", count, main.constant(residual_sizes(program)), axis=0)
+    rows = main.op("Reshape", "rollout_rows", rows, allowzero=1)
+    values = LoopInputs(
+        initial="initial_noise",
+        offset=offset,
+        update=update,
+        anchors=ANCHORS,
+        history=history,
+        memory=memory,
+        rows=rows,
+        index=main.op("Transpose", "rollout_index", perm=[1, 2, 0]),
+        jumps=jumps,
+    )
+    denoised = write_streams(main, program, models, weights, contexts, plans, values, "rollout_keep")
+    sample = denoised.sample
+    bound = spec.sampler.bound
+    if bound is not None:  # without a correction no number is beyond it
         sample = main.op("Clip", sample, *(main.constant(end, np.float32) for end in (-bound, bound)))
-    _write_actions(main, sample, spec)
-    main.rename(plan.executed, "executed_plan")
-    _write_cache(main, plan, stored, residuals, (spec.sampler.steps, len(groups)))
+    _write_actions(main, main.op("Add", sample, plans.broken), spec)
+    main.rename(plans.executed, "executed_plan")
+    main.rename(plans.legalised, "legalised")
+    _write_cache(main, plans, denoised, rows)
     model = own_model(main.graph("ttscompile", outputs, inputs), opsets(models.values()))
     if (size := model.ByteSize()) > LARGEST:
         what = f"the single file would have {size / 1e9:.1f} GB; an ONNX file holds at most 2"
         raise LoweringError(f"{what}. Convert without the single file and use the artifact.")
     return model
-
-
-def _interface(spec: PolicySpec, stream: TensorType, count: int) -> tuple[list[ValueInfoProto], list[ValueInfoProto]]:
-    """Inputs and outputs; see the top of the file."""
-    (horizon, channels), chunk, steps = spec.sample, spec.chunk, spec.sampler.steps
-    row = [n if isinstance(n, int) else str(n) for n in stream.shape]
-    inputs = [tensor(key, each.dtype, ["B", *each.shape]) for key, each in spec.observations.items()]
-    own = [tensor("initial_noise", np.float32, ["B", horizon, channels])]
-    if spec.sampler.stochastic:
-        own.append(tensor("step_noise", np.float32, [steps, "B", horizon, channels]))
-    own += [
-        tensor("plan", np.int8, [steps, count]),
-        tensor("rollout_rows", np.float32, ["R", *row]),
-        tensor("rollout_index", np.int64, [steps, count]),
-        tensor("rollout_keep", np.bool_, [steps, count]),
-    ]
-    outputs = [
-        tensor("action", np.float32, ["B", chunk.stop - chunk.start, chunk.action_dim]),
-        tensor("action_pred", np.float32, ["B", horizon, chunk.action_dim]),
-        tensor("executed_plan", np.int8, [steps, count]),
-        tensor("rollout_rows_next", np.float32, ["R_next", *row]),
-        tensor("rollout_index_next", np.int64, [steps, count]),
-    ]
-    if clash := sorted(set(spec.observations) & {value.name for value in (*own, *outputs)}):
-        what = f"the observations {clash} have names of the single file's own inputs or outputs"
-        raise LoweringError(f"{what}. Rename them, or convert without the single file.")
-    return [*inputs, *own], outputs
 
 
 def _normalized(main: GraphWriter, key: str, spec: PolicySpec) -> str:
@@ -187,29 +175,6 @@ def _update(main: GraphWriter, spec: PolicySpec, streams: str) -> tuple[str, str
     return update, offset
 
 
-def _condition_inputs(main: GraphWriter, spec: PolicySpec, numbers: int) -> list[ValueInfoProto]:
-    """The inputs of a correction that reads N numbers of the condition; they read one that adds nothing by default."""
-    (horizon, dimensions), steps = spec.sample, spec.sampler.steps
-    main.default(READING, np.zeros((numbers, 1), np.float32))
-    main.default(OBSERVED, np.zeros((1, steps, dimensions, horizon), np.float32))
-    return [
-        tensor(READING, np.float32, [numbers, "F"]),
-        tensor(OBSERVED, np.float32, ["F", steps, dimensions, horizon]),
-    ]
-
-
-def _jump_inputs(main: GraphWriter, spec: PolicySpec, numbers: int) -> list[ValueInfoProto]:
-    """The inputs of jumps that read N numbers of the condition; by default there are none."""
-    steps, chunk = spec.sampler.steps, math.prod(spec.sample)
-    main.default(JUMPS, np.full(steps, -1, np.int64))
-    inputs = [tensor(JUMPS, np.int64, [steps])]
-    layers = {INNER: (numbers + HISTORY * chunk + 1, HIDDEN), MIDDLE: (HIDDEN + 1, HIDDEN), OUTER: (HIDDEN + 1, chunk)}
-    for name, shape in layers.items():
-        main.default(name, np.zeros((1, *shape), np.float32))
-        inputs.append(tensor(name, np.float32, ["J", *shape]))
-    return inputs
-
-
 def _observed(main: GraphWriter, spec: PolicySpec, condition: str) -> str:
     """``Correction.from_condition`` in ONNX: ``[K, D, B, T]`` of the condition's numbers ``[B, N]``."""
     (horizon, dimensions), steps = spec.sample, spec.sampler.steps
@@ -226,11 +191,6 @@ def _zeros(main: GraphWriter, spec: PolicySpec, streams: str, count: int) -> str
     return main.op("ConstantOfShape", shape)
 
 
-def _width(main: GraphWriter) -> str:
-    """E, int64 ``[1]``: how many numbers a residual has."""
-    return main.op("ReduceProd", main.op("Shape", "rollout_rows", start=1), keepdims=1)
-
-
 def _write_actions(main: GraphWriter, sample: str, spec: PolicySpec) -> None:
     chunk = spec.chunk
     predicted = main.op("Slice", sample, *(main.constant([n]) for n in (0, chunk.action_dim, 2)))
@@ -241,29 +201,22 @@ def _write_actions(main: GraphWriter, sample: str, spec: PolicySpec) -> None:
     main.rename(main.op("Slice", predicted, *(main.constant([n]) for n in (chunk.start, chunk.stop, 1))), "action")
 
 
-def _write_cache(main: GraphWriter, plan: LoweredPlan, stored: str, computed: str, lattice: tuple[int, int]) -> None:
-    """The next call's rollout cache: rows that were ``stored`` and not computed anew, then those ``computed``.
-
-    The latter are residuals of the computed cells, in order; the lattice is K and N.
-    """
-    keep, index, anew = (
-        main.op("Reshape", value, main.constant([-1])) for value in ("rollout_keep", "rollout_index", plan.computed)
-    )
-    known = main.op("And", main.op("GreaterOrEqual", index, main.constant(0)), main.op("Not", anew))
-    old_cells = _true(main, main.op("And", known, keep))
-    new_cells = _true(main, main.op("And", anew, keep))
-    old_rows = main.op("Gather", stored, main.op("Gather", index, old_cells))
-    new_rows = main.op("Compress", computed, main.op("Compress", keep, anew), axis=0)
-    rows = main.op("Concat", old_rows, new_rows, axis=0)
-    shape = main.op("Concat", main.op("Shape", rows, start=0, end=1), main.op("Shape", "rollout_rows", start=1), axis=0)
+def _write_cache(main: GraphWriter, plans: ExecutedPlans, denoised: Denoised, stored: str) -> None:
+    """The next call's rollout cache: rows that were ``stored`` and not computed anew, then those ``denoised``."""
+    anew = main.op("Equal", plans.executed, main.constant(Source.COMPUTE.value, np.int8))
+    known = main.op("And", main.op("GreaterOrEqual", "rollout_index", main.constant(0)), main.op("Not", anew))
+    old = main.op("And", known, "rollout_keep")
+    flat = main.constant([-1])
+    old_cells = main.op("Reshape", main.op("NonZero", main.op("Reshape", old, flat)), flat)
+    old_rows = main.op("Gather", stored, main.op("Gather", main.op("Reshape", "rollout_index", flat), old_cells))
+    rows = main.op("Concat", old_rows, denoised.rows, axis=0)
+    row = main.op("Shape", "rollout_rows", start=1)
+    shape = main.op("Concat", main.op("Shape", rows, start=0, end=1), row, axis=0)
     main.rename(main.op("Reshape", rows, shape, allowzero=1), "rollout_rows_next")
-    cells = main.op("Concat", old_cells, new_cells, axis=0)
+    cells = main.op("Concat", old_cells, denoised.cells, axis=0)
     numbers = main.op("Range", main.constant(0), main.op("Size", cells), main.constant(1))
-    nothing = main.constant(np.full(lattice[0] * lattice[1], -1))
+    shape = main.op("Shape", "rollout_index")
+    size = main.op("ReduceProd", shape, keepdims=1)
+    nothing = main.op("Expand", main.constant([-1]), size)
     merged = main.op("ScatterElements", nothing, cells, numbers, axis=0)
-    main.rename(main.op("Reshape", merged, main.constant(lattice)), "rollout_index_next")
-
-
-def _true(main: GraphWriter, flags: str) -> str:
-    """Indices of what is true in a vector."""
-    return main.op("Reshape", main.op("NonZero", flags), main.constant([-1]))
+    main.rename(main.op("Reshape", merged, shape), "rollout_index_next")

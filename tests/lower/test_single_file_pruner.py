@@ -1,0 +1,203 @@
+"""The pruner in the single file: the plans that it makes, executed, against the reference runtime."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+from onnx import GraphProto
+from onnxruntime.capi.onnxruntime_pybind11_state import InvalidArgument
+
+import ttscompile
+from tests.lower.whole_call import Episode, inputs, make
+from tests.rounding import assert_equal_but_for_rounding
+from tests.runtimes.agreement import call_terms
+from tests.runtimes.plans import random_correction
+from tests.runtimes.toys import toy_program
+from ttscompile.artifact import load_artifact
+from ttscompile.artifact.distilled import DistilledWeights
+from ttscompile.artifact.write import update_calibration
+from ttscompile.core.lattice import Source, uniform_plan
+from ttscompile.errors import ArtifactError, IllegalPlanError
+from ttscompile.ir.program import Program
+from ttscompile.lower.program import lower_program
+from ttscompile.lower.single_file import lower_single_file
+from ttscompile.runtimes.single_file import inputs_of
+
+
+def random_pruner(program: Program, seed: int) -> dict[str, np.ndarray]:
+    """Weights of a head that wants anything anywhere, a reuse in step 0 too, and other things of other observations."""
+    rng = np.random.default_rng(seed)
+    head = program.pieces.pruner
+    assert head is not None
+    weights = {name: rng.standard_normal(type_.at(1)).astype(np.float32) for name, type_ in head.constants.items()}
+    return weights | {"pruner.mask": np.zeros_like(weights["pruner.mask"])}
+
+
+def calibrated(folder: Path, program: Program, corrected: bool = True) -> Path:
+    """The artifact with another pruner than it was converted with, which has a correction with jumps."""
+    artifact, shape = load_artifact(folder), (program.spec.sampler.steps, len(program.blocks))
+    corrections = {"pruner": random_correction(artifact, np.random.default_rng(1))} if corrected else {}
+    schedules = {"evenly": uniform_plan(*shape, 2)}
+    update_calibration(folder, random_pruner(program, 2), schedules, "pruner", {}, corrections=corrections)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("options", "corrected"),
+    [
+        ({"steps": 6}, True),
+        ({"noise": 0.0, "sequence_first": True, "steps": 5, "blocks": 7}, True),
+        ({"blocks": 2}, False),  # no step values
+    ],
+)
+def test_episodes_of_its_plans(tmp_path: Path, options: dict[str, Any], corrected: bool) -> None:
+    """All sources, a plan for each stream, residuals of earlier calls, and a schedule in between."""
+    program = toy_program(**options)
+    _, model = make(program, tmp_path)
+    folder = calibrated(tmp_path / "artifact", program, corrected)
+    policy = ttscompile.load(folder, "reference")
+    assert policy.info.default_plan == "pruner"
+    terms = 4 * call_terms(load_artifact(folder)) + 7 * 6 * program.spec.sample[0] * program.spec.sampler.steps
+    rng, reads, repaired, seen, plans = np.random.default_rng(0), np.zeros(4, int), 0, 0, set()
+    given = {name: inputs_of(folder, name) for name in ("pruner", "evenly")}
+    for streams in (1, 3, 2):
+        policy.reset()
+        episode = Episode(model, streams)
+        for call in range(4):
+            name = "evenly" if call == 2 else "pruner"
+            obs, noise = inputs(policy, rng, streams)
+            expected = policy.predict_action(obs, noise=noise, plan=name)
+            found = episode.call(obs, noise, **given[name])
+            report = policy.last_report
+            assert report is not None
+            np.testing.assert_array_equal(found["executed_plan"], report.plan)
+            assert found["legalised"].tolist() == list(report.legalised)
+            assert_equal_but_for_rounding(found["action_pred"], expected["action_pred"], terms)
+            np.testing.assert_array_equal(found["action"], found["action_pred"][:, 1:])
+            if name == "pruner":
+                reads += np.bincount(report.plan.ravel(), minlength=4)
+                repaired += sum(report.legalised)
+                plans |= {plan.tobytes() for plan in report.plan}
+                seen += streams
+    assert (reads > 0).all()
+    assert repaired > 0
+    assert len(plans) > seen / 2
+
+
+def test_streams_of_one_plan_go_together_and_others_do_not_see_it(tmp_path: Path) -> None:
+    """Two streams of one observation and a third: each has the actions that it has alone."""
+    program = toy_program()
+    policy, model = make(program, tmp_path)
+    given = inputs_of(calibrated(tmp_path / "artifact", program, corrected=False))
+    terms = call_terms(load_artifact(tmp_path / "artifact"))
+    obs, noise = inputs(policy, np.random.default_rng(5), 3)
+    obs["obs"][2] = obs["obs"][0]
+    found = Episode(model, 3).call(obs, noise, **given)
+    assert (found["executed_plan"][0] == found["executed_plan"][2]).all()
+    assert (found["executed_plan"][0] != found["executed_plan"][1]).any()
+    assert noise.steps is not None
+    for s in range(3):
+        one = ttscompile.Noise(noise.initial[s : s + 1], noise.steps[:, s : s + 1])
+        alone = Episode(model, 1).call({"obs": obs["obs"][s : s + 1]}, one, **given)
+        np.testing.assert_array_equal(alone["executed_plan"][0], found["executed_plan"][s])
+        assert_equal_but_for_rounding(found["action_pred"][s], alone["action_pred"][0], terms)
+
+
+def test_a_plan_of_the_caller_for_each_stream(tmp_path: Path) -> None:
+    program = toy_program(pruner=False)
+    policy, model = make(program, tmp_path)
+    obs, noise = inputs(policy, np.random.default_rng(0), 2)
+    plans = np.stack([uniform_plan(5, 5, n) for n in (2, 5)])
+    expected = policy.predict_action(obs, noise=noise, plan=plans)["action_pred"]
+    found = Episode(model, 2).call(obs, noise, plans)
+    np.testing.assert_array_equal(found["executed_plan"], plans)
+    assert found["legalised"].tolist() == [0, 0]
+    assert_equal_but_for_rounding(found["action_pred"], expected, call_terms(load_artifact(tmp_path / "artifact")))
+
+
+def test_weights_that_are_left_out_are_those_that_were_converted(tmp_path: Path) -> None:
+    """And the plan that is given is not looked at."""
+    program = toy_program()
+    policy, model = make(program, tmp_path)
+    obs, noise = inputs(policy, np.random.default_rng(0), 1)
+    plan, used = np.full((1, 5, 5), Source.TIMESTEP, np.int8), np.array(True)
+    found = Episode(model, 1).call(obs, noise, plan, use_pruner=used)
+    own = {name: np.asarray(program.weights[name]) for name in ("pruner.w", "pruner.b", "pruner.mask")}
+    both = (own, random_pruner(program, 0))
+    same, other = (Episode(model, 1).call(obs, noise, plan, use_pruner=used, **weights) for weights in both)
+    np.testing.assert_array_equal(found["executed_plan"], same["executed_plan"])
+    np.testing.assert_array_equal(found["action"], same["action"])
+    assert (found["executed_plan"] != other["executed_plan"]).any()
+    assert (Episode(model, 1).call(obs, noise, plan)["executed_plan"][0, 1:] == Source.TIMESTEP).all()
+
+
+def test_a_broken_pruner_gives_no_actions(tmp_path: Path) -> None:
+    program = toy_program()
+    policy, model = make(program, tmp_path)
+    obs, noise = inputs(policy, np.random.default_rng(0), 2)
+    given, weights = np.zeros((5, 5), np.int8), random_pruner(program, 0)
+    fine = Episode(model, 2).call(obs, noise, given, use_pruner=np.array(True), **weights)
+    weights["pruner.b"][7] = np.nan
+    found = Episode(model, 2).call(obs, noise, given, use_pruner=np.array(True), **weights)
+    assert np.isfinite(fine["action_pred"]).all()
+    assert np.isnan(found["action_pred"]).all()
+    assert np.isfinite(Episode(model, 2).call(obs, noise, given, **weights)["action_pred"]).all()  # nobody asked it
+
+
+def test_a_policy_without_a_pruner_has_no_such_input(tmp_path: Path) -> None:
+    program = toy_program(pruner=False)
+    policy, model = make(program, tmp_path)
+    obs, noise = inputs(policy, np.random.default_rng(0), 1)
+    names = {value.name for value in onnx.load_model_from_string(model).graph.input}
+    assert not [name for name in names if "pruner" in name]
+    with pytest.raises(InvalidArgument, match="use_pruner"):
+        Episode(model, 1).call(obs, noise, np.zeros((5, 5)), use_pruner=np.array(True))
+    with pytest.raises(ArtifactError, match=r"has no plan 'pruner'; it has \['dense'\]"):
+        inputs_of(tmp_path / "artifact", "pruner")
+
+
+def test_a_plan_with_weights_of_its_own_is_refused(tmp_path: Path) -> None:
+    program = toy_program()
+    make(program, tmp_path)
+    own = DistilledWeights({"block.0.w": np.zeros((4, 4), np.float32)}, {})
+    schedules = {"evenly": uniform_plan(5, 5, 2), "distilled": uniform_plan(5, 5, 2)}
+    update_calibration(tmp_path / "artifact", None, schedules, "distilled", {}, distilled=own)
+    with pytest.raises(IllegalPlanError, match="plan 'distilled' has weights of its own"):
+        inputs_of(tmp_path / "artifact")
+    np.testing.assert_array_equal(inputs_of(tmp_path / "artifact", "evenly")["plan"], schedules["evenly"][None])
+
+
+def graphs(graph: GraphProto) -> Iterator[GraphProto]:
+    """A graph and all that are in it, at any depth."""
+    yield graph
+    for node in graph.node:
+        for attribute in node.attribute:
+            if attribute.HasField("g"):
+                yield from graphs(attribute.g)
+
+
+def test_the_head_and_the_branches_are_in_the_file() -> None:
+    """Of the head every operation and constant, in a branch; of each block one that computes and one that reuses."""
+    program = toy_program(blocks=8)
+    models = lower_program(program)
+    model = lower_single_file(program, models, program.weights)
+    parts = {graph.name: graph for graph in graphs(model.graph)}
+    assert {f"block_{b:02d}{end}" for b in range(8) for end in ("", "_reused")} <= parts.keys()
+    head = parts["pruner"]
+    operations = [node.op_type for node in models["pruner"].graph.node]
+    assert operations
+    assert [node.op_type for node in head.node][: len(operations)] == operations
+    assert "ArgMax" in [node.op_type for node in head.node]
+    read = {name for node in head.node for name in node.input}
+    assert {"pruner.w", "pruner.b", "pruner.mask"} <= read & {value.name for value in model.graph.input}
+    (asked,) = [node for node in model.graph.node if node.op_type == "If" and "use_pruner" in node.input]
+    asked_for = {attribute.name: attribute.g.name for attribute in asked.attribute}
+    assert asked_for == {"then_branch": "pruner", "else_branch": "given_plan"}
+    without = toy_program(blocks=8, pruner=False)
+    model = lower_single_file(without, lower_program(without), without.weights)
+    assert "pruner" not in {graph.name for graph in graphs(model.graph)}

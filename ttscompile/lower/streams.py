@@ -1,0 +1,140 @@
+"""Streams of a batch that follow one plan go through the denoising loop together, in ONNX.
+
+    for each different plan:                                             Loop
+        take what belongs to the streams that follow it
+        samples of these streams = the denoising loop (``loop``)
+        residuals that later calls may read -> a row for each stream and cell
+
+A schedule is one plan for all streams, so this loop runs once; so it does for one stream, whatever its plan.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from onnx import GraphProto, ModelProto
+
+from ..ir.program import Program
+from .contexts import Contexts, StreamContexts
+from .executed_plan import ExecutedPlans
+from .graph_writer import GraphWriter, Weights, sequence, tensor
+from .loop import GROUP, DenoisingLoop, LoopInputs
+from .plan import INT64, lower_plan
+
+AXES = {"initial": 0, "offset": 2, "history": 1, "memory": 1, "index": 2}
+"""Axis of the streams in members of ``LoopInputs``."""
+
+
+@dataclass(frozen=True)
+class Denoised:
+    """Names of values after the loop.
+
+    Attributes:
+        sample: [B, T, D].
+        rows: residuals that were computed and are to be kept, [new rows, A, C] as ``LoopInputs.rows``.
+        cells: int64 [new rows]; what each of them is of, as ``stream * K * N + k * N + b``.
+    """
+
+    sample: str
+    rows: str
+    cells: str
+
+
+def write_streams(
+    main: GraphWriter,
+    program: Program,
+    models: Mapping[str, ModelProto],
+    weights: Weights,
+    contexts: Contexts,
+    plans: ExecutedPlans,
+    inputs: LoopInputs,
+    keep: str,
+) -> Denoised:
+    """Write the loop over plans, with all that is in it.
+
+    Args:
+        main: writer of the main graph.
+        program: after all passes.
+        models: from ``lower_program``.
+        weights: values of their constants.
+        contexts: of all streams.
+        plans: of all streams.
+        inputs: of all streams.
+        keep: bool [K, N]; computed residuals that later calls may read.
+    """
+    count = main.op("Shape", plans.different, start=0, end=1)
+    carried = [inputs.initial, main.op("SequenceEmpty"), main.op("SequenceEmpty", dtype=INT64)]
+    body = _of_one_plan(main.inner(), program, models, weights, contexts, plans, inputs, keep)
+    count = main.op("Reshape", count, main.constant(np.zeros(0)))
+    sample, rows, cells = main.ops("Loop", [count, "", *carried], len(carried), body=body)
+    joined = (main.op("ConcatFromSequence", each, axis=0) for each in (rows, cells))
+    return Denoised(sample, *joined)
+
+
+def _of_one_plan(
+    w: GraphWriter,
+    program: Program,
+    models: Mapping[str, ModelProto],
+    weights: Weights,
+    contexts: Contexts,
+    plans: ExecutedPlans,
+    inputs: LoopInputs,
+    keep: str,
+) -> GraphProto:
+    """Body of the loop: carries all samples, and sequences of rows and of their cells."""
+    i, on, samples, rows, cells = (w.fresh(n) for n in ("i", "on", "samples", "rows", "cells"))
+    steps, groups = program.spec.sampler.steps, [block.group for block in program.blocks]
+    members = w.op("Reshape", w.op("NonZero", w.op("Equal", plans.which, i)), w.constant([-1]))
+    plan = lower_plan(w, w.op("Gather", plans.different, i), groups, steps, GROUP)
+    loop = DenoisingLoop(w, program, models, weights, StreamContexts(w, contexts, members))
+    sample, residuals = loop.write(plan, _of_members(w, inputs, members))
+    every = w.op("ScatterND", samples, w.op("Unsqueeze", members, w.constant([1])), sample)
+
+    computed, kept = (w.op("Reshape", flags, w.constant([-1])) for flags in (plan.computed, keep))
+    chosen = w.op("Compress", residuals, w.op("Compress", kept, computed), axis=0)
+    cell = w.op("NonZero", w.op("And", computed, kept))  # [1, new cells]
+    first = w.op("Mul", members, w.constant(steps * len(groups)))
+    numbers = w.op("Add", w.op("Transpose", cell, perm=[1, 0]), first)  # [new cells, S]
+    before, after = (w.constant([n]) for n in residual_sizes(program))
+    sizes = [w.op("Shape", cell, start=1), before, w.op("Shape", members), after]
+    by_stream = w.op("Reshape", chosen, w.op("Concat", *sizes, axis=0), allowzero=1)
+    by_stream = w.op("Transpose", by_stream, perm=[0, 2, 1, 3])
+    flat = w.op("Reshape", numbers, w.constant([-1]))
+    shape = w.op("Concat", w.op("Shape", flat), before, after, axis=0)
+    new = w.op("Reshape", by_stream, shape, allowzero=1)
+    more = [w.op("SequenceInsert", rows, new), w.op("SequenceInsert", cells, flat)]
+    going_on = w.op("Identity", on)
+    return w.graph(
+        "streams_of_one_plan",
+        [tensor(going_on, np.bool_), tensor(every, np.float32), sequence(more[0]), sequence(more[1], np.int64)],
+        [
+            tensor(i, np.int64, []),
+            tensor(on, np.bool_, []),
+            tensor(samples, np.float32),
+            sequence(rows),
+            sequence(cells, np.int64),
+        ],
+    )
+
+
+def _of_members(w: GraphWriter, inputs: LoopInputs, members: str) -> LoopInputs:
+    """What belongs to some streams."""
+
+    def of(value: str | None, axis: int) -> str | None:
+        return None if value is None else w.op("Gather", value, members, axis=axis)
+
+    some = replace(inputs, **{name: of(getattr(inputs, name), axis) for name, axis in AXES.items()})
+    if inputs.jumps is None:
+        return some
+    return replace(some, jumps=replace(inputs.jumps, condition=of(inputs.jumps.condition, 0)))
+
+
+def residual_sizes(program: Program) -> tuple[int, int]:
+    """A and C: how many numbers a residual of one stream has before and after the axis of streams."""
+    type_ = program.blocks[0].type
+    axis, sizes = type_.batch_axis, type_.at(1)
+    assert axis is not None
+    return math.prod(sizes[:axis]), math.prod(sizes[axis + 1 :])
