@@ -83,7 +83,8 @@ def denoise(  # noqa: PLR0913  # the tensors of a call, each by its name
         """Step k; what its jump adds where the steps after it end is known now."""
         state = advance(state, prediction, k, offset[k])
         if k in advance.jumps:
-            added, landing = advance.jump(k, read, state.history), advance.jumps[k][1]
+            number, landing = advance.jumps[k]
+            added = advance.jump([layer[number] for layer in advance.layers], read, state.history)
             added = added if free is None else added * free
             offset[landing] = offset[landing] + torch.nn.functional.pad(added, (0, advance.memories * advance.horizon))
         return state

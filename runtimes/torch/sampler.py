@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import copy
 from typing import NamedTuple
 
@@ -104,19 +104,19 @@ class Advance:
         added = (read @ self.observed).reshape(len(condition), self.steps, -1, self.horizon)
         return read, added.permute(1, 2, 0, 3)
 
-    def jump(self, anchor: int, read: Tensor | None, history: Tensor) -> Tensor:
-        """What the jump from an anchor adds, ``[D, B, T]``.
+    def jump(self, layers: Sequence[Tensor], read: Tensor | None, history: Tensor) -> Tensor:
+        """What a jump adds, ``[D, B, T]``.
 
         Args:
-            anchor: one that has a jump.
+            layers: its own of ``layers``.
             read: of the condition, ``[B, F]``; None if nothing is.
-            history: after the anchor, ``[D, B, 4 T]``.
+            history: after its anchor, ``[D, B, 4 T]``.
         """
         dimensions, streams, _ = history.shape
         value = history.permute(1, 0, 2).reshape(streams, -1)
         value = value if read is None else torch.cat([read, value], 1)
-        inner, middle, outer = (layer[self.jumps[anchor][0]] for layer in self.layers)
-        for layer in (inner, middle):
+        *hidden, outer = layers
+        for layer in hidden:
             value = torch.addmm(layer[-1], value, layer[:-1]).relu()
         added = torch.addmm(outer[-1], value, outer[:-1])
         return added.reshape(streams, dimensions, self.horizon).permute(1, 0, 2)
@@ -130,20 +130,25 @@ class Advance:
             k: step.
             offset: what the step adds beside, ``[D, B, (1 + S) T]``.
         """
-        sample, history, memory = state
-        read = [sample, prediction, history]
+        clean = None
         if self._clip is not None:
             of_sample, of_prediction = self._to_clean[k]
-            clean = (sample * of_sample).add_(prediction, alpha=of_prediction)
-            read.append(clean.clamp_(-self._clip, self._clip))
-        if self.memories:
-            read.append(memory)
-        following = torch.baddbmm(offset, torch.cat(read, 2), self._of_step[k])
+            clean = (state.sample * of_sample).add_(prediction, alpha=of_prediction).clamp_(-self._clip, self._clip)
+        moved = self._moved(state, prediction, clean, self._of_step[k], offset)
+        return moved._replace(history=self._longer(state, prediction)) if self._anchors[k] else moved
+
+    def _moved(self, state: State, prediction: Tensor, clean: Tensor | None, matrix: Tensor, offset: Tensor) -> State:
+        """Sample and memories after a step."""
+        sample, history, memory = state
+        read = [sample, prediction, history, *([] if clean is None else [clean]), *[memory] * bool(self.memories)]
+        following = torch.baddbmm(offset, torch.cat(read, 2), matrix)
         if self.memories:
             memory, following = following[..., self.horizon :], following[..., : self.horizon].contiguous()
-        if self._anchors[k]:
-            history = torch.cat([sample, prediction, history[..., : 2 * self.horizon]], 2)
         return State(following, history, memory)
+
+    def _longer(self, state: State, prediction: Tensor) -> Tensor:
+        """The history after an anchor."""
+        return torch.cat([state.sample, prediction, state.history[..., : 2 * self.horizon]], 2)
 
 
 def begin(initial: Tensor, advance: Advance) -> State:

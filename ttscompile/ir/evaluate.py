@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import operator
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, TypeAlias
 
@@ -158,9 +158,15 @@ class Evaluator:
                 contradict each other about B.
             CaptureError: an operation fails on these values; names the node.
         """
-        streams = bind_batch(self._graph.inputs, inputs)
-        frame: Frame = [inputs[name] for name in self._graph.inputs]
-        frame += self._constants
+        return self.run([inputs[name] for name in self._graph.inputs], bind_batch(self._graph.inputs, inputs))
+
+    def run(self, inputs: Sequence[torch.Tensor], streams: int) -> tuple[torch.Tensor, ...]:
+        """The same for inputs in order, which are known to fit, and for so many streams.
+
+        Raises:
+            CaptureError: an operation fails on these values; names the node.
+        """
+        frame: Frame = [*inputs, *self._constants]
         index = 0
         try:
             for call, dead in self._steps:

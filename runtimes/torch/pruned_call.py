@@ -1,0 +1,153 @@
+"""The sparse call as a module that makes its own plan: the pruner, the repair of its plan, and the loop."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ttscompile.artifact.load import Artifact
+from ttscompile.core.correction import Correction
+from ttscompile.core.lattice import Source
+from ttscompile.errors import ObservationError
+from ttscompile.runtimes.instructions import Instructions, instructions_of
+from ttscompile.runtimes.settle import LoweringCache, pruner_plan, repair_plan
+
+from .call_module import CPU, CallModule
+from .loop import denoise
+from .plain_network import PlainNetwork
+from .planned_loop import SteppedAdvance, denoise_as_planned
+
+Rollout = tuple[Tensor, Tensor]
+"""The rollout cache of an episode: residuals float32 ``[K, blocks, ...]``, each of the type of the residual stream; and
+bool ``[B, K, blocks]``, whether a stream has computed the residual in an earlier call."""
+
+
+class PrunedCall(CallModule):
+    """One call of a policy with the plan that its pruner makes of the observation.
+
+    What is skipped: a reused cell adds a tensor, and its block is not evaluated. As the module stands, streams of one
+    plan are a batch of their own, so each stream computes what its plan says, and no more. Exported, or compiled, it is
+    one loop over the steps (``torch.while_loop``) in which each block is a ``torch.cond``: it is not evaluated at a
+    step if no stream of the batch computes it there, and otherwise for all of them. For one stream both are the same.
+    Stem, tail and sampler are computed at every step.
+
+    Args:
+        artifact: loaded and checked, with a pruner.
+        correction: of the pruner's plans; None for none.
+    """
+
+    def __init__(self, artifact: Artifact, correction: Correction | None) -> None:
+        manifest = artifact.manifest
+        advance = SteppedAdvance(manifest.spec, correction, CPU)
+        super().__init__(artifact, {**artifact.weights, **artifact.pruner}, advance, correction)
+        self._type = manifest.blocks[0].type
+        numbers = {group: number for number, group in enumerate(dict.fromkeys(manifest.groups))}
+        self._groups = tuple(numbers[group] for group in manifest.groups)
+        self._lowering = LoweringCache(partial(instructions_of, groups=self._groups))
+
+    def empty_rollout(self, streams: int) -> Rollout:
+        """The rollout cache at the start of an episode of so many streams, where the module is."""
+        lattice, device = (self.spec.sampler.steps, len(self._groups)), self._kept("offset")["noise"].device
+        residuals = torch.zeros(*lattice, *self._type.at(streams), device=device)
+        return residuals, torch.zeros(streams, *lattice, dtype=torch.bool, device=device)
+
+    def forward(
+        self, obs: Mapping[str, Tensor], initial: Tensor, steps: Tensor | None = None, rollout: Rollout | None = None
+    ) -> tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Rollout]:
+        """One call.
+
+        Args:
+            obs: observations by key, ``[B, ...]`` each, not normalised: as ``predict_action`` takes them.
+            initial: the noise that the sample starts from, float32 ``[B, T, D]``.
+            steps: noise of the steps, float32 ``[K, B, T, D]``; needed if the sampler draws noise, else not looked at.
+            rollout: what the call before gave, or ``empty_rollout`` in the first call of an episode. Without it no
+                residual of an earlier call is there, and cells that want one have TIMESTEP.
+
+        Returns:
+            The actions of all predicted steps, float32 ``[B, T, Da]``, in their own units (``action_pred``); the plan
+            that was executed, int8 ``[B, K, blocks]`` of ``Source``; and, if ``rollout`` was given, that of the next
+            call.
+
+        Raises:
+            ObservationError: an observation, noise or a rollout cache of another shape or dtype, or missing.
+            IllegalPlanError: the pruner's weights are broken, so that its logits are NaN. Exported, the actions of such
+                a stream are NaN.
+        """
+        network, advance = self._network(obs, initial), self._advance.on(self._kept("advance"))
+        assert isinstance(advance, SteppedAdvance)
+        offset, read = self._offset(network, advance, initial, steps)
+        empty = self.empty_rollout(len(initial))
+        if rollout is not None:
+            self._check(rollout, empty)
+        residuals, written = empty if rollout is None else rollout
+        if not torch.compiler.is_compiling():
+            return self._by_plan(network, advance, initial, offset, read, residuals, written, rollout is not None)
+        logits = network.logits()
+        plan = _repaired(logits.argmax(-1).to(torch.int8), written)
+        cache = residuals if rollout is not None else None
+        sample, cache = denoise_as_planned(
+            network, self._type, self._groups, plan, advance, initial, offset, read, cache
+        )
+        broken = torch.where(logits.isnan().flatten(1).any(1), torch.nan, 0.0)
+        actions = self._actions(sample) + broken[:, None, None]
+        return (actions, plan) if cache is None else (actions, plan, (cache, written | (plan == Source.COMPUTE.value)))
+
+    def _by_plan(
+        self,
+        network: PlainNetwork,
+        advance: SteppedAdvance,
+        initial: Tensor,
+        offset: Tensor,
+        read: Tensor | None,
+        residuals: Tensor,
+        written: Tensor,
+        keeps: bool,
+    ) -> tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Rollout]:
+        """The call, with a batch for each different plan."""
+        logits = network.logits().detach().cpu().numpy()
+        plans, _ = repair_plan(pruner_plan(logits), written.cpu().numpy())
+        alike: dict[bytes, list[int]] = {}
+        for stream, one in enumerate(plans):
+            alike.setdefault(one.tobytes(), []).append(stream)
+        keep = np.full(plans.shape[1:], keeps)
+        sample, after, axis = initial.clone(), residuals.clone() if keeps else residuals, self._type.batch_axis or 0
+        for some in alike.values():
+            members = torch.tensor(some, device=initial.device)
+            line: Instructions = self._lowering.lower(plans[some[0]])
+            reads = {
+                cell: residuals.flatten(0, 1)[cell].index_select(axis, members)
+                for cell in np.flatnonzero(line.rollout).tolist()
+            }
+            done = denoise(
+                network.of(members),
+                line,
+                keep,
+                advance,
+                initial.index_select(0, members),
+                offset.index_select(2, members).unbind(),
+                reads,
+                None if read is None else read.index_select(0, members),
+            )
+            sample = sample.index_copy(0, members, done.sample)
+            for cell, residual in done.residuals.items():
+                after.flatten(0, 1)[cell].index_copy_(axis, members, residual)
+        plan = torch.from_numpy(plans).to(initial.device)
+        actions = self._actions(sample)
+        return (actions, plan, (after, written | (plan == Source.COMPUTE.value))) if keeps else (actions, plan)
+
+    def _check(self, rollout: Rollout, like: Rollout) -> None:
+        for name, found, expected in zip(("residuals", "written"), rollout, like, strict=True):
+            if found.shape != expected.shape or found.dtype != expected.dtype:
+                kinds = [f"{value.dtype} {list(value.shape)}" for value in (expected, found)]
+                raise ObservationError(f"rollout: expected {name} {kinds[0]}; found {kinds[1]}. Use empty_rollout.")
+
+
+def _repaired(plan: Tensor, written: Tensor) -> Tensor:
+    """``lattice.without_illegal_reads`` in operations that are exported."""
+    missing = (plan == Source.ROLLOUT.value) & ~written
+    plan = torch.where(missing, Source.TIMESTEP.value, plan).to(torch.int8)
+    return torch.cat([torch.zeros_like(plan[:, :1]), plan[:, 1:]], 1)
