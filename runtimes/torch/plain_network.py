@@ -67,6 +67,12 @@ class PlainNetwork:
         }
         return other
 
+    def apart(self) -> PlainNetwork:
+        """The same with condition values that share no memory, which a loop of ``torch.export`` wants."""
+        other, read = copy(self), {name for piece in self._pieces.graphs().values() for name in piece.inputs}
+        other._condition = {n: value.clone() for n, value in self._condition.items() if n in read}
+        return other
+
     def condition(self, features: Sequence[str]) -> Tensor:
         """What a correction reads, ``[B, N]``."""
         types = self._pieces.condition.types()

@@ -117,7 +117,7 @@ def denoise_as_planned(
     streams, steps, blocks = plan.shape
     shape = stream_type.at(streams)
     of_streams = [streams if i == stream_type.batch_axis else 1 for i in range(len(shape))]
-    first = begin(initial, advance)
+    first, network = begin(initial, advance), network.apart()
 
     def step(
         k: Tensor, sample: Tensor, history: Tensor, latest: Tensor, newest: Tensor, *more: Tensor
@@ -164,7 +164,8 @@ def _evaluated(
     network: PlainNetwork, name: str, stream: Tensor, contexts: Mapping[str, Tensor], computing: Tensor, reused: Tensor
 ) -> Tensor:
     """A block's residual, for the streams that compute it."""
-    return torch.where(computing, network.run(name, stream, contexts), reused).contiguous()
+    residual = torch.where(computing, network.run(name, stream, contexts), reused)
+    return residual.clone(memory_format=torch.contiguous_format)  # both branches of a cond have to have one layout
 
 
 def _either(flag: Tensor, then: Callable[[], Tensor], otherwise: Tensor) -> Tensor:
