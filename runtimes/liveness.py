@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -46,7 +47,7 @@ def readable_rollout(artifact: Artifact) -> BoolArray:
     for schedule in artifact.schedules.values():
         readable |= schedule == Source.ROLLOUT
     if any(plan.pruned for plan in manifest.plans.values()):
-        readable |= _pruner_can_read(artifact)
+        readable |= sources_of_pruner(artifact)[..., Source.ROLLOUT]
     return readable
 
 
@@ -54,21 +55,20 @@ def reading_earlier_calls(artifact: Artifact) -> set[str]:
     """Names of the plans that can read what an earlier call of the episode computed."""
     reading = {name for name, schedule in artifact.schedules.items() if (schedule == Source.ROLLOUT).any()}
     pruned = {name for name, plan in artifact.manifest.plans.items() if plan.pruned}
-    return reading | pruned if pruned and _pruner_can_read(artifact).any() else reading
+    return reading | pruned if pruned and sources_of_pruner(artifact)[..., Source.ROLLOUT].any() else reading
 
 
-def _pruner_can_read(artifact: Artifact) -> BoolArray:
-    """Cells in which the ROLLOUT logit can be the largest; every cell of a pruner that is not the head we know."""
+def sources_of_pruner(artifact: Artifact) -> BoolArray:
+    """Sources whose logit can be the largest: bool ``[K, blocks, 4]``; all of a pruner that is not the head we know."""
     shape = (artifact.manifest.steps, len(artifact.manifest.blocks), len(Source))
-    head = artifact.pruner
+    head, possible = artifact.pruner, np.ones(shape, dtype=np.bool_)
     if not set(HEAD) <= set(head) or head["pruner.base"].shape != shape:
-        return np.ones(shape[:2], dtype=np.bool_)
+        return possible
     fixed = head["pruner.base"].astype(np.float64) + head["pruner.mask"]
     by_step = np.abs(head["pruner.step"].astype(np.float64))
     by_cell = head["pruner.block"].astype(np.float64).reshape(by_step.shape[1], *shape[1:])
-    possible = np.ones(shape[:2], dtype=np.bool_)
-    for other in Source:
-        lead = fixed[..., Source.ROLLOUT] - fixed[..., other]
-        swing = by_step @ np.abs(by_cell[..., Source.ROLLOUT] - by_cell[..., other])
-        possible &= lead + swing >= -1e-4 * (1 + np.abs(lead) + swing)  # the pruner computes in float32
+    for source, other in itertools.permutations(Source, 2):
+        lead = fixed[..., source] - fixed[..., other]
+        swing = by_step @ np.abs(by_cell[..., source] - by_cell[..., other])
+        possible[..., source] &= lead + swing >= -1e-4 * (1 + np.abs(lead) + swing)  # it computes in float32
     return possible

@@ -16,35 +16,16 @@ import ttscompile
 from tests.lower.whole_call import Episode, inputs, make
 from tests.rounding import assert_equal_but_for_rounding
 from tests.runtimes.agreement import call_terms
-from tests.runtimes.plans import random_correction
+from tests.runtimes.pruners import calibrated, random_pruner
 from tests.runtimes.toys import toy_program
 from ttscompile.artifact import load_artifact
 from ttscompile.artifact.distilled import DistilledWeights
 from ttscompile.artifact.write import update_calibration
 from ttscompile.core.lattice import Source, uniform_plan
 from ttscompile.errors import ArtifactError, IllegalPlanError
-from ttscompile.ir.program import Program
 from ttscompile.lower.program import lower_program
 from ttscompile.lower.single_file import lower_single_file
 from ttscompile.runtimes.single_file import inputs_of
-
-
-def random_pruner(program: Program, seed: int) -> dict[str, np.ndarray]:
-    """Weights of a head that wants anything anywhere, a reuse in step 0 too, and other things of other observations."""
-    rng = np.random.default_rng(seed)
-    head = program.pieces.pruner
-    assert head is not None
-    weights = {name: rng.standard_normal(type_.at(1)).astype(np.float32) for name, type_ in head.constants.items()}
-    return weights | {"pruner.mask": np.zeros_like(weights["pruner.mask"])}
-
-
-def calibrated(folder: Path, program: Program, corrected: bool = True) -> Path:
-    """The artifact with another pruner than it was converted with, which has a correction with jumps."""
-    artifact, shape = load_artifact(folder), (program.spec.sampler.steps, len(program.blocks))
-    corrections = {"pruner": random_correction(artifact, np.random.default_rng(1))} if corrected else {}
-    schedules = {"evenly": uniform_plan(*shape, 2)}
-    update_calibration(folder, random_pruner(program, 2), schedules, "pruner", {}, corrections=corrections)
-    return folder
 
 
 @pytest.mark.parametrize(

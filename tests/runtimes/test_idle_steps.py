@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.rounding import assert_equal_but_for_rounding
-from ttscompile import SamplerTable, Source
+from ttscompile import Source
 from ttscompile.artifact import Artifact
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import legalize, uniform_plan
@@ -21,22 +21,9 @@ from ttscompile.runtimes.onnxruntime.idle_steps import IdleSteps
 from .agreement import call_terms, random_inputs
 from .conftest import MakeArtifact
 from .plans import random_correction
-from .toys import toy_program
+from .toys import random_sampler, toy_program
 
 STEPS, BLOCKS = 12, 4
-
-
-def random_sampler(steps: int, seed: int, memories: int, clip: float | None) -> SamplerTable:
-    rng = np.random.default_rng(seed)
-    columns = {name: rng.uniform(-0.6, 0.6, steps) for name in SamplerTable.COLUMNS}
-    return SamplerTable(
-        "random",
-        np.arange(steps)[::-1].copy(),
-        clip=clip,
-        **columns,
-        memory_to_next=rng.uniform(-0.4, 0.4, (steps, memories)),
-        to_memory=rng.uniform(-0.4, 0.4, (steps, memories, 3 + memories)),
-    )
 
 
 def random_plans(rng: np.random.Generator, artifact: Artifact, streams: int, written: np.ndarray) -> np.ndarray:

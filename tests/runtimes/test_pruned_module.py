@@ -16,7 +16,6 @@ from torch import Tensor
 from torch.fx import GraphModule
 
 import ttscompile
-from tests.lower.test_single_file_pruner import calibrated, random_pruner
 from tests.rounding import assert_equal_but_for_rounding
 from ttscompile import Noise, Source
 from ttscompile.artifact import load_artifact
@@ -28,9 +27,10 @@ from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.runtimes.torch.pruned_call import PrunedCall, Rollout
 
 from .agreement import call_terms
-from .test_idle_steps import random_sampler
-from .test_torch_module import NO_COMPILER
-from .toys import toy_program, written_artifact
+from .pruners import calibrated, random_pruner
+from .toys import random_sampler, toy_program, written_artifact
+
+NO_COMPILER = "NO C++ COMPILER: the exported module was not compiled; install g++"
 
 Inputs = tuple[dict[str, Tensor], Tensor, Tensor]
 

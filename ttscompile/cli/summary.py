@@ -11,7 +11,7 @@ from rich.padding import Padding
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.cli.output import print_json, results, table
 from ttscompile.measure.units import flops, share
-from ttscompile.report import Table, facts
+from ttscompile.report import Table, facts, usage
 from ttscompile.report.summary import document
 
 
@@ -59,6 +59,8 @@ def print_summary(artifact: Artifact, console: Console) -> None:
     costs = [(name.replace("_", " "), flops(n), share(n / captured)) for name, n in summary["flops"].items()]
     console.print(table("FLOPs a call, one stream", "", "of the captured policy", rows=costs))
     _print_facts(console, facts.plan_table(artifact))
+    _print_facts(console, usage.usage_table(artifact))
+    console.print(Padding(usage.told_unused(artifact), (0, 0, 0, 2)))
     record = manifest.calibration
     if record is None:
         console.print("Not calibrated: every call is dense. Run 'ttscompile calibrate' to give it a plan.")

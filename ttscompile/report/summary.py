@@ -11,6 +11,7 @@ from ..ir.flops import graph_flops
 from ..ir.pieces import frame_name
 from ..runtimes.liveness import rollout_needs
 from .facts import plan_flops, plans_of
+from .usage import uses
 
 
 def document(artifact: Artifact) -> dict[str, Any]:
@@ -46,6 +47,7 @@ def document(artifact: Artifact) -> dict[str, Any]:
         "plans": {
             name: asdict(plan) | {"flops": plan_flops(artifact, name)} for name, plan in plans_of(manifest).items()
         },
+        "uses": [asdict(use) for use in uses(artifact)],
         "rollout_cache": asdict(rollout_needs(artifact)),
         "default_plan": manifest.default_plan,
         "calibration": None if manifest.calibration is None else dict(manifest.calibration),

@@ -1,0 +1,108 @@
+"""Which heads, branches and tables of an artifact its plans use."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import groupby
+
+import numpy as np
+
+from ..artifact.load import Artifact
+from ..artifact.manifest import DENSE
+from ..core.lattice import BoolArray, Source
+from ..ir.pieces import IDLE, PRUNER, of_tokens
+from ..ir.program import Binding
+from ..runtimes.liveness import sources_of_pruner
+from .page import Table
+
+HEAD, BRANCH, TABLE = "head", "branch", "table"
+
+
+@dataclass(frozen=True)
+class Use:
+    """Something that an artifact holds for the sake of plans.
+
+    Attributes:
+        kind: ``head``, which makes plans; ``branch``, one way to go on of several; or ``table``, numbers.
+        name: what it is, for people.
+        plans: names of the plans that use it, ``dense`` among them.
+        block: whose branch it is; None of what is no block's.
+    """
+
+    kind: str
+    name: str
+    plans: tuple[str, ...]
+    block: int | None = None
+
+
+def uses(artifact: Artifact) -> tuple[Use, ...]:
+    """Everything that only some plans use, and by which plans it is used.
+
+    Of each block that is the branch that evaluates it, and one for each source of a residual. A plan that falls back to
+    TIMESTEP in the first call of an episode uses both. What a pruner can choose follows from its weights.
+    """
+    manifest, found = artifact.manifest, list[Use]()
+    sources = _sources(artifact)
+    pruned = tuple(name for name, plan in manifest.plans.items() if plan.pruned)
+    if PRUNER in manifest.pieces:
+        found.append(Use(HEAD, "the pruner", pruned))
+    for source in Source:
+        for b in range(len(manifest.blocks)):
+            plans = tuple(name for name, cells in sources.items() if cells[:, b, source].any())
+            found.append(Use(BRANCH, source.name, plans, b))
+    if IDLE in manifest.pieces:
+        idle = (name for name, cells in sources.items() if cells[..., 1:].any(axis=2).all(axis=1).any())
+        found.append(Use(BRANCH, "steps without a computed block", tuple(idle)))
+    reusing = tuple(sources) if manifest.reuse is not None else ()
+    found += [
+        Use(BRANCH, f"piece {name}, for some tokens", reusing) for name in sorted(manifest.pieces) if of_tokens(name)
+    ]
+    read = {name for piece in manifest.pieces.values() for name in piece.contexts}
+    tables = (name for name, context in manifest.contexts.items() if context.binding is Binding.TABLE)
+    found += [Use(TABLE, f"context {name}", tuple(sources) if name in read else ()) for name in tables]
+    for name, correction in artifact.corrections.items():
+        found += [
+            Use(TABLE, f"{what} of {name}", (name,)) for what in ("correction", "jumps")[: 1 + bool(correction.jumps)]
+        ]
+    return tuple(found)
+
+
+def unused(found: tuple[Use, ...]) -> int:
+    """How many of them no plan uses."""
+    return sum(not use.plans for use in found)
+
+
+def usage_table(artifact: Artifact) -> Table:
+    """Of every head, branch and table the plans that use it; blocks of one use are one row."""
+    rows = []
+    for (kind, name, plans), group in groupby(uses(artifact), key=lambda use: (use.kind, use.name, use.plans)):
+        blocks = [use.block for use in group if use.block is not None]
+        of = f" of block {blocks[0]}" if len(blocks) == 1 else f" of blocks {blocks[0]}..{blocks[-1]}" if blocks else ""
+        rows.append((kind, name + of, ", ".join(plans) or "no plan: unused"))
+    return Table(("part", "", "used by"), tuple(rows), prose=True)
+
+
+def told_unused(artifact: Artifact) -> str:
+    """How much is unused, in words."""
+    found = uses(artifact)
+    count = unused(found)
+    if not count:
+        return f"Each of the {len(found)} heads, branches and tables is used by a plan."
+    verb = "is" if count == 1 else "are"
+    return f"{count} of {len(found)} heads, branches and tables {verb} used by no plan of the artifact."
+
+
+def _sources(artifact: Artifact) -> Mapping[str, BoolArray]:
+    """By plan, the sources that its cells can have when they are executed: bool ``[K, blocks, 4]``."""
+    found: dict[str, BoolArray] = {}
+    for name in (DENSE, *artifact.manifest.plans):
+        record = artifact.manifest.plans.get(name)
+        if record is not None and record.pruned:
+            cells = sources_of_pruner(artifact)
+        else:
+            cells = artifact.schedule(name)[..., None] == np.arange(len(Source))
+        cells[0] = np.arange(len(Source)) == Source.COMPUTE
+        cells[..., Source.TIMESTEP] |= cells[..., Source.ROLLOUT]
+        found[name] = cells
+    return found
