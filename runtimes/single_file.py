@@ -11,11 +11,9 @@ import numpy.typing as npt
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import DENSE, DISTILLED
 from ttscompile.errors import ArtifactError, IllegalPlanError
+from ttscompile.ir.pieces import USE_PRUNER
 
 from .liveness import readable_rollout
-
-USE_PRUNER = "use_pruner"
-"""Input of the file that says who makes the plan."""
 
 
 def inputs_of(path: str | Path, plan: str | None = None) -> dict[str, npt.NDArray[Any]]:

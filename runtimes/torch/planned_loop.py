@@ -16,12 +16,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch._higher_order_ops.while_loop import while_loop
+from torch._higher_order_ops.while_loop import while_loop  # torch has no public name for it
 
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import Source
@@ -156,7 +155,7 @@ def denoise_as_planned(
     carried += [initial.new_zeros(count, *shape) for count in (blocks, max(groups) + 1)]
     carried += [first.memory] if advance.memories else []
     carried += [] if rollout is None else [rollout]
-    last: Any = while_loop(before_the_end, step, tuple(carried))
+    last = _while(before_the_end, step, tuple(carried))
     return last[1].permute(1, 2, 0), None if rollout is None else last[-1]
 
 
@@ -166,6 +165,9 @@ def _evaluated(
     """A block's residual, for the streams that compute it."""
     residual = torch.where(computing, network.run(name, stream, contexts), reused)
     return residual.clone(memory_format=torch.contiguous_format)  # both branches of a cond have to have one layout
+
+
+_while: Callable[..., tuple[Tensor, ...]] = while_loop
 
 
 def _either(flag: Tensor, then: Callable[[], Tensor], otherwise: Tensor) -> Tensor:

@@ -26,6 +26,9 @@ STEP = "step"
 PRUNER: Final = "pruner"
 """Condition values -> logits of the plan, once a call."""
 
+USE_PRUNER: Final = "use_pruner"
+"""Input of the single ONNX file of a call that says whether the pruner makes the plan."""
+
 STEM = "stem"
 """Sample -> residual stream."""
 

@@ -26,11 +26,9 @@ from ..core.correction import (
 from ..core.spec import PolicySpec
 from ..errors import LoweringError
 from ..ir.graph import Graph
+from ..ir.pieces import USE_PRUNER
 from ..ir.program import Program
 from .graph_writer import GraphWriter, Weights, tensor
-
-USE_PRUNER = "use_pruner"
-"""Input that says who makes the plan."""
 
 Values = list[ValueInfoProto]
 

@@ -67,8 +67,9 @@ from ..core.lattice import Source
 from ..core.spec import PolicySpec
 from ..core.update import columns, diagonals, rows
 from ..errors import LoweringError
+from ..ir.pieces import USE_PRUNER
 from ..ir.program import Program
-from .call_interface import USE_PRUNER, condition_numbers, write_interface
+from .call_interface import condition_numbers, write_interface
 from .contexts import Contexts
 from .executed_plan import ExecutedPlans, write_executed_plans
 from .graph_writer import GraphWriter, Weights

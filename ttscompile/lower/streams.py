@@ -24,9 +24,6 @@ from .graph_writer import GraphWriter, Weights, sequence, tensor
 from .loop import GROUP, DenoisingLoop, LoopInputs
 from .plan import INT64, lower_plan
 
-AXES = {"initial": 0, "offset": 2, "history": 1, "memory": 1, "index": 2}
-"""Axis of the streams in members of ``LoopInputs``."""
-
 
 @dataclass(frozen=True)
 class Denoised:
@@ -123,13 +120,21 @@ def _of_one_plan(
 def _of_members(w: GraphWriter, inputs: LoopInputs, members: str) -> LoopInputs:
     """What belongs to some streams."""
 
-    def of(value: str | None, axis: int) -> str | None:
-        return None if value is None else w.op("Gather", value, members, axis=axis)
+    def of(value: str, axis: int) -> str:
+        return w.op("Gather", value, members, axis=axis)
 
-    some = replace(inputs, **{name: of(getattr(inputs, name), axis) for name, axis in AXES.items()})
-    if inputs.jumps is None:
-        return some
-    return replace(some, jumps=replace(inputs.jumps, condition=of(inputs.jumps.condition, 0)))
+    jumps, memory = inputs.jumps, inputs.memory
+    if jumps is not None and jumps.condition is not None:
+        jumps = replace(jumps, condition=of(jumps.condition, 0))
+    return replace(
+        inputs,
+        initial=of(inputs.initial, 0),
+        offset=of(inputs.offset, 2),
+        history=of(inputs.history, 1),
+        memory=None if memory is None else of(memory, 1),
+        index=of(inputs.index, 2),
+        jumps=jumps,
+    )
 
 
 def residual_sizes(program: Program) -> tuple[int, int]:

@@ -52,7 +52,7 @@ def uses(artifact: Artifact) -> tuple[Use, ...]:
             plans = tuple(name for name, cells in sources.items() if cells[:, b, source].any())
             found.append(Use(BRANCH, source.name, plans, b))
     if IDLE in manifest.pieces:
-        idle = (name for name, cells in sources.items() if cells[..., 1:].any(axis=2).all(axis=1).any())
+        idle = (name for name, cells in sources.items() if np.all(cells[..., 1:].any(axis=2), axis=1).any())
         found.append(Use(BRANCH, "steps without a computed block", tuple(idle)))
     reusing = tuple(sources) if manifest.reuse is not None else ()
     found += [
