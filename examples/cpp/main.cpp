@@ -5,7 +5,8 @@
 // runs CALLS calls of one episode. Call r reads its inputs from FOLDER/r/NAME.bin, raw numbers in the machine's byte
 // order: the observations, initial_noise, step_noise (if the sampler is stochastic), plan, rollout_keep; and, where there
 // are such files, the plan's correction (correction.bin, correction_bias.bin and so on), without which nothing is
-// corrected. The rollout cache is handed from call to call here. Prints one line of actions a call; times go to standard error.
+// corrected, and use_pruner.bin with the pruner's weights, without which the plan is that of plan.bin. The rollout cache
+// is handed from call to call here. Prints one line of actions a call; times go to standard error.
 #include <onnxruntime_c_api.h>
 
 #include <chrono>
@@ -158,16 +159,21 @@ void run(const std::string& model, const std::string& folder, int calls, int thr
     for (const auto& [name, input] : inputs) {
       if (name == "rollout_rows" || name == "rollout_index") continue;
       const std::string path = folder + "/" + std::to_string(r) + "/" + name + ".bin";
-      if (!input.optional || std::ifstream(path)) load(tensors[name], input, path, memory);
+      if (!input.optional || std::ifstream(path)) {
+        load(tensors[name], input, path, memory);
+      } else if (const auto earlier = tensors.find(name); earlier != tensors.end()) {  // it was in the call before
+        ort->ReleaseValue(earlier->second.value);
+        tensors.erase(earlier);
+      }
     }
     if (r == 0) {  // a new episode: no residuals yet
       Tensor& rows = tensors["rollout_rows"];
       rows.shape = inputs.at("rollout_rows").shape;
       rows.shape[0] = 0;
-      for (int64_t& n : rows.shape) n = n < 0 ? tensors["initial_noise"].shape[0] : n;
       wrap(rows, ONNX_TENSOR_ELEMENT_DATA_TYPE_FLOAT, memory);
       Tensor& index = tensors["rollout_index"];
       index.shape = inputs.at("rollout_index").shape;
+      index.shape[0] = tensors["initial_noise"].shape[0];  // streams
       index.bytes.assign(static_cast<size_t>(product(index.shape)) * 8, '\xff');  // -1 everywhere
       wrap(index, ONNX_TENSOR_ELEMENT_DATA_TYPE_INT64, memory);
     }

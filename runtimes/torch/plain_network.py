@@ -31,6 +31,9 @@ class PlainNetwork:
         obs: normalised, by key.
         streams: B.
         idle: see ``loop.Network``.
+
+    Attributes:
+        stream_type: of the residual stream.
     """
 
     def __init__(
@@ -46,6 +49,7 @@ class PlainNetwork:
     ) -> None:
         self._pieces, self._evaluators, self._streams, self.idle = pieces, evaluators, streams, idle
         self._weights, self._first, self._tables = weights, first, tables
+        self.stream_type = pieces.blocks[0].type
         seen = frame_values(pieces, lambda name, given: evaluators[name]({**weights, **given}), obs)
         made = evaluators[CONDITION]({**weights, **obs, **seen})
         self._condition = dict(zip(pieces.condition.outputs, made, strict=True))

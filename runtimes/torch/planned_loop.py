@@ -25,7 +25,6 @@ from torch._higher_order_ops.while_loop import while_loop  # torch has no public
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import Source
 from ttscompile.core.spec import PolicySpec
-from ttscompile.ir.graph import TensorType
 from ttscompile.ir.pieces import STEM, TAIL, block_name
 
 from .plain_network import PlainNetwork
@@ -88,7 +87,6 @@ class SteppedAdvance(Advance):
 
 def denoise_as_planned(
     network: PlainNetwork,
-    stream_type: TensorType,
     groups: Sequence[int],
     plan: Tensor,
     advance: SteppedAdvance,
@@ -101,7 +99,6 @@ def denoise_as_planned(
 
     Args:
         network: of the call.
-        stream_type: of the residual stream.
         groups: FORWARD group of each block, numbered from zero.
         plan: int8 ``[B, K, blocks]``, legal.
         advance: the sampler.
@@ -114,8 +111,8 @@ def denoise_as_planned(
         The sample ``[B, T, D]``; and ``rollout`` with what this call has computed, None where that is None.
     """
     streams, steps, blocks = plan.shape
-    shape = stream_type.at(streams)
-    of_streams = [streams if i == stream_type.batch_axis else 1 for i in range(len(shape))]
+    shape = network.stream_type.at(streams)
+    of_streams = [streams if i == network.stream_type.batch_axis else 1 for i in range(len(shape))]
     first, network = begin(initial, advance), network.apart()
 
     def step(

@@ -89,9 +89,7 @@ class PrunedCall(CallModule):
         logits = network.logits()
         plan = _repaired(logits.argmax(-1).to(torch.int8), written)
         cache = residuals if rollout is not None else None
-        sample, cache = denoise_as_planned(
-            network, self._type, self._groups, plan, advance, initial, offset, read, cache
-        )
+        sample, cache = denoise_as_planned(network, self._groups, plan, advance, initial, offset, read, cache)
         broken = torch.where(logits.isnan().flatten(1).any(1), torch.nan, 0.0)
         actions = self._actions(sample) + broken[:, None, None]
         return (actions, plan) if cache is None else (actions, plan, (cache, written | (plan == Source.COMPUTE.value)))

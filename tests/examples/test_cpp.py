@@ -12,6 +12,7 @@ import pytest
 
 from tests.lower.whole_call import Episode, groups, inputs, make
 from tests.runtimes.plans import random_plan, random_reading
+from tests.runtimes.pruners import random_pruner
 from tests.runtimes.toys import toy_program
 from ttscompile.artifact import load_artifact
 from ttscompile.core.correction import Correction, no_correction
@@ -52,6 +53,7 @@ def test_an_episode_is_what_python_computes(program: Path, tmp_path: Path, strea
     episode, written, expected = Episode(model, streams), np.zeros((8, 7), np.bool_), []
     reads = np.zeros(4, int)
     feeds: dict[str, Any] = {}
+    calibrated = {"use_pruner": np.array(True), **random_pruner(toy, 0)}
     if streams == 2:  # of a calibrated schedule
         empty = no_correction(8, toy.spec.sample)
         weights, bias = (rng.normal(0, 0.01, each.shape).astype(np.float32) for each in (empty.weights, empty.bias))
@@ -60,10 +62,12 @@ def test_an_episode_is_what_python_computes(program: Path, tmp_path: Path, strea
     for r in range(CALLS):
         plan = random_plan(rng, 8, groups(toy), written, 0.3)
         obs, drawn = inputs(policy, rng, streams)
-        expected.append(episode.call(obs, drawn, plan, **feeds)["action"].ravel())
-        written |= plan == Source.COMPUTE
-        reads += np.bincount(plan.ravel(), minlength=4)
-        given = {**obs, **feeds, "initial_noise": drawn.initial, "plan": plan}
+        pruned = calibrated if r % 2 else {}  # in every second call each stream has a plan of its own
+        call = episode.call(obs, drawn, plan, **feeds, **pruned)
+        expected.append(call["action"].ravel())
+        written |= (call["executed_plan"] == Source.COMPUTE).all(axis=0)
+        reads += np.bincount(call["executed_plan"].ravel(), minlength=4)
+        given = {**obs, **feeds, **pruned, "initial_noise": drawn.initial, "plan": plan}
         given["rollout_keep"] = np.ones((8, 7), np.bool_)
         if drawn.steps is not None:
             given["step_noise"] = drawn.steps

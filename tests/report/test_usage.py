@@ -17,7 +17,7 @@ from ttscompile.artifact.write import update_calibration
 from ttscompile.cli import main
 from ttscompile.core.lattice import dense_plan, uniform_plan
 from ttscompile.ir.plan_head import first_numbers
-from ttscompile.report.usage import BRANCH, HEAD, TABLE, told_unused, unused, usage_table, uses
+from ttscompile.report.usage import BRANCH, CONTEXTS, HEAD, TABLE, told_unused, unused, usage_table, uses
 from ttscompile.runtimes.liveness import sources_of_pruner
 
 
@@ -31,8 +31,8 @@ def own(converted: Artifact, tmp_path: Path) -> Artifact:
     return load_artifact(shutil.copytree(converted.path, tmp_path / "artifact"))
 
 
-def plans_of(artifact: Artifact) -> dict[tuple[str, str, int | None], tuple[str, ...]]:
-    return {(use.kind, use.name, use.block): use.plans for use in uses(artifact)}
+def plans_of(artifact: Artifact) -> dict[tuple[str, str, int | str | None], tuple[str, ...]]:
+    return {(use.kind, use.name, use.of): use.plans for use in uses(artifact)}
 
 
 def test_an_artifact_that_was_only_converted_uses_no_head_and_no_reuse(converted: Artifact) -> None:
@@ -42,7 +42,7 @@ def test_an_artifact_that_was_only_converted_uses_no_head_and_no_reuse(converted
     assert [found[BRANCH, "COMPUTE", b] for b in range(5)] == [("dense",)] * 5
     reuse = [found[BRANCH, source, b] for source in ("FORWARD", "TIMESTEP", "ROLLOUT") for b in range(5)]
     assert reuse == [()] * 15
-    assert found[TABLE, "context row", None] == found[TABLE, "context time", None] == ("dense",)
+    assert found[TABLE, CONTEXTS, "row"] == found[TABLE, CONTEXTS, "time"] == ("dense",)
     assert found[idle] == ()
     assert len(found) == 1 + 20 + 1 + 2
     assert unused(uses(converted)) == 17
@@ -66,14 +66,12 @@ def test_what_schedules_use(own: Artifact) -> None:
     assert found[BRANCH, "steps without a computed block", None] == ("evenly",)
     assert found[TABLE, "correction of evenly", None] == found[TABLE, "jumps of evenly", None] == ("evenly",)
     assert found[HEAD, "the pruner", None] == ()
-    rows = [row[1:] for row in usage_table(artifact).rows if row[1].startswith(("FORWARD", "TIMESTEP"))]
+    rows = [row for row in usage_table(artifact).rows if "FORWARD" in row[0] or "TIMESTEP" in row[0]]
     assert rows == [
-        ("FORWARD of block 0", "no plan: unused"),
-        ("FORWARD of block 1", "single"),
-        ("FORWARD of blocks 2..4", "no plan: unused"),
-        ("TIMESTEP of blocks 0..1", "evenly"),
-        ("TIMESTEP of block 2", "evenly, single"),
-        ("TIMESTEP of blocks 3..4", "evenly"),
+        ("branch: FORWARD of blocks 0, 2, 3, 4 (4)", "no plan: unused"),
+        ("branch: FORWARD of blocks 1 (1)", "single"),
+        ("branch: TIMESTEP of blocks 0, 1, 3, 4 (4)", "evenly"),
+        ("branch: TIMESTEP of blocks 2 (1)", "evenly, single"),
     ]
 
 
@@ -105,5 +103,5 @@ def test_inspect_says_it(converted: Artifact) -> None:
     assert "17 of 24 heads, branches and tables are used by no plan of the artifact." in " ".join(told.split())
     as_json = CliRunner().invoke(main, ["inspect", str(converted.path), "--json"], catch_exceptions=False).stdout
     listed = json.loads(as_json)["uses"]
-    assert {"kind": "head", "name": "the pruner", "plans": [], "block": None} in listed
+    assert {"kind": "head", "name": "the pruner", "plans": [], "of": None} in listed
     assert sum(not use["plans"] for use in listed) == 17

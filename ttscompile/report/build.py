@@ -13,7 +13,7 @@ from ..artifact.manifest import DENSE
 from ..measure.machine import fingerprint, one_line
 from ..measure.points import Point, efficient
 from ..measure.units import flops, ms, share
-from ..report import facts, pictures
+from ..report import facts, pictures, usage
 from ..runtimes.policy import CompiledPolicy
 from ..trajectories.episodes import Episode
 from .comparison import Compared
@@ -130,7 +130,9 @@ def _plans(artifact: Artifact, course: Course | None) -> Section:
         text.append(f"{MOST_PICTURES} of {len(ordered)} schedules are drawn.")
     if not ordered:
         text.append("This artifact has no schedule to draw.")
-    return Section("Plans", tuple(text), (facts.plan_table(artifact),), tuple(drawn))
+    text.append(usage.told_unused(artifact))
+    tables = facts.plan_table(artifact), usage.usage_table(artifact)
+    return Section("Plans", tuple(text), tables, tuple(drawn))
 
 
 def _episode(course: Course) -> Section:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import groupby
 from typing import Any
 
@@ -151,10 +151,22 @@ def block_table(manifest: Manifest) -> Table:
     rows = []
     for key, members in groupby(sorted(enumerate(manifest.blocks), key=alike), alike):
         group, kind, type_, cost, reason = key
-        indices = [str(index) for index, _ in members]
-        shown = ", ".join(indices if len(indices) <= 4 else [*indices[:2], "..", indices[-1]]) + f" ({len(indices)})"
-        rows.append((shown, kind + (f": {reason}" if reason else ""), type_, str(group), flops(cost)))
+        rows.append(
+            (
+                of_blocks([index for index, _ in members]),
+                kind + (f": {reason}" if reason else ""),
+                type_,
+                str(group),
+                flops(cost),
+            )
+        )
     return Table(("block", "kind", "residual", "group", "FLOPs, one evaluation"), tuple(rows))
+
+
+def of_blocks(indices: Sequence[int]) -> str:
+    """Which blocks, told shortly: ``0, 3, .. 21 (8)``."""
+    all_of = [str(index) for index in indices]
+    return ", ".join(all_of if len(all_of) <= 4 else [*all_of[:2], "..", all_of[-1]]) + f" ({len(all_of)})"
 
 
 def plans_of(manifest: Manifest) -> dict[str, PlanRecord]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import groupby
 
 import numpy as np
 
@@ -14,9 +13,11 @@ from ..core.lattice import BoolArray, Source
 from ..ir.pieces import IDLE, PRUNER, of_tokens
 from ..ir.program import Binding
 from ..runtimes.liveness import sources_of_pruner
+from .facts import of_blocks
 from .page import Table
 
 HEAD, BRANCH, TABLE = "head", "branch", "table"
+CONTEXTS = "what the loop reads at each step"
 
 
 @dataclass(frozen=True)
@@ -27,13 +28,13 @@ class Use:
         kind: ``head``, which makes plans; ``branch``, one way to go on of several; or ``table``, numbers.
         name: what it is, for people.
         plans: names of the plans that use it, ``dense`` among them.
-        block: whose branch it is; None of what is no block's.
+        of: the block whose branch it is, or the context whose values are in the table; None of what is alone.
     """
 
     kind: str
     name: str
     plans: tuple[str, ...]
-    block: int | None = None
+    of: int | str | None = None
 
 
 def uses(artifact: Artifact) -> tuple[Use, ...]:
@@ -60,7 +61,7 @@ def uses(artifact: Artifact) -> tuple[Use, ...]:
     ]
     read = {name for piece in manifest.pieces.values() for name in piece.contexts}
     tables = (name for name, context in manifest.contexts.items() if context.binding is Binding.TABLE)
-    found += [Use(TABLE, f"context {name}", tuple(sources) if name in read else ()) for name in tables]
+    found += [Use(TABLE, CONTEXTS, tuple(sources) if name in read else (), name) for name in tables]
     for name, correction in artifact.corrections.items():
         found += [
             Use(TABLE, f"{what} of {name}", (name,)) for what in ("correction", "jumps")[: 1 + bool(correction.jumps)]
@@ -75,12 +76,15 @@ def unused(found: tuple[Use, ...]) -> int:
 
 def usage_table(artifact: Artifact) -> Table:
     """Of every head, branch and table the plans that use it; blocks of one use are one row."""
+    alike: dict[tuple[str, str, tuple[str, ...]], list[Use]] = {}
+    for use in uses(artifact):
+        alike.setdefault((use.kind, use.name, use.plans), []).append(use)
     rows = []
-    for (kind, name, plans), group in groupby(uses(artifact), key=lambda use: (use.kind, use.name, use.plans)):
-        blocks = [use.block for use in group if use.block is not None]
-        of = f" of block {blocks[0]}" if len(blocks) == 1 else f" of blocks {blocks[0]}..{blocks[-1]}" if blocks else ""
-        rows.append((kind, name + of, ", ".join(plans) or "no plan: unused"))
-    return Table(("part", "", "used by"), tuple(rows), prose=True)
+    for (kind, name, plans), group in alike.items():
+        blocks = [use.of for use in group if isinstance(use.of, int)]
+        of = f" of blocks {of_blocks(blocks)}" if blocks else f" ({len(group)})" if len(group) > 1 else ""
+        rows.append((f"{kind}: {name}{of}", ", ".join(plans) or "no plan: unused"))
+    return Table(("part", "used by"), tuple(rows), prose=True)
 
 
 def told_unused(artifact: Artifact) -> str:
