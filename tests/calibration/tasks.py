@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.view import view_of
 from ttscompile.calibration.calls import Calls, prepare_calls, sample_calls
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.task import Task
@@ -26,17 +27,17 @@ def make_task(
 ) -> Task:
     """A task with all that a strategy may ask for."""
     artifact = load_artifact(directory)
-    spec, executor = artifact.manifest.spec, Executor(artifact)
+    spec, executor = artifact.manifest.spec, Executor(view_of(artifact, "dense"))
     recorded = load_trajectories([recording], spec.observations, 4)
     chosen = sample_calls(recorded, episodes, calls, seed=0, repeats=100)
     prepared = prepare_calls(executor.model, spec, recorded, chosen, (0, episodes.start))
     prepared = replace(prepared, path=executor.run_dense(prepared))
-    return Task.of(artifact, executor, prepared, budget, seed)
+    return Task.of(executor, prepared, budget, seed)
 
 
 def in_windows(task: Task, windows: int, window: int = WINDOW, pinned: bool = False) -> Calls:
     """Consecutive calls of made-up episodes, with targets."""
-    spec, model = task.executor.artifact.manifest.spec, task.executor.model
+    spec, model = task.executor.view.manifest.spec, task.executor.model
     walk = np.cumsum(np.random.default_rng(5).standard_normal((windows, window, 2, 3)), 1).astype(np.float32)
     episodes = [Episode("made up", {"obs": one}) for one in walk]
     chosen = [(n, row) for n in range(windows) for row in range(window)]

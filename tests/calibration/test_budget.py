@@ -12,14 +12,14 @@ import pytest
 
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration import budget as budgets
-from ttscompile.calibration import pipeline
-from ttscompile.calibration.budget import Goal, cells_of, goal_of, measure_budget
+from ttscompile.calibration import pipeline, schedule
+from ttscompile.calibration.budget import Budget, Goal, cells_of, goal_of, measure_budget
+from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.progress import Bar
 from ttscompile.calibration.result import CalibrationResult
 from ttscompile.calibration.state import FILE, StateFile
 from ttscompile.calibration.step_counts import SpacedSchedules, budget_of_error
-from ttscompile.calibration.task import Clock
 from ttscompile.calibration.whole_steps import Errors, WholeSteps
 from ttscompile.core.lattice import Source
 from ttscompile.errors import CalibrationError, CalibrationFailedError
@@ -102,6 +102,11 @@ def test_a_target_of_flops_is_kept_and_recorded(artifact: Path, recording: Path)
     assert one_more < 0.5  # another whole step would not fit
 
 
+def measured(directory: Path, goal: Goal, pruned: bool) -> Budget:
+    artifact = load_artifact(directory)
+    return measure_budget(artifact, artifact.plans["dense"], goal, pruned)
+
+
 def _timed(monkeypatch: pytest.MonkeyPatch, step_ms: float) -> list[str]:
     """Calls take ``step_ms`` for each computed step, and no time; what was timed."""
     asked: list[str] = []
@@ -113,7 +118,7 @@ def _timed(monkeypatch: pytest.MonkeyPatch, step_ms: float) -> list[str]:
         return float(step_ms * np.count_nonzero(policy.last_report.plan == Source.COMPUTE) / BLOCKS)
 
     monkeypatch.setattr(budgets, "median_ms", median_ms)
-    monkeypatch.setattr(budgets, "_pruner_ms", lambda artifact, runtime: 0.5)
+    monkeypatch.setattr(budgets, "_pruner_ms", lambda *_: 0.5)
     return asked
 
 
@@ -122,7 +127,7 @@ def test_a_latency_is_as_many_whole_steps_as_fit(
     compiled: Path, monkeypatch: pytest.MonkeyPatch, limit: float, full: int
 ) -> None:
     asked = _timed(monkeypatch, 1.0)
-    budget = measure_budget(load_artifact(compiled), Goal("latency_ms", limit), pruned=False)
+    budget = measured(compiled, Goal("latency_ms", limit), pruned=False)
     assert budget.cells == full * BLOCKS
     assert budget.measured["measured_ms"][str(full)] == full
     assert len(asked) <= 6
@@ -130,7 +135,7 @@ def test_a_latency_is_as_many_whole_steps_as_fit(
 
 def test_what_the_loop_waits_for_the_pruner_counts(compiled: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _timed(monkeypatch, 1.0)
-    budget = measure_budget(load_artifact(compiled), Goal("latency_ms", 3.4), pruned=True)
+    budget = measured(compiled, Goal("latency_ms", 3.4), pruned=True)
     assert budget.cells == 2 * BLOCKS
 
 
@@ -142,7 +147,7 @@ def test_a_latency_out_of_reach_is_refused(
 ) -> None:
     _timed(monkeypatch, 1.0)
     with pytest.raises(CalibrationError, match=message):
-        measure_budget(load_artifact(compiled), Goal("latency_ms", limit), pruned=False)
+        measured(compiled, Goal("latency_ms", limit), pruned=False)
 
 
 def test_the_real_clock_finds_that_nothing_takes_no_time(artifact: Path, recording: Path) -> None:
@@ -156,12 +161,12 @@ def test_the_latency_is_measured_once(artifact: Path, recording: Path, monkeypat
     _timed(monkeypatch, 1.0)
     with killed(saves=2):  # of the latency, and of some targets
         quick(artifact, recording, latency_ms=3.9)
-    monkeypatch.setattr(pipeline, "measure_budget", lambda *_: pytest.fail("measured again"))
+    monkeypatch.setattr(schedule, "measure_budget", lambda *_: pytest.fail("measured again"))
     result = quick(artifact, recording, latency_ms=3.9, resume=True)
     assert result.budget["cells"] == 3 * BLOCKS
     assert result.budget["latency_ms"] == 3.9
     assert result.budget["measured_ms"]["3"] == 3.0  # the pruner is not part of it
-    assert np.count_nonzero(load_artifact(artifact).schedule("schedule") == Source.COMPUTE) == 3 * BLOCKS
+    assert np.count_nonzero(load_artifact(artifact).plans["schedule"].cells == Source.COMPUTE) == 3 * BLOCKS
 
 
 class _Judged(WholeSteps):

@@ -52,10 +52,10 @@ def test_the_plan_reaches_the_target_and_beats_the_uniform_schedule(calibrated: 
     artifact = load_artifact(directory)
     steps, blocks = artifact.manifest.steps, len(artifact.manifest.blocks)
     budget = int((1 - TARGET) * steps * blocks + 1e-6)
-    schedule = artifact.schedule("schedule")
+    schedule = artifact.plans["schedule"].cells
     assert np.count_nonzero(schedule == Source.COMPUTE) == budget
     assert (schedule[0] == Source.COMPUTE).all()
-    np.testing.assert_array_equal(artifact.schedule("uniform"), uniform_plan(steps, blocks, 3))
+    np.testing.assert_array_equal(artifact.plans["uniform"].cells, uniform_plan(steps, blocks, 3))
     assert result.sparsity >= TARGET
     assert result.plans["uniform"].sparsity == pytest.approx(TARGET)
     assert result.plans["schedule"].error < 0.7 * result.plans["uniform"].error
@@ -183,7 +183,7 @@ def test_the_time_limit_ends_the_search_with_the_best_plan_so_far(artifact: Path
 def test_the_interval_strategy_is_the_uniform_schedule(artifact: Path, recording: Path) -> None:
     result = quick(artifact, recording, strategy="interval")
     loaded = load_artifact(artifact)
-    np.testing.assert_array_equal(loaded.schedule("schedule"), loaded.schedule("uniform"))
+    np.testing.assert_array_equal(loaded.plans["schedule"].cells, loaded.plans["uniform"].cells)
     assert result.default_plan == "schedule"
     assert "pruner" not in loaded.manifest.plans
 
@@ -291,9 +291,9 @@ def test_a_rival_is_corrected_on_request(compiled: Path, recording: Path, tmp_pa
         directory = Path(shutil.copytree(compiled, tmp_path / f"{correct}"))
         results.append(quick(directory, recording, strategy="interval", correct=correct, max_intervals=None))
         artifact = load_artifact(directory)
-        schedules.append(artifact.schedule("schedule"))
+        schedules.append(artifact.plans["schedule"].cells)
         assert ((artifact.manifest.calibration or {}).get("corrected") is True) == correct
-        assert ("schedule" in artifact.corrections) == correct
+        assert (artifact.plans["schedule"].correction is not None) == correct
     np.testing.assert_array_equal(*schedules)
     plain, corrected = (result.plans["schedule"].error for result in results)
     assert corrected < 0.7 * plain

@@ -97,7 +97,7 @@ def test_calls_end_where_the_fitted_jumps_lead_them(
     assert made == [2, 5, 8]
     assert correction.landings == {2: 0, 5: 1, 8: 2}
     assert not correction.outer[1].any() and correction.outer[0].any()
-    manifest = task.executor.artifact.manifest
+    manifest = task.executor.view.manifest
     correction.require_fit(steps, manifest.spec.sample, manifest.condition_numbers)
     ran = task.executor.corrected(correction).run(plan, others)
     torch.testing.assert_close(place.samples, ran, rtol=1e-4, atol=1e-4)

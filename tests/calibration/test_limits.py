@@ -16,11 +16,13 @@ import torch
 
 from ttscompile import ObservationSpec
 from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.view import view_of
 from ttscompile.calibration import arguments, targets
 from ttscompile.calibration.arguments import MOST_CALLS, MOST_LEARNED, calls_to_learn_from
 from ttscompile.calibration.budget import _pruner_ms
 from ttscompile.calibration.calls import LARGEST, Actions, split_episodes
-from ttscompile.calibration.compare import _error, compare
+from ttscompile.calibration.clock import Clock
+from ttscompile.calibration.compare import compare
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.progress import Bar
@@ -29,12 +31,13 @@ from ttscompile.calibration.state import FILE, StateFile
 from ttscompile.calibration.step_counts import SpacedSchedules
 from ttscompile.calibration.strategies import FITTED, NAMES, strategy_of
 from ttscompile.calibration.targets import draw_calls, with_targets
-from ttscompile.calibration.task import Clock
 from ttscompile.calibration.tts import Tts
-from ttscompile.core.lattice import PlanArray, Source, uniform_plan
+from ttscompile.core.lattice import Source, uniform_plan
+from ttscompile.core.plan import Plan
 from ttscompile.errors import CalibrationError, CalibrationFailedError
 from ttscompile.rivals.switched import Switched
 from ttscompile.runtimes.reference.model import Contexts, ReferenceModel
+from ttscompile.runtimes.runtime import Runtime
 from ttscompile.trajectories import load_trajectories
 
 from . import policies
@@ -122,9 +125,9 @@ def test_when_half_of_the_time_is_over_no_more_targets_are_made_than_needed(
 ) -> None:
     monkeypatch.setattr(targets, "TARGETS_AT_ONCE", 2)
     artifact = load_artifact(compiled)
-    executor, spec = Executor(artifact), artifact.manifest.spec
+    executor, spec = Executor(view_of(artifact, "dense")), artifact.manifest.spec
     episodes = load_trajectories([recording], spec.observations, 4)
-    calls = draw_calls(executor, spec, episodes, split_episodes(6, 0.25, 0), 16, 4, 0)["calibration"]
+    calls = draw_calls(executor, spec, episodes, split_episodes(6, 0.25, 0), 16, 0)
     state, fresh, clock = StateFile(tmp_path, {}), StateFile(tmp_path, {}), _Hand(100.0)
     clock.now = 51.0
     with Bar(shown=False) as bar:
@@ -160,20 +163,18 @@ def test_errors_that_are_no_numbers_are_large_ones(compiled: Path) -> None:
     for units in (False, True):
         errors = actions.errors(samples, torch.zeros_like(samples), units)
         np.testing.assert_array_equal(errors, np.array([LARGEST, LARGEST, 0], np.float32))
-    assert _error(np.array([np.inf]), np.array([np.inf])) == LARGEST
-    assert _error(np.array([3.0]), np.array([1.0])) == 2.0
 
 
 def test_a_baseline_that_diverges_is_worse_than_any_plan(
     artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run = Executor.run
+    predict = Runtime.predict
 
-    def diverging(self: Executor, plan: PlanArray, calls: Any) -> torch.Tensor:
-        samples = run(self, plan, calls)
-        return samples * float("nan") if np.array_equal(plan, uniform_plan(10, 6, 5)) else samples
+    def diverging(self: Runtime, obs: Any, noise: Any, plan: Plan, prefix: Any = None) -> Any:
+        sample, report = predict(self, obs, noise, plan, prefix)
+        return sample * float("nan") if np.array_equal(plan.cells, uniform_plan(10, 6, 5)) else sample, report
 
-    monkeypatch.setattr(Executor, "run", diverging)
+    monkeypatch.setattr(Runtime, "predict", diverging)
     result = calibrate(artifact, [recording], 0.55, "deepcache", progress=False, max_minutes=1e-6)
     assert result.plans["uniform"].error == pytest.approx(LARGEST)
     assert result.validation_error < 1
@@ -223,12 +224,13 @@ def test_the_pruner_is_timed_with_observations_as_the_network_takes_them(compile
     manifest = replace(artifact.manifest, spec=replace(artifact.manifest.spec, observations=observations))
     given: list[dict[str, Any]] = []
 
-    def predict(obs: dict[str, Any], noise: Any) -> tuple[None, Any]:
+    def predict(obs: dict[str, Any], noise: Any, plan: Plan) -> tuple[None, Any]:
+        assert plan.pruned
         given.append({key: str(value.dtype) for key, value in obs.items()})
         return None, SimpleNamespace(timings=SimpleNamespace(wait_pruner=0.25))
 
     runtime: Any = SimpleNamespace(predict=predict, reset=lambda: None)
-    assert _pruner_ms(replace(artifact, manifest=manifest), runtime) == 0.25
+    assert _pruner_ms(manifest, runtime, artifact.plans["dense"]) == 0.25
     assert given[0] == {"obs": "float32", "tokens": "int64"}
 
 

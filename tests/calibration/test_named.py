@@ -27,7 +27,7 @@ def calibrated(
 
 
 def computed(artifact: Path, name: str) -> list[int]:
-    plan = load_artifact(artifact).schedule(name)
+    plan = load_artifact(artifact).plans[name].cells
     rows = (plan == Source.COMPUTE).all(1)
     np.testing.assert_array_equal((plan == Source.COMPUTE).any(1), rows)  # whole steps
     return [int(k) for k in np.flatnonzero(rows)]
@@ -44,8 +44,9 @@ def test_safe_computes_twice_as_much_and_fast_half_each_with_its_own_score(
         "fast": 2,
     }
     assert result.plans["safe"].error < result.plans["schedule"].error < result.plans["fast"].error
-    assert {"safe", "schedule", "fast"} <= set(loaded.corrections)
-    weights = [loaded.corrections[name].weights.tobytes() for name in ("safe", "schedule", "fast")]
+    assert result.plans["safe"].distance < result.plans["schedule"].distance < result.plans["fast"].distance
+    corrections = [loaded.plans[name].correction for name in ("safe", "schedule", "fast")]
+    weights = [one.weights.tobytes() for one in corrections if one is not None]
     assert len(set(weights)) == 3
     record = loaded.manifest.calibration
     assert record is not None
@@ -85,7 +86,7 @@ def test_what_cannot_be_made_is_said(artifact: Path, recording: Path) -> None:
     record = load_artifact(artifact).manifest.calibration
     assert record is not None
     assert record["skipped"] == dict(result.skipped)
-    assert set(load_artifact(artifact).schedules) == {"schedule", "uniform"}
+    assert set(load_artifact(artifact).plans) == {"dense", "schedule", "uniform"}
 
 
 def test_a_plan_that_is_no_safer_is_left_out_with_the_reason(
@@ -95,7 +96,6 @@ def test_a_plan_that_is_no_safer_is_left_out_with_the_reason(
     monkeypatch.setattr(step_counts.SpacedSchedules, "best", lambda *_: step_counts.Best(tuple(range(8)), 1.0))
     result = calibrate(artifact, [recording], 0.6, progress=False, max_minutes=1)
     assert "safe" not in result.plans
-    assert result.skipped["safe"].endswith("off, no safer than schedule: its search was cut short")
+    assert result.skipped["safe"].endswith("from the original, no safer than schedule: its search was cut short")
     loaded = load_artifact(artifact)
     assert "safe" not in loaded.manifest.plans
-    assert "safe" not in loaded.corrections

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,14 @@ import torch
 import ttscompile
 from tests.once import Once
 from ttscompile.artifact.load import load_artifact
-from ttscompile.calibration.calls import draw_noise
-from ttscompile.calibration.judge import WITH_OTHER_NOISE, dense_with_other_noise
-from ttscompile.calibration.result import CalibrationResult, PlanScore
+from ttscompile.calibration.calls import load_episodes
+from ttscompile.calibration.judge import Score, other_noise
+from ttscompile.calibration.result import CalibrationResult
+from ttscompile.calibration.state import StateFile
+from ttscompile.calibration.trials import DRAWS, Trials
 from ttscompile.report import facts
 
-from . import policies, tasks
+from . import policies
 
 NOISE = 0.05
 
@@ -39,28 +42,40 @@ def answer(initial: np.ndarray, noise: np.ndarray) -> np.ndarray:
     return sample[:, 1:5] / np.array([0.5, 2.0])
 
 
-@pytest.mark.parametrize("count", [1, 5, 40])
-def test_the_distance_of_known_answers(constant: Path, recording: Path, count: int) -> None:
-    task = tasks.make_task(constant, recording, calls=count)
-    artifact = load_artifact(constant)
-    found = dense_with_other_noise(artifact, task.executor, task.calls, seed=7)
-    some = min(count, WITH_OTHER_NOISE)
-    initial, noise = draw_noise(artifact.manifest.spec, some, (7, 5))
-    other = answer(initial.numpy(), noise.numpy())
-    own = answer(task.calls.initial[:some].numpy(), task.calls.noise[:, :some].numpy())
-    assert found == pytest.approx(np.abs(other - own).mean(), rel=1e-4)
-    assert found > 0.01
-    assert found == dense_with_other_noise(artifact, task.executor, task.calls, seed=7)
-    assert found != dense_with_other_noise(artifact, task.executor, task.calls, seed=8)
+def trials_of(directory: Path, recording: Path, state: Path, seed: int, most: int = 32) -> Trials:
+    artifact = load_artifact(directory)
+    episodes = load_episodes(artifact.manifest.spec, [recording], None)
+    return Trials.of(artifact, episodes, StateFile(state, {}), seed=seed, observations=most)
+
+
+@pytest.mark.parametrize("most", [2, 5, 32])
+def test_the_distance_of_known_answers(constant: Path, recording: Path, tmp_path: Path, most: int) -> None:
+    trials = trials_of(constant, recording, tmp_path, 7, most)
+    sample, spec = trials.held_out, trials.artifact.manifest.spec
+    assert 1 <= len(sample.calls) <= most
+    apart = []
+    for stretch, row in sample.calls.tolist():
+        noise = trials.noise(spec, [trials.key(sample.part, stretch, row, draw) for draw in range(DRAWS)])
+        assert noise.steps is not None
+        answers = answer(noise.initial, noise.steps)
+        apart += [np.abs(answers[i] - answers[j]).mean() for i, j in combinations(range(DRAWS), 2)]
+    assert other_noise(trials) == pytest.approx(np.mean(apart), rel=1e-4)
+    assert other_noise(trials) > 0.01
+    assert other_noise(trials) == other_noise(trials_of(constant, recording, tmp_path / "new", 7, most))
+    assert other_noise(trials) != other_noise(trials_of(constant, recording, tmp_path / "new", 8, most))
 
 
 def result(other_noise: float | None) -> CalibrationResult:
+    def score(distance: float, error: float, more: float, sparsity: float) -> Score:
+        return Score(distance, (0.0, 1.0), error, more, sparsity, sparsity, sparsity, plans=1)
+
     return CalibrationResult(
+        learned=("schedule",),
         strategy="tts",
         seed=0,
         target_sparsity=0.9,
         default_plan="schedule",
-        plans={"schedule": PlanScore(2.5, 3.0, 0.9, 0.9, 0.9), "fast": PlanScore(8.0, 9.0, 0.95, 0.95, 0.95)},
+        plans={"schedule": score(0.2, 2.5, 3.0, 0.9), "fast": score(0.7, 8.0, 9.0, 0.95)},
         episodes={},
         calls={},
         intervals=1,

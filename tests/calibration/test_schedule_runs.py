@@ -76,7 +76,7 @@ def test_calls_beside_end_where_the_fitted_correction_leads_them(task: Task, rea
 
 def test_what_is_judged_is_bounded_as_a_call_is(task: Task, monkeypatch: pytest.MonkeyPatch) -> None:
     """A correction can leave what the sampler has clipped; a call clips that once more."""
-    model, table = task.executor.model, task.executor.artifact.manifest.spec.sampler
+    model, table = task.executor.model, task.executor.view.manifest.spec.sampler
     last = np.arange(table.steps) == table.steps - 1
     columns = {name: np.where(last, float(name == "x0_to_next"), getattr(table, name)) for name in table.COLUMNS[2:]}
     monkeypatch.setattr(model, "sampler", TorchSampler(replace(table, clip=0.05, **columns)))

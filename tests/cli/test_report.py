@@ -99,9 +99,9 @@ def pictures_of(reader: Reader) -> list[np.ndarray]:
 @pytest.fixture(scope="module")
 def page(calibrated: Path, calls: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
     output = tmp_path_factory.mktemp("page") / "report.html"
-    point = {"series": HOSTILE, "name": "0.9", "error": 2.0, "latency_ms": 12.5}
+    point = {"series": HOSTILE, "name": "0.9", "distance": 2.0, "latency_ms": 12.5}
     comparison = calls.with_name("comparison.json")
-    comparison.write_text(json.dumps({"points": [point], "yardsticks": {"all": 9.0}}))
+    comparison.write_text(json.dumps({"points": [point]}))
     options = ("--verify", "--comparison", comparison)
     result = run(calibrated, "-o", output, "--trajectories", calls, *options)
     assert result.exit_code == 0, result.stderr

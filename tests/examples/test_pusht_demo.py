@@ -18,7 +18,8 @@ from variants import open_variant
 from tests.examples.printed import printed
 from tests.plans import store_schedules
 from ttscompile.artifact.load import load_artifact
-from ttscompile.calibration.result import CalibrationResult, PlanScore
+from ttscompile.calibration.judge import Score
+from ttscompile.calibration.result import CalibrationResult
 from ttscompile.core.lattice import uniform_plan
 
 
@@ -104,13 +105,14 @@ def test_episodes_that_were_run_before_are_compared(compiled_pusht: Path, tmp_pa
 
 def test_calibration_table_names_the_default_and_the_baseline() -> None:
     result = CalibrationResult(
+        learned=("schedule",),
         strategy="tts",
         seed=0,
         target_sparsity=0.95,
         default_plan="schedule",
         plans={
-            "schedule": PlanScore(11.04, 47.0, 0.95, 0.94, 0.93),
-            "uniform": PlanScore(91.0, 288.0, 0.95, 0.95, 0.94),
+            "schedule": Score(0.3, (0.2, 0.4), 11.04, 47.0, 0.95, 0.94, 0.93, plans=1),
+            "uniform": Score(1.9, (1.5, 2.1), 91.0, 288.0, 0.95, 0.95, 0.94, plans=1),
         },
         episodes={"calibration": (0, 1), "validation": (2,)},
         calls={"calibration": 20, "validation": 10},
@@ -119,8 +121,8 @@ def test_calibration_table_names_the_default_and_the_baseline() -> None:
         seconds=60.0,
     )
     rows = cells(calibration_table(result))
-    assert ["schedule (default)", "11.0", "47.0", "95.0%", "93.0%"] in rows
-    assert ["uniform", "91.0", "288.0", "95.0%", "94.0%"] in rows
+    assert ["schedule (default)", "0.30", "11.0", "47.0", "95.0%", "93.0%"] in rows
+    assert ["uniform", "1.90", "91.0", "288.0", "95.0%", "94.0%"] in rows
 
 
 def test_a_bad_checkpoint_is_one_clear_error(tmp_path: Path) -> None:

@@ -175,7 +175,7 @@ def test_noise_of_a_deterministic_sampler_is_not_read(made: Made) -> None:
 def test_calibration_runs_the_same_loop_and_its_corrections_help(made: Made) -> None:
     """Batches of plans and calls, and corrections fitted step by step: the memories go along with the samples."""
     artifact, rng = made[1], np.random.default_rng(4)
-    executor, count, table = Executor(artifact), 240, artifact.manifest.spec.sampler
+    executor, count, table = Executor(view_of(artifact, "dense")), 240, artifact.manifest.spec.sampler
     obs, noise = random_inputs(artifact, rng, count)
     initial, steps = noise_tensors(noise, artifact.manifest.spec.sampler.stochastic)
     with torch.no_grad():

@@ -1,13 +1,8 @@
-"""What accuracy costs: held-out action error against measured latency, for strategies, plans and other artifacts.
+"""What accuracy costs: the judge on a list of plans, of strategies, of the artifact, and of other artifacts.
 
-Every point is a plan that onnxruntime executes, in the artifact's precision and with its correction. On each held-out
-call all points take their turn with the same observation and the same noise, and are held against the actions of the
-dense policy in fp32 with all tokens. So error and latency are of the same calls, and whatever else the machine does
-hits all points. Every call is the first of an episode: nothing is reused from one to the next.
-
-Another artifact of the policy with another sampler has no use for all of that noise: it starts from the same initial
-sample, and where the number of steps is the same and its sampler is stochastic, takes the same draws. How far two dense
-calls are apart that start alike and draw differently is the yardstick for its error.
+Every point is a plan that onnxruntime executes, in its precision and with its correction, on the same held-out calls;
+how far its actions are from those of the original, and what a call takes: all points take their turn, so that whatever
+else the machine does hits all.
 """
 
 from __future__ import annotations
@@ -18,56 +13,46 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from ..artifact.load import Artifact, load_artifact
-from ..artifact.manifest import DENSE
 from ..core.coercion import integer
 from ..core.correction import FEATURES
-from ..core.lattice import Source
-from ..core.spec import FP32, Noise
+from ..core.plan import Plan
 from ..errors import CalibrationError
 from ..measure.points import Comparison, MeasuredPoint
-from ..measure.timer import Timer
-from ..pool import Pool, Work, artifact_elsewhere, opened_pool, place_of
-from ..runtimes.open import open_runtime
-from ..runtimes.policy import CompiledPolicy
-from ..runtimes.random_calls import random_noise
-from ..trajectories.episodes import Episode
-from .budget import cells_of, goal_of, with_plans
-from .calls import FRACTION, LARGEST, Calls, Split, digest_of, load_episodes, sample_calls, split_episodes
+from ..pool import Work, opened_pool
+from .budget import cells_of, goal_of
+from .calls import Calls, Split, digest_of, load_episodes
 from .execute import Executor
+from .judge import judge, other_noise, timed
 from .progress import Progress
 from .saved_searches import Outcome, Searches
 from .search import plan_of
+from .state import COMPARISON, StateFile
 from .strategies import strategy_of
-from .targets import dense_rounds, draw_calls
-from .task import Array, Found, Task
+from .targets import executor_elsewhere, where
+from .task import Task
+from .trials import Trials
 
 LEARNED = 256
 """Calls that strategies learn from, at most. ``calibrate`` takes more: its corrections are better."""
 
-WARM_UP = 2
-"""Rounds whose times do not count, where there are more than these; their actions count."""
 
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Entrant:
     """A plan that takes part.
 
     Attributes:
         series: see ``MeasuredPoint``.
         name: see ``MeasuredPoint``.
-        policy: the policy that runs the plan.
-        plan: the plan's name in that policy.
-        paired: whether it takes all the noise of the dense calls.
+        trials: of its artifact.
+        plan: what is judged.
     """
 
     series: str
     name: str
-    policy: CompiledPolicy
-    plan: str
-    paired: bool
+    trials: Trials
+    plan: Plan
 
 
 def compare(
@@ -125,8 +110,6 @@ def compare(
     if intervals is not None:
         intervals = integer(intervals, "intervals", CalibrationError, 1)
     artifact = load_artifact(path)
-    spec = artifact.manifest.spec
-    budgets = {one: cells_of(goal_of(target_sparsity=one), artifact.manifest, False) for one in sparsities}
     compared: dict[str, Artifact] = {}
     for other in others:
         name = other.resolve().name
@@ -134,12 +117,7 @@ def compare(
             raise CalibrationError(f"two artifacts are called {name!r}: points could not be told apart. Rename one.")
         compared[name] = load_artifact(other)
         _require_same_policy(artifact, compared[name], name)
-    episodes = load_episodes(spec, trajectories, observation)
-    split = split_episodes(len(episodes), FRACTION, seed)
-    wished = [(strategy_of(name).name, sparsity) for name in strategies for sparsity in budgets]
-    skipped: dict[str, str] = {}
-    found: dict[tuple[str, float], Found] = {}
-    cut: list[str] = []
+    episodes = load_episodes(artifact.manifest.spec, trajectories, observation)
     settings = {
         "model": artifact.manifest.model_identity[:16],
         "trajectories": digest_of(episodes),
@@ -149,52 +127,54 @@ def compare(
         "max_minutes": max_minutes,
         "correct": correct,
     }
-    searches = Searches(path, artifact.manifest, settings, resume)
-    names = {(strategy, budgets[sparsity]): f"{strategy} {sparsity:g}" for strategy, sparsity in wished}
-    missing = [wish for wish in names if searches.known(*wish) is None]
-    if missing:
-        how = (intervals, 60 * max_minutes, correct)
-        with opened_pool(ray) as pool:
-            task = _task(artifact, episodes, split, learned, seed, progress, pool, searches)
-            work = Work(
-                partial(_searched, task, how), _searched_elsewhere, (*place_of(artifact), task.calls, seed, how)
-            )
-            outcomes = pool.map(work, missing)
+    with opened_pool(ray) as pool:
+        state = StateFile(path, settings, COMPARISON, needed=False)
+        limits = learned, learned
+        trials = Trials.of(artifact, episodes, state, seed=seed, pool=pool, limits=limits, observations=calls)
+        manifest = trials.executor.view.manifest
+        budgets = {one: cells_of(goal_of(target_sparsity=one), manifest, False) for one in sparsities}
+        wished = [(strategy_of(name).name, sparsity) for name in strategies for sparsity in budgets]
+        if not (resume and state.load()):
+            state.remove()
+        searches = Searches(state, (manifest.steps, len(manifest.blocks)))
+        names = {(strategy, budgets[sparsity]): f"{strategy} {sparsity:g}" for strategy, sparsity in wished}
+        missing = [wish for wish in names if searches.known(*wish) is None]
+        if missing:
+            progress("dense calls to learn from", 0, 1)
+            how, task = (intervals, 60 * max_minutes, correct), _of_schedules(trials.executor, trials.calls, seed)
+            given = *where(trials.executor), trials.calls, seed, how
+            outcomes = pool.map(Work(partial(_searched, task, how), _searched_elsewhere, given), missing)
             for number, wish in enumerate(missing, len(names) - len(missing)):
                 progress(f"search: {names[wish]}", number, len(names))
                 searches.keep(*wish, next(outcomes))
             progress("search", len(names), len(names))
-    for strategy, sparsity in wished:
-        for series, one in (searches.known(strategy, budgets[sparsity]) or {}).items():
-            if isinstance(one, str):
-                skipped[f"{series} {sparsity:g}"] = one
-            else:
-                found[series, sparsity], short = one
+        entrants = [Entrant("this artifact", name, trials, plan) for name, plan in artifact.plans.items()]
+        skipped, cut = dict[str, str](), list[str]()
+        for strategy, sparsity in wished:
+            for series, one in (searches.known(strategy, budgets[sparsity]) or {}).items():
+                if isinstance(one, str):
+                    skipped[f"{series} {sparsity:g}"] = one
+                    continue
+                found, short = one
+                plan = replace(trials.base, cells=found.schedule, correction=found.correction)
+                entrants.append(Entrant(series, f"{sparsity:g}", trials, plan))
                 cut += [f"{series} {sparsity:g}"] * short
-    warnings = _warnings(artifact, split, compared)
-    if missing and searches.warning:
-        warnings.append(f"nothing was kept for --resume: {searches.warning}.")
-    if cut:
-        told = f"the limit of {max_minutes:g} minutes cut the search short of {', '.join(cut)}: see --max-minutes."
-        warnings.append(told)
-    if strategies and not budgets:
-        warnings.append(f"no strategy takes part: no share of the cells was given for K = {artifact.manifest.steps}.")
-    if pruning := [name for name in strategies if strategy_of(name).uses_pruner]:
-        warnings.append(
-            f"{', '.join(pruning)}: one plan for all calls takes part, of independent calls. What depends on the"
-            " observation is found by 'calibrate', after which it is among the plans of the artifact."
+        for name, other_artifact in compared.items():
+            own = replace(trials, artifact=other_artifact)
+            entrants += [Entrant(name, plan, own, one) for plan, one in other_artifact.plans.items()]
+        points = _measured(entrants, threads, progress)
+        warnings = _warnings(artifact, trials.split, compared)
+        if missing and state.warning:
+            warnings.append(f"nothing was kept for --resume: {state.warning}.")
+        if cut:
+            told = f"the limit of {max_minutes:g} minutes cut the search short of {', '.join(cut)}: see --max-minutes."
+            warnings.append(told)
+        warnings += _of_strategies(strategies, budgets, manifest.steps, learned, FEATURES * manifest.spec.sample[0])
+        state.remove()
+        held_out = trials.held_out
+        return Comparison(
+            points, len(held_out.calls), trials.split.validation, threads, other_noise(trials), skipped, tuple(warnings)
         )
-    fitted, features = [name for name in strategies if strategy_of(name).fits_correction], FEATURES * spec.sample[0]
-    if fitted and learned < features:
-        warnings.append(
-            f"{', '.join(fitted)} fits corrections of {features} features from at most {learned} calls: its points are"
-            " far worse than they would be after a calibration. Let it learn from more."
-        )
-    entrants = _enter(artifact, found, compared, threads)
-    chosen = sample_calls(episodes, split.validation, calls, seed)
-    points, yardsticks = _measure(artifact, entrants, episodes, chosen, seed, threads, progress)
-    searches.end()
-    return Comparison(points, len(chosen), split.validation, threads, yardsticks, skipped, tuple(warnings))
 
 
 How = tuple[int | None, float, bool]
@@ -218,56 +198,63 @@ def _searched(task: Task, how: How, wish: tuple[str, int]) -> Outcome:
 
 
 def _searched_elsewhere(
-    path: str, identity: str, calls: Calls, seed: int, how: How
+    path: str, identity: str, loop: str, calls: Calls, seed: int, how: How
 ) -> Callable[[tuple[str, int]], Outcome]:
-    artifact = artifact_elsewhere(path, identity)
-    return partial(_searched, _of_schedules(Task.of(artifact, Executor(artifact), calls, 0, seed)), how)
+    return partial(_searched, _of_schedules(executor_elsewhere(path, identity, loop), calls, seed), how)
 
 
-def _task(
-    artifact: Artifact,
-    episodes: Sequence[Episode],
-    split: Split,
-    limit: int,
-    seed: int,
-    progress: Progress,
-    pool: Pool,
-    searches: Searches,
-) -> Task:
-    """What strategies are given, but for the budget: calls with what the dense policy answers to them."""
-    executor = Executor(artifact)
-    calls = draw_calls(executor, artifact.manifest.spec, episodes, split, limit, 1, seed)["calibration"]
-    paths = searches.dense(calls.count, (executor.model.steps, *calls.initial.shape[1:]))
-    progress("dense calls to learn from", len(paths), calls.count)
-    for found in dense_rounds(executor, calls, len(paths), pool):
-        paths = torch.cat([paths, found])
-        searches.keep_dense(paths)
-        progress("dense calls to learn from", len(paths), calls.count)
-    return _of_schedules(Task.of(artifact, executor, replace(calls, path=paths), 0, seed))
+def _of_schedules(executor: Executor, calls: Calls, seed: int) -> Task:
+    """What strategies are given, but for the budget.
+
+    Without constants of a pruner nobody spends time on plans that depend on the observation.
+    """
+    return replace(Task.of(executor, calls, 0, seed), pruner={})
 
 
-def _of_schedules(task: Task) -> Task:
-    """Without constants of a pruner nobody spends time on plans that depend on the observation."""
-    return replace(task, pruner={})
+def _measured(entrants: Sequence[Entrant], threads: int, progress: Progress) -> tuple[MeasuredPoint, ...]:
+    """All entrants judged, and then timed in turn."""
+    scores = []
+    for number, one in enumerate(entrants):
+        progress("held-out calls", number, len(entrants))
+        scores.append(judge(one.trials, one.plan))
+    times = timed([(one.trials, one.plan) for one in entrants], threads)
+    progress("held-out calls", len(entrants), len(entrants))
+    return tuple(
+        MeasuredPoint(
+            series=one.series,
+            name=one.name,
+            distance=score.distance,
+            interval=score.interval,
+            error=score.error,
+            error_p90=score.error_p90,
+            latency_ms=took.median,
+            quartiles_ms=took.quartiles,
+            sparsity=score.sparsity,
+            flops=(1 - score.flops_saved) * one.trials.artifact.manifest.flops.dense,
+        )
+        for one, score, took in zip(entrants, scores, times, strict=True)
+    )
 
 
-def _enter(
-    artifact: Artifact, found: Mapping[tuple[str, float], Found], others: Mapping[str, Artifact], threads: int
-) -> list[Entrant]:
-    """Everything that takes part: the artifact's own plans, those of strategies, and those of other artifacts."""
-    named = {f"{strategy} {sparsity:g}": one for (strategy, sparsity), one in found.items()}
-    whole = with_plans(artifact, named)
-    policy = CompiledPolicy(whole, open_runtime(whole, "onnxruntime", threads))
-    entrants = [Entrant("this artifact", name, policy, name, True) for name in (DENSE, *artifact.manifest.plans)]
-    for strategy, sparsity in found:
-        entrants.append(Entrant(strategy, f"{sparsity:g}", policy, f"{strategy} {sparsity:g}", True))
-    sampler = artifact.manifest.spec.sampler
-    for name, other in others.items():
-        theirs = other.manifest.spec.sampler
-        paired = (theirs.stochastic, theirs.name, theirs.steps) == (sampler.stochastic, sampler.name, sampler.steps)
-        opened = CompiledPolicy(other, open_runtime(other, "onnxruntime", threads))
-        entrants += [Entrant(name, plan, opened, plan, paired) for plan in (DENSE, *other.manifest.plans)]
-    return entrants
+def _of_strategies(
+    strategies: Sequence[str], budgets: Mapping[float, int], steps: int, learned: int, features: int
+) -> list[str]:
+    """What a reader has to know of the strategies that take part."""
+    found = []
+    if strategies and not budgets:
+        found.append(f"no strategy takes part: no share of the cells was given for K = {steps}.")
+    if pruning := [name for name in strategies if strategy_of(name).uses_pruner]:
+        found.append(
+            f"{', '.join(pruning)}: one plan for all calls takes part, of independent calls. What depends on the"
+            " observation is found by 'calibrate', after which it is among the plans of the artifact."
+        )
+    fitted = [name for name in strategies if strategy_of(name).fits_correction]
+    if fitted and learned < features:
+        found.append(
+            f"{', '.join(fitted)} fits corrections of {features} features from at most {learned} calls: its points are"
+            " far worse than they would be after a calibration. Let it learn from more."
+        )
+    return found
 
 
 def _require_same_policy(artifact: Artifact, other: Artifact, name: str) -> None:
@@ -300,79 +287,3 @@ def _warnings(artifact: Artifact, split: Split, others: Mapping[str, Artifact]) 
                 f" {list(split.validation)}: its plans may have been learned from them. Give the same files and --seed."
             )
     return found
-
-
-def _measure(
-    artifact: Artifact,
-    entrants: Sequence[Entrant],
-    episodes: Sequence[Episode],
-    chosen: Sequence[tuple[int, int]],
-    seed: int,
-    threads: int,
-    progress: Progress,
-) -> tuple[tuple[MeasuredPoint, ...], dict[str, float]]:
-    """All entrants on all calls, in turn: a point for each, and ``Comparison.yardsticks``.
-
-    ``chosen`` has the number of the episode, and the row in it, of each call.
-    """
-    # Noise of the original's shape fits every artifact of the policy, however many steps it predicts.
-    spec, draw = artifact.manifest.spec.whole_horizon, np.random.default_rng((seed, 4))
-    exact = artifact.at_precision(FP32).with_reuse(None)
-    truth = CompiledPolicy(exact, open_runtime(exact, "onnxruntime", threads))
-    errors: list[list[float]] = [[] for _ in entrants]
-    reports: list[list[tuple[float, float]]] = [[] for _ in entrants]
-    apart: dict[str, list[float]] = {"all": [], **({"steps": []} if spec.sampler.stochastic else {})}
-    timer = Timer(len(entrants), WARM_UP if len(chosen) > WARM_UP else 0)
-    for number, (episode, row) in enumerate(chosen):
-        obs = {key: array[row : row + 1] for key, array in episodes[episode].observations.items()}
-        one, two = random_noise(spec, draw), random_noise(spec, draw)
-        dense = _call(truth, obs, one, DENSE)
-        apart["all"].append(_error(_call(truth, obs, two, DENSE), dense))
-        if "steps" in apart:
-            apart["steps"].append(_error(_call(truth, obs, Noise(one.initial, two.steps), DENSE), dense))
-        for i in timer.round():
-            entrant, policy = entrants[i], entrants[i].policy
-            noise = one if entrant.paired else _adapted(one, policy, draw)
-            errors[i].append(_error(timer.time(i, partial(_call, policy, obs, noise, entrant.plan)), dense))
-            report = policy.last_report
-            assert report is not None
-            reports[i].append((float(np.mean(report.plan != Source.COMPUTE)), report.flops[0]))
-        progress("held-out calls", number + 1, len(chosen))
-    points = []
-    for entrant, wrong, times, seen in zip(entrants, errors, timer.times, reports, strict=True):
-        sparsity, flops = np.mean(seen, axis=0)
-        points.append(
-            MeasuredPoint(
-                series=entrant.series,
-                name=entrant.name,
-                sparsity=float(sparsity),
-                flops=float(flops),
-                error=float(np.mean(wrong)),
-                error_p90=float(np.quantile(wrong, 0.9)),
-                latency_ms=times.median,
-                quartiles_ms=times.quartiles,
-                noise="all" if entrant.paired else "initial",
-            )
-        )
-    return tuple(points), {name: float(np.mean(found)) for name, found in apart.items()}
-
-
-def _call(policy: CompiledPolicy, obs: Mapping[str, Array], noise: Noise, plan: str) -> Array:
-    """The executed actions of a first call, ``[Ta, Da]``."""
-    policy.reset()
-    actions: Array = policy.predict_action(obs, noise=noise, plan=plan)["action"][0]
-    return actions
-
-
-def _error(actions: Array, dense: Array) -> float:
-    with np.errstate(invalid="ignore", over="ignore"):
-        difference = np.abs(actions - dense).mean()
-    return float(np.nan_to_num(difference, nan=LARGEST, posinf=LARGEST))
-
-
-def _adapted(noise: Noise, policy: CompiledPolicy, draw: np.random.Generator) -> Noise:
-    """The same initial sample, with the draws that another sampler needs."""
-    info = policy.info
-    if not info.stochastic:
-        return Noise(noise.initial)
-    return Noise(noise.initial, draw.standard_normal((info.K, *noise.initial.shape), dtype=np.float32))

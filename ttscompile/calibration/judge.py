@@ -104,7 +104,7 @@ def judge(trials: Trials, plan: Plan, part: str = HELD_OUT, threads: int | None 
     answered = _Answers(trials, plan, sample)
     scores = [_scored(trials, plan, sample, made, answered.reports) for made in answered.all()]
     score = max(scores, key=lambda one: one.distance)
-    return score if threads is None else replace(score, milliseconds=timed(trials, [plan], threads)[0].median)
+    return score if threads is None else replace(score, milliseconds=timed([(trials, plan)], threads)[0].median)
 
 
 def further(score: Score, other: Score) -> tuple[float, float]:
@@ -118,18 +118,20 @@ def further(score: Score, other: Score) -> tuple[float, float]:
     return difference, float(np.quantile(own - theirs, 0.975))
 
 
-def timed(trials: Trials, plans: Sequence[Plan], threads: int, rounds: int = TIMED) -> list[Times]:
+def timed(entrants: Sequence[tuple[Trials, Plan]], threads: int, rounds: int = TIMED) -> list[Times]:
     """What calls of plans take with onnxruntime, of one stream, in turn: whatever else the machine does hits all.
 
-    Every call computes all of its frames. Weights that are in memory alone are timed as the original's.
+    Every call computes all of its frames. Weights that are in memory alone are timed as the original's. All trials are
+    of the same episodes.
     """
-    opened = [open_runtime(trials.artifact, "onnxruntime", threads, plan=_filed(trials, plan)) for plan in plans]
-    timer, sample = Timer(len(plans), WARM_UP), trials.held_out
+    filed = [(trials, _filed(trials, plan)) for trials, plan in entrants]
+    opened = [open_runtime(trials.artifact, "onnxruntime", threads, plan=plan) for trials, plan in filed]
+    timer, sample = Timer(len(filed), WARM_UP), entrants[0][0].held_out
     for number in range(WARM_UP + rounds):
         stretch, row = sample.calls[number % len(sample.calls)].tolist()
-        obs = trials.observation([(int(sample.stretches[stretch, 0]), row)])
         for i in timer.round():
-            runtime, plan = opened[i], _filed(trials, plans[i])
+            (trials, plan), runtime = filed[i], opened[i]
+            obs = trials.observation([(int(sample.stretches[stretch, 0]), row)])
             noise = trials.noise(_loop_spec(trials, plan), [trials.key(sample.part, stretch, row, 0)])
             if plan.otherwise is not None:
                 runtime.predict(obs, noise, plan)  # so that there is a chunk to begin with
@@ -198,9 +200,12 @@ class _Answers:
         else:
             yield self._apart()
 
+    def _empty(self) -> FloatArray:
+        return np.empty((len(self._sample.calls), DRAWS, *self._spec.sample), np.float32)
+
     def _apart(self) -> FloatArray:
         """Every call the first of an episode."""
-        sample, made = self._sample, np.empty_like(self._sample.answers)
+        sample, made = self._sample, self._empty()
         asked = [(n, draw) for n in range(len(sample.calls)) for draw in range(DRAWS)]
         for some in _batches(asked, self._streams):
             self._runtime.reset()
@@ -210,7 +215,7 @@ class _Answers:
 
     def _in_order(self) -> FloatArray:
         """All calls of each stretch, one after the other; those of several stretches together."""
-        sample, made = self._sample, np.empty_like(self._sample.answers)
+        sample, made = self._sample, self._empty()
         numbers = {(stretch, row): n for n, (stretch, row) in enumerate(sample.calls.tolist())}
         asked = [(stretch, draw) for stretch in range(len(sample.stretches)) for draw in range(DRAWS)]
         for some in _batches(asked, self._streams):
@@ -229,7 +234,7 @@ class _Answers:
 
     def _after_another(self) -> FloatArray:
         """Every call after one of another episode, drawn at random: as if the world had changed between the two."""
-        sample, made, trials = self._sample, np.empty_like(self._sample.answers), self._trials
+        sample, made, trials = self._sample, self._empty(), self._trials
         draw = np.random.default_rng((trials.seed, 6))
         asked = [(n, r) for n in range(len(sample.calls)) for r in range(DRAWS)]
         for some in _batches(asked, self._streams):

@@ -110,8 +110,8 @@ class Schedule:
         named, self.skipped = named_plans(crowded, task, self._strategy, budget.cells)
         for name, one in named.items():
             made = replace(plan, cells=one.schedule, correction=one.correction)
-            refusal = {"refusal": _no_safer} if name == SAFE else {}
-            yield Proposal(name, made, {"steps": one.notes["steps"]}, beside=True, **refusal)
+            proposal = Proposal(name, made, {"steps": one.notes["steps"]}, beside=True)
+            yield replace(proposal, refusal=_no_safer) if name == SAFE else proposal
 
     def _budget(self, trials: Trials, view: View, clock: Clock) -> Budget | None:
         """The budget; None where it is found on the calls to learn from."""

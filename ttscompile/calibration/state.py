@@ -43,7 +43,11 @@ class StateFile:
         progress: how far the work is, as JSON.
     """
 
-    def __init__(self, directory: Path, settings: Mapping[str, Any], work: str = CALIBRATION) -> None:
+    def __init__(
+        self, directory: Path, settings: Mapping[str, Any], work: str = CALIBRATION, needed: bool = True
+    ) -> None:
+        self.warning = "" if needed or directory.is_dir() else "its artifact is no directory"
+        self._needed = needed
         self._path, self._work, self._again = directory / f"{work}-state.safetensors", work, _AGAIN[work]
         self._settings = json.dumps(settings, sort_keys=True)
         self.arrays: dict[str, Array] = {}
@@ -58,7 +62,7 @@ class StateFile:
         Raises:
             CalibrationError: it is damaged, or belongs to a run with other settings.
         """
-        if not self._path.exists():
+        if self.warning or not self._path.exists():
             return False
         try:
             arrays = {name: np.array(array) for name, array in tensors.read(self._path).items()}
@@ -89,6 +93,8 @@ class StateFile:
         Raises:
             CalibrationError: the directory cannot be written.
         """
+        if self.warning:
+            return
         texts = {_SETTINGS: self._settings, _PROGRESS: json.dumps(self.progress, sort_keys=True)}
         content = {name: np.frombuffer(text.encode(), np.uint8) for name, text in texts.items()}
         arrays = {**self.arrays, **content}
@@ -96,9 +102,10 @@ class StateFile:
         try:
             replace_file(self._path, tensors.serialize(arrays))
         except OSError as error:
-            raise CalibrationError(
-                f"{self._path}: the state of the {self._work} cannot be written: {error}."
-            ) from error
+            told = f"{self._path}: the state of the {self._work} cannot be written: {error}."
+            if self._needed:
+                raise CalibrationError(told) from error
+            self.warning = told
 
     def remove(self) -> None:
         """Forget everything.
@@ -106,6 +113,8 @@ class StateFile:
         Raises:
             CalibrationError: the directory cannot be written.
         """
+        if self.warning:
+            return
         try:
             self._path.unlink(missing_ok=True)
         except OSError as error:

@@ -35,10 +35,10 @@ from .targets import dense_rounds, draw_calls, with_targets
 if TYPE_CHECKING:
     from .proposer import Proposal
 
-DRAWS = 2
+DRAWS = 4
 """Of noise for each observation."""
 
-OBSERVATIONS = 64
+OBSERVATIONS = 32
 """That the original answers, at most, of either part."""
 
 EPISODES = 16
@@ -88,6 +88,7 @@ class Trials:
         base: what a calibration begins with: every cell of its loop, in its precision and with its tokens.
         executor: runs plans of the base's loop on many calls at once, in fp32.
         limits: of the calls to learn from: how many there are whatever the time, and if there is enough.
+        observations: that the original answers, at most, of either part.
         name: of the best plan so far.
         fresh: whether the artifact holds in memory what it has not in its files.
         state: of the calibration; what the original answers is kept there.
@@ -110,6 +111,7 @@ class Trials:
     device: torch.device | None = None
     fresh: bool = False
     limits: tuple[int, int] = (FEWEST_CALLS, FEWEST_CALLS)
+    observations: int = OBSERVATIONS
     name: str = DENSE
     _calls: dict[int, Calls] = field(default_factory=dict)
     _samples: dict[str, Sample] = field(default_factory=dict)
@@ -175,7 +177,7 @@ class Trials:
         """The answered calls of a part; answered when they are first asked for."""
         if part not in self._samples:
             numbers = self.split.calibration if part == LEARNED else self.split.validation
-            stretches, calls = _places(self.episodes, numbers, (self.seed, 4, _NUMBERS[part]))
+            stretches, calls = _places(self.episodes, numbers, (self.seed, 4, _NUMBERS[part]), self.observations)
             self._samples[part] = Sample(part, stretches, calls, self._answers(part, stretches, calls))
         return self._samples[part]
 
@@ -221,7 +223,7 @@ class Trials:
         initial = np.stack([one for one, _ in drawn])
         if not spec.sampler.stochastic:
             return Noise(initial)
-        return Noise(initial, np.stack([steps for _, steps in drawn], 1))
+        return Noise(initial, np.stack([steps for _, steps in drawn if steps is not None], 1))
 
     def key(self, part: str, stretch: int, row: int, draw: int) -> tuple[int, ...]:
         """See ``noise``."""
@@ -235,7 +237,10 @@ class Trials:
         noise = self.noise(spec, [self.key(part, *one) for one in asked])
         places = [(int(stretches[s, 0]), row) for s, row, _ in asked]
         key = f"{part} answers"
-        known = self.state.get(key).get("samples", np.zeros((0, *spec.sample), np.float32))
+        kept = self.state.get(key)
+        if not np.array_equal(kept.get("calls", 0), calls):  # of another number of them
+            kept = {}
+        known = kept.get("samples", np.zeros((0, *spec.sample), np.float32))
         with self.state.reading():
             if known.shape[1:] != spec.sample or known.dtype != np.float32 or len(known) > len(asked):
                 raise ValueError(f"expected answers float32 [n, {spec.sample}]; found {known.dtype} {known.shape}")
@@ -245,7 +250,7 @@ class Trials:
             self.bar.stage(f"original, {part} episodes", len(asked), len(known))
             for found in dense_rounds(executor, drawn, len(known), self.pool):
                 known = np.concatenate([known, found[:, -1].numpy()])
-                self.state.put(key, {"samples": known})
+                self.state.put(key, {"samples": known, "calls": calls})
                 self.state.progress["seconds"] = self.clock.elapsed()
                 self.state.save()
                 self.bar.update(len(known), "", self.clock.left())
@@ -266,16 +271,18 @@ def _draw(spec: PolicySpec, seed: tuple[int, ...]) -> tuple[FloatArray, FloatArr
     return initial, rng.standard_normal((spec.sampler.steps, *shape), dtype=np.float32)[:, :predicted]
 
 
-def _places(episodes: Sequence[Episode], numbers: Sequence[int], seed: tuple[int, ...]) -> tuple[IntArray, IntArray]:
-    """Stretches, and calls among them, as ``Sample`` has them: evenly over at most so many of the episodes."""
+def _places(
+    episodes: Sequence[Episode], numbers: Sequence[int], seed: tuple[int, ...], most: int
+) -> tuple[IntArray, IntArray]:
+    """Stretches, and calls among them, as ``Sample`` has them: evenly over the episodes, at most so many calls."""
     draw = np.random.default_rng(seed)
-    chosen = np.sort(draw.permutation(np.array(numbers))[:EPISODES])
+    chosen = np.sort(draw.permutation(np.array(numbers))[: min(EPISODES, most)])
     stretches, calls = [], []
     for stretch, number in enumerate(chosen.tolist()):
         length = min(episodes[number].calls, STRETCH)
         first = int(draw.integers(episodes[number].calls - length + 1))
         last = first + length - 1
         stretches.append((number, first, last))
-        rows = np.linspace(min(first + 1, last), last, OBSERVATIONS // len(chosen)).round()
+        rows = np.linspace(min(first + 1, last), last, most // len(chosen)).round()
         calls += [(stretch, int(row)) for row in np.unique(rows)]
     return np.array(stretches, np.int64), np.array(calls, np.int64)

@@ -119,11 +119,11 @@ def compare(
     as_json: bool,
     **search: Any,  # the comparison of ttscompile.calibration takes them by the same names
 ) -> None:
-    """Hold plans of the artifact DIRECTORY against each other: held-out action error and measured latency.
+    """Hold plans of the artifact DIRECTORY against each other: how far from the original, and how fast.
 
     Strategies find plans now, from the episodes that are not held out. Until the end, what they found is kept in a file
     beside the artifact's own, for --resume; nothing else is written there. Every plan
-    runs on the same calls, in turn, and its actions are held against those of the dense policy with the same noise.
+    runs on the same calls; how far its actions are from the original's is what 'calibrate' goes by, too.
     """
     manifests = {path: manifest_of(path) for path in (directory, *others)}  # of what is measured now
     require_recordings(trajectories)
@@ -163,20 +163,35 @@ def compare(
         say(output, *(f"{path}: identity {manifest.short_identity}" for path, manifest in manifests.items()))
     if picture is not None:
         title = f"{directory.resolve().name}: {found.calls} held-out calls, {threads}\n{one_line(machine)}"
-        plot_frontier(found.points, found.efficient(), found.yardsticks, picture, title)
+        plot_frontier([p.point for p in found.points], [p.point for p in found.efficient()], picture, title)
         say(told, f"wrote {picture}")
 
 
 def _print(found: Comparison, output: Console, threads: str) -> None:
     """The comparison as a table, and what is compared."""
     efficient = found.efficient()
-    made = table("", "plan", "error", "90th pct.", "ms a call", "quartiles", "GFLOP", "reused", "frontier")
+    head = (
+        "",
+        "plan",
+        "distance",
+        "95 %",
+        "error",
+        "90th pct.",
+        "ms a call",
+        "quartiles",
+        "GFLOP",
+        "reused",
+        "frontier",
+    )
+    made = table(*head)
     for p in found.points:
         made.add_row(
             p.series,
-            p.name + " *" * (p.noise != "all"),
-            f"{p.error:.4g}",
-            f"{p.error_p90:.4g}",
+            p.name,
+            f"{p.distance:.3f}",
+            "..".join(f"{one:.3f}" for one in p.interval),
+            "" if p.error is None else f"{p.error:.4g}",
+            "" if p.error_p90 is None else f"{p.error_p90:.4g}",
             ms(p.latency_ms, 4),
             "..".join(ms(quartile, 4) for quartile in p.quartiles_ms),
             f"{p.flops / 1e9:.3f}",
@@ -186,19 +201,10 @@ def _print(found: Comparison, output: Console, threads: str) -> None:
     output.print(made)
     say(
         output,
-        f"Error: mean absolute difference of the executed actions, in their units, from those of the dense policy in"
-        f" fp32 with the same observation and noise; {found.calls} calls of episodes that no strategy here learned"
-        f" from, each as the first of its episode. Latency: medians of the same calls, one stream, {threads}."
-        " Comparison: no other plan is faster and more accurate.",
+        f"Distance: between the actions and the original's for the same observation, in units of what other noise"
+        f" changes; 0 is the same. {found.calls} observations of episodes that no strategy here learned from, each with"
+        f" several draws of noise. Error: with the same noise, in the units of the actions, in which two calls of the"
+        f" original are {found.other_noise:.4g} apart; another sampler takes other noise, and has none. Latency:"
+        f" medians, one stream, {threads}. Frontier: no other plan is faster and nearer.",
     )
-    told = {"steps": "the same initial sample and other draws", "all": "other noise altogether"}
-    apart = "; ".join(f"by {error:.4g} with {told[name]}" for name, error in found.yardsticks.items())
-    if any(p.noise != "all" for p in found.points):
-        say(
-            output,
-            "* Another sampler: it shares the initial sample with the dense policy and nothing else (and a stochastic"
-            " sampler soon forgets that), so its error holds what other noise would change too. Compare it with the"
-            " yardstick, and judge it by the task's score.",
-        )
-    say(output, f"Yardstick: two dense calls are apart {apart}.")
     say(output, *(f"{name}: left out: {reason}" for name, reason in found.skipped.items()))

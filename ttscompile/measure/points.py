@@ -14,7 +14,7 @@ class Point:
     Attributes:
         series: strategy, or artifact.
         name: of the plan in its series; a sparsity of a strategy.
-        error: mean absolute difference of the executed actions from those of the dense policy, in their units.
+        error: how far its actions are from those of the original, on whatever scale.
         latency_ms: median wall time of a call on one stream.
     """
 
@@ -25,22 +25,38 @@ class Point:
 
 
 @dataclass(frozen=True)
-class MeasuredPoint(Point):
+class MeasuredPoint:
     """One plan on the held-out calls of a comparison.
 
     Attributes:
+        series: see ``Point``.
+        name: see ``Point``.
+        distance: of its actions from the original's (``calibration.judge``).
+        interval: 95 % interval of that, over episodes.
+        error: mean absolute difference of the executed actions from the original's with the same noise, in their units;
+            None of another sampler or start, which takes other noise.
+        error_p90: 90th percentile of that over the calls.
+        latency_ms: median wall time of a call on one stream.
+        quartiles_ms: first and third quartile of the latency.
         sparsity: share of the cells that are reused, mean over the calls.
         flops: of a call, mean.
-        error_p90: 90th percentile over the calls.
-        quartiles_ms: first and third quartile of the latency.
-        noise: what its noise has in common with the dense calls': ``all`` or ``initial``.
     """
 
+    series: str
+    name: str
+    distance: float
+    interval: tuple[float, float]
+    error: float | None
+    error_p90: float | None
+    latency_ms: float
+    quartiles_ms: tuple[float, float]
     sparsity: float
     flops: float
-    error_p90: float
-    quartiles_ms: tuple[float, float]
-    noise: str
+
+    @property
+    def point(self) -> Point:
+        """Its distance against its latency, to be drawn; none is below 0."""
+        return Point(self.series, self.name, max(self.distance, 0.0), self.latency_ms)
 
 
 AnyPoint = TypeVar("AnyPoint", bound=Point)
@@ -64,8 +80,7 @@ class Comparison:
         calls: held-out calls that each point was measured on.
         episodes: numbers of the held-out episodes.
         threads: threads that onnxruntime computed with.
-        yardsticks: mean error of a dense call with other noise: ``steps``: the same initial sample and other draws (of
-            stochastic samplers alone); ``all``: everything else.
+        other_noise: mean absolute difference of two dense calls of one observation, in the units of the actions.
         skipped: why a strategy has no plan at a sparsity.
         warnings: what a reader has to know.
     """
@@ -74,17 +89,22 @@ class Comparison:
     calls: int
     episodes: tuple[int, ...]
     threads: int
-    yardsticks: Mapping[str, float]
+    other_noise: float
     skipped: Mapping[str, str]
     warnings: tuple[str, ...]
 
     def efficient(self) -> tuple[MeasuredPoint, ...]:
-        """Points that no other beats in error and latency both, fastest first."""
-        return efficient(self.points)
+        """Points that no other beats in distance and latency both, fastest first."""
+        points = [(one, one.point) for one in self.points]
+        best = efficient([point for _, point in points])
+        return tuple(one for kept in best for one, point in points if point is kept)
 
     def to_json(self) -> dict[str, Any]:
         """As plain JSON values."""
         best = self.efficient()
-        points = [{**asdict(p), "quartiles_ms": list(p.quartiles_ms), "efficient": p in best} for p in self.points]
+        points = [
+            {**asdict(p), "quartiles_ms": list(p.quartiles_ms), "interval": list(p.interval), "efficient": p in best}
+            for p in self.points
+        ]
         record = {**asdict(self), "points": points, "episodes": list(self.episodes), "warnings": list(self.warnings)}
-        return {**record, "yardsticks": dict(self.yardsticks), "skipped": dict(self.skipped)}
+        return {**record, "skipped": dict(self.skipped)}

@@ -1,8 +1,8 @@
-"""The picture of a comparison: latency across, action error up, a line for each series."""
+"""The picture of a comparison: latency across, distance from the original up, a line for each series."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from math import log
 from pathlib import Path
 from textwrap import wrap
@@ -19,18 +19,13 @@ MARKERS = "osD^vP*"
 _TITLE_WIDTH = 105
 """Characters."""
 
-_TOLD = {"steps": "dense, same initial sample, other draws", "all": "dense, other noise"}
 
-
-def plot_frontier(
-    points: Sequence[Point], efficient: Sequence[Point], yardsticks: Mapping[str, float], path: Path, title: str
-) -> None:
+def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], path: Path, title: str) -> None:
     """Draw the points and write the picture.
 
     Args:
-        points: of all series; those without an error (the dense policy) are told in the title: the axis is logarithmic.
+        points: of all series; those at no distance (the dense policy) are told in the title: the axis is logarithmic.
         efficient: points that no other beats, fastest first.
-        yardsticks: errors that are drawn as level lines, by their key in ``Comparison.yardsticks``.
         path: see ``write_picture``.
         title: over the picture.
 
@@ -61,18 +56,15 @@ def plot_frontier(
     if len(best) > 1:  # of one point there is no line
         line: dict[str, Any] = {"color": "#999999", "linewidth": 4, "alpha": 0.35, "zorder": 0}
         axes.step([p.latency_ms for p in best], [p.error for p in best], where="post", label="frontier", **line)
-    for (name, height), style in zip(yardsticks.items(), ("--", ":"), strict=False):
-        if height > 0:
-            axes.axhline(height, color="#555555", linestyle=style, linewidth=1, label=_TOLD[name])
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_xlabel("latency of a call, ms (median)")
-    axes.set_ylabel("error of the executed actions on held-out calls, in their units")
+    axes.set_ylabel("distance from the original on held-out calls (1: about what other noise changes)")
     plain_powers(axes.xaxis)
     plain_powers(axes.yaxis)
     axes.margins(x=0.08, y=0.1)
     exact = ", ".join(f"{p.name} of {p.series}, {p.latency_ms:.3g} ms" for p in points if p.error == 0)
-    parts = [*title.splitlines(), *([f"not drawn, with no error: {exact}"] if exact else [])]
+    parts = [*title.splitlines(), *([f"not drawn, with no distance: {exact}"] if exact else [])]
     lines = [line for part in parts for line in wrap(part, _TITLE_WIDTH)]
     axes.set_title("\n".join(lines), fontsize=8, loc="left")
     axes.grid(which="both", color="#dddddd", linewidth=0.5)

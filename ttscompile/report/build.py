@@ -16,7 +16,6 @@ from ..measure.units import flops, ms, share
 from ..report import facts, pictures, usage
 from ..runtimes.policy import CompiledPolicy
 from ..trajectories.episodes import Episode
-from .comparison import Compared
 from .measure import Course, Latency, measure_parts, run_episode
 from .page import Page, Picture, Section, Table, require_packages
 from .verified import NOT_RUN
@@ -31,14 +30,14 @@ class Given:
 
     Attributes:
         episode: recorded observations; None for none.
-        comparison: points and yardsticks of one; None for none.
+        comparison: points of one; None for none.
         verification: what was found; see ``verified``.
         threads: of the calls that are timed.
         runs: counted calls of each plan.
     """
 
     episode: Episode | None = None
-    comparison: Compared | None = None
+    comparison: tuple[Point, ...] | None = None
     verification: Section = NOT_RUN
     threads: int = 1
     runs: int = 10
@@ -181,25 +180,26 @@ def _latency(latencies: Sequence[Latency], given: Given, default: str) -> Sectio
     return Section("Latency", (text, one_line(fingerprint())), (Table(head, rows),), (drawn,))
 
 
-def _frontier(artifact: Artifact, latencies: Sequence[Latency], compared: Compared | None) -> Section:
+def _frontier(artifact: Artifact, latencies: Sequence[Latency], compared: tuple[Point, ...] | None) -> Section:
     manifest = artifact.manifest
     if compared is not None:
-        points, yardsticks = compared
+        points = compared
         text = "As ttscompile compare measured it, on the machine and the calls that its document names."
     else:
-        judged = facts.scores(manifest.calibration)
+        judged = facts.scores(manifest.calibration, ("distance",))
         known = [one for one in latencies if one.plan in judged]
-        points = tuple(Point("this artifact", p.plan, float(judged[p.plan]["error"]), p.total) for p in known)
-        yardsticks = {}
-        text = "Errors from the calibration record, latencies measured now. ttscompile compare measures more of it."
+        points = tuple(
+            Point("this artifact", p.plan, max(float(judged[p.plan]["distance"]), 0.0), p.total) for p in known
+        )
+        text = "Distances from the calibration record, latencies measured now. ttscompile compare measures more of it."
     if not any(point.error > 0 for point in points):
-        return Section("Comparison", ("There is no error to hold against a latency: calibrate the artifact first.",))
+        return Section("Comparison", ("There is no distance to hold against a latency: calibrate the artifact first.",))
     best = efficient(points)
-    png = pictures.frontier_picture(points, best, yardsticks, f"artifact {manifest.short_identity}")
-    alt = "Points: action error against latency of each plan. The table has the figures."
-    drawn = Picture(png, "Action error against latency: down and left is better.", alt)
+    png = pictures.frontier_picture(points, best, f"artifact {manifest.short_identity}")
+    alt = "Points: distance from the original against latency of each plan. The table has the figures."
+    drawn = Picture(png, "Distance from the original against latency: down and left is better.", alt)
     rows = tuple((p.series, p.name, f"{p.error:.4g}", ms(p.latency_ms), "yes" if p in best else "") for p in points)
-    head = ("", "plan", "action error", "ms a call", "on the frontier")
+    head = ("", "plan", "distance", "ms a call", "on the frontier")
     return Section("Comparison", (text,), (Table(head, rows),), (drawn,))
 
 
@@ -208,10 +208,11 @@ def _calibration(record: Mapping[str, Any] | None) -> Section:
         return Section("Calibration", ("Not calibrated: every call is dense. ttscompile calibrate gives it a plan.",))
     scores = facts.scores(record)
     drawn: tuple[Picture, ...] = ()
-    if scores and all(score["error"] > 0 for score in scores.values()):
+    told = facts.scores(record, ("sparsity", "error", "error_p90"))
+    if told and all(score["error"] > 0 for score in told.values()):
         caption = "Held-out action error against computed cells: mean (point) and 90th percentile (bar)."
         alt = "Points: held-out action error of each plan against the share of cells it computes."
-        drawn = (Picture(pictures.plans_picture(scores), caption, alt),)
+        drawn = (Picture(pictures.plans_picture(told), caption, alt),)
     tables = (facts.score_table(record), facts.record_table(record)) if scores else (facts.record_table(record),)
     text = "Errors on episodes that nothing was learned from, against the dense policy with the same noise."
     return Section(

@@ -1,4 +1,4 @@
-"""Points of action error against latency, from what ``ttscompile compare --json`` printed."""
+"""Points of distance from the original against latency, from what ``ttscompile compare --json`` printed."""
 
 from __future__ import annotations
 
@@ -14,12 +14,9 @@ from ..measure.points import Point
 MAX_BYTES = 16 * 2**20
 _REMEDY = "Give what 'ttscompile compare ... --json' printed."
 
-Compared = tuple[tuple[Point, ...], dict[str, float]]
-"""Points and yardsticks of a comparison."""
 
-
-def read_comparison(path: Path) -> Compared:
-    """Points and yardsticks of a comparison.
+def read_comparison(path: Path) -> tuple[Point, ...]:
+    """Points of a comparison.
 
     Raises:
         ReportError: the file is not what ``ttscompile compare --json`` prints.
@@ -32,21 +29,19 @@ def read_comparison(path: Path) -> Compared:
         raise ReportError(f"{path}: no JSON document: {error}. {_REMEDY}") from error
     document = document if isinstance(document, dict) else {}
     points: Any = document.get("points")
-    yardsticks = document.get("yardsticks", {})
-    good = isinstance(points, list) and isinstance(yardsticks, dict)
-    good = good and all(isinstance(p, dict) and _is_number(p.get("error")) for p in points)
-    good = good and all(map(_is_number, [*(p.get("latency_ms") for p in points), *yardsticks.values()]))
+    good = isinstance(points, list) and all(
+        isinstance(p, dict) and all(map(_is_number, (p.get("distance"), p.get("latency_ms")))) for p in points
+    )
     if not good:
         raise ReportError(
-            f"{path}: expected an object with 'points', which have error and latency_ms, and with 'yardsticks'; found"
+            f"{path}: expected an object with 'points', which have distance and latency_ms; found"
             f" {sorted(map(str, document))[:8]}. {_REMEDY}"
         )
-    found = (
-        Point(str(p.get("series", "")), str(p.get("name", "")), float(p["error"]), float(p["latency_ms"]))
+    return tuple(
+        Point(str(p.get("series", "")), str(p.get("name", "")), max(float(p["distance"]), 0.0), float(p["latency_ms"]))
         for p in points
     )
-    return tuple(found), {name: float(value) for name, value in yardsticks.items() if name in ("steps", "all")}
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value >= 0
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

@@ -220,9 +220,9 @@ def score_table(record: Mapping[str, Any]) -> Table:
     told = any(isinstance(score.get(compared), int | float) for score in scores(record).values())
 
     def row(name: str, score: Mapping[str, Any], *saved: str) -> tuple[str, ...]:
-        ratio = score.get(compared)
-        beside = (f"{ratio:.2f}" if isinstance(ratio, int | float) else "",) if told else ()
-        return name, f"{score['error']:.4g}", *beside, f"{score['error_p90']:.4g}", *(saved or ("", ""))
+        beside = (_figure(score, compared, ".2f"),) if told else ()
+        errors = _figure(score, "error"), *beside, _figure(score, "error_p90")
+        return name, _figure(score, "distance", ".3f"), *errors, *(saved or ("", ""))
 
     of_precision = _mapping(record.get("precision"))
     parts, against = _mapping(of_precision.get("parts")), f"{of_precision.get('name')} against fp32"
@@ -230,11 +230,17 @@ def score_table(record: Mapping[str, Any]) -> Table:
     rows = [
         *(row(marked(name), s, share(s["sparsity"]), share(s["flops_saved"])) for name, s in scores(record).items()),
         *(row(f"{name}: {against}", s) for name, s in scores(of_precision, _ERRORS).items()),
-        *((f"{name}: {against}", f"{error:.4g}", *[""] * (3 + told)) for name, error in alone.items()),
+        *((f"{name}: {against}", "", f"{error:.4g}", *[""] * (3 + told)) for name, error in alone.items()),
     ]
     beside = ("/ other noise",) if told else ()
-    head = ("held-out episodes", "mean action error", *beside, "90th percentile", "cells reused", "FLOPs saved")
+    errors = "mean action error", *beside, "90th percentile"
+    head = ("held-out episodes", "distance from the original", *errors, "cells reused", "FLOPs saved")
     return Table(head, tuple(rows))
+
+
+def _figure(score: Mapping[str, Any], key: str, form: str = ".4g") -> str:
+    """A number of a score; empty where it has none."""
+    return format(score[key], form) if isinstance(score.get(key), int | float) else ""
 
 
 def remarks(record: Mapping[str, Any]) -> tuple[str, ...]:
@@ -306,7 +312,7 @@ def record_table(record: Mapping[str, Any], most: int = 200) -> Table:
 
 
 def scores(
-    record: Mapping[str, Any] | None, wanted: tuple[str, ...] = (*_ERRORS, "sparsity", "flops_saved")
+    record: Mapping[str, Any] | None, wanted: tuple[str, ...] = ("sparsity", "flops_saved")
 ) -> Mapping[str, Mapping[str, Any]]:
     """Of each plan that calibration judged, if its figures are there: a record is free JSON of whoever made it."""
     return {

@@ -57,11 +57,9 @@ def plan_picture(plan: PlanArray, kinds: Sequence[str], title: str, caption: str
     return Picture(png, f"{caption} {sparsity(plan):.1%} of {plan.size} cells are reused: {counts}.")
 
 
-def frontier_picture(
-    points: Sequence[Point], efficient: Sequence[Point], yardsticks: Mapping[str, float], title: str
-) -> bytes:
-    """Error against latency, names as matplotlib can draw them; see ``ttscompile.plots.frontier.plot_frontier``."""
-    return drawn(lambda path: plot_frontier(points, efficient, yardsticks, path, plain(title, 110)))
+def frontier_picture(points: Sequence[Point], efficient: Sequence[Point], title: str) -> bytes:
+    """Distance against latency, names as matplotlib can draw them; see ``ttscompile.plots.frontier.plot_frontier``."""
+    return drawn(lambda path: plot_frontier(points, efficient, path, plain(title, 110)))
 
 
 def shares_picture(course: Course) -> bytes:

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from ..artifact.load import load_artifact
+from ..artifact.view import view_of
 from ..calibration.calls import FRACTION, Actions, Calls, load_episodes, prepare_calls, sample_calls, split_episodes
 from ..calibration.execute import Executor
 from ..calibration.fit_correction import fit_correction
@@ -25,6 +26,7 @@ from ..calibration.progress import Progress
 from ..calibration.spacing import spacings
 from ..calibration.targets import REPEATS, dense_rounds
 from ..calibration.task import Array
+from ..calibration.trials import base_of
 from ..core.coercion import integer
 from ..core.correction import MOST_NUMBERS, Correction
 from ..core.lattice import PlanArray, whole_steps_plan
@@ -93,7 +95,8 @@ def oracle(
     sizes = {"schedules": schedules, "calls": calls, "draws": draws}
     schedules, calls, draws = (integer(size, name, CalibrationError, 2) for name, size in sizes.items())
     artifact = load_artifact(path)
-    spec, steps, blocks = artifact.manifest.spec, artifact.manifest.steps, len(artifact.manifest.blocks)
+    view = view_of(artifact, base_of(artifact).exact)
+    spec, steps, blocks = view.manifest.spec, view.manifest.steps, len(view.manifest.blocks)
     if steps < 3:
         told = f"the policy has {steps} denoising step{'s' * (steps > 1)}; expected three at least"
         raise CalibrationError(f"{told}: with fewer there is nothing to choose. Convert with more denoising steps.")
@@ -108,7 +111,7 @@ def oracle(
     split = split_episodes(len(episodes), FRACTION, seed)
     inner = split_episodes(len(split.calibration), 1 / 3, seed)
     fitting, learning = (tuple(split.calibration[i] for i in part) for part in (inner.calibration, inner.validation))
-    executor, actions = Executor(artifact), Actions(spec)
+    executor, actions = Executor(view), Actions(spec)
 
     def answered(drawn: Calls, what: str) -> Calls:
         paths: list[torch.Tensor] = []
