@@ -12,7 +12,7 @@ from ttscompile.artifact.golden import GoldenPlan, load_golden, load_golden_plan
 from ttscompile.artifact.load import load_artifact
 from ttscompile.core.lattice import Source
 from ttscompile.runtimes import open_runtime
-from ttscompile.verification.calls import check_plans_precision
+from ttscompile.verification.precision import check_plans_precision
 from ttscompile.verification.record_golden import record_plans
 from ttscompile.verification.rung import FAILED, PASSED, Rung
 
