@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -92,11 +94,7 @@ def check_plans_precision(
 
 
 def _steps_off(artifact: Artifact) -> Iterator[tuple[float, str]]:
-    """How far the integers of each matrix are from the weights that they stand for, in their largest step; its name.
-
-    They are compared as sets, since a product has them in another order. Sorting brings no two sets further apart than
-    they are element by element, so those that were rounded are half a step apart at most.
-    """
+    """How far the integers of each matrix are from the weights that they stand for, in steps; and its name."""
     manifest = artifact.manifest
     assert manifest.precision is not None
     yield from _apart(artifact, manifest.precision.weights, artifact.weights)
@@ -115,5 +113,19 @@ def _apart(artifact: Artifact, file: str, weights: Mapping[str, npt.NDArray[Any]
             if constant not in weights or weights[constant].size != integers.size:
                 found = f"{name!r}, {integers.size} integers that stand for no constant of as many numbers"
                 raise ArtifactError(f"{artifact.path}: {file}: {found}. Convert the checkpoint again.")
-            apart = np.sort((integers * scale).ravel()) - np.sort(weights[constant].ravel())
-            yield float(np.abs(apart).max() / scale.max()), constant
+            yield _off(integers, scale, weights[constant]), constant
+
+
+def _off(integers: npt.NDArray[np.int8], scale: npt.NDArray[np.float32], weight: npt.NDArray[Any]) -> float:
+    """The largest difference of integers ``[rows, columns]`` from a constant that they were made of, in steps.
+
+    Some axes of the constant are the columns, and the numbers of a column may have another order there: they are
+    compared as sets. Sorting brings no two sets further apart than they are element by element, so those that were
+    rounded are half a step apart at most.
+    """
+    made, (rows, columns), found = np.sort(integers * scale, 0), integers.shape, [np.inf]
+    for i, j in combinations(range(weight.ndim + 1), 2):
+        if math.prod(weight.shape[i:j]) == columns:
+            by_column = weight.reshape(math.prod(weight.shape[:i]), columns, -1).swapaxes(1, 2).reshape(rows, columns)
+            found.append(float((np.abs(made - np.sort(by_column, 0)) / scale).max()))
+    return min(found)
