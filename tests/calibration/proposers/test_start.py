@@ -14,6 +14,7 @@ from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import StartRecord
 from ttscompile.artifact.write import update_plans
+from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.judge import Score, judge
 from ttscompile.calibration.proposer import Proposal
 from ttscompile.calibration.proposers import start
@@ -54,6 +55,15 @@ def scheduled(trials: Trials, *steps: int) -> Plan:
     return replace(trials.base, cells=whole_steps_plan(STEPS, blocks, (0, *steps)))
 
 
+def first(proposer: Start, trials: Trials, plan: Plan) -> Proposal:
+    """What is proposed first; it is kept."""
+    proposals = proposer.propose(trials, plan, Clock())
+    found = next(proposals)
+    with pytest.raises(StopIteration):
+        proposals.send(True)
+    return found
+
+
 def described(proposal: Proposal) -> tuple[int, list[int]]:
     """How many steps there are, and which are computed."""
     cells = proposal.plan.cells
@@ -92,9 +102,10 @@ def test_the_fewest_cells_within_the_margin_are_taken(trials: Trials, monkeypatc
     monkeypatch.setattr(start, "further", lambda one, _: (one.distance / 2, one.distance))
     plan = scheduled(trials, 4, 6)
     for margin, expected in ((1.45, (2, [0])), (1.35, (2, [0, 1])), (1.1, (3, [0, 1, 2]))):
-        (found,) = proposed(Start(request(), margin), trials, plan)
+        found = first(Start(request(), margin), trials, plan)
         assert described(found) == expected
         assert (found.name, found.margin, found.notes["steps"]) == (NAME, margin, expected[0])
+    assert [described(one) for one in proposed(Start(request(), 1.25), trials, plan)] == [(3, [0, 1]), (3, [0, 1, 2])]
     with pytest.raises(CalibrationFailedError, match="the last 3 steps are 1 further off at worst, and 0.9 is allowed"):
         proposed(Start(request(), 0.9), trials, plan)
 
@@ -107,13 +118,13 @@ def test_a_later_start_keeps_more_of_the_chunk(trials: Trials) -> None:
 
 def test_a_plan_that_begins_so_already_is_made_anew(trials: Trials) -> None:
     warm = begun(trials.base, 3, dense_plan(3, len(trials.artifact.manifest.blocks)))
-    (found,) = proposed(Start(request(), 1e6), trials.holding(warm), warm.plan)
+    found = first(Start(request(), 1e6), trials.holding(warm), warm.plan)
     assert found.plan.otherwise is trials.base
     assert described(found) == (1, [0])
 
 
 def test_what_is_proposed_can_be_written_and_loaded(trials: Trials, folder: Path) -> None:
-    (found,) = proposed(Start(request(), 1e6), trials, trials.base)
+    found = first(Start(request(), 1e6), trials, trials.base)
     artifact = load_artifact(folder)
     plans = {**artifact.plans, NAME: replace(found.plan, otherwise=artifact.plans[FULL])}
     update_plans(folder, plans, FULL, starts=found.starts)
