@@ -34,8 +34,8 @@ nothing in 100 episodes, and fewer steps are beyond it and lose (``docs/decision
 class Start:
     """Tries numbers of steps, dense and with those steps alone that the plan computes, from what costs least on."""
 
-    def __init__(self, request: Request, margin: float = MARGIN) -> None:
-        self._margin = margin
+    def __init__(self, request: Request) -> None:
+        self._margin = MARGIN if request.margin is None else request.margin
         self.told = ""
 
     def applies(self, artifact: Artifact) -> str | None:
