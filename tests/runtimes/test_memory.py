@@ -15,6 +15,7 @@ from tests.lower.whole_call import inputs, make
 from tests.rounding import Counted, amplified, assert_equal_but_for_rounding, bound
 from ttscompile import Noise, SamplerTable, Source, flow_matching_table
 from ttscompile.artifact import Artifact, load_artifact
+from ttscompile.artifact.view import view_of
 from ttscompile.calibration.calls import Calls
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.fit_correction import fit_correction

@@ -138,7 +138,7 @@ def calibrate(
         artifact = load_artifact(Path(path))
         view = view_of(artifact, base_of(artifact))
         goal = goal_of(*asked, usual=usual_sparsity(view.manifest.steps))
-        request = Request(goal, strategy, correct, max_intervals, rank, updates)
+        request = Request(goal, strategy, correct, max_intervals, rank, updates, max_distance)
         made = [(row, row.make(request)) for row in rows]
         for _, proposer in made:
             if (reason := proposer.applies(artifact)) is not None:

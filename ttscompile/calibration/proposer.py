@@ -69,6 +69,7 @@ class Request:
         intervals: of a search, at most; None for its own number.
         rank: of the low-rank update to each weight matrix.
         updates: of the weights.
+        margin: what a proposer allows in place of its own (``Proposal.margin``); None leaves that to it.
     """
 
     goal: Goal
@@ -77,6 +78,7 @@ class Request:
     intervals: int | None = None
     rank: int = 16
     updates: int = 600
+    margin: float | None = None
 
 
 Proposals: TypeAlias = Generator[Proposal, bool, None]
