@@ -6,21 +6,19 @@ import os
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from torch import nn
 
 from .artifact.bind import LoweredPieces
 from .artifact.files import replace_file
-from .artifact.load import load_artifact
 from .artifact.write import require_replaceable, write_artifact
 from .capture.export import capture
 from .capture.narrow import narrow, unneeded
 from .core.coercion import integer
 from .core.paths import on_hub, require_free_or_path
-from .core.spec import AUTO, FP32, INT8, ORIGINAL, PolicySpec
-from .errors import ArtifactError, LoweringError, NoResidualBlocksError, PassError, SpecError
+from .core.spec import FP32, INT8, ORIGINAL, PolicySpec
+from .errors import ArtifactError, NoResidualBlocksError, PassError, SpecError
 from .frontends import files_beside, load_checkpoint_policy
 from .frontends.copies import own_copy
 from .frontends.encoded import parts
@@ -52,7 +50,6 @@ from .passes.split_frames import SplitFrames
 from .passes.split_tokens import SplitTokens
 from .passes.unfold_batch import UnfoldBatch
 from .passes.widen_attention import WidenAttention
-from .runtimes.against_fp32 import SHARE, measure_parts
 from .verification.record_golden import record_original
 
 if TYPE_CHECKING:
@@ -106,7 +103,7 @@ def convert(
         without_cameras: of a vision-language-action model: names of cameras that it was trained with and that the robot
             lacks. None leaves out only those that lerobot calls empty.
         prediction_horizon: predict only the first so many steps of the policy's horizon; see ``compile_denoiser``.
-        precision: of the weights: ``fp32``, ``int8`` or ``auto``; see ``compile_denoiser``.
+        precision: of the weights: ``fp32`` or ``int8``; see ``compile_denoiser``.
         keep_fp32: what stays in fp32 beside another precision; see ``compile_denoiser``.
         single_file: where one ONNX file of the whole call goes too, for programs without ttscompile; None for none. It
             is of the loop that is asked for, or else of the policy's own. ``ttscompile.lower.single_file`` describes
@@ -156,10 +153,9 @@ def compile_denoiser(
         prediction_horizon: predict only the first so many steps of the sample: less to compute at every step, with the
             same actions, where attention is causal. Refused where it is not. None predicts all.
         precision: of the weights of residual blocks and of the prologue, image encoders above all: ``fp32``, or
-            ``int8``, which is faster on processors with integer dot products. What it does to the actions is measured,
-            and the artifact says it; fp32 stays in the artifact too, for the reference runtime and ``load(...,
-            precision="fp32")``. ``auto`` takes int8 and leaves out the parts that change the actions by more than a
-            tenth of what other noise does.
+            ``int8``, which is faster on processors with integer dot products. Plan ``full`` then computes in it; fp32
+            stays in the artifact too, for plan ``dense``. What it does to the actions is not measured here:
+            ``calibrate(..., learn=("precision",))`` does, and leaves out the parts that change them too much.
         keep_fp32: parts that stay in fp32 whatever the precision: ``blocks``; ``prologue``, or a piece of it by name,
             ``frame_00``, ``condition`` or ``step``.
         single_file: see ``convert``; of the policy's own loop.
@@ -210,7 +206,7 @@ def _compile(
         return program
     models = lower_program(program)
     explain("lower", (f"{len(models)} ONNX models",))
-    lowered = None if precision == FP32 else _lower_pieces(program, models, precision, keep_fp32, explain)
+    lowered = None if precision == FP32 else _lower_pieces(program, models, keep_fp32, explain)
     whole: bytes | None = None
     if single_file is not None:  # made before anything is written: without one there is no artifact either
         own, weights = ({}, {}) if lowered is None else (lowered.models, lowered.weights)
@@ -250,39 +246,14 @@ def _write(path: Path, content: bytes) -> None:
         raise ArtifactError(f"{path}: the single file cannot be written: {error}. Give another path.") from error
 
 
-def _lower_pieces(
-    program: Program, models: Models, precision: str, keep_fp32: Collection[str], explain: Explain
-) -> LoweredPieces | None:
-    """Blocks and prologue in another precision than fp32, and what that changes; None if nothing is left of it."""
+def _lower_pieces(program: Program, models: Models, keep_fp32: Collection[str], explain: Explain) -> LoweredPieces:
+    """Blocks and prologue in eight bits. What that changes is not known here: calibration measures it."""
     parts, asked, staying = parts_to_lower(program, keep_fp32)
-    try:
-        own, weights, notes = lower_precision(models, program.weights, INT8, parts)
-    except LoweringError as reason:
-        if precision != AUTO:
-            raise
-        explain("lower_precision", (*staying, str(reason)))
-        return None
+    own, weights, notes = lower_precision(models, program.weights, INT8, parts)
     if any(map(is_block, own)):
         own |= lower_all_blocks(program.pieces.blocks, {**models, **own})
-    lowered = LoweredPieces(INT8, own, weights)
-    with TemporaryDirectory() as folder:
-        write_artifact(program, models, folder, lowered)
-        found = measure_parts(load_artifact(folder), choose=precision == AUTO)
-    error, noise = found.error, found.other_noise
-    off = {part: mean for part, mean in found.alone.items() if part not in found.kept}
-    left = [f"{part} stays fp32: actions would be {mean:.4g} off" for part, mean in off.items()]
-    if error is None:
-        told = f"fp32: other noise changes actions by {noise:.4g}, and int8 by more than {SHARE:.0%} of it"
-    else:
-        told = (
-            f"action error of dense calls {error.mean:.4g} on average, 90th percentile {error.p90:.4g}, against fp32;"
-            f" other noise changes them by {noise:.4g}"
-        )
-    alone = [f"{part} alone: {found.alone[part]:.4g}" for part in found.kept if part in found.alone]
-    explain("lower_precision", (*notes, *staying, *left, told, *alone))
-    if error is None:
-        return None
-    return replace(lowered.of_parts(found.kept), error=error, parts={**found.alone, **dict.fromkeys(asked)})
+    explain("lower_precision", (*notes, *staying))
+    return LoweredPieces(INT8, own, weights, asked)
 
 
 def transform(module: nn.Module, spec: PolicySpec, *, explain: Explain = _silent) -> Program:

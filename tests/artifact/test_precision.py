@@ -16,7 +16,7 @@ from tests.rounding import assert_equal_but_for_rounding
 from ttscompile.artifact import codec
 from ttscompile.artifact.bind import LoweredPieces
 from ttscompile.artifact.load import load_artifact, read_manifest
-from ttscompile.artifact.manifest import Manifest, PrecisionError
+from ttscompile.artifact.manifest import Manifest
 from ttscompile.artifact.strict_json import Value
 from ttscompile.artifact.view import view_of
 from ttscompile.artifact.write import write_artifact
@@ -26,14 +26,12 @@ from ttscompile.ir.pieces import DENSE_STEP, JOINT
 from ttscompile.lower.joint import lower_all_blocks
 from ttscompile.lower.precision import lower_precision, quantize_model
 
-ERROR = PrecisionError(calls=8, mean=0.25, p90=0.5, largest=1.5, tolerance=0.03, other_noise=4.0)
-
 
 def lowered(seed: int = 0) -> LoweredPieces:
     program = tiny_program(seed)
     models, weights, _ = lower_precision(tiny_models(program), program.weights, "int8")
     whole = lower_all_blocks(program.pieces.blocks, models)
-    return LoweredPieces("int8", {**models, **whole}, weights, ERROR)
+    return LoweredPieces("int8", {**models, **whole}, weights)
 
 
 def write(directory: Path, blocks: LoweredPieces | None) -> Path:
@@ -65,13 +63,13 @@ def test_the_identity_tells_the_precision_and_a_calibration_belongs_to_both(int8
     other = read_manifest(write(tmp_path / "other", lowered(seed=1)))
     assert len({plain.identity, both.identity, other.identity}) == 3
     assert plain.model_identity == both.model_identity == other.model_identity
-    unmeasured = read_manifest(write(tmp_path / "unmeasured", replace(lowered(), error=None)))
-    assert unmeasured.identity == both.identity, "figures about an artifact are not what it computes"
+    asked = read_manifest(write(tmp_path / "asked", replace(lowered(), asked=("step",))))
+    assert asked.identity == both.identity, "what was asked for is not what an artifact computes"
 
 
 def test_blocks_are_opened_in_the_precision_of_the_plan(int8: Path) -> None:
     artifact = load_artifact(int8)
-    assert artifact.manifest.precision is not None and artifact.manifest.precision.error == ERROR
+    assert artifact.manifest.precision is not None
     assert artifact.default is artifact.plans["full"]
     assert artifact.default.precision == {"blocks": "int8"} and artifact.plans["dense"].precision == {}
     x = np.random.default_rng(0).standard_normal((2, HORIZON, WIDTH)).astype(np.float32)
@@ -93,10 +91,10 @@ def test_blocks_are_opened_in_the_precision_of_the_plan(int8: Path) -> None:
 def test_a_piece_of_the_prologue_has_a_model_of_its_own(tmp_path: Path) -> None:
     program = tiny_program()
     step, weights = quantize_model(tiny_models(program)["step"], program.weights)
-    write_artifact(program, tiny_models(program), tmp_path / "a", LoweredPieces("int8", {"step": step}, weights, ERROR))
+    write_artifact(program, tiny_models(program), tmp_path / "a", LoweredPieces("int8", {"step": step}, weights))
     artifact = load_artifact(tmp_path / "a")
     record = artifact.manifest.precision
-    assert record is not None and (record.kept, record.parts, record.blocks) == (("step",), {"step": None}, 0)
+    assert record is not None and (record.kept, record.asked, record.blocks) == (("step",), (), 0)
     view, plain = view_of(artifact), view_of(artifact, "dense")
     assert (view.onnx_file("step"), view.onnx_file("block_00")) == ("step_int8.onnx", "block_00.onnx")
     assert plain.onnx_file("step") == "step.onnx"
@@ -171,18 +169,11 @@ def decoded(manifest: Manifest, change: Change) -> Manifest:
         (lambda p: p["models"].update(block_00="block_00_int9.onnx"), "files: expected exactly the files"),
         (lambda p: p["models"].pop("block_00"), "files: expected exactly the files"),
         (lambda p: p.update(models={"blocks": "blocks_int8.onnx"}), "models of some blocks beside blocks"),
-        (lambda p: p["parts"].update(stem=None), "the parts that its models belong to, and no others"),
-        (lambda p: p.update(parts={}), "the parts that its models belong to, and no others"),
-        (lambda p: p["parts"].update(blocks=-1.0), "parts.blocks: expected a number that is not negative"),
-        (lambda p: p.pop("error"), "missing: ..error"),
+        (lambda p: p.update(asked=["stem"]), "parts of the policy that none of its models belongs to"),
+        (lambda p: p.update(asked=["blocks"]), "parts of the policy that none of its models belongs to"),
+        (lambda p: p.update(asked={}), "precision.asked: expected a"),
+        (lambda p: p.pop("asked"), "missing: ..asked"),
         (lambda p: p.update(more=1), "unknown: ..more"),
-        (lambda p: p.update(error=0), "precision.error: expected an object"),
-        (lambda p: p["error"].update(mean=-1), "error.mean: expected a number that is not negative"),
-        (lambda p: p["error"].update(tolerance=float("nan")), "error.tolerance: expected a finite number"),
-        (lambda p: p["error"].update(largest="1"), "error.largest: expected a number"),
-        (lambda p: p["error"].update(calls=0), "error.calls: expected a 64-bit integer of at least 1"),
-        (lambda p: p["error"].pop("p90"), "missing: ..p90"),
-        (lambda p: p["error"].update(other_noise=None), "error.other_noise: expected a number"),
     ],
 )
 def test_a_hostile_record_is_refused(int8: Path, change: Change, message: str) -> None:

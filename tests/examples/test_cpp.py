@@ -53,7 +53,7 @@ def test_an_episode_is_what_python_computes(program: Path, tmp_path: Path, strea
     episode, written, expected = Episode(model, streams), np.zeros((8, 7), np.bool_), []
     reads = np.zeros(4, int)
     feeds: dict[str, Any] = {}
-    calibrated = {"use_pruner": np.array(True), **random_pruner(toy, 0)}
+    calibrated: dict[str, Any] = {"use_pruner": np.array(True), **random_pruner(toy, 0)}
     if streams == 2:  # of a calibrated schedule
         empty = no_correction(8, toy.spec.sample)
         weights, bias = (rng.normal(0, 0.01, each.shape).astype(np.float32) for each in (empty.weights, empty.bias))
@@ -62,7 +62,7 @@ def test_an_episode_is_what_python_computes(program: Path, tmp_path: Path, strea
     for r in range(CALLS):
         plan = random_plan(rng, 8, groups(toy), written, 0.3)
         obs, drawn = inputs(policy, rng, streams)
-        pruned = calibrated if r % 2 else {}  # in every second call each stream has a plan of its own
+        pruned: dict[str, Any] = calibrated if r % 2 else {}  # in every second call each stream has a plan of its own
         call = episode.call(obs, drawn, plan, **feeds, **pruned)
         expected.append(call["action"].ravel())
         written |= (call["executed_plan"] == Source.COMPUTE).all(axis=0)

@@ -108,7 +108,7 @@ def test_spacings_of_the_solver(payload: Build, save: Save) -> None:
     built = payload()
     built["cfg"]["policy"]["noise_scheduler"]["timestep_spacing"] = "leading"  # of DDPM, that is trained on all of them
     path, options = save(built), LoadOptions(sampler="dpmsolver++", steps=4)
-    found = {}
+    found: dict[str, list[int]] = {}
     for spacing in (None, "leading", "trailing", "linspace"):
         spec = load_checkpoint_policy(path, options=replace(options, spacing=spacing))[1]
         assert spec.sampler.timesteps.tolist() == list(range(19, -1, -1))
@@ -191,12 +191,18 @@ def test_converting_keeps_the_original_beside_the_loop_that_is_asked_for(
     payload: Build, save: Save, tmp_path: Path
 ) -> None:
     """The program has both; the single file is of the one asked for."""
-    options = {"sampler": "ddim", "steps": 4, "single_file": tmp_path / "policy.onnx"}
     told: dict[str, tuple[str, ...]] = {}
-    program = ttscompile.convert(save(payload()), tmp_path / "compiled", explain=told.__setitem__, **options)
+    program = ttscompile.convert(
+        save(payload()),
+        tmp_path / "compiled",
+        sampler="ddim",
+        steps=4,
+        single_file=tmp_path / "policy.onnx",
+        explain=told.__setitem__,
+    )
     assert {name: one.steps for name, one in program.spec.all_loops.items()} == {"original": 20, "ddim-4": 4}
     assert told["record_original"] == ("20 of 20 steps, 2 streams", "ddim-4: 4 of 4")
-    session = onnxruntime.InferenceSession(options["single_file"], providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(tmp_path / "policy.onnx", providers=["CPUExecutionProvider"])
     shapes = {value.name: value.shape for value in session.get_inputs()}
     assert shapes["plan"] == [4, len(program.blocks)] and "step_noise" not in shapes
     assert ttscompile.verify(tmp_path / "compiled").passed

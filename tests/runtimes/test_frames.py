@@ -109,13 +109,11 @@ def test_the_single_file_computes_them_inside(compiled: Path, policy: CompiledPo
     cells = (cameras.STEPS, len(policy.info.blocks))
     feed: Obs = {**window(frame(0), frame(1)), "initial_noise": np.asarray(noise().initial)}
     feed |= {
-        "plan": np.zeros(cells, np.int8),
-        "rollout_index": np.full(cells, -1),
+        "plan": np.zeros((1, *cells), np.int8),
+        "rollout_index": np.full((1, *cells), -1),
         "rollout_keep": np.zeros(cells, bool),
     }
-    feed["rollout_rows"] = np.zeros(
-        (0, *(n if isinstance(n, int) else 1 for n in shapes["rollout_rows"].shape[1:])), "f4"
-    )
+    feed["rollout_rows"] = np.zeros((0, *shapes["rollout_rows"].shape[1:]), "f4")
     found = session.run(["action_pred"], feed)[0]
     np.testing.assert_allclose(found, act(policy, window(frame(0), frame(1))), rtol=0, atol=1e-5)
 

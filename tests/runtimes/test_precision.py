@@ -11,12 +11,12 @@ import pytest
 import ttscompile
 from tests.calibration import policies
 from tests.once import Once
-from ttscompile import Noise, TtscompileError
+from ttscompile import TtscompileError
 from ttscompile.artifact import load_artifact
 from ttscompile.errors import ArtifactError, RuntimeUnavailableError
-from ttscompile.runtimes import against_fp32, open_runtime
+from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.onnxruntime import sessions
-from ttscompile.runtimes.random_calls import random_calls
+from ttscompile.verification.precision import CARRIED, EIGHT_BITS
 
 from .agreement import largest_difference, random_inputs
 
@@ -33,35 +33,15 @@ def fp32(once: Once) -> Path:
     return policies.compiled(once)
 
 
-def test_it_is_the_reference_within_its_own_tolerance_on_random_plans(int8: Path) -> None:
+def test_it_is_the_reference_within_the_tolerance_of_eight_bits_on_random_plans(int8: Path) -> None:
     """Plans of all sources over episodes of three calls; the reference computes in fp32."""
     artifact = load_artifact(int8)
-    record = artifact.manifest.precision
-    assert record is not None and record.error is not None
-    assert 0 < record.error.tolerance < 0.2
-    assert 0 < record.error.mean <= record.error.p90 <= record.error.largest
     own = artifact.plan("dense@int8")
     compiled, reference = open_runtime(artifact), open_runtime(artifact, "reference", plan=own.exact)
     for seed in range(6):
         rng = np.random.default_rng(seed)
         found = largest_difference(artifact, compiled, reference, rng, 1 + seed % 3, calls=3, base=own)
-        assert 1e-5 < found < record.error.tolerance, "not in eight bits, or further off than the artifact says"
-
-
-def test_the_measured_error_is_what_the_public_interface_gives(int8: Path) -> None:
-    record = load_artifact(int8).manifest.precision
-    assert record is not None and record.error is not None
-    policies_ = [ttscompile.load(int8), ttscompile.load(int8, plan="full@fp32")]
-    assert [one.info.precision for one in policies_] == ["int8", "fp32"]
-    errors = []
-    for obs, noise in random_calls(policies.spec(), record.error.calls, against_fp32.SEED):
-        actions = []
-        for policy in policies_:
-            policy.reset()
-            actions.append(policy.predict_action(obs, noise=noise)["action"])
-        errors.append(np.abs(actions[0] - actions[1]))
-    assert record.error.mean == pytest.approx(np.mean(errors), rel=0.05)
-    assert record.error.largest == pytest.approx(np.max(errors), rel=0.05)
+        assert 1e-5 < found < CARRIED * EIGHT_BITS, "not in eight bits, or further off than verify allows"
 
 
 def test_fp32_of_an_int8_artifact_is_the_fp32_artifact(int8: Path, fp32: Path) -> None:
@@ -115,25 +95,15 @@ def test_where_sums_saturate_they_are_made_exact_and_a_warning_says_that_it_is_s
     open_runtime(artifact, plan=artifact.plans["dense"])  # no warning, which would be an error here
 
 
-def test_a_policy_that_gives_no_numbers_is_not_measured(int8: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    artifact = load_artifact(int8)
-    broken = {"obs": np.full((1, 2, 3), np.nan, np.float32)}
-    noise = Noise(np.zeros((1, 8, 2), np.float32), np.zeros((10, 1, 8, 2), np.float32))
-    plans, runtime = (artifact.plans[name] for name in ("full", "dense")), open_runtime(artifact)
-    own, exact = (against_fp32.answers(runtime, one, [(broken, noise)]) for one in plans)
-    with pytest.raises(TtscompileError, match="not a number"):
-        against_fp32.mean_errors(policies.spec().chunk, own, exact)
-
-
 def test_nothing_to_lower_and_unknown_precisions_are_refused_before_anything_is_written(tmp_path: Path) -> None:
     module, spec = policies.Mixer(0).eval(), policies.spec()
-    for name in ("bf16", "int4", "FP32"):
+    for name in ("bf16", "int4", "FP32", "auto"):
         with pytest.raises(TtscompileError, match=f"precision '{name}'"):
             ttscompile.compile_denoiser(module, spec, tmp_path / "compiled", precision=name)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_converting_again_gives_the_same_bytes_measured_error_and_all(int8: Path, tmp_path: Path) -> None:
+def test_converting_again_gives_the_same_bytes(int8: Path, tmp_path: Path) -> None:
     ttscompile.compile_denoiser(policies.Mixer(0).eval(), policies.spec(), tmp_path / "again", precision="int8")
     assert {p.name: p.read_bytes() for p in (tmp_path / "again").iterdir()} == {
         p.name: p.read_bytes() for p in int8.iterdir()

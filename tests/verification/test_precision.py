@@ -1,18 +1,29 @@
 """Plans of an artifact with int8 blocks are verified as ``load`` runs them, not in fp32 alone."""
 
+import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import ttscompile
 from tests.plans import store_schedules
 from tests.rounding import PROMISED
+from ttscompile.artifact import codec, tensors
+from ttscompile.artifact.files import describe
 from ttscompile.artifact.golden import GoldenPlan, load_golden, load_golden_plans
 from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.manifest import MANIFEST
+from ttscompile.artifact.write import identified
 from ttscompile.core.lattice import Source
+from ttscompile.lower.precision import quantize_matrix
 from ttscompile.runtimes import open_runtime
-from ttscompile.verification.calls import check_plans_precision
+from ttscompile.verification.precision import EIGHT_BITS, HALF, _off, check_plans_precision, check_precision
 from ttscompile.verification.record_golden import record_plans
 from ttscompile.verification.rung import FAILED, PASSED, Rung
 
@@ -62,3 +73,62 @@ def test_other_samples_and_other_cells_than_recorded_fail(int8: Path) -> None:
     assert rung.status == FAILED
     assert "'schedule' in 1 of 60 cells" in rung.told
     assert "plan.exact" in rung.remedy
+
+
+def changed(directory: Path, change: Callable[[dict[str, Any]], None]) -> Rung:
+    """The rung of an artifact whose integers are others, though hashes say that it is whole."""
+    manifest = codec.decode((directory / MANIFEST).read_bytes())
+    assert manifest.precision is not None
+    path = directory / manifest.precision.weights
+    arrays = {name: np.array(array) for name, array in tensors.read(path).items()}
+    change(arrays)
+    path.write_bytes(tensors.serialize(arrays))
+    manifest = replace(manifest, files={**manifest.files, path.name: describe(path)})
+    (directory / MANIFEST).write_bytes(codec.encode(identified(manifest)))
+    artifact = load_artifact(directory)
+    rung = check_precision(artifact, load_golden(artifact), open_runtime(artifact))
+    assert rung is not None
+    return rung
+
+
+def test_integers_are_the_weights_rounded(int8: Path, tmp_path: Path) -> None:
+    """A scale that is a twentieth too large moves the largest of its column by six steps, and a call by little."""
+
+    def larger(arrays: dict[str, Any]) -> None:
+        name = next(name for name in arrays if name.endswith(".scale"))
+        arrays[name][0] *= np.float32(1.05)
+
+    rung = changed(Path(shutil.copytree(int8, tmp_path / "same")), lambda arrays: None)
+    assert (rung.status, rung.tolerance) == (PASSED, EIGHT_BITS)
+    assert rung.figure is not None and 1e-5 < rung.figure < EIGHT_BITS
+    rung = changed(Path(shutil.copytree(int8, tmp_path / "larger")), larger)
+    assert rung.status == FAILED and rung.figure == pytest.approx(127 * 0.05 / 1.05, abs=0.01)
+    assert "of their steps off; rounded weights are half of one" in rung.told
+
+
+def test_integers_in_another_order_make_another_call(int8: Path, tmp_path: Path) -> None:
+    def turned(arrays: dict[str, Any]) -> None:
+        for name, array in arrays.items():
+            if array.dtype == np.int8:
+                arrays[name] = array[::-1].copy()
+
+    rung = changed(Path(shutil.copytree(int8, tmp_path / "turned")), turned)
+    assert rung.status == FAILED and rung.figure is not None and rung.figure > EIGHT_BITS
+    assert rung.told.startswith("a dense call with int8 in blocks")
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_rounding_is_half_a_step_wherever_the_columns_are(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    matrix = rng.standard_normal((36, 6)).astype(np.float32) * rng.uniform(0.1, 10, 6).astype(np.float32)
+    integers, scale = quantize_matrix(matrix)
+    of_convolution = matrix.reshape(3, 3, 4, 6).transpose(3, 2, 0, 1)
+    ways = (matrix, np.ascontiguousarray(matrix.T), of_convolution, matrix.reshape(4, 9, 2, 3))
+    assert all(_off(integers, scale, weight) <= HALF for weight in ways)
+    integers[:, rng.integers(6)] //= 2
+    assert all(_off(integers, scale, weight) > HALF for weight in ways)
+
+
+def test_a_constant_without_such_columns_is_far_off() -> None:
+    integers, scale = quantize_matrix(np.ones((5, 7), np.float32))
+    assert _off(integers, scale, np.ones((35, 1, 1), np.float32)) == np.inf

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,10 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ArtifactError
-from ..ir.pieces import part_of
 from . import tensors
 from .files import write_synced
-from .manifest import PieceRecord, PrecisionError, PrecisionRecord
+from .manifest import PieceRecord, PrecisionRecord
 
 if TYPE_CHECKING:
     from onnx import GraphProto, ModelProto, TensorProto
@@ -51,21 +50,13 @@ class LoweredPieces:
         name: of the precision.
         models: by piece, those that hold all blocks among them.
         weights: the constants that these models have and the program has not.
-        error: as measured; None if it was not.
-        parts: see ``PrecisionRecord``.
+        asked: see ``PrecisionRecord``.
     """
 
     name: str
     models: Mapping[str, ModelProto]
     weights: Mapping[str, npt.NDArray[Any]]
-    error: PrecisionError | None = None
-    parts: Mapping[str, float | None] = field(default_factory=dict)
-
-    def of_parts(self, parts: Collection[str]) -> LoweredPieces:
-        """The same with the models of these parts alone, and what they read."""
-        models = {name: model for name, model in self.models.items() if part_of(name) in parts}
-        read = {tensor.name for model in models.values() for tensor in _initializers(model.graph)}
-        return replace(self, models=models, weights={n: value for n, value in self.weights.items() if n in read})
+    asked: tuple[str, ...] = ()
 
 
 def places_of(path: Path, values: Mapping[str, npt.NDArray[Any]]) -> dict[str, Place]:
@@ -139,10 +130,7 @@ def store_pieces(
             )
         files[name] = f"{name}_{lowered.name}.onnx"
         write_synced(folder / files[name], bind(model, places, name))
-    known = {*lowered.parts, *map(part_of, files)}
-    order = dict.fromkeys(part for part in map(part_of, pieces) if part is not None and part in known)
-    parts = {part: lowered.parts.get(part) for part in order}
-    return PrecisionRecord(lowered.name, file, files, lowered.error, parts)
+    return PrecisionRecord(lowered.name, file, files, lowered.asked)
 
 
 def _set(tensor: TensorProto, place: Place, piece: str) -> None:

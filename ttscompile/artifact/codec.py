@@ -272,8 +272,8 @@ def _check_precision(manifest: Manifest, record: PrecisionRecord, value: Value) 
         value.fail(f"models of some blocks beside {' and '.join(sorted(all_blocks))}")
     if blocks & models and len(all_blocks) < len(OF_ALL_BLOCKS):
         value.fail(f"models called {' and '.join(OF_ALL_BLOCKS)} too")
-    if not {part_of(piece) for piece in models} <= set(record.parts) <= {part_of(piece) for piece in known}:
-        value.fail("the parts that its models belong to, and no others than the policy has")
+    if not set(record.asked) <= {part_of(piece) for piece in known} - {part_of(piece) for piece in models}:
+        value.fail("parts of the policy that none of its models belongs to, as those that stay fp32")
     own = {record.weights, *record.models.values()}
     others = {piece.file for piece in manifest.pieces.values()} | set(vars(manifest.stores).values())
     if len(own) <= len(record.models) or own & others:

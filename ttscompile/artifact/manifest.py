@@ -13,10 +13,10 @@ from typing import Annotated, Any, Literal
 from ..core.correction import Correction, numbers_of
 from ..core.lattice import PlanArray, plan_flops
 from ..core.plan import ORIGINAL, UNIFORM, TokenReuse
-from ..core.rules import NotNegative, Positive, Rule, Sha256, Share
+from ..core.rules import Positive, Rule, Sha256, Share
 from ..core.spec import FP32, PolicySpec, SamplerTable
 from ..ir.graph import TensorType
-from ..ir.pieces import PRUNER, is_block, part_of
+from ..ir.pieces import BLOCKS, PRUNER, is_block, part_of
 from ..ir.program import Binding
 from .towers import TokensRecord
 
@@ -210,32 +210,6 @@ class Requires:
 
 
 @dataclass(frozen=True)
-class PrecisionError:
-    """How far the actions of a dense call are from those of a dense call in fp32 with the same noise.
-
-    Measured on random observations within the range of the normaliser, when the artifact was made. The difference of
-    one call is the mean over its executed actions.
-
-    Attributes:
-        calls: how many were measured.
-        mean: over the calls, in the units of the actions.
-        p90: 90th percentile over the calls.
-        largest: of any executed action number of any call.
-        tolerance: what may be expected of dense calls in general: the largest difference of a denoised sample from the
-            reference runtime's, as a share of its largest value.
-        other_noise: the yardstick: the same mean for two dense calls in fp32 on one observation with different noise,
-            over some of the calls.
-    """
-
-    calls: Positive
-    mean: NotNegative
-    p90: NotNegative
-    largest: NotNegative
-    tolerance: NotNegative
-    other_noise: NotNegative
-
-
-@dataclass(frozen=True)
 class PrecisionRecord:
     """Parts with weights of another precision than fp32, which the artifact holds beside those in fp32.
 
@@ -244,17 +218,13 @@ class PrecisionRecord:
         weights: name of the file with their weights.
         models: name of the ONNX file by piece, where it is not the file of the piece: of blocks, and with them of the
             pieces that hold all of them; and of pieces of the prologue.
-        error: what it does to the actions; None before it is measured.
-        parts: by part (``ir.pieces.part_of``), the mean over some calls of the difference that it makes where it alone
-            is in this precision; None where that was not measured. A part without models stays fp32: it was asked for,
-            or what was measured is too much.
+        asked: parts (``ir.pieces.part_of``) that stay fp32 because it was asked for.
     """
 
     name: Annotated[str, Rule("one of 'int8'", "int8".__eq__)]
     weights: FileName
     models: Mapping[str, FileName]
-    error: PrecisionError | None
-    parts: Mapping[str, NotNegative | None]
+    asked: tuple[str, ...] = ()
 
     @property
     def blocks(self) -> int:
@@ -263,9 +233,9 @@ class PrecisionRecord:
 
     @property
     def kept(self) -> tuple[str, ...]:
-        """The parts that have such weights, in order."""
-        own = {part_of(piece) for piece in self.models}
-        return tuple(part for part in self.parts if part in own)
+        """The parts that have such weights, those of the prologue first."""
+        own = {str(part_of(piece)) for piece in self.models}
+        return tuple(sorted(own, key=lambda part: (part == BLOCKS, part)))
 
     @property
     def told(self) -> str:

@@ -17,7 +17,8 @@ def upgraded(document: Mapping[str, Any], where: str) -> dict[str, Any]:
     """What a manifest of schema 10 says, in schema 11.
 
     There an artifact had one loop, which may be another than the policy was trained to run in; all plans had the
-    artifact's precision, and reused tokens in one way; and beside them stood how many steps a warm start takes.
+    artifact's precision, and reused tokens in one way; and beside them stood how many steps a warm start takes, and
+    what the precision does to actions.
 
     Args:
         document: the manifest of schema 10, without its checksum, which was right.
@@ -69,12 +70,19 @@ def _upgraded(document: Mapping[str, Any]) -> dict[str, Any]:
         "loop_pruners": {},
         "starts": starts,
         "weights": {} if distilled is None else {_DISTILLED: distilled},
+        "precision": None if precision is None else _without_measurement(precision),
     }
 
 
 def _free(name: str, plans: Mapping[str, Any]) -> str:
     """The name, or one like it that no plan has."""
     return next(each for each in (name, *(f"{name}-{i}" for i in range(len(plans)))) if each not in plans)
+
+
+def _without_measurement(precision: Mapping[str, Any]) -> dict[str, Any]:
+    own = _kept(precision)
+    left = [part for part, measured in precision["parts"].items() if part not in own and measured is None]
+    return {**{key: precision[key] for key in ("name", "weights", "models")}, "asked": left}
 
 
 def _kept(precision: Mapping[str, Any]) -> list[str]:

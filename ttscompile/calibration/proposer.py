@@ -69,7 +69,7 @@ class Request:
         intervals: of a search, at most; None for its own number.
         rank: of the low-rank update to each weight matrix.
         updates: of the weights.
-        margin: in place of what a proposer allows (``Proposal.margin``), where that is a number; None leaves it.
+        margin: what a proposer allows in place of its own (``Proposal.margin``); None leaves that to it.
     """
 
     goal: Goal

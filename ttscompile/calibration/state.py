@@ -1,4 +1,4 @@
-"""What a calibration, distillation or comparison has done so far: a file each in the artifact's directory."""
+"""What a calibration or comparison has done so far: a file each in the artifact's directory."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from ..errors import ArtifactError, CalibrationError
 
 Array = npt.NDArray[Any]
 
-CALIBRATION, DISTILLATION, COMPARISON = "calibration", "distillation", "comparison"
+CALIBRATION, COMPARISON = "calibration", "comparison"
 FILE = f"{CALIBRATION}-state.safetensors"
 """Never listed in the manifest: an artifact is complete without it, and it is removed when calibration ends."""
-_AGAIN = {CALIBRATION: "Calibrate", DISTILLATION: "Distil", COMPARISON: "Compare"}
+_AGAIN = {CALIBRATION: "Calibrate", COMPARISON: "Compare"}
 
 MAX_TEXT_BYTES = 16 * 2**20
 
@@ -31,12 +31,12 @@ _SETTINGS, _PROGRESS, _CHECKSUM = "json/settings", "json/progress", "sha256"
 
 
 class StateFile:
-    """The state of one calibration, distillation or comparison.
+    """The state of one calibration or comparison.
 
     Args:
         directory: the directory of the artifact.
         settings: everything that the outcome depends on; JSON. A state with other settings is not continued.
-        work: ``calibration``, ``distillation`` or ``comparison``.
+        work: ``calibration`` or ``comparison``.
 
     Attributes:
         arrays: the saved arrays by name.

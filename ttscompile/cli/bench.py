@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 
 import click
+import numpy as np
 
-from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.cli.options import (
     artifact_argument,
     count_option,
@@ -26,8 +26,9 @@ from ttscompile.core.spec import FP32
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.units import ms, share
 from ttscompile.report.facts import told_plan
-from ttscompile.runtimes.against_fp32 import measure_precision
-from ttscompile.runtimes.open import CPU, open_runtime
+from ttscompile.runtimes.load import open_policy
+from ttscompile.runtimes.open import CPU
+from ttscompile.runtimes.random_calls import random_calls
 
 RIVALS = ("original", "eager", "onnxruntime-dense", "onnxruntime")
 """The checkpoint with the sampler it was saved with; with the artifact's; the artifact computed in full; and the same
@@ -35,6 +36,9 @@ plan of it on the CPU, for --runtime torch."""
 
 MOST_IN_A_ROW = 100
 """Calls of a turn, whose observations are drawn before it."""
+
+COMPARED = 8
+"""Dense calls on random observations, in another precision and in fp32."""
 
 WORTH = 0.1
 """Share of a call's time that more threads have to save: they take their cores from the rest of the robot."""
@@ -120,14 +124,12 @@ def bench(
     error = None
     if runtime == "torch" and precision not in (None, FP32):
         with console.status(f"comparing actions in {precision} and {FP32}"):
-            plans = (artifact.plan(f"dense@{each}") for each in (precision, FP32))
-            pair = (open_runtime(artifact, runtime, threads[0], device, one) for one in plans)
-            error = measure_precision(artifact, (next(pair), next(pair)))
+            error = _apart(artifact, str(precision), threads[0], device)
     timed = dict(zip(threads, (m.median_ms for m in measured), strict=False))
     if as_json:
         of = {"identity": identity, "machine": fingerprint(), "threads": threads[0], "runs": runs, "runtime": runtime}
         of |= {"best_threads": fewest_threads(timed), "in_a_row": in_a_row}
-        of |= {"device": device or CPU, "precision_error": error and asdict(error)}
+        of |= {"device": device or CPU, "precision_error": error}
         print_json(of | {"contestants": [m.to_json() for m in measured]})
         return
     output, head = results(), ("", "ms a call", "quartiles", "calls/s", "speed-up", "GFLOP", "reused")
@@ -153,11 +155,27 @@ def bench(
     if error is not None:
         say(
             output,
-            f"Actions of {error.calls} dense calls in {precision} are {error.mean:.4g} off those in {FP32} on average,"
-            f" {error.p90:.4g} at the 90th percentile, {error.largest:.4g} at most, in their units.",
+            f"Actions of {COMPARED} dense calls in {precision} are {error['mean']:.4g} off those in {FP32} on average,"
+            f" {error['p90']:.4g} at the 90th percentile, {error['largest']:.4g} at most, in their units.",
         )
     print_identity(identity, output)
     say(output, one_line(fingerprint()))
+
+
+def _apart(artifact: Artifact, precision: str, threads: int, device: str | None) -> dict[str, float]:
+    """How far executed actions of dense calls on torch are from those in fp32, with equal noise, in their units."""
+    actions = []
+    for each in (precision, FP32):
+        policy = open_policy(artifact, "torch", threads, plan=artifact.plan(f"dense@{each}"), device=device)
+        made = []
+        for obs, noise in random_calls(artifact.manifest.spec, COMPARED, seed=0):
+            policy.reset()
+            made.append(policy.predict_action(obs, noise=noise)["action"])
+        actions.append(np.concatenate(made))
+    apart = np.abs(actions[0] - actions[1])
+    means = apart.mean((1, 2))
+    found = {"mean": means.mean(), "p90": np.quantile(means, 0.9), "largest": apart.max()}
+    return {"calls": COMPARED, **{name: float(value) for name, value in found.items()}}
 
 
 def fewest_threads(medians: Mapping[int, float]) -> int:

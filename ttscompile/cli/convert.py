@@ -16,7 +16,7 @@ from ttscompile.cli.output import only_results_on_stdout, print_json, progress, 
 from ttscompile.cli.summary import print_summary
 from ttscompile.cli.types import ANY_TEXT, FOLDER, NEW_FILE, PATH, PATH_OR_HUB
 from ttscompile.core.paths import on_hub, require_path
-from ttscompile.core.spec import AUTO, FP32, PRECISIONS
+from ttscompile.core.spec import FP32, PRECISIONS
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends.families import FAMILIES, FORMATS, SAMPLERS, SPACINGS
 from ttscompile.report.facts import precision as told_precision
@@ -77,11 +77,11 @@ from ttscompile.report.summary import document
 )
 @click.option(
     "--precision",
-    type=click.Choice((*PRECISIONS, AUTO)),
+    type=click.Choice(PRECISIONS),
     default=FP32,
     show_default=True,
-    help="Of the weights of residual blocks and prologue. int8 is faster on processors with VNNI; its error is measured"
-    " and shown. auto leaves out the parts that change the actions by more than a tenth of what other noise does.",
+    help="Precision of the weights of residual blocks and prologue. int8 is faster on processors with VNNI;"
+    " 'ttscompile calibrate --learn precision' measures what it does, and leaves out the parts where that is much.",
 )
 @click.option(
     "--keep-fp32",
@@ -145,9 +145,8 @@ def convert(
     for stage in stages:
         if stage["stage"] == "narrow" and prediction_horizon is None:
             say(console, " ".join(["hint:", *stage["notes"]]))
-        if stage["stage"] == "lower_precision" and precision == AUTO:
-            why = f" ({stage['notes'][-1]})" if artifact.manifest.precision is None else ""
-            say(console, f"precision: {told_precision(artifact.manifest)}{why}")
+        if stage["stage"] == "lower_precision":
+            say(console, f"precision: {told_precision(artifact.manifest)}")
     if of_checkpoint["sampler"] is None and (hint := many_steps(artifact.manifest)) is not None:
         say(console, f"hint: {hint}")
     if as_json:

@@ -88,17 +88,6 @@ def _told_precision(precision: dict[str, Any], blocks: int) -> str:
     if not precision["parts"]:
         return str(precision["name"])
     count = f"{precision['blocks']} of {blocks} blocks"
-    kept = [count if part == "blocks" else part for part, one in precision["parts"].items() if one["kept"]]
-    told = f"{precision['name']} weights in {' and '.join(kept)}, {precision['bytes'] / 1e6:.1f} MB"
-    error = precision["error"]
-    if error is None:
-        return f"{told}; its action error was not measured"
-    told += (
-        f"; dense actions {error['mean']:.4g} from fp32 on average, 90th percentile {error['p90']:.4g}"
-        f" ({error['calls']} random observations, equal noise; other noise: {error['other_noise']:.4g})"
-    )
-    measured = {part: one for part, one in precision["parts"].items() if one["alone"] is not None}
-    alone = [
-        f"{part} alone {one['alone']:.4g}" + ", left in fp32" * (not one["kept"]) for part, one in measured.items()
-    ]
-    return f"{told}: {'; '.join(alone)}" if alone else told
+    parts = [count if part == "blocks" else part for part in precision["parts"]]
+    told = f"{precision['name']} weights in {' and '.join(parts)}, {precision['bytes'] / 1e6:.1f} MB"
+    return told + f"; {' and '.join(precision['asked'])} in fp32, as was asked" * bool(precision["asked"])

@@ -22,8 +22,6 @@ from .sampler import SamplerTable as SamplerTable
 FP32, INT8, BF16, FP16 = "fp32", "int8", "bf16", "fp16"
 PRECISIONS = (FP32, INT8)
 """Names of what an artifact can hold its weights in."""
-AUTO = "auto"
-"""In place of a precision: int8 in the parts that it changes little, as measured in actions."""
 
 ORIGINAL = "original"
 """The loop that a policy was trained to run in: ``PolicySpec.sampler``."""

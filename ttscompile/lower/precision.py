@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from onnx import AttributeProto, ModelProto, NodeProto, TensorProto, helper, numpy_helper
 
-from ..core.spec import AUTO, FP32, INT8, PRECISIONS
+from ..core.spec import FP32, INT8, PRECISIONS
 from ..errors import LoweringError
 from ..ir.flops import graph_flops
 from ..ir.pieces import BLOCKS, INDEX, OF_ALL_BLOCKS, PIXELS, STEP, frame_name, is_tokens, part_of
@@ -181,9 +181,8 @@ def require_precision(precision: str, keep_fp32: Collection[str] = ()) -> None:
     Raises:
         LoweringError: says why not.
     """
-    known = (*PRECISIONS, AUTO)
-    if precision not in known:
-        raise LoweringError(f"precision {precision!r}: expected one of {', '.join(map(repr, known))}.")
+    if precision not in PRECISIONS:
+        raise LoweringError(f"precision {precision!r}: expected one of {', '.join(map(repr, PRECISIONS))}.")
     if isinstance(keep_fp32, str) or not all(isinstance(part, str) for part in keep_fp32):
         raise LoweringError(f"keep_fp32: expected names of parts, ('prologue',) say; found {keep_fp32!r}.")
     if keep_fp32 and precision == FP32:

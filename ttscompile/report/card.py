@@ -216,7 +216,7 @@ def _made(manifest: Manifest, base: HubName | None) -> Section:
     checkpoint = "CHECKPOINT" if base is None else base.at(str(base.revision))
     precision = "" if manifest.precision is None else f" --precision {manifest.precision_name}"
     if manifest.precision is not None:
-        precision += "".join(f" --keep-fp32 {p}" for p in manifest.precision.parts if p not in manifest.precision.kept)
+        precision += "".join(f" --keep-fp32 {part}" for part in manifest.precision.asked)
     spec = manifest.spec
     more = " --task TASK" * ("task" in spec.source)
     more += "".join(f" --without-camera {_word(name)}" for name in spec.source.get(WITHOUT, "").split())

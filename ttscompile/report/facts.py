@@ -17,7 +17,6 @@ from ..core.spec import SamplerTable
 from ..ir.flops import frames_flops, graph_flops
 from ..ir.program import Binding
 from ..measure.units import flops, plain, share
-from ..runtimes.against_fp32 import SHARE
 from ..runtimes.liveness import rollout_needs
 from .page import Section, Table
 
@@ -110,8 +109,7 @@ def precision(manifest: Manifest) -> str:
     record = manifest.precision
     if record is None:
         return manifest.precision_name
-    left = [part for part in record.parts if part not in record.kept]
-    return record.told + f"; fp32 in {' and '.join(left)}" * bool(left)
+    return record.told + f"; fp32 in {' and '.join(record.asked)}" * bool(record.asked)
 
 
 def hoisting(artifact: Artifact) -> Section:
@@ -224,14 +222,7 @@ def score_table(record: Mapping[str, Any]) -> Table:
         errors = _figure(score, "error"), *beside, _figure(score, "error_p90")
         return name, _figure(score, "distance", ".3f"), *errors, *(saved or ("", ""))
 
-    of_precision = _mapping(record.get("precision"))
-    parts, against = _mapping(of_precision.get("parts")), f"{of_precision.get('name')} against fp32"
-    alone = {f"dense, {n} alone": e for n, e in parts.items() if len(parts) > 1 and isinstance(e, int | float)}
-    rows = [
-        *(row(marked(name), s, share(s["sparsity"]), share(s["flops_saved"])) for name, s in scores(record).items()),
-        *(row(f"{name}: {against}", s) for name, s in scores(of_precision, _ERRORS).items()),
-        *((f"{name}: {against}", "", f"{error:.4g}", *[""] * (3 + told)) for name, error in alone.items()),
-    ]
+    rows = [row(marked(name), s, share(s["sparsity"]), share(s["flops_saved"])) for name, s in scores(record).items()]
     beside = ("/ other noise",) if told else ()
     errors = "mean action error", *beside, "90th percentile"
     head = ("held-out episodes", "distance from the original", *errors, "cells reused", "FLOPs saved")
@@ -282,20 +273,8 @@ def other_noise(record: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def left_out(record: Mapping[str, Any]) -> tuple[str, ...]:
-    """Why there is no plan of a name that calibration could have made; and what had better been left in fp32."""
-    plans = (f"Plan {name!r}: none, {reason}." for name, reason in _mapping(record.get("skipped")).items())
-    of_precision, apart = _mapping(record.get("precision")), record.get("other_noise")
-    much = {
-        part: error / apart
-        for part, error in _mapping(of_precision.get("parts")).items()
-        if isinstance(apart, int | float) and isinstance(error, int | float) and error > SHARE * apart > 0
-    }
-    parts = (
-        f"{of_precision.get('name')} in {part} changes actions by {times:.0%} of what other noise does."
-        f" Convert with --keep-fp32 {part} to leave it out."
-        for part, times in much.items()
-    )
-    return (*plans, *parts)
+    """Why there is no plan of a name that calibration could have made."""
+    return tuple(f"Plan {name!r}: none, {reason}." for name, reason in _mapping(record.get("skipped")).items())
 
 
 def record_table(record: Mapping[str, Any], most: int = 200) -> Table:

@@ -58,17 +58,13 @@ def document(artifact: Artifact) -> dict[str, Any]:
 
 
 def _precision(manifest: Manifest) -> dict[str, Any]:
-    """Of the weights, and what it does to the actions of dense calls; ``error`` is null for fp32.
-
-    ``parts`` says of each part whether it is in this precision, and how much it alone changes the actions.
-    """
+    """Of the weights: in which parts, and which stay fp32 because it was asked for."""
     record = manifest.precision
     if record is None:
-        return {"name": manifest.precision_name, "blocks": 0, "bytes": 0, "error": None, "parts": {}}
+        return {"name": manifest.precision_name, "blocks": 0, "bytes": 0, "parts": [], "asked": []}
     size = sum(manifest.files[name].bytes for name in (record.weights, *record.models.values()))
-    error = None if record.error is None else dict(vars(record.error))
-    parts = {part: {"kept": part in record.kept, "alone": alone} for part, alone in record.parts.items()}
-    return {"name": record.name, "blocks": record.blocks, "bytes": size, "error": error, "parts": parts}
+    parts = {"parts": list(record.kept), "asked": list(record.asked)}
+    return {"name": record.name, "blocks": record.blocks, "bytes": size, **parts}
 
 
 def _flops(manifest: Manifest) -> dict[str, int]:

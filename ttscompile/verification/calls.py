@@ -25,8 +25,7 @@ from .network import CONVERT, block_errors, describe_blocks, largest
 from .probe import Probe
 from .rung import FAILED, PASSED, SKIPPED, Rung, finite, judged
 
-DENSE_CALL, PRECISION, RUNTIMES, PLANS = "dense call", "precision", "runtimes", "plans"
-PLANS_PRECISION = "precision of plans"
+DENSE_CALL, RUNTIMES, PLANS = "dense call", "runtimes", "plans"
 
 SAMPLE = 2e-3
 """Tolerance of a denoised sample, relative to its largest value. Push-T after 100 steps: 1e-5."""
@@ -34,10 +33,6 @@ SAMPLE = 2e-3
 CELLS = 0.005
 """Share of cells in which the plans that a pruner makes may differ: its logits are rounded otherwise on another
 processor, and near ties fall the other way."""
-
-CARRIED = 2.0
-"""How much more than a dense call a plan may differ for the precision: an error that is made in one step
-is reused in those after it. Push-T in int8: 1.8 to 4.6 times a dense call's, which has a ninth of its tolerance."""
 
 REFERENCE_STEPS = 3
 """Steps at which the reference runtime's blocks are looked at."""
@@ -73,22 +68,6 @@ def check_dense(policy: CompiledPolicy, artifact: Artifact, golden: Golden) -> R
     told = f"a dense call of {golden.streams} streams: its executed actions are within {units:.2g} of the original's"
     told += f" in each of {len(found)} loops" * (len(found) > 1)
     return judged(DENSE_CALL, worst, SAMPLE, ACTION, told, CONVERT, details={"error_in_units": finite(units)})
-
-
-def check_precision(artifact: Artifact, golden: Golden, runtime: Runtime) -> Rung | None:
-    """Dense calls with parts of another precision than fp32 against the original; None if no plan has any."""
-    record, spec = artifact.manifest.precision, artifact.manifest.spec
-    if record is None:
-        return None
-    tolerance, error = SAMPLE if record.error is None else record.error.tolerance, 0.0
-    obs, parts = golden.network_observations(spec), dict.fromkeys(record.kept, record.name)
-    for loop in spec.all_loops:
-        own, plan = golden.in_loop(loop), computed(artifact, loop, parts)
-        runtime.reset()
-        error = max(error, largest(runtime.predict(obs, own.noise, plan)[0], own.sample))
-    told = f"a dense call with {record.told} against the original"
-    remedy = "Take plans in fp32 (plan.exact), or convert the checkpoint again."
-    return judged(PRECISION, error, tolerance, VALUE, told, remedy)
 
 
 def check_runtimes(artifact: Artifact, golden: Golden, runtime: Runtime) -> Rung:
@@ -154,7 +133,7 @@ def check_plans(
     cells, worst = dict[str, npt.NDArray[np.bool_]](), 0.0
     for name, record in recorded.items():
         plan = artifact.plans[name].exact
-        made, differ, few, error = _replay(artifact, golden, runtime, plan, record)
+        made, differ, few, error = replay(artifact, golden, runtime, plan, record)
         if not few:
             cells[name] = differ
             step, block = np.argwhere(differ)[0].tolist()
@@ -182,37 +161,7 @@ def check_plans(
     return Rung(PLANS, PASSED, told, worst, SAMPLE, VALUE), {}
 
 
-def check_plans_precision(
-    artifact: Artifact, golden: Golden, recorded: Mapping[str, GoldenPlan], runtime: Runtime
-) -> Rung | None:
-    """The same episodes of plans with parts of another precision than fp32; None if there are none.
-
-    The record is made in fp32, so that the samples differ by what the precision does to them.
-    """
-    precision = artifact.manifest.precision
-    own = {name: record for name, record in recorded.items() if artifact.plans[name].precision}
-    if precision is None or not own:
-        return None
-    tolerance = CARRIED * (SAMPLE if precision.error is None else precision.error.tolerance)
-    errors, wrong = dict[str, float](), dict[str, str]()
-    for name, record in own.items():
-        plan = replace(artifact.plans[name], tokens=None)  # what is recorded knows of no frames before
-        _, differ, few, errors[name] = _replay(artifact, golden, runtime, plan, record)
-        if not few:
-            wrong[name] = f"{name!r} in {np.count_nonzero(differ)} of {differ.size} cells"
-        elif not errors[name] <= tolerance:
-            wrong[name] = f"the samples of {name!r} by {errors[name]:.2g}"
-    told = f"{', '.join(errors)}: two calls with {precision.told} against what calibration stored of fp32"
-    status, remedy = PASSED, ""
-    if wrong:
-        told = f"with {precision.told} plans are not what calibration stored of fp32: "
-        told += ", ".join(wrong.values())
-        status, remedy = FAILED, "Take plans in fp32 (plan.exact), or convert the checkpoint again and calibrate."
-    details = {"errors": {name: finite(error) for name, error in errors.items()}}
-    return Rung(PLANS_PRECISION, status, told, finite(max(errors.values())), tolerance, VALUE, remedy, details=details)
-
-
-def _replay(
+def replay(
     artifact: Artifact, golden: Golden, runtime: Runtime, plan: Plan, record: GoldenPlan
 ) -> tuple[PlanArray, npt.NDArray[np.bool_], bool, float]:
     """The episode that ``GoldenPlan`` describes.

@@ -25,18 +25,15 @@ from ..trajectories.episodes import load_trajectories
 from .calls import (
     DENSE_CALL,
     PLANS,
-    PLANS_PRECISION,
-    PRECISION,
     RUNTIMES,
     check_dense,
     check_plans,
-    check_plans_precision,
-    check_precision,
     check_runtimes,
 )
 from .engaged import ENGAGED, check_engaged
 from .episodes import SPARSITY, Progress, check_episodes, choose
 from .network import BLOCK, EVALUATION, PREPROCESSING, check_blocks, check_evaluation, check_preprocessing
+from .precision import PLANS_PRECISION, PRECISION, check_plans_precision, check_precision
 from .probe import Probe
 from .rung import FAILED, PASSED, ErrorMap, Rung, Verification
 from .tokens import TOKENS, check_tokens

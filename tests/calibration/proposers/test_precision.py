@@ -16,11 +16,12 @@ from tests.once import Once
 from tests.runtimes import seeing
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.judge import Score, further, judge
+from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.proposers import precision
 from ttscompile.calibration.proposers.precision import MARGIN, Precision
 from ttscompile.calibration.trials import LEARNED, Trials
 from ttscompile.core.lattice import whole_steps_plan
-from ttscompile.core.plan import Plan
+from ttscompile.core.plan import FULL, Plan
 
 from .trying import proposed, request, trials_of
 
@@ -57,7 +58,7 @@ def test_all_parts_are_in_eight_bits_where_that_changes_little(trials: Trials) -
     proposer = Precision(request())
     (found,) = proposed(proposer, trials, trials.base)
     assert dict(found.plan.precision) == {"condition": "int8", "blocks": "int8"}
-    assert (found.name, found.margin, found.shared) == (trials.name, MARGIN, {"precision": found.plan.precision})
+    assert (found.name, found.margin, found.shared) == (FULL, MARGIN, {"precision": found.plan.precision})
     exact = judge(trials, trials.base.exact, LEARNED)
     assert further(judge(trials, found.plan, LEARNED), exact)[1] <= MARGIN
     assert proposer.told == "int8 in condition and blocks"
@@ -73,13 +74,20 @@ def test_what_changes_the_actions_much_stays_fp32(tmp_path: Path) -> None:
     assert proposer.told.startswith("int8 in blocks; condition stays fp32")
 
 
+def test_what_is_learned_is_written_for_all_plans(tmp_path: Path) -> None:
+    ttscompile.compile_denoiser(*seeing.policy(LOUD), tmp_path / "loud", precision="int8")
+    calibrate(tmp_path / "loud", recorded(tmp_path / "calls.npz"), learn=("precision",), progress=False)
+    plans = load_artifact(tmp_path / "loud").plans
+    assert {name: dict(plan.precision) for name, plan in plans.items()} == {"dense": {}, "full": {"blocks": "int8"}}
+
+
 def test_the_worst_part_is_left_out_first(trials: Trials, monkeypatch: pytest.MonkeyPatch) -> None:
     both, far, near = ("condition", "blocks"), 3 * MARGIN, 0.9 * MARGIN
     limits = {(): 0.0, both: far, ("condition",): near, ("blocks",): 2 * near}
     scripted(monkeypatch, limits)
     assert tuple(proposed(Precision(request()), trials, trials.base)[0].plan.precision) == ("condition",)
     scripted(monkeypatch, {**limits, ("condition",): far})
-    proposer = Precision(request(), margin=2 * MARGIN)
+    proposer = Precision(request(margin=2 * MARGIN))
     assert tuple(proposed(proposer, trials, trials.base)[0].plan.precision) == ("blocks",)
     scripted(monkeypatch, {**limits, both: near})
     assert tuple(proposed(Precision(request()), trials, trials.base)[0].plan.precision) == both
@@ -98,7 +106,7 @@ def test_one_part_is_not_tried_twice(once: Once, recording: Path, tmp_path: Path
     folder = Path(shutil.copytree(policies.compiled(once, "int8"), tmp_path / "int8"))
     trials = trials_of(folder, [recording])
     plan = replace(trials.base, cells=whole_steps_plan(policies.STEPS, 2 * policies.LAYERS, [0, 5]))
-    (found,) = proposed(Precision(request(), margin=1.0), trials, plan)
+    (found,) = proposed(Precision(request(margin=1.0)), trials, plan)
     assert found.plan.cells is plan.cells and dict(found.plan.precision) == {"blocks": "int8"}
     assert found.notes["alone"] == {}
 

@@ -13,8 +13,9 @@ import ttscompile
 from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import StartRecord
-from ttscompile.artifact.write import update_plans
+from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.judge import Score, judge
+from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.proposer import Proposal
 from ttscompile.calibration.proposers import start
 from ttscompile.calibration.proposers.start import NAME, Start, begun, candidates
@@ -52,6 +53,15 @@ def trials(folder: Path, tmp_path: Path) -> Trials:
 def scheduled(trials: Trials, *steps: int) -> Plan:
     blocks = len(trials.artifact.manifest.blocks)
     return replace(trials.base, cells=whole_steps_plan(STEPS, blocks, (0, *steps)))
+
+
+def first(proposer: Start, trials: Trials, plan: Plan) -> Proposal:
+    """What is proposed first; it is kept."""
+    proposals = proposer.propose(trials, plan, Clock())
+    found = next(proposals)
+    with pytest.raises(StopIteration):
+        proposals.send(True)
+    return found
 
 
 def described(proposal: Proposal) -> tuple[int, list[int]]:
@@ -92,11 +102,15 @@ def test_the_fewest_cells_within_the_margin_are_taken(trials: Trials, monkeypatc
     monkeypatch.setattr(start, "further", lambda one, _: (one.distance / 2, one.distance))
     plan = scheduled(trials, 4, 6)
     for margin, expected in ((1.45, (2, [0])), (1.35, (2, [0, 1])), (1.1, (3, [0, 1, 2]))):
-        (found,) = proposed(Start(request(), margin), trials, plan)
+        found = first(Start(request(margin=margin)), trials, plan)
         assert described(found) == expected
         assert (found.name, found.margin, found.notes["steps"]) == (NAME, margin, expected[0])
+    assert [described(one) for one in proposed(Start(request(margin=1.25)), trials, plan)] == [
+        (3, [0, 1]),
+        (3, [0, 1, 2]),
+    ]
     with pytest.raises(CalibrationFailedError, match="the last 3 steps are 1 further off at worst, and 0.9 is allowed"):
-        proposed(Start(request(), 0.9), trials, plan)
+        proposed(Start(request(margin=0.9)), trials, plan)
 
 
 def test_a_later_start_keeps_more_of_the_chunk(trials: Trials) -> None:
@@ -107,17 +121,20 @@ def test_a_later_start_keeps_more_of_the_chunk(trials: Trials) -> None:
 
 def test_a_plan_that_begins_so_already_is_made_anew(trials: Trials) -> None:
     warm = begun(trials.base, 3, dense_plan(3, len(trials.artifact.manifest.blocks)))
-    (found,) = proposed(Start(request(), 1e6), trials.holding(warm), warm.plan)
+    found = first(Start(request(margin=1e6)), trials.holding(warm), warm.plan)
     assert found.plan.otherwise is trials.base
     assert described(found) == (1, [0])
 
 
-def test_what_is_proposed_can_be_written_and_loaded(trials: Trials, folder: Path) -> None:
-    (found,) = proposed(Start(request(), 1e6), trials, trials.base)
+def test_what_is_learned_is_written_and_loaded(folder: Path, tmp_path: Path) -> None:
+    files = recorded(tmp_path / "calls.npz")
+    result = calibrate(folder, files, learn=("start",), max_distance=1e6, progress=False)
     artifact = load_artifact(folder)
-    plans = {**artifact.plans, NAME: replace(found.plan, otherwise=artifact.plans[FULL])}
-    update_plans(folder, plans, FULL, starts=found.starts)
-    policy = ttscompile.load(folder, plan=NAME)
+    assert result.default_plan == artifact.manifest.default_plan == NAME
+    assert artifact.manifest.starts == {f"{LOOP}-last-1": StartRecord(LOOP, 1)}
+    assert artifact.plans[NAME].otherwise is artifact.plans[FULL]
+    assert "in the last 1 steps" in result.told["start"]
+    policy = ttscompile.load(folder)
     policy.reset()
     obs = np.random.default_rng(1).uniform(100, 400, (1, 2, 20)).astype(np.float32)
     loops = []
@@ -126,6 +143,13 @@ def test_what_is_proposed_can_be_written_and_loaded(trials: Trials, folder: Path
         assert policy.last_report is not None
         loops.append(policy.last_report.loop)
     assert loops == [LOOP, f"{LOOP}-last-1"]
+
+
+def test_what_is_far_off_changes_nothing(folder: Path, tmp_path: Path) -> None:
+    before = (folder / "manifest.json").read_bytes()
+    with pytest.raises(CalibrationFailedError, match="is allowed"):
+        calibrate(folder, recorded(tmp_path / "calls.npz"), learn=("start",), max_distance=1e-9, progress=False)
+    assert (folder / "manifest.json").read_bytes() == before
 
 
 def test_too_little_is_refused(folder: Path, tmp_path: Path) -> None:

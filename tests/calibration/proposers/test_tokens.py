@@ -14,12 +14,14 @@ from tests.families import cameras
 from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.judge import Score, further, judge
+from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.proposer import Proposal
 from ttscompile.calibration.proposers import tokens
 from ttscompile.calibration.proposers.tokens import MARGIN, MOST_COMPUTED, Tokens
 from ttscompile.calibration.trials import HELD_OUT, Trials
-from ttscompile.core.plan import Plan, TokenReuse
+from ttscompile.core.plan import DENSE, FULL, Plan, TokenReuse
 from ttscompile.errors import CalibrationFailedError
+from ttscompile.verification import verify
 
 from .trying import proposed, request, trials_of
 
@@ -57,12 +59,32 @@ def test_what_is_proposed_saves_and_is_near_on_other_episodes(folder: Path, tmp_
     trials, found = tried(folder, recorded(tmp_path / "calls.npz"))
     assert found.plan.tokens is not None and found.shared == {"tokens": found.plan.tokens}
     assert found.plan.tokens.refresh == 6, "that of 64 was never seen in episodes of six calls"
-    assert (found.name, found.margin) == (trials.name, MARGIN)
+    assert (found.name, found.margin) == (FULL, MARGIN)
     whole, score = judge(trials, trials.base, HELD_OUT), judge(trials, found.plan, HELD_OUT)
     assert 5 / 37 <= score.tokens < 0.5
     assert whole.tokens == 1
     assert further(score, whole)[0] < 2 * MARGIN
     assert found.plan.cells is trials.base.cells and found.plan.precision == trials.base.precision
+
+
+def test_what_is_learned_is_written(folder: Path, tmp_path: Path) -> None:
+    files = recorded(tmp_path / "calls.npz")
+    result = calibrate(folder, files, learn=("tokens",), progress=False)
+    artifact = load_artifact(folder)
+    plan = artifact.default
+    assert result.default_plan == artifact.manifest.default_plan == FULL
+    assert plan.tokens is not None and plan.tokens.refresh == 6
+    assert artifact.plans[DENSE].tokens is None
+    assert 5 / 37 <= result.plans[FULL].tokens < 0.5
+    assert result.told["tokens"].endswith("of the tokens of new frames are computed")
+    (rung,) = (rung for rung in verify(folder).rungs if rung.name == "tokens")
+    assert rung.status == "passed"
+    computed, of = rung.details["spot"]
+    assert 0 < computed < of == 2 * 2 * 37, "of two streams, and two cameras"
+    before = (folder / "manifest.json").read_bytes()
+    with pytest.raises(CalibrationFailedError, match="does not pay"):
+        calibrate(folder, recorded(tmp_path / "calls.npz", shaking=0.5), learn=("tokens",), progress=False)
+    assert (folder / "manifest.json").read_bytes() == before
 
 
 def test_what_does_not_pay_is_refused(folder: Path, tmp_path: Path) -> None:

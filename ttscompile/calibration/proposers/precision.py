@@ -11,6 +11,7 @@ from ..clock import Clock
 from ..judge import further, judge
 from ..proposer import Proposal, Proposals, Request
 from ..trials import LEARNED, Trials
+from . import changed_name
 
 MARGIN = 0.1
 """Of what other noise changes. Push-T in int8: 0.03."""
@@ -19,8 +20,8 @@ MARGIN = 0.1
 class Precision:
     """Leaves out parts, the one that changes the actions most alone first, until the rest is within the margin."""
 
-    def __init__(self, request: Request, margin: float = MARGIN) -> None:
-        self._margin = margin
+    def __init__(self, request: Request) -> None:
+        self._margin = MARGIN if request.margin is None else request.margin
         self.told = ""
 
     def applies(self, artifact: Artifact) -> str | None:
@@ -54,4 +55,4 @@ class Precision:
         if left and kept:
             self.told += f"; {' and '.join(left)} stay{'s' * (len(left) == 1)} fp32: there {more}"
         notes = {"parts": kept, "alone": alone}
-        yield Proposal(trials.name, best, notes, margin=self._margin, shared={"precision": best.precision})
+        yield Proposal(changed_name(trials), best, notes, margin=self._margin, shared={"precision": best.precision})

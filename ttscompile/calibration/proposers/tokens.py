@@ -12,6 +12,7 @@ from ..clock import Clock
 from ..judge import Score, further, judge
 from ..proposer import Proposal, Proposals, Request
 from ..trials import LEARNED, Trials
+from . import changed_name
 
 THRESHOLDS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2)
 """Differences that are tried, ascending. Encoders read pixels with a deviation of about one."""
@@ -30,8 +31,8 @@ class Tokens:
     the margin already where it is chosen.
     """
 
-    def __init__(self, request: Request, margin: float = MARGIN) -> None:
-        self._margin = margin
+    def __init__(self, request: Request) -> None:
+        self._margin = MARGIN if request.margin is None else request.margin
         self.told = ""
 
     def applies(self, artifact: Artifact) -> str | None:
@@ -67,7 +68,7 @@ class Tokens:
         assert best.tokens is not None
         self.told = f"{score.tokens:.0%} of the tokens of new frames are computed"
         notes, shared = {**asdict(best.tokens), "computed": score.tokens}, {"tokens": best.tokens}
-        yield Proposal(trials.name, best, notes, margin=self._margin, shared=shared, refusal=_too_many)
+        yield Proposal(changed_name(trials), best, notes, margin=self._margin, shared=shared, refusal=_too_many)
 
 
 def _too_many(score: Score, others: Mapping[str, Score]) -> str | None:
