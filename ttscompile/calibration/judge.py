@@ -6,9 +6,9 @@ For draws i < j of noise of one observation, with x the plan's answers and y the
     h = |x_i - y_j| + |x_j - y_i| - |x_i - x_j| - |y_i - y_j|
 
 has the energy distance of the two distributions of answers as its mean, whether or not draw i of the plan has the noise
-of draw i of the original, as long as it shares none with another draw. Where it has, x_i is near y_i, the terms nearly cancel, and h varies little. ``distance`` is
-the root of the mean of h over the mean of |y_i - y_j|: 0 where nothing can be told apart; the root grows as the error
-does. ``docs/decisions.md`` has the measurements behind norm and root.
+of draw i of the original, as long as it shares none with another draw. Where it has, x_i is near y_i, the terms nearly
+cancel, and h varies little. ``distance`` is the root of the mean of h over the mean of |y_i - y_j|: 0 where nothing can
+be told apart; the root grows as the error does. ``docs/decisions.md`` has the measurements behind norm and root.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from ..core.spec import FloatArray, SamplerTable
 from ..errors import CalibrationError
 from ..measure.timer import Timer, Times
 from ..runtimes.open import open_runtime
+from ..runtimes.reference.backend import ReferenceBackend
 from ..runtimes.report import CallReport
 from ..runtimes.runtime import Runtime
 from .calls import LARGEST
@@ -174,13 +175,10 @@ class _Answers:
         self._trials, self._sample = trials, sample
         self._plan = plan.exact if trials.fresh else plan
         self._spec = _loop_spec(trials, self._plan)
-        name, device = "onnxruntime", None
-        if trials.fresh:
-            name = "reference"
-        elif trials.device is not None and self._plan is self._plan.exact:
-            name, device = "torch", str(trials.device)
-        threads = 1 if name == "reference" else trials.threads
-        self._runtime: Runtime = open_runtime(trials.artifact, name, threads, device, self._plan)
+        if trials.fresh or (trials.device is not None and self._plan is self._plan.exact):
+            self._runtime = Runtime(trials.artifact, partial(ReferenceBackend, device=trials.device), self._plan)
+        else:
+            self._runtime = open_runtime(trials.artifact, "onnxruntime", trials.threads, plan=self._plan)
         # The scale of int8 activations is that of the whole batch, and a robot has one stream.
         self._streams = 1 if self._plan.precision else STREAMS
         self.reports: list[tuple[CallReport, int]] = []
