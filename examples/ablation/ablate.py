@@ -27,23 +27,27 @@ from rich.console import Console
 from rich.table import Table
 
 from ttscompile.artifact.load import load_artifact
-from ttscompile.artifact.write import update_calibration
+from ttscompile.artifact.view import view_of
+from ttscompile.artifact.write import update_plans
 from ttscompile.calibration.calls import (
     FRACTION,
     Actions,
     Calls,
+    draw_noise,
     load_episodes,
     prepare_calls,
     sample_windows,
     split_episodes,
     window_of,
 )
+from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.execute import Executor
-from ttscompile.calibration.judge import dense_with_other_noise, uniform_of
 from ttscompile.calibration.pruner.paper import UPDATES, Paper
+from ttscompile.calibration.schedule import uniform_of
 from ttscompile.calibration.search import search_plan
 from ttscompile.calibration.targets import REPEATS, dense_rounds
-from ttscompile.calibration.task import Clock, Found, Search, Task
+from ttscompile.calibration.task import Found, Search, Task
+from ttscompile.calibration.trials import base_of
 from ttscompile.calibration.tts import Tts
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import PlanArray, Source
@@ -219,16 +223,28 @@ def keep(found: Found, directory: Path) -> None:
 
     Of a head the mean of its plans is beside it, as ``calibrate`` leaves it.
     """
-    schedule = found.pruner is None
-    corrections = {"found": found.correction if schedule else found.pruner_correction}
-    update_calibration(
-        directory,
-        found.pruner,
-        {"found" if schedule else "mean": found.schedule},
-        "found",
-        {"strategy": "ablation", **found.notes},
-        corrections={name: one for name, one in corrections.items() if one is not None},
-    )
+    artifact = load_artifact(directory)
+    base = base_of(artifact)
+    mean = replace(base, cells=found.schedule, correction=found.correction)
+    plans = {**artifact.plans, "found": mean}
+    if found.pruner is not None:
+        own = replace(base, cells=None, correction=found.pruner_correction)
+        plans |= {"found": own, "mean": replace(mean, correction=None)}
+    record = {"strategy": "ablation", **found.notes}
+    update_plans(directory, plans, "found", record, pruner_weights=found.pruner, pruner_loop=base.loop)
+
+
+OTHER = 32
+"""Judged calls at most that are answered a second time, with other noise."""
+
+
+def other_noise(executor: Executor, calls: Calls, seed: int) -> float:
+    """How far two dense answers to one observation are apart, in the units of the actions."""
+    spec = executor.view.manifest.spec
+    some = executor.select(calls, np.arange(min(OTHER, calls.count)))
+    initial, noise = draw_noise(spec, some.count, (seed, 5))
+    paths = torch.cat(list(dense_rounds(executor, replace(some, initial=initial, noise=noise, path=None))))
+    return float(Actions(spec).errors(paths[:, -1], some.targets, units=True).mean())
 
 
 def drawn(
@@ -242,7 +258,7 @@ def drawn(
     pinned: bool,
 ) -> Calls:
     """Windows of consecutive calls, with what the dense policy answers."""
-    spec = executor.artifact.manifest.spec
+    spec = executor.view.manifest.spec
     chosen = sample_windows(episodes, numbers, most, window, seed, REPEATS if stage == 0 else 1)
     calls = prepare_calls(executor.model, spec, episodes, chosen, (seed, 9, stage), window, pinned)
     return replace(calls, path=torch.cat(list(dense_rounds(executor, calls))))
@@ -308,7 +324,10 @@ def main(
 ) -> None:
     """Measure all rows on the artifact in DIRECTORY."""
     artifact = load_artifact(directory)
-    spec, executor, progress = artifact.manifest.spec, Executor(artifact), Console(stderr=True)
+    executor, progress = Executor(view_of(artifact, base_of(artifact).exact)), Console(stderr=True)
+    manifest = executor.view.manifest
+    spec, flops = manifest.spec, manifest.flops
+    even = uniform_of(manifest.steps, len(manifest.blocks), round(computed_steps * executor.model.blocks))
     budget = round(computed_steps * executor.model.blocks)
     episodes = load_episodes(spec, trajectories, None)
     split = split_episodes(len(episodes), FRACTION, seed)
@@ -317,11 +336,11 @@ def main(
         drawn(executor, episodes, numbers, most, window, seed, stage, pinned)
         for stage, (numbers, most) in enumerate(((split.calibration, learned), (split.validation, judged)))
     ]
-    task = Task.of(artifact, executor, sets[0], budget, seed)
-    judge = Judge(executor, task.actions, sets[1], dense_with_other_noise(artifact, executor, sets[1], seed))
-    rows = [judge.row("even steps", "TIMESTEP", uniform_of(artifact.manifest, budget).schedule, None, 0.0)]
+    task = Task.of(executor, sets[0], budget, seed)
+    judge = Judge(executor, task.actions, sets[1], other_noise(executor, sets[1], seed))
+    rows = [judge.row("even steps", "TIMESTEP", even, None, 0.0)]
     if "refreshed" in ways:
-        rows += refreshed(task, judge, uniform_of(artifact.manifest, budget).schedule)
+        rows += refreshed(task, judge, even)
     if kept is not None:
         shutil.copytree(directory, kept)
     for decided, reads, maker in rows_of(directions, ways, updates):
@@ -334,11 +353,10 @@ def main(
             "calls": [one.count for one in sets],
             "window": window,
             "pinned": pinned,
-            "pruner_share": artifact.manifest.flops.pruner / artifact.manifest.flops.dense,
+            "pruner_share": flops.pruner / flops.dense,
             "rows": [asdict(row) for row in rows],
         }
         path.write_text(json.dumps(told, indent=2))
-    flops = artifact.manifest.flops
     show(rows, f"{budget} of {executor.model.steps * executor.model.blocks} cells, windows of {window} calls")
     print(f"A head costs {flops.pruner / flops.dense:.4%} of the FLOPs of a dense call.")
 

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.view import view_of
 from ttscompile.calibration.calls import Calls, prepare_calls
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.spacing import spacings
@@ -32,7 +33,7 @@ from ttscompile.trajectories.episodes import Episode
 
 def drawn_calls(executor: Executor, count: int) -> Calls:
     """Calls without targets, each an episode of its own."""
-    spec = executor.artifact.manifest.spec
+    spec = executor.view.manifest.spec
     episodes = [Episode("drawn", obs) for obs, _ in random_calls(spec, count, seed=0)]
     return prepare_calls(executor.model, spec, episodes, [(number, 0) for number in range(count)], (0,))
 
@@ -46,7 +47,7 @@ def drawn_calls(executor: Executor, count: int) -> Calls:
 def main(directory: Path, cores: str, calls: int, full_steps: int, rounds: int) -> None:
     """Time dense calls and candidates of the artifact DIRECTORY on clusters of some of this machine's cores."""
     torch.set_num_threads(1)
-    executor = Executor(load_artifact(directory))
+    executor = Executor(view_of(load_artifact(directory), "dense"))
     drawn = drawn_calls(executor, calls)
     counts = [int(each) for each in cores.split(",")]
     seconds: dict[int, list[tuple[float, float]]] = {count: [] for count in counts}
@@ -58,7 +59,7 @@ def main(directory: Path, cores: str, calls: int, full_steps: int, rounds: int) 
                 begun = time.perf_counter()
                 path = torch.cat(list(dense_rounds(executor, drawn, pool=pool)))
                 dense = time.perf_counter()
-                whole = Task.of(executor.artifact, executor, replace(drawn, path=path), 0, 0, pool).whole
+                whole = Task.of(executor, replace(drawn, path=path), 0, 0, pool).whole
                 family = spacings(executor.model.steps, full_steps)
                 for number in range(len(family)):
                     whole.expect(family[number:])
