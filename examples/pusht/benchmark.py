@@ -229,12 +229,13 @@ def contestants_for(
         plans.append((f"given plan, {np.mean(given != Source.COMPUTE):.0%} reused", full, given))
     if default not in (DENSE, FULL):
         plans.append(("compiled", default, None))
-    others = []
-    for label, name, plan in plans:
-        policy = ttscompile.load(artifact, threads=threads, plan=name)
-        others.append(Contestant(label, policy, plan, policy.info.dense_flops, noise_shape(policy.info)))
-    original, info = EagerPolicy(checkpoint, threads), others[0].policy.info
+    policies = [ttscompile.load(artifact, threads=threads, plan=name) for _, name, _ in plans]
+    original, info = EagerPolicy(checkpoint, threads), policies[0].info
     eager = Contestant("eager PyTorch", original, None, info.dense_flops, original.noise)
+    others = [
+        Contestant(label, policy, plan, info.dense_flops, noise_shape(policy.info))
+        for (label, _, plan), policy in zip(plans, policies, strict=True)
+    ]
     return [eager, *others], info
 
 

@@ -93,17 +93,16 @@ def time_alone(artifact: Path, checkpoint: Path, runs: int) -> list[Measurement]
 
 def calibration_table(result: CalibrationResult) -> Table:
     """The plans that calibration judged, on the episodes that it did not learn from."""
-    title = f"distance from the original, and error of the actions, on {result.calls['validation']} calls of the dense policy that were held out"
-    table = Table(title=title)
+    title = f"distance from the original on {result.calls['validation']} observations that were held out"
+    table = Table(title=title, caption="1: as far as other noise moves the original's actions")
     table.add_column("plan")
-    for column in ("distance", "mean, px", "90th percentile, px", "cells reused", "FLOPs saved"):
+    for column in ("distance", "95 % interval", "cells reused", "FLOPs saved"):
         table.add_column(column, justify="right")
     for name, score in result.plans.items():
         table.add_row(
             f"{name} (default)" if name == result.default_plan else name,
-            f"{score.distance:.2f}",
-            "" if score.error is None else f"{score.error:.1f}",
-            "" if score.error_p90 is None else f"{score.error_p90:.1f}",
+            f"{score.distance:.3f}",
+            "[{:.3f}, {:.3f}]".format(*score.interval),
             f"{score.sparsity:.1%}",
             f"{score.flops_saved:.1%}",
         )

@@ -19,7 +19,8 @@ from tests.examples.printed import printed
 from ttscompile import Plan
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import update_plans
-from ttscompile.calibration.result import CalibrationResult, PlanScore
+from ttscompile.calibration.judge import Score
+from ttscompile.calibration.result import CalibrationResult
 from ttscompile.core.lattice import dense_plan, uniform_plan
 from ttscompile.core.plan import FULL
 
@@ -107,13 +108,14 @@ def test_episodes_that_were_run_before_are_compared(compiled_pusht: Path, tmp_pa
 
 def test_calibration_table_names_the_default_and_the_baseline() -> None:
     result = CalibrationResult(
+        learned=("schedule",),
         strategy="tts",
         seed=0,
         target_sparsity=0.95,
         default_plan="schedule",
         plans={
-            "schedule": PlanScore(11.04, 47.0, 0.95, 0.94, 0.93),
-            "uniform": PlanScore(91.0, 288.0, 0.95, 0.95, 0.94),
+            "schedule": Score(0.1104, (0.05, 0.17), None, None, 0.95, 0.94, 0.93, 1),
+            "uniform": Score(0.91, (0.8, 1.2), None, None, 0.95, 0.95, 0.94, 1),
         },
         episodes={"calibration": (0, 1), "validation": (2,)},
         calls={"calibration": 20, "validation": 10},
@@ -122,8 +124,8 @@ def test_calibration_table_names_the_default_and_the_baseline() -> None:
         seconds=60.0,
     )
     rows = cells(calibration_table(result))
-    assert ["schedule (default)", "11.0", "47.0", "95.0%", "93.0%"] in rows
-    assert ["uniform", "91.0", "288.0", "95.0%", "94.0%"] in rows
+    assert ["schedule (default)", "0.110", "[0.050, 0.170]", "95.0%", "93.0%"] in rows
+    assert ["uniform", "0.910", "[0.800, 1.200]", "95.0%", "94.0%"] in rows
 
 
 def test_a_bad_checkpoint_is_one_clear_error(tmp_path: Path) -> None:
