@@ -3,10 +3,10 @@
     pip install 'ttscompile[compile,ray]'
     python examples/benchmark/scaling.py compiled/ --cores 1,2
 
-It answers dense calls with observations that are drawn, and compares the schedules of one crowded family, each with a
-correction of its own. Every number of cores takes its turn in every round; what counts is the ratio of the medians.
-The start of Ray and of its processes is not counted; that each opens the artifact is. The answers must be the same
-bits, or this ends with status 1.
+It answers calls with every block computed, of the loop that a calibration begins with and with observations that are
+drawn; and it compares the schedules of one crowded family, each with a correction of its own. Every number of cores
+takes its turn in every round; what counts is the ratio of the medians. The start of Ray and of its processes is not
+counted; that each opens the artifact is. The answers must be the same bits, or this ends with status 1.
 """
 
 from __future__ import annotations
@@ -20,11 +20,13 @@ import numpy as np
 import torch
 
 from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.view import view_of
 from ttscompile.calibration.calls import Calls, prepare_calls
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.spacing import spacings
 from ttscompile.calibration.targets import dense_rounds
 from ttscompile.calibration.task import Task
+from ttscompile.calibration.trials import base_of
 from ttscompile.pool import RayPool
 from ttscompile.runtimes.random_calls import random_calls
 from ttscompile.trajectories.episodes import Episode
@@ -32,7 +34,7 @@ from ttscompile.trajectories.episodes import Episode
 
 def drawn_calls(executor: Executor, count: int) -> Calls:
     """Calls without targets, each an episode of its own."""
-    spec = executor.artifact.manifest.spec
+    spec = executor.view.manifest.spec
     episodes = [Episode("drawn", obs) for obs, _ in random_calls(spec, count, seed=0)]
     return prepare_calls(executor.model, spec, episodes, [(number, 0) for number in range(count)], (0,))
 
@@ -46,7 +48,8 @@ def drawn_calls(executor: Executor, count: int) -> Calls:
 def main(directory: Path, cores: str, calls: int, full_steps: int, rounds: int) -> None:
     """Time dense calls and candidates of the artifact DIRECTORY on clusters of some of this machine's cores."""
     torch.set_num_threads(1)
-    executor = Executor(load_artifact(directory))
+    artifact = load_artifact(directory)
+    executor = Executor(view_of(artifact, base_of(artifact).exact))
     drawn = drawn_calls(executor, calls)
     counts = [int(each) for each in cores.split(",")]
     seconds: dict[int, list[tuple[float, float]]] = {count: [] for count in counts}
@@ -58,7 +61,7 @@ def main(directory: Path, cores: str, calls: int, full_steps: int, rounds: int) 
                 begun = time.perf_counter()
                 path = torch.cat(list(dense_rounds(executor, drawn, pool=pool)))
                 dense = time.perf_counter()
-                whole = Task.of(executor.artifact, executor, replace(drawn, path=path), 0, 0, pool).whole
+                whole = Task.of(executor, replace(drawn, path=path), 0, 0, pool).whole
                 family = spacings(executor.model.steps, full_steps)
                 for number in range(len(family)):
                     whole.expect(family[number:])
