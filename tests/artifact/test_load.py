@@ -83,6 +83,7 @@ def test_a_longer_file(calibrated: Path, role: str) -> None:
         load_artifact(calibrated)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("role", FILES)
 @settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(where=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))

@@ -50,6 +50,7 @@ def tiny(tiny_artifact: Path) -> tuple[Path, dict[float, np.ndarray]]:
     return tiny_artifact, {s: artifact.schedule(plan_name(s)) for s in (0.0, 0.5)}
 
 
+@pytest.mark.slow
 def test_an_artifact_has_the_plans_that_there_can_be(tiny: tuple[Path, dict[float, np.ndarray]]) -> None:
     directory, plans = tiny
     artifact = load_artifact(directory)

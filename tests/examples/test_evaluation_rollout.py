@@ -113,6 +113,7 @@ def test_the_batch_stays_the_same_when_an_episode_is_done() -> None:
     assert sum(result.legalised) == 39
 
 
+@pytest.mark.slow
 def test_batches_give_what_single_episodes_give() -> None:
     policy = StayAway()
     done: list[int] = []

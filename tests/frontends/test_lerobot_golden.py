@@ -112,6 +112,7 @@ def test_whole_call(golden: Golden) -> None:
     assert np.abs(spec.chunk.normalizer.unnormalize(executed) - numbers["action"]).max() < 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
 def test_compiled_call(golden: Golden, compiled: Path, runtime: str) -> None:
     """The artifact from raw observations to the action in its units, within 1e-4."""
