@@ -65,6 +65,7 @@ def test_a_missing_file(calibrated: Path, role: str) -> None:
         load_artifact(calibrated)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("role", FILES)
 @pytest.mark.parametrize("size", [0, 1, 0.5, -1])
 def test_a_truncated_file(calibrated: Path, role: str, size: float) -> None:

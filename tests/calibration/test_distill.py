@@ -76,6 +76,7 @@ def actions(policy: CompiledPolicy, plan: str, seed: int = 0) -> Any:
     return policy.predict_action(obs, noise=noise, plan=plan)["action_pred"]
 
 
+@pytest.mark.slow
 def test_the_artifact_gets_a_plan_that_is_nearer_to_the_dense_policy(distilled: tuple[Path, Distilled]) -> None:
     directory, result = distilled
     artifact = load_artifact(directory)
@@ -89,6 +90,7 @@ def test_the_artifact_gets_a_plan_that_is_nearer_to_the_dense_policy(distilled: 
     assert record["plans"][DISTILLED]["error"] == result.after.error
 
 
+@pytest.mark.slow
 def test_the_command_says_what_it_did(copied: Path, recording: Path) -> None:
     options = ["--rank", "4", "--updates", str(UPDATES), "--max-minutes", "5"]
     done = CliRunner().invoke(main, ["distill", str(copied), "--trajectories", str(recording), *options])
@@ -196,6 +198,7 @@ def exchange_weights(directory: Path) -> None:
     (directory / MANIFEST).write_bytes(codec.encode(replace(manifest, identity=identity, model_identity=model)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("saves", [1, 4])
 def test_a_distillation_that_was_killed_goes_on_to_the_same_bytes(
     distilled: tuple[Path, Distilled], copied: Path, recording: Path, saves: int
@@ -208,6 +211,7 @@ def test_a_distillation_that_was_killed_goes_on_to_the_same_bytes(
     assert contents(copied) == contents(distilled[0])
 
 
+@pytest.mark.slow
 def test_the_rate_of_a_distillation_that_goes_on_is_not_what_it_began_with(
     copied: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -242,6 +246,7 @@ def test_an_interrupted_calibration_and_an_interrupted_distillation_do_not_know_
         train(copied, recording, rank=2, resume=True)
 
 
+@pytest.mark.slow
 def test_the_outcome_does_not_depend_on_the_number_of_threads(
     distilled: tuple[Path, Distilled], copied: Path, recording: Path
 ) -> None:
@@ -254,6 +259,7 @@ def test_the_outcome_does_not_depend_on_the_number_of_threads(
     assert contents(copied) == contents(distilled[0])
 
 
+@pytest.mark.slow
 def test_what_is_no_better_is_not_kept(copied: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = contents(copied)
     monkeypatch.setattr(student, "RATE", 0.0)
@@ -279,6 +285,7 @@ def test_calibrating_again_drops_it(distilled: tuple[Path, Distilled], recording
     assert not list(directory.glob("distilled*"))
 
 
+@pytest.mark.slow
 def test_in_eight_bits(once: Once, recording: Path, tmp_path: Path) -> None:
     directory = Path(shutil.copytree(policies.compiled(once, "int8"), tmp_path / "compiled"))
     train(policies.whole_steps(directory, recording), recording)

@@ -46,6 +46,7 @@ def recorded(path: Path, shaking: float = 0.0) -> list[Path]:
     return [path]
 
 
+@pytest.mark.slow
 def test_what_is_settled_saves_and_is_written(folder: Path, tmp_path: Path) -> None:
     found = ttscompile.reuse_tokens(folder, recorded(tmp_path / "calls.npz"))
     reuse = load_artifact(folder).manifest.reuse
@@ -61,6 +62,7 @@ def test_what_is_settled_saves_and_is_written(folder: Path, tmp_path: Path) -> N
     assert again.reuse == found.reuse, "what is settled already changes nothing"
 
 
+@pytest.mark.slow
 def test_what_does_not_pay_is_refused_and_changes_nothing(folder: Path, tmp_path: Path) -> None:
     before = (folder / "manifest.json").read_bytes()
     with pytest.raises(CalibrationFailedError, match=r"does not pay: \d+% of the tokens would be computed"):
@@ -80,6 +82,7 @@ def test_a_setting_that_is_good_in_one_episode_alone_is_not_taken_for_good() -> 
     assert with_spread(steady[:3], episodes[:3]) == (pytest.approx(2.0), pytest.approx(2.0)), "one has no spread"
 
 
+@pytest.mark.slow
 def test_settings_are_chosen_with_their_spread(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     files = recorded(tmp_path / "calls.npz")
     error = ttscompile.reuse_tokens(folder, files).reuse.error
@@ -101,6 +104,7 @@ def test_nobody_changes_the_artifact_meanwhile(folder: Path, tmp_path: Path) -> 
         ttscompile.reuse_tokens(folder, recorded(tmp_path / "calls.npz"), calls=2, progress=told)
 
 
+@pytest.mark.slow
 def test_an_encoder_without_tokens_is_refused(once: Once, tmp_path: Path) -> None:
     folder = once.folder("seeing", cameras.compile_seeing) / "artifact"
     with pytest.raises(CalibrationError, match="no image encoder of this policy is a vision transformer"):
@@ -114,6 +118,7 @@ def test_a_zipped_artifact_is_refused_before_anything_is_tried(folder: Path, tmp
     assert not told
 
 
+@pytest.mark.slow
 def test_the_command(folder: Path, tmp_path: Path) -> None:
     files, run = [str(path) for path in recorded(tmp_path / "calls.npz")], CliRunner().invoke
     told = run(main, ["reuse-tokens", str(folder), "--trajectories", *files, "--json"])

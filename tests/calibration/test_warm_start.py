@@ -39,6 +39,7 @@ def recorded(path: Path, episodes: int = 3, calls: int = 4) -> list[Path]:
     return [path]
 
 
+@pytest.mark.slow
 def test_what_is_settled_is_what_a_policy_is_loaded_with(folder: Path, tmp_path: Path) -> None:
     identity = load_artifact(folder).manifest.identity
     found = ttscompile.warm_start(folder, recorded(tmp_path / "calls.npz"), max_distance=ENOUGH)
@@ -50,6 +51,7 @@ def test_what_is_settled_is_what_a_policy_is_loaded_with(folder: Path, tmp_path:
     assert ttscompile.load(folder).info.warm_steps is None
 
 
+@pytest.mark.slow
 def test_the_fewest_steps_within_the_distance_are_taken(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -69,6 +71,7 @@ def test_the_fewest_steps_within_the_distance_are_taken(
     assert (folder / "manifest.json").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_a_distance_is_one_where_nothing_of_the_chunk_is_left(folder: Path, tmp_path: Path) -> None:
     """Told by hand: calls that begin with noise alone, and with the whole of the chunk before."""
     artifact = load_artifact(folder)
@@ -94,6 +97,7 @@ def test_the_world_changes_to_another_episode_that_lasts_as_long(folder: Path, t
     assert {warm_start.another(episodes, 1, 2, rng) for _ in range(50)} == {0}
 
 
+@pytest.mark.slow
 def test_calls_are_spread_over_episodes_and_have_one_before_them(folder: Path, tmp_path: Path) -> None:
     files = recorded(tmp_path / "calls.npz", 3, 5)
     assert ttscompile.warm_start(folder, files, max_distance=ENOUGH).warm.calls == 12
@@ -112,6 +116,7 @@ def test_too_little_is_refused(folder: Path, tmp_path: Path) -> None:
         ttscompile.warm_start(folder, recorded(tmp_path / "calls.npz"), max_distance=-1)
 
 
+@pytest.mark.slow
 def test_a_loop_of_two_steps_has_half(one_layer_checkpoint: Path, tmp_path: Path) -> None:
     ttscompile.convert(one_layer_checkpoint, tmp_path / "one", sampler="ddim", steps=2)
     found = ttscompile.warm_start(tmp_path / "one", recorded(tmp_path / "calls.npz"), max_distance=ENOUGH)
@@ -139,6 +144,7 @@ def test_a_record_of_more_steps_than_there_are_is_refused(folder: Path) -> None:
     assert load_artifact(folder).manifest.warm is None
 
 
+@pytest.mark.slow
 def test_the_command(folder: Path, tmp_path: Path) -> None:
     files, run = [str(path) for path in recorded(tmp_path / "calls.npz")], CliRunner().invoke
     words = ["warm-start", str(folder), "--trajectories", *files, "--max-distance", "1000000"]

@@ -35,6 +35,7 @@ def converted(one_layer_checkpoint: Path, tmp_path_factory: pytest.TempPathFacto
     return directory, json.loads(result.stdout)
 
 
+@pytest.mark.slow
 def test_convert_and_inspect_say_the_precision_and_its_error(converted: tuple[Path, dict[str, Any]]) -> None:
     directory, told = converted
     stage = next(stage for stage in told.pop("stages") if stage["stage"] == "lower_precision")

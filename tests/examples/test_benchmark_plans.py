@@ -38,6 +38,7 @@ def test_a_plan_has_its_share_of_reused_cells(steps: int, sparsity: float) -> No
     assert set(np.unique(plan)) <= {Source.COMPUTE, Source.TIMESTEP}
 
 
+@pytest.mark.slow
 def test_a_sampler_may_have_more_steps_than_the_training() -> None:
     table = sampler_of("ddpm", 120)
     assert table.steps == len(set(table.timesteps.tolist())) == 120

@@ -119,6 +119,7 @@ def test_the_plan_is_the_one_that_a_warm_call_executes(tiny: Subject) -> None:
     assert dense.plan.sum() == 0
 
 
+@pytest.mark.slow
 def test_the_checkpoint_has_to_be_the_artifacts(tiny: Subject, pusht_checkpoint: Path) -> None:
     with pytest.raises(ttscompile.TtscompileError, match="expected the policy that the artifact was made from"):
         subject(tiny.directory, pusht_checkpoint, None)

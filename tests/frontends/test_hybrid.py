@@ -227,6 +227,7 @@ def test_the_grid_of_half_precision_is_exact(build: Callable[..., tuple[Any, Any
         assert torch.equal(camera.pool.pos_x, grid.pos_x) and torch.equal(camera.pool.pos_y, grid.pos_y)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("weights", "message"),
     [

@@ -153,6 +153,7 @@ def test_encoders_and_modulations_leave_the_loop(golden: Golden, compiled: Path)
     assert kinds == ["self_attention", "feed_forward"] * 4
 
 
+@pytest.mark.slow
 def test_runtimes_agree_on_random_plans(golden: Golden, compiled: Path) -> None:
     """Episodes of random legal plans, several streams."""
     artifact = load_artifact(compiled)

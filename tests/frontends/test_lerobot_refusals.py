@@ -140,6 +140,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", BAD)
 def test_bad_directories(tmp_path: Path, case: str) -> None:
     """Every error names the place, what was found and what was expected."""

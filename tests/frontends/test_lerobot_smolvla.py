@@ -68,6 +68,7 @@ def eager(directory: Path, given: Mapping[str, Array], batch: Mapping[str, Array
     return spec.chunk.unnormalized(eager_policy(module, spec)(obs, Noise(given["noise"])).numpy())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
 def test_two_instructions(compiled: Path, golden: Mapping[str, Array], runtime: str) -> None:
     policy = ttscompile.load(compiled, runtime=runtime)

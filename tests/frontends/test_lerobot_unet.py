@@ -42,6 +42,7 @@ def load(directory: Path) -> tuple[EncodedDenoiser, PolicySpec]:
     return module, spec
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", lerobot_unets.VARIANTS)
 def test_lerobot_gave_the_same(variant: str, tmp_path: Path) -> None:
     """The condition, single evaluations, and the executed actions of a whole call, from the files that are saved."""
@@ -221,6 +222,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", BAD)
 def test_settings_that_do_not_fit(changed: Callable[..., Path], case: str) -> None:
     """Each is named, with what was expected, and the directory."""

@@ -57,6 +57,7 @@ CASES: list[tuple[type[Any], dict[str, Any], int, dict[str, Any]]] = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scheduler_class", "settings", "steps", "arguments"), CASES)
 def test_table_gives_what_the_scheduler_gives(
     scheduler_class: type[Any], settings: dict[str, Any], steps: int, arguments: dict[str, Any]

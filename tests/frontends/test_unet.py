@@ -31,6 +31,7 @@ GIVEN = {"local": "local condition", "inpainting": "inpainting", "hybrid_inpaint
 SAVED_BY_THE_ORIGINAL = {"global": "global condition", "local": "local condition", "inpainting": "inpainting"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", unets.VARIANTS)
 def test_the_original_gave_the_same(variant: str, tmp_path: Path) -> None:
     """Single evaluations, and the actions of a whole call, from the file that is saved."""

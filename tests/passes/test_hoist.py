@@ -36,6 +36,7 @@ def test_a_mixing_condition_encoder_runs_all_steps_in_one_batch() -> None:
     assert Binding.STEP in program.pieces.bindings.values()
 
 
+@pytest.mark.slow
 def test_modulations_leave_the_loop() -> None:
     _, program = compiled("adaLN")
     pieces = program.pieces

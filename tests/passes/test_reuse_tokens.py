@@ -143,5 +143,6 @@ def test_near_misses_are_left_whole(change: str, why: str) -> None:
     assert why in said
 
 
+@pytest.mark.slow
 def test_without_the_miss_it_is_one() -> None:
     assert not isinstance(found(""), str)

@@ -33,6 +33,7 @@ def fp32(once: Once) -> Path:
     return policies.compiled(once)
 
 
+@pytest.mark.slow
 def test_it_is_the_reference_within_its_own_tolerance_on_random_plans(int8: Path) -> None:
     """Plans of all sources over episodes of three calls; the reference computes in fp32."""
     artifact = load_artifact(int8)
@@ -62,6 +63,7 @@ def test_the_measured_error_is_what_the_public_interface_gives(int8: Path) -> No
     assert record.error.largest == pytest.approx(np.max(errors), rel=0.05)
 
 
+@pytest.mark.slow
 def test_fp32_of_an_int8_artifact_is_the_fp32_artifact(int8: Path, fp32: Path) -> None:
     with_both, plain = load_artifact(int8).at_precision("fp32"), load_artifact(fp32)
     obs, noise = random_inputs(plain, np.random.default_rng(0), 2)
@@ -125,6 +127,7 @@ def test_nothing_to_lower_and_unknown_precisions_are_refused_before_anything_is_
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_converting_again_gives_the_same_bytes_measured_error_and_all(int8: Path, tmp_path: Path) -> None:
     ttscompile.compile_denoiser(policies.Mixer(0).eval(), policies.spec(), tmp_path / "again", precision="int8")
     assert {p.name: p.read_bytes() for p in (tmp_path / "again").iterdir()} == {

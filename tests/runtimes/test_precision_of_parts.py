@@ -62,6 +62,7 @@ def operations(path: Path, piece: str) -> set[str]:
     return {node.op_type for node in onnx.load(artifact.onnx_path(piece), load_external_data=False).graph.node}
 
 
+@pytest.mark.slow
 def test_the_encoder_has_integer_products_and_convolutions_beside_the_blocks(int8: Path) -> None:
     found = operations(int8, "condition")
     assert {"DynamicQuantizeMatMul", "MatMulIntegerToFloat", "Conv"} <= found, "a convolution of three channels stays"
@@ -134,6 +135,7 @@ def test_calibration_measures_the_parts_on_recorded_calls(int8: Path) -> None:
     assert "--keep-fp32 condition" in told
 
 
+@pytest.mark.slow
 def test_auto_leaves_out_what_changes_the_actions_much_and_says_so(tmp_path: Path) -> None:
     manifest, said = compiled(tmp_path / "auto", LOUD, precision="auto")
     record = manifest.precision
@@ -149,6 +151,7 @@ def test_auto_leaves_out_what_changes_the_actions_much_and_says_so(tmp_path: Pat
     assert weights < seeing.FEATURES * seeing.FEATURES * 16, "the integers of the encoder are not stored"
 
 
+@pytest.mark.slow
 def test_auto_is_fp32_where_nothing_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ttscompile.runtimes.against_fp32.SHARE", 1e-9)
     manifest, said = compiled(tmp_path / "none", precision="auto")
@@ -157,6 +160,7 @@ def test_auto_is_fp32_where_nothing_is_left(tmp_path: Path, monkeypatch: pytest.
     assert any("fp32: other noise changes actions by" in note for note in said)
 
 
+@pytest.mark.slow
 def test_a_part_that_was_left_out_is_in_fp32_and_named(tmp_path: Path) -> None:
     manifest, said = compiled(tmp_path / "compiled", precision="int8", keep_fp32=("blocks",))
     record = manifest.precision
@@ -193,6 +197,7 @@ def test_a_prologue_that_is_small_beside_a_step_stays_as_it_is(program: Program)
     assert notes == ("condition stays fp32: 0.0% of the arithmetic of a step",)
 
 
+@pytest.mark.slow
 def test_a_frame_piece_counts_with_all_of_its_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     pieces = (seen := transform(*cameras.policy("stacked"))).pieces
     assert pieces.rows == (4,)

@@ -73,6 +73,7 @@ def continued(policy: CompiledPolicy, before: Any, noise: Noise) -> Noise:
     return Noise(initial.astype(np.float32), noise.steps[STEPS - LAST :])
 
 
+@pytest.mark.slow
 def test_calls_after_the_first_are_the_rest_of_the_loop(policies: tuple[CompiledPolicy, ...]) -> None:
     both, cold, rest = policies
     for _ in range(2):  # an episode, and one more
@@ -116,6 +117,7 @@ def test_the_arithmetic_of_the_rest_is_counted(warm: CompiledPolicy, whole: Path
     assert own.dense == all_steps.dense * LAST // STEPS
 
 
+@pytest.mark.slow
 def test_an_update_in_fewer_groups_than_the_rest_would_have(
     one_layer_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
