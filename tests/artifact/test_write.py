@@ -135,6 +135,7 @@ def test_the_same_inputs_give_the_same_bytes(written: Path, tmp_path: Path) -> N
     assert contents(tmp_path / "elsewhere" / "again") == contents(written)
 
 
+@pytest.mark.slow
 def test_the_same_bytes_in_another_process(written: Path, tmp_path: Path) -> None:
     script = (
         "import sys; sys.path.insert(0, sys.argv[1])\n"
@@ -264,6 +265,7 @@ class Interrupted(BaseException):
     """As a Ctrl-C: no Exception."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("error", [Interrupted, OSError])
 @pytest.mark.parametrize("function", ["replace", "fsync", "mkdir"])
 @pytest.mark.parametrize("existing", [True, False])

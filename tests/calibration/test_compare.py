@@ -66,6 +66,7 @@ def points(frontier: Comparison) -> dict[tuple[str, str], MeasuredPoint]:
     return {(point.series, point.name): point for point in frontier.points}
 
 
+@pytest.mark.slow
 def test_every_plan_is_measured_on_the_same_calls(frontier: Comparison) -> None:
     found = points(frontier)
     assert list(found) == [
@@ -90,6 +91,7 @@ def test_every_plan_is_measured_on_the_same_calls(frontier: Comparison) -> None:
     assert frontier.calls == 8
 
 
+@pytest.mark.slow
 def test_rivals_take_part_with_a_correction_of_their_own(planned: Path, recording: Path) -> None:
     found = points(compare(planned, [recording], ["interval"], [0.5], calls=8, learned=400, correct=True))
     plain, corrected = found["interval", "0.5"], found["interval, corrected", "0.5"]
@@ -140,6 +142,7 @@ def interrupted_after(searches: int, monkeypatch: pytest.MonkeyPatch) -> list[st
     return begun
 
 
+@pytest.mark.slow
 def test_an_interrupted_comparison_goes_on_to_the_same_outcome(
     planned: Path, frontier: Comparison, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -250,6 +253,7 @@ def test_it_says_who_does_not_take_part_as_he_is(planned: Path, recording: Path)
     assert found.warnings[1] == "no strategy takes part: no share of the cells was given for K = 10."
 
 
+@pytest.mark.slow
 def test_the_truth_has_all_tokens(once: Once, tmp_path: Path) -> None:
     """With a threshold that nothing passes the newest of two frames is taken for the one before."""
 
@@ -328,6 +332,7 @@ def test_the_picture_has_the_points_and_needs_a_folder(frontier: Comparison, tmp
         plot_frontier(*arguments, tmp_path / "none" / "f.png", "title")
 
 
+@pytest.mark.slow
 def test_the_command_prints_the_same_as_a_table_and_as_json(
     planned: Path, other_sampler: Path, recording: Path, tmp_path: Path
 ) -> None:
@@ -363,6 +368,7 @@ def test_the_command_prints_the_same_as_a_table_and_as_json(
     assert "Yardstick: two dense calls are apart" in shown.stdout
 
 
+@pytest.mark.slow
 def test_without_sparsities_those_are_taken_that_the_steps_allow(planned: Path, recording: Path) -> None:
     assert default_sparsities(100) == (0.9, 0.95, 0.98)
     assert default_sparsities(16) == (11 / 16, 13 / 16, 14 / 16)

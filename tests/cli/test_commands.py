@@ -61,6 +61,7 @@ def test_help_has_a_whole_line_for_each_command_in_the_order_of_use(
     assert [name for name, _ in listed][:4] == ["doctor", "convert", "calibrate", "inspect"]
 
 
+@pytest.mark.slow
 def test_convert_says_what_it_made_and_explains_on_standard_error(one_layer_checkpoint: Path, tmp_path: Path) -> None:
     arguments = ("--sampler", "ddim", "--steps", "4", "--explain", "--json")
     result = run("convert", one_layer_checkpoint, "-o", tmp_path / "compiled", *arguments)
@@ -76,6 +77,7 @@ def test_convert_says_what_it_made_and_explains_on_standard_error(one_layer_chec
     assert json.loads(run("inspect", tmp_path / "compiled", "--json").stdout) == made
 
 
+@pytest.mark.slow
 def test_inspect_accounts_for_every_flop(scheduled: Path) -> None:
     made = json.loads(run("inspect", scheduled, "--json").stdout)
     flops, plans = made["flops"], made["plans"]
@@ -99,6 +101,7 @@ def test_inspect_draws_the_default_plan(scheduled: Path, tmp_path: Path) -> None
     assert (tmp_path / "plan.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_a_pruners_plan_needs_an_observation(pruned: Path, tmp_path: Path) -> None:
     picture = tmp_path / "plan.png"
     result = CliRunner().invoke(main, ["inspect", str(pruned), "--plot", str(picture)])
@@ -133,6 +136,7 @@ def test_a_plan_that_is_not_there_is_named_beside_those_that_are(scheduled: Path
     assert "has no plan 'best'; it has ['dense', 'uniform']" in result.stderr
 
 
+@pytest.mark.slow
 def test_bench_times_everybody_on_the_same_calls(scheduled: Path, one_layer_checkpoint: Path) -> None:
     arguments = ("--runs", 2, "--against", "eager,onnxruntime-dense", "--checkpoint", one_layer_checkpoint, "--json")
     made = json.loads(run("bench", scheduled, *arguments).stdout)
@@ -145,6 +149,7 @@ def test_bench_times_everybody_on_the_same_calls(scheduled: Path, one_layer_chec
     assert compiled["flops"] < dense["flops"] < eager["flops"]
 
 
+@pytest.mark.slow
 def test_bench_times_several_numbers_of_threads_and_takes_the_fewest_that_are_worth_it(scheduled: Path) -> None:
     arguments = ("--runs", 2, "--threads", "2,1,2", "--against", "onnxruntime-dense")
     made = json.loads(run("bench", scheduled, *arguments, "--json").stdout)
@@ -171,6 +176,7 @@ def test_threads_that_bench_cannot_time(arguments: tuple[str, ...], told: str, s
     assert told in result.stderr
 
 
+@pytest.mark.slow
 def test_bench_prints_a_table_and_warns_of_a_dense_artifact(compiled_layer: Path) -> None:
     result = run("bench", compiled_layer, "--runs", 1)
     assert "dense onnxruntime" in result.stdout

@@ -110,6 +110,7 @@ def page(calibrated: Path, calls: Path, tmp_path_factory: pytest.TempPathFactory
     return output.read_text()
 
 
+@pytest.mark.slow
 def test_the_page_is_whole_and_needs_nothing_else(page: str) -> None:
     reader = Reader(page)
     assert page.startswith("<!doctype html>")
@@ -173,6 +174,7 @@ def test_a_record_is_told_without_brackets() -> None:
     assert (plain(0.123456), plain([]), plain("a_b"), plain(None)) == ("0.1235", "none", "a_b", "None")
 
 
+@pytest.mark.slow
 def test_hostile_names_stay_text(calibrated: Path) -> None:
     artifact = load_artifact(calibrated)
     manifest = artifact.manifest
@@ -211,6 +213,7 @@ def test_a_check_that_failed_is_told_and_is_the_exit_status(
     assert "First at step 1, block 2." in text
 
 
+@pytest.mark.slow
 def test_arrays_of_other_names_reach_the_episode_and_the_checks(
     calibrated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

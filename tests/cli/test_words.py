@@ -123,6 +123,7 @@ def stops_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys.modules["ttscompile.cli.serve"], "ray_copies", nobody)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("stops_at_once")
 @pytest.mark.parametrize(("command", "parameter"), ALL)
 def test_unkind_words_are_refused_or_taken(command: str, parameter: click.Parameter) -> None:

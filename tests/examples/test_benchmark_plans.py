@@ -39,6 +39,7 @@ def test_a_plan_has_its_share_of_reused_cells(steps: int, sparsity: float) -> No
     assert set(np.unique(plan)) <= {Source.COMPUTE, Source.TIMESTEP}
 
 
+@pytest.mark.slow
 def test_a_sampler_may_have_more_steps_than_the_training() -> None:
     table = sampler_of("ddpm", 120)
     assert table.steps == len(set(table.timesteps.tolist())) == 120
@@ -51,6 +52,7 @@ def tiny(tiny_artifact: Path) -> tuple[Path, dict[float, np.ndarray]]:
     return tiny_artifact, {s: cells for s, cells in found.items() if cells is not None}
 
 
+@pytest.mark.slow
 def test_an_artifact_has_the_plans_that_there_can_be(tiny: tuple[Path, dict[float, np.ndarray]]) -> None:
     directory, plans = tiny
     artifact = load_artifact(directory)

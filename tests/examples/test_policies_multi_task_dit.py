@@ -24,6 +24,7 @@ TASK = "push the T onto its place"
 WORLD = 512.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["flow", "pixels"])
 def test_dense_compiled_is_what_lerobot_answered(name: str, once: Once) -> None:
     def convert(directory: Path) -> Program:

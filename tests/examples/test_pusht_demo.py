@@ -128,6 +128,7 @@ def test_calibration_table_names_the_default_and_the_baseline() -> None:
     assert ["uniform", "0.910", "[0.800, 1.200]", "95.0%", "94.0%"] in rows
 
 
+@pytest.mark.slow
 def test_a_bad_checkpoint_is_one_clear_error(tmp_path: Path) -> None:
     bad = tmp_path / "not-a-policy.ckpt"
     bad.write_text("nothing of the kind")

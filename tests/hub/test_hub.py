@@ -175,6 +175,7 @@ def test_a_changed_artifact_is_refused_as_any_other(hub: Hub, toy_files: dict[st
         ttscompile.load("hf://org/name")
 
 
+@pytest.mark.slow
 def test_a_checkpoint_is_converted_and_passes_its_licence_on(
     hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -213,6 +214,7 @@ def test_a_checkpoint_is_converted_and_passes_its_licence_on(
     assert pushed.stdout == f"pushed hf://org/made@{hub.find('org/made', 'main')[0]}\n"
 
 
+@pytest.mark.slow
 def test_the_card_tells_what_was_left_out(tmp_path: Path) -> None:
     """Else the command on it makes another artifact."""
     shorter = {"task": "push", "without": "observation.images.side, observation.images.`top`"}

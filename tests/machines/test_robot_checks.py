@@ -34,6 +34,7 @@ def found(folder: Path) -> list[robot.Check]:
     return list(robot.compare("toy", folder / "artifact", folder / "actions.npz"))
 
 
+@pytest.mark.slow
 def test_the_machine_that_compiled_agrees_with_itself(folder: Path) -> None:
     checks = found(folder)
     assert [check.what for check in checks] == [f"actions toy fp32 {plan}" for plan in PLANS]

@@ -61,6 +61,7 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_blocks_and_dense_steps_have_it(compiled: Path) -> None:
     artifact = load_artifact(compiled)
     counts = {

@@ -84,6 +84,7 @@ def test_the_default_plan_is_the_artifacts(artifact: Artifact) -> None:
     assert torch.equal(found, named)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", [{"sequence_first": True}, {"noise": 0.0}, {"blocks": 1}], ids=str)
 def test_other_forms_of_networks(make_artifact: MakeArtifact, variant: dict[str, bool]) -> None:
     made = make_artifact(toy_program(**variant))
@@ -92,6 +93,7 @@ def test_other_forms_of_networks(make_artifact: MakeArtifact, variant: dict[str,
     assert_equal_but_for_rounding(found, expected(made, given, "dense"), terms(made))
 
 
+@pytest.mark.slow
 def test_it_can_be_exported_and_what_is_exported_computes_the_same(artifact: Artifact) -> None:
     module = ttscompile.to_module(artifact.path, "mixed")
     with torch.no_grad():
@@ -101,6 +103,7 @@ def test_it_can_be_exported_and_what_is_exported_computes_the_same(artifact: Art
     assert_equal_but_for_rounding(found.detach(), expected(artifact, other, "mixed"), terms(artifact))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")  # of torch's compiler, about itself
 def test_what_is_exported_can_be_compiled_and_run_without_python(artifact: Artifact, tmp_path: Path) -> None:
     if shutil.which("g++") is None:

@@ -20,6 +20,7 @@ def run(*arguments: object) -> Result:
     return CliRunner().invoke(main, [str(a) for a in arguments], catch_exceptions=False)
 
 
+@pytest.mark.slow
 def test_a_sound_artifact_gives_status_0_and_a_picture(quick: Path, recording: Path, tmp_path: Path) -> None:
     picture = tmp_path / "errors.png"
     arguments = ("--trajectories", recording, "--calls", 5, "--plot", picture, "--json")

@@ -174,6 +174,7 @@ def exchange_weights(directory: Path) -> None:
     (directory / MANIFEST).write_bytes(codec.encode(replace(manifest, identity=identity, model_identity=model)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("saves", [1, 4])
 def test_a_distillation_that_was_killed_goes_on_to_the_same_bytes(
     distilled: Trained, copied: Path, recording: Path, saves: int
@@ -186,6 +187,7 @@ def test_a_distillation_that_was_killed_goes_on_to_the_same_bytes(
     assert contents(copied) == contents(distilled[0])
 
 
+@pytest.mark.slow
 def test_the_rate_of_a_distillation_that_goes_on_is_not_what_it_began_with(
     copied: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -218,6 +220,7 @@ def test_what_was_interrupted_is_not_taken_for_something_else(copied: Path, reco
         train(copied, recording, rank=2, resume=True)
 
 
+@pytest.mark.slow
 def test_the_outcome_does_not_depend_on_the_number_of_threads(
     distilled: Trained, copied: Path, recording: Path
 ) -> None:
@@ -282,6 +285,7 @@ def test_calibrating_again_drops_it(distilled: Trained, recording: Path, tmp_pat
     assert not list(directory.glob("blocks-*"))
 
 
+@pytest.mark.slow
 def test_in_eight_bits(once: Once, recording: Path, tmp_path: Path) -> None:
     directory = Path(shutil.copytree(policies.compiled(once, "int8"), tmp_path / "compiled"))
     train(policies.whole_steps(directory, recording), recording)
