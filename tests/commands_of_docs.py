@@ -14,7 +14,7 @@ NOT_RUN = {
     ".venv/bin/ruff": "make lint",
     "ttscompile serve": "has no end; tests/server and tests/fleet start it",
     "ttscompile calibrate compiled/ --trajectories calls.npz --learn tokens": "needs tokens: tests/calibration",
-    "ttscompile calibrate compiled/ --trajectories calls.npz --learn schedule,start": "ends with 1 after a short search",
+    "ttscompile calibrate compiled/ --trajectories calls.npz --learn schedule,start": "a short search ends with 1",
     "ttscompile calibrate compiled/ --trajectories calls.npz --target-sparsity 0.875 --learn": "the same",
     "curl": "needs a server; tests/server/test_metrics.py and tests/fleet ask the same of one",
     "python examples/serve": "needs a server; the same tests run it against one",
