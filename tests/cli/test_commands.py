@@ -15,7 +15,7 @@ from click.testing import CliRunner
 
 from ttscompile.artifact.write import update_calibration
 from ttscompile.cli import main
-from ttscompile.cli.bench import fewest_threads
+from ttscompile.cli.bench_report import fewest_threads
 from ttscompile.core.lattice import uniform_plan
 
 
@@ -134,24 +134,30 @@ def test_a_plan_that_is_not_there_is_named_beside_those_that_are(scheduled: Path
 
 
 def test_bench_times_everybody_on_the_same_calls(scheduled: Path, one_layer_checkpoint: Path) -> None:
-    arguments = ("--runs", 2, "--against", "eager,onnxruntime-dense", "--checkpoint", one_layer_checkpoint, "--json")
+    arguments = ("--calls", 2, "--checkpoint", one_layer_checkpoint, "--json")
     made = json.loads(run("bench", scheduled, *arguments).stdout)
     assert made["machine"]["cores"] >= 1
-    compiled, eager, dense = made["contestants"]
-    assert [len(c["times_ms"]) for c in (compiled, eager, dense)] == [2, 2, 2]
+    original, dense, compiled = made["contestants"]
+    assert [c["label"] for c in made["contestants"]] == ["original, ddpm 100", "dense", "uniform (baseline)"]
+    assert [len(c["times_ms"]) for c in (original, dense, compiled)] == [2, 2, 2]
     assert compiled["plan"] == "uniform"
     assert compiled["sparsity"] == pytest.approx(0.95)
     assert dense["sparsity"] == 0
-    assert compiled["flops"] < dense["flops"] < eager["flops"]
+    assert compiled["flops"] < dense["flops"] < original["flops"]
 
 
 def test_bench_times_several_numbers_of_threads_and_takes_the_fewest_that_are_worth_it(scheduled: Path) -> None:
-    arguments = ("--runs", 2, "--threads", "2,1,2", "--against", "onnxruntime-dense")
+    arguments = ("--calls", 2, "--threads", "2,1,2")
     made = json.loads(run("bench", scheduled, *arguments, "--json").stdout)
-    assert [one["label"] for one in made["contestants"]] == ["compiled", "compiled, threads: 1", "dense onnxruntime"]
-    assert made["threads"] == 2 and made["best_threads"] in (1, 2)
+    assert [one["label"] for one in made["contestants"]] == [
+        "dense, 2 threads",
+        "uniform (baseline), 2 threads",
+        "dense, 1 thread",
+        "uniform (baseline), 1 thread",
+    ]
+    assert made["threads"] == [2, 1] and made["best_threads"] in (1, 2)
     assert "Load it with threads=" in run("bench", scheduled, *arguments).stdout
-    assert "Load it with threads=" not in run("bench", scheduled, "--runs", 1).stdout
+    assert "Load it with threads=" not in run("bench", scheduled, "--calls", 1).stdout
     assert fewest_threads({4: 9.0, 2: 9.9, 1: 12.0}) == 2
     assert fewest_threads({4: 8.0, 2: 9.9, 1: 12.0}) == 4
 
@@ -172,6 +178,6 @@ def test_threads_that_bench_cannot_time(arguments: tuple[str, ...], told: str, s
 
 
 def test_bench_prints_a_table_and_warns_of_a_dense_artifact(compiled_layer: Path) -> None:
-    result = run("bench", compiled_layer, "--runs", 1)
-    assert "dense onnxruntime" in result.stdout
+    result = run("bench", compiled_layer, "--calls", 1)
+    assert "dense (default)" in result.stdout
     assert "is not calibrated" in result.stderr

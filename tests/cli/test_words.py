@@ -39,15 +39,18 @@ UNKIND = (
 )
 
 NEEDED = {
-    "bench": [("A", "--runs", "1")],
+    "bench": [
+        ("A", "--calls", "1"),
+        ("A", "--calls", "1", "--control-hz", "1"),
+        ("A", "--calls", "1", "--trajectories", "calls.npz"),
+        ("A", "--calls", "1", "--checkpoint", "policy.ckpt"),
+    ],
     "calibrate": [("A", "-t", "calls.npz", "--max-minutes", "0.001")],
-    "compare": [("A", "-t", "calls.npz", "--strategies", "", "--calls", "1")],
     "convert": [("policy.ckpt", "-o", "out")],
     "distill": [("A", "-t", "calls.npz", "--updates", "1", "--max-minutes", "0.001")],
     "doctor": [("A",)],
     "inspect": [("A",), ("A", "--output", "out.html"), ("A", "--plot", "plan.png")],
-    "push": [("A", "org/name", "--dry-run", "--runs", "1")],
-    "realtime": [("A", "--control-hz", "1", "--runs", "1")],
+    "push": [("A", "org/name", "--dry-run")],
     "reuse-tokens": [("A", "-t", "calls.npz", "--calls", "2")],
     "serve": [
         ("A", "--control-hz", "1", "--port", "0", "--margin-ticks", "0"),

@@ -31,8 +31,9 @@ from ..measure.points import Comparison, MeasuredPoint
 from ..measure.timer import Timer
 from ..pool import Pool, Work, artifact_elsewhere, opened_pool, place_of
 from ..runtimes.open import open_runtime
-from ..runtimes.policy import CompiledPolicy
+from ..runtimes.policy import CompiledPolicy, require_plan
 from ..runtimes.random_calls import random_noise
+from ..runtimes.runtime import Runtime
 from ..trajectories.episodes import Episode
 from .budget import cells_of, goal_of, with_plans
 from .calls import FRACTION, LARGEST, Calls, Split, digest_of, load_episodes, sample_calls, split_episodes
@@ -88,6 +89,9 @@ def compare(
     progress: Progress = lambda what, done, total: None,
     ray: str | None = None,
     resume: bool = False,
+    plans: Sequence[str] = (),
+    runtime: str = "onnxruntime",
+    device: str | None = None,
 ) -> Comparison:
     """Measure plans against each other. Searches that are done are kept in the artifact's directory until the end.
 
@@ -100,7 +104,7 @@ def compare(
         others: artifacts of the same policy, for instance with other samplers; all their plans take part.
         calls: held-out calls, at most.
         learned: calls that strategies learn from, at most.
-        threads: how many threads onnxruntime uses.
+        threads: how many threads the runtime uses.
         seed: the seed of the split, the calls, the noise and the searches.
         intervals: of a search, at most; None for the strategy's own number.
         max_minutes: of a search, about: what it has found by then takes part, and a warning says so. A strategy that
@@ -112,6 +116,10 @@ def compare(
             ``ttscompile.calibrate``; held-out calls are timed in this process. None does everything here.
         resume: go on after the searches that an interrupted comparison had done, with the same arguments but for
             strategies, sparsities, other artifacts and held-out calls; begins anew if none was.
+        plans: of the artifact, and of others where they have one of this name, which take part beside the dense one;
+            all where none is named.
+        runtime: that executes the plans.
+        device: see ``load``.
 
     Raises:
         ClusterError: the cluster cannot be reached, or is gone; what was done before can be resumed.
@@ -119,12 +127,15 @@ def compare(
             nothing to resume with these arguments.
         TrajectoryError: the recordings do not fit the policy.
         ArtifactError: an artifact cannot be opened.
+        IllegalPlanError: the artifact has no plan of this name.
     """
     calls, learned = integer(calls, "calls", CalibrationError, 1), integer(learned, "learned", CalibrationError, 2)
     threads, seed = integer(threads, "threads", CalibrationError, 1), integer(seed, "seed", CalibrationError)
     if intervals is not None:
         intervals = integer(intervals, "intervals", CalibrationError, 1)
     artifact = load_artifact(path)
+    for plan in plans:
+        require_plan(artifact, plan)
     spec = artifact.manifest.spec
     budgets = {one: cells_of(goal_of(target_sparsity=one), artifact.manifest, False) for one in sparsities}
     compared: dict[str, Artifact] = {}
@@ -190,7 +201,8 @@ def compare(
             f"{', '.join(fitted)} fits corrections of {features} features from at most {learned} calls: its points are"
             " far worse than they would be after a calibration. Let it learn from more."
         )
-    entrants = _enter(artifact, found, compared, threads)
+    opened = partial(open_runtime, runtime=runtime, threads=threads, device=device)
+    entrants = _enter(artifact, found, compared, plans, opened)
     chosen = sample_calls(episodes, split.validation, calls, seed)
     points, yardsticks = _measure(artifact, entrants, episodes, chosen, seed, threads, progress)
     searches.end()
@@ -252,21 +264,29 @@ def _of_schedules(task: Task) -> Task:
 
 
 def _enter(
-    artifact: Artifact, found: Mapping[tuple[str, float], Found], others: Mapping[str, Artifact], threads: int
+    artifact: Artifact,
+    found: Mapping[tuple[str, float], Found],
+    others: Mapping[str, Artifact],
+    plans: Sequence[str],
+    opened: Callable[[Artifact], Runtime],
 ) -> list[Entrant]:
     """Everything that takes part: the artifact's own plans, those of strategies, and those of other artifacts."""
+
+    def of(one: Artifact) -> list[str]:
+        return [DENSE, *(name for name in one.manifest.plans if name in plans or not plans)]
+
     named = {f"{strategy} {sparsity:g}": one for (strategy, sparsity), one in found.items()}
     whole = with_plans(artifact, named)
-    policy = CompiledPolicy(whole, open_runtime(whole, "onnxruntime", threads))
-    entrants = [Entrant("this artifact", name, policy, name, True) for name in (DENSE, *artifact.manifest.plans)]
+    policy = CompiledPolicy(whole, opened(whole))
+    entrants = [Entrant("this artifact", name, policy, name, True) for name in of(artifact)]
     for strategy, sparsity in found:
         entrants.append(Entrant(strategy, f"{sparsity:g}", policy, f"{strategy} {sparsity:g}", True))
     sampler = artifact.manifest.spec.sampler
     for name, other in others.items():
-        theirs = other.manifest.spec.sampler
-        paired = (theirs.stochastic, theirs.name, theirs.steps) == (sampler.stochastic, sampler.name, sampler.steps)
-        opened = CompiledPolicy(other, open_runtime(other, "onnxruntime", threads))
-        entrants += [Entrant(name, plan, opened, plan, paired) for plan in (DENSE, *other.manifest.plans)]
+        own = other.manifest.spec.sampler
+        paired = (own.stochastic, own.name, own.steps) == (sampler.stochastic, sampler.name, sampler.steps)
+        theirs = CompiledPolicy(other, opened(other))
+        entrants += [Entrant(name, plan, theirs, plan, paired) for plan in of(other)]
     return entrants
 
 

@@ -14,7 +14,6 @@ Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 MOST = 1_000_000
 """Of whatever is counted: none of it is of use beyond, and all of it fits a machine."""
 
-MOST_RUNS = 10_000
 MOST_THREADS = 1024
 """onnxruntime makes as many as it is told."""
 MOST_SEED = 2**63 - 1
@@ -45,11 +44,6 @@ def several_threads_option(help: str) -> Decorator:
         return tuple(dict.fromkeys(number(part.strip(), option, context) for part in value.split(",")))
 
     return click.option("--threads", type=ANY_TEXT, default="1", show_default=True, callback=parsed, help=help)
-
-
-def runs_option(help: str, default: int = 20) -> Decorator:
-    """``--runs``."""
-    return count_option("--runs", help, default=default, most=MOST_RUNS)
 
 
 def together(*options: Decorator) -> Decorator:

@@ -1,4 +1,4 @@
-"""Points of action error against latency, from what ``ttscompile compare --json`` printed."""
+"""Points of action error against latency, from what ``ttscompile bench -t --json`` printed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..errors import ReportError
 from ..measure.points import Point
 
 MAX_BYTES = 16 * 2**20
-_REMEDY = "Give what 'ttscompile compare ... --json' printed."
+_REMEDY = "Give what 'ttscompile bench DIRECTORY -t FILE... --json' printed."
 
 Compared = tuple[tuple[Point, ...], dict[str, float]]
 """Points and yardsticks of a comparison."""
@@ -22,7 +22,7 @@ def read_comparison(path: Path) -> Compared:
     """Points and yardsticks of a comparison.
 
     Raises:
-        ReportError: the file is not what ``ttscompile compare --json`` prints.
+        ReportError: the file is not what ``ttscompile bench -t --json`` prints.
     """
     require_path(path, ReportError, _REMEDY)
     try:
@@ -30,6 +30,7 @@ def read_comparison(path: Path) -> Compared:
             document: Any = parse_json(file.read(MAX_BYTES + 1), MAX_BYTES)
     except (OSError, ValueError) as error:
         raise ReportError(f"{path}: no JSON document: {error}. {_REMEDY}") from error
+    document = document.get("comparison") if isinstance(document, dict) else None
     document = document if isinstance(document, dict) else {}
     points: Any = document.get("points")
     yardsticks = document.get("yardsticks", {})
@@ -38,8 +39,8 @@ def read_comparison(path: Path) -> Compared:
     good = good and all(map(_is_number, [*(p.get("latency_ms") for p in points), *yardsticks.values()]))
     if not good:
         raise ReportError(
-            f"{path}: expected an object with 'points', which have error and latency_ms, and with 'yardsticks'; found"
-            f" {sorted(map(str, document))[:8]}. {_REMEDY}"
+            f"{path}: expected a 'comparison' with 'points', which have error and latency_ms, and with 'yardsticks';"
+            f" found {sorted(map(str, document))[:8]}. {_REMEDY}"
         )
     found = (
         Point(str(p.get("series", "")), str(p.get("name", "")), float(p["error"]), float(p["latency_ms"]))
