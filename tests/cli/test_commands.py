@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -59,6 +60,21 @@ def test_help_has_a_whole_line_for_each_command_in_the_order_of_use(
     assert {name for name, _ in listed} == set(main.commands)
     assert all(what.endswith((".", "?")) and not what.endswith("...") for _, what in listed), "cut off"
     assert [name for name, _ in listed][:4] == ["doctor", "convert", "calibrate", "distill"]
+
+
+def test_every_option_is_in_one_list_of_the_help_and_says_what_it_does() -> None:
+    for name, command in main.commands.items():
+        options = [one for one in command.params if isinstance(one, click.Option)]
+        known = {one.name for one in options}
+        for section in getattr(command, "sections", ()):
+            assert {*section.options, *section.needs} <= known, f"{name}: {section.title}"
+        told = CliRunner().invoke(main, [name, "--help"]).stdout
+        lines = [line.split() for line in told.splitlines() if line.startswith("  -")]
+        for option in options:
+            word = max(option.opts, key=len)
+            assert sum(word in (one.rstrip(",") for one in line[:2]) for line in lines) == 1, f"{name} {word}"
+            first = (option.help or "").partition(" ")[0]
+            assert first[:1].isupper() and first not in ("Of", "In", "To", "Its"), f"{name} {word}: {option.help}"
 
 
 def test_convert_says_what_it_made_and_explains_on_standard_error(one_layer_checkpoint: Path, tmp_path: Path) -> None:

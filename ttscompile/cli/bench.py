@@ -22,6 +22,7 @@ from ttscompile.cli.options import (
     json_option,
     loop_options,
     names_option,
+    number_option,
     seed_option,
     several_threads_option,
 )
@@ -41,7 +42,7 @@ MOST_CALLS = 10_000
 
 SECTIONS = (
     Section("Beside the original network", ("checkpoint", "encoders"), ("checkpoint",)),
-    Section("In a control loop", ("control_hz", *LOOP_OPTIONS, "jitter_seconds"), ("control_hz",)),
+    Section("In a control loop", ("control_hz", *LOOP_OPTIONS, "jitter"), ("control_hz",)),
     Section("Action error, on recorded episodes", ("trajectories", "sources", "picture"), ("trajectories",)),
 )
 
@@ -68,10 +69,10 @@ SECTIONS = (
     "--runtime",
     ("onnxruntime", "torch"),
     default="onnxruntime",
-    help="What executes the plans: onnxruntime, or torch, which needs the extra 'compile'. Of both, with a comma"
-    " between them, each does.",
+    help="Execute the plans with onnxruntime, or with torch, which needs the extra 'compile'; or with each of them:"
+    " onnxruntime,torch.",
 )
-@click.option("--device", type=TEXT, help="Device that torch computes on, as it calls it: cpu, cuda.")
+@click.option("--device", type=TEXT, help="Have torch compute on this device, as it calls it: cpu, cuda.")
 @click.option(
     "--precision",
     type=TEXT,
@@ -93,20 +94,18 @@ SECTIONS = (
 @click.option(
     "--encoders",
     type=FOLDER,
-    help="Folder that 'ttscompile convert' was given by the same name with the checkpoint, if it was.",
+    help="Folder that 'ttscompile convert' was given by the same name, if it was.",
 )
-@click.option(
+@number_option(
     "--control-hz",
-    type=RATE,
-    help="Say which plans keep up with a control loop of this rate in Hz. The exit status is 1 if none does.",
+    RATE,
+    "Say which plans keep up with a control loop of this rate in Hz. The exit status is 1 if none does.",
 )
 @loop_options
-@click.option(
+@number_option(
     "--jitter",
-    "jitter_seconds",
-    type=SECONDS,
-    help="Also run a loop of 200 Hz for so many seconds, alone and then beside the default plan, and say how late it"
-    " wakes.",
+    SECONDS,
+    "Also run a loop of 200 Hz for so many seconds, alone and then beside the default plan, and say how late it wakes.",
 )
 @trajectories_options(
     required=False, what="Hold the actions of the plans against those of the dense policy on these recorded episodes."
@@ -129,7 +128,7 @@ def bench(
     checkpoint: Path | None,
     encoders: Path | None,
     control_hz: float | None,
-    jitter_seconds: float | None,
+    jitter: float | None,
     trajectories: tuple[Path, ...],
     sources: Sources,
     picture: Path | None,
@@ -148,7 +147,7 @@ def bench(
     require_recordings(trajectories)
     artifact, console = artifacts[THIS], progress()
     ways = [_way(one, runtime, device, precision, number) for one in runtime for number in threads]
-    loop = None if control_hz is None else Loop(control_hz, ExecutorSettings(**settings), jitter_seconds)
+    loop = None if control_hz is None else Loop(control_hz, ExecutorSettings(**settings), jitter)
     with console.status("loading"):
         entered = contestants(artifacts, plans, ways)
         if loop is not None:

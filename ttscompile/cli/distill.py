@@ -18,12 +18,14 @@ from ttscompile.cli.types import MINUTES, TEXT
 @click.command(cls=FilesCommand)
 @artifact_argument
 @trajectories_options()
-@click.option("--plan", type=TEXT, default="schedule", show_default=True, help="Schedule to distil.")
-@count_option("--rank", "Of the change of each matrix.", default=16)
-@count_option("--updates", "Of the weights, if there is time.", default=600)
-@seed_option("Of the split, the noise and the training; take that of the calibration.")
-@click.option("--max-minutes", type=MINUTES, default=15.0, show_default=True, help="All in all, about.")
-@click.option("--device", type=TEXT, help="Device to train on, as torch calls it: cuda, mps. Otherwise the CPU.")
+@click.option("--plan", type=TEXT, default="schedule", show_default=True, help="Train weights for this schedule.")
+@count_option("--rank", "Rank of the low-rank update to each weight matrix.", default=16)
+@count_option("--updates", "Update the weights so many times, if there is time.", default=600)
+@seed_option("Seed of the split, the noise and the training; take that of the calibration.")
+@click.option("--max-minutes", type=MINUTES, default=15.0, show_default=True, help="End after so many minutes, about.")
+@click.option(
+    "--device", type=TEXT, help="Train on this device, as torch calls it: cuda, mps. Without this option it is the CPU."
+)
 @click.option("--resume", is_flag=True, help="Go on where a distillation that was interrupted stopped.")
 @json_option
 def distill(

@@ -73,7 +73,7 @@ class Loop:
     Attributes:
         control_hz: its rate.
         settings: of the executor.
-        jitter_seconds: for which a loop is run to see how late it wakes; None for not at all.
+        jitter: seconds for which a loop is run to see how late it wakes; None for not at all.
     """
 
     control_hz: float

@@ -20,16 +20,16 @@ from ttscompile.cli.types import FILE, TEXT
     "evaluations",
     type=FILE,
     multiple=True,
-    help="What examples/evaluation/evaluate.py --json printed of this artifact: success figures for the card. May be"
-    " repeated.",
+    help="Put the success figures on the card that examples/evaluation/evaluate.py --json printed of this artifact into"
+    " this file. May be repeated.",
 )
 @click.option(
     "--license",
     "licence",
     type=TEXT,
-    help="Licence of the base, as the hub writes it (apache-2.0), where the base did not say one to convert.",
+    help="Name this licence of the base, as the hub writes it (apache-2.0), where the base did not say one to convert.",
 )
-@click.option("--private", is_flag=True, help="A repository that is made now is private.")
+@click.option("--private", is_flag=True, help="Make the repository private, if it is made now.")
 @click.option("--dry-run", is_flag=True, help="Print the card, and upload nothing.")
 def push(
     directory: Path,

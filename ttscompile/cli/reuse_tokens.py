@@ -27,15 +27,15 @@ from ttscompile.report.facts import told_reuse
 
 @click.command("reuse-tokens", cls=FilesCommand)
 @artifact_argument
-@trajectories_options(required=False)
-@count_option("--calls", "To choose on, and as many to judge on, at most.", default=256, least=2)
+@trajectories_options(required=False, what="Choose when a token is computed on these recorded episodes.")
+@count_option("--calls", "Choose on so many calls, and judge on as many, at most.", default=256, least=2)
 @click.option(
     "--max-action-error",
     type=ERROR,
-    help="Mean difference of the executed actions, in their units, that is allowed. Without this option it is a tenth"
+    help="Allow so large a mean difference of the executed actions, in their units. Without this option it is a tenth"
     " of what other noise changes.",
 )
-@seed_option("Of the division of the episodes and of the noise.")
+@seed_option("Seed of the division of the episodes and of the noise.")
 @click.option("--off", is_flag=True, help="Compute all tokens again, as before.")
 @json_option
 def reuse_tokens(

@@ -26,16 +26,17 @@ from ttscompile.report.facts import told_warm
 
 @click.command("warm-start", cls=FilesCommand)
 @artifact_argument
-@trajectories_options(required=False)
-@count_option("--calls", "To measure, at most.", default=512, least=2)
+@trajectories_options(required=False, what="Measure on these recorded episodes.")
+@count_option("--calls", "Measure so many calls, at most.", default=512, least=2)
 @click.option(
     "--max-distance",
     type=ERROR,
     default=1.4,
     show_default=True,
-    help="How far actions may be from those of a dense call with other noise; 1 is how far two dense calls are apart.",
+    help="Allow actions to be so far from those of a dense call with other noise; 1 is how far two dense calls are"
+    " apart.",
 )
-@seed_option("Of the noise.")
+@seed_option("Seed of the noise.")
 @click.option("--off", is_flag=True, help="Forget what was settled.")
 @json_option
 def warm_start(
