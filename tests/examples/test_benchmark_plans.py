@@ -15,8 +15,8 @@ import ttscompile
 from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile import Source
 from ttscompile.artifact import load_artifact
-from ttscompile.cli.timing import Contestant, Measurement
 from ttscompile.errors import RuntimeUnavailableError
+from ttscompile.report.timing import Contestant, Measurement
 from ttscompile.runtimes.onnxruntime.sessions import Bound, open_sessions
 from ttscompile.runtimes.onnxruntime.workspace import Workspace
 from ttscompile.runtimes.random_calls import random_calls
