@@ -92,7 +92,8 @@ def time_alone(artifact: Path, checkpoint: Path, runs: int) -> list[Measurement]
 
 def calibration_table(result: CalibrationResult) -> Table:
     """The plans that calibration judged, on the episodes that it did not learn from."""
-    title = f"distance from the original, and error of the actions, on {result.calls['validation']} calls of the dense policy that were held out"
+    calls = f"{result.calls['validation']} calls of the dense policy that were held out"
+    title = f"distance from the original, and error of the actions, on {calls}"
     table = Table(title=title)
     table.add_column("plan")
     for column in ("distance", "mean, px", "90th percentile, px", "cells reused", "FLOPs saved"):

@@ -347,6 +347,8 @@ def test_bench_prints_the_same_as_a_table_and_as_json(
         ("five", "dense"),
     ]
     assert points[1]["error"] > points[0]["error"] == 0
+    assert points[2]["error"] is None  # another sampler takes other noise
+    assert points[1]["distance"] > points[0]["distance"] == 0
     identity, other = (load_artifact(path).manifest.identity for path in (planned, other_sampler))
     assert record["identity"] == identity
     assert record["with"] == [{"path": str(other_sampler), "identity": other}]
@@ -360,14 +362,15 @@ def test_bench_prints_the_same_as_a_table_and_as_json(
     assert "folder" in lost.stderr
     shown = runner.invoke(main, ["bench", *arguments])
     assert shown.exit_code == 0, shown.stderr
-    assert "* Another sampler" in shown.stdout
-    assert "Yardstick: two dense calls are apart" in shown.stdout
+    words = " ".join(shown.stdout.split())
+    assert "another sampler takes other noise, and has none" in words
+    assert "in which two calls of the original are" in words
     assert f"five: identity {other[:12]}" in shown.stdout
 
 
 def test_bench_judges_the_plans_that_are_named(planned: Path, other_sampler: Path, recording: Path) -> None:
     twins = shutil.copytree(planned, planned.parent / "three")
-    update_calibration(twins, None, {name: uniform_plan(10, 6, 5) for name in ("half", "same")}, "half", {})
+    store_schedules(twins, None, {name: uniform_plan(10, 6, 5) for name in ("half", "same")}, "half", {})
     words = ["bench", str(twins), "-t", str(recording), "--with", str(planned), "--calls", "2", "--json"]
 
     def judged(*more: str) -> list[tuple[str, str]]:

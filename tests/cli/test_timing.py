@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from tests.passes.specs import toy_spec
+from tests.plans import store_schedules
 from ttscompile import Affine, Noise
 from ttscompile.artifact.load import load_artifact
-from ttscompile.artifact.write import update_calibration
 from ttscompile.cli.contestants import Way, _different_statistics, contestants
 from ttscompile.core.lattice import Source, uniform_plan
 from ttscompile.measure.units import ms
@@ -56,7 +56,7 @@ def test_plans_that_follow_each_other_share_no_memory(toy_compiled: Path, tmp_pa
     rollout = np.full((5, 5), Source.ROLLOUT, np.int8)
     rollout[0] = Source.COMPUTE
     plans = {"a": uniform_plan(5, 5, 2), "b": uniform_plan(5, 5, 3), "c": uniform_plan(5, 5, 4), "reads": rollout}
-    update_calibration(calibrated, None, plans, "a", {"strategy": "tts"})
+    store_schedules(calibrated, None, plans, "a", {"strategy": "tts"})
     entered = contestants({"": load_artifact(calibrated)}, (), [Way()])
     assert [one.plan for one in entered] == ["dense", "a", "b", "c", "reads"]
     dense, a, b, c, reads = (one.policy for one in entered)

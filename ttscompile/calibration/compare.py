@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -87,7 +88,7 @@ def compare(
         strategies: names; each finds a plan for each sparsity.
         sparsities: shares of the cells to reuse.
         observation: see ``ttscompile.calibrate``.
-        others: artifacts of the same policy, for instance with other samplers; all their plans take part.
+        others: artifacts of the same policy, for instance with other samplers; their plans take part.
         calls: held-out calls, at most.
         learned: calls that strategies learn from, at most.
         threads: how many threads the runtime uses.
@@ -103,7 +104,7 @@ def compare(
         resume: go on after the searches that an interrupted comparison had done, with the same arguments but for
             strategies, sparsities, other artifacts and held-out calls; begins anew if none was.
         plans: of the artifact, and of others where they have one of this name, which take part beside the dense one;
-            all where none is named.
+            all where none is named. ``NAME@PRECISION`` is one in another precision.
         runtime: that executes the plans.
         device: see ``load``.
 
@@ -120,8 +121,8 @@ def compare(
     if intervals is not None:
         intervals = integer(intervals, "intervals", CalibrationError, 1)
     artifact = load_artifact(path)
-    for plan in plans:
-        require_able(runtime, artifact, artifact.plan(plan))  # refused before anything is searched for
+    for name in plans:
+        require_able(runtime, artifact, artifact.plan(name))  # refused before anything is searched for
     compared: dict[str, Artifact] = {}
     for other in others:
         name = other.resolve().name
@@ -142,8 +143,9 @@ def compare(
     with opened_pool(ray) as pool:
         state = StateFile(path, settings, COMPARISON, needed=False)
         limits = learned, learned
-        on = {"runtime": runtime, "device": None if device is None else torch.device(device)}
-        trials = Trials.of(artifact, episodes, state, seed=seed, pool=pool, limits=limits, observations=calls, **on)
+        on = None if device is None else torch.device(device)
+        how: dict[str, Any] = {"limits": limits, "observations": calls, "device": on, "runtime": runtime}
+        trials = Trials.of(artifact, episodes, state, seed=seed, pool=pool, **how)
         manifest = trials.executor.view.manifest
         budgets = {one: cells_of(goal_of(target_sparsity=one), manifest, False) for one in sparsities}
         wished = [(strategy_of(name).name, sparsity) for name in strategies for sparsity in budgets]
@@ -154,9 +156,9 @@ def compare(
         missing = [wish for wish in names if searches.known(*wish) is None]
         if missing:
             progress("dense calls to learn from", 0, 1)
-            how, task = (intervals, 60 * max_minutes, correct), _of_schedules(trials.executor, trials.calls, seed)
-            given = *where(trials.executor), trials.calls, seed, how
-            outcomes = pool.map(Work(partial(_searched, task, how), _searched_elsewhere, given), missing)
+            effort, task = (intervals, 60 * max_minutes, correct), _of_schedules(trials.executor, trials.calls, seed)
+            given = *where(trials.executor), trials.calls, seed, effort
+            outcomes = pool.map(Work(partial(_searched, task, effort), _searched_elsewhere, given), missing)
             for number, wish in enumerate(missing, len(names) - len(missing)):
                 progress(f"search: {names[wish]}", number, len(names))
                 searches.keep(*wish, next(outcomes))

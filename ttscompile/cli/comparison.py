@@ -72,8 +72,8 @@ def _threads(found: Comparison) -> str:
 def print_comparison(found: Comparison, output: Console) -> None:
     """The comparison as a table, and what is compared."""
     efficient = found.efficient()
-    head = ("", "plan", "distance", "95 %", "error", "90th pct.", "ms a call", "quartiles", "GFLOP", "reused", "frontier")
-    made = table(*head)
+    scored = ("", "plan", "distance", "95 %", "error", "90th pct.")
+    made = table(*scored, "ms a call", "quartiles", "GFLOP", "reused", "frontier")
     for p in found.points:
         made.add_row(
             p.series,

@@ -106,9 +106,7 @@ def contestants(artifacts: Mapping[str, Artifact], plans: Sequence[str], ways: S
 
 def _goes_on(artifact: Artifact, plan: Plan) -> bool:
     """Whether what a call of it computes depends on the calls before."""
-    return (
-        plan.otherwise is not None or plan.tokens is not None or reads_earlier_calls(view_of(artifact, plan), plan)
-    )
+    return plan.otherwise is not None or plan.tokens is not None or reads_earlier_calls(view_of(artifact, plan), plan)
 
 
 def originals(checkpoint: Path, encoders: Path | None, threads: int, artifact: Artifact) -> list[Contestant]:
@@ -138,7 +136,7 @@ def originals(checkpoint: Path, encoders: Path | None, threads: int, artifact: A
     torch.set_num_threads(threads)
     manifest, found = artifact.manifest, artifact.default.otherwise or artifact.default
     own = replace(manifest.spec.whole_horizon, sampler=manifest.sampler_of(found.loop), loops={})
-    made = []
+    made: list[Contestant] = []
     for spec in (saved, own):
         sampler = spec.sampler
         if made and sampler.name == saved.sampler.name and np.array_equal(sampler.timesteps, saved.sampler.timesteps):

@@ -172,7 +172,7 @@ def _frontier(artifact: Artifact, measured: Sequence[Measurement], compared: tup
         points = tuple(
             Point("this artifact", p.plan, max(float(judged[p.plan]["distance"]), 0.0), p.median_ms) for p in known
         )
-        text = "Distances from the calibration record, latencies measured now. ttscompile bench -t measures both on calls."
+        text = "Distances from the calibration record, latencies measured now. ttscompile bench -t measures both."
     if not any(point.error > 0 for point in points):
         return Section("Comparison", ("There is no distance to hold against a latency: calibrate the artifact first.",))
     best = efficient(points)
