@@ -73,7 +73,7 @@ def folder(one_layer_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory)
         recording.create_array(name, data=rng.uniform(100, 400, shape).astype(np.float32))
     recording.create_array("meta/episode_ends", data=np.array([20, 40]))
     point = {"series": "interval", "name": "0.8", "distance": 20.0, "latency_ms": 3.0}
-    (place / "comparison.json").write_text(json.dumps({"points": [point]}))
+    (place / "comparison.json").write_text(json.dumps({"comparison": {"points": [point]}}))
     for words in (
         ["convert", "policy.ckpt", "-o", "compiled"],
         ["calibrate", "compiled", "--trajectories", "calls.npz"],

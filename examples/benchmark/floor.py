@@ -15,9 +15,9 @@ import numpy as np
 
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.view import View, view_of
-from ttscompile.cli.timing import Contestant, Measurement
 from ttscompile.core.lattice import PlanArray, plan_flops
 from ttscompile.ir.pieces import block_name
+from ttscompile.report.timing import Contestant, Measurement
 from ttscompile.runtimes.instructions import instructions_of
 from ttscompile.runtimes.onnxruntime.idle_steps import WORTH
 from ttscompile.runtimes.onnxruntime.sessions import Bound, Sessions

@@ -34,11 +34,12 @@ from rounds import DENSE, EAGER, Effort, eager_contestant, measure_in_passes, ro
 import ttscompile
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.view import view_of
+from ttscompile.cli.contestants import original_policy
 from ttscompile.cli.output import identity_of, only_results_on_stdout, print_json, progress, results_console, run, table
-from ttscompile.cli.timing import Contestant, Measurement, original_policy, plan_contestant
 from ttscompile.core.lattice import PlanArray, dense_plan
 from ttscompile.core.plan import ORIGINAL
 from ttscompile.measure.machine import fingerprint, one_line
+from ttscompile.report.timing import Contestant, Measurement, plan_contestant
 from ttscompile.runtimes.random_calls import Observation, random_calls
 
 OURS, LONGER = "compiled", "compiled, longer loop"
@@ -282,7 +283,7 @@ def profile(of: Subject, one: Mapping[str, Measurement]) -> dict[str, float]:
     parts = {
         "computed cells (the floor)": floor_ms(of.plan, of.artifact, one[FLOOR]),
         f"{len(of.plan)} tails, sampler steps and stems": one[TAILS].median_ms,
-        "prologue": one[OURS].prologue_ms or 0.0,
+        "prologue": one[OURS].parts_ms["prologue"],
     }
     return parts | {"rest": one[OURS].median_ms - sum(parts.values())}
 

@@ -88,7 +88,7 @@ def test_an_interruption_of_the_imports_is_one_too(monkeypatch: pytest.MonkeyPat
         start()
 
 
-@pytest.mark.parametrize("command", ["calibrate", "compare"])
+@pytest.mark.parametrize("command", ["calibrate"])
 @pytest.mark.parametrize("before", [[], ["--traceback"]])
 def test_what_can_go_on_says_so(command: str, before: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(_: Path) -> None:
@@ -191,7 +191,7 @@ def test_a_signal_ends_a_command_and_leaves_nothing(
     archive = shutil.make_archive(str(tmp_path / "zipped"), "zip", toy_compiled)
     temporary = tmp_path / "temporary"
     temporary.mkdir()
-    words = [*COMMAND, "bench", archive, "--runs", "10000"]
+    words = [*COMMAND, "bench", archive, "--calls", "10000"]
     settings = {"env": {**os.environ, "TMPDIR": str(temporary)}, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(words, text=True, **settings) as bench:  # type: ignore[call-overload]
         end = time.monotonic() + 60

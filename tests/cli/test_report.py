@@ -101,7 +101,7 @@ def page(calibrated: Path, calls: Path, tmp_path_factory: pytest.TempPathFactory
     output = tmp_path_factory.mktemp("page") / "report.html"
     point = {"series": HOSTILE, "name": "0.9", "distance": 2.0, "latency_ms": 12.5}
     comparison = calls.with_name("comparison.json")
-    comparison.write_text(json.dumps({"points": [point]}))
+    comparison.write_text(json.dumps({"comparison": {"points": [point]}}))
     options = ("--verify", "--comparison", comparison)
     result = run(calibrated, "-o", output, "--trajectories", calls, *options)
     assert result.exit_code == 0, result.stderr
@@ -191,7 +191,7 @@ def test_hostile_names_stay_text(calibrated: Path) -> None:
     rung = Rung(HOSTILE, "failed", HOSTILE, unit=HOSTILE, remedy=HOSTILE, step=3, blocks=(1, 2))
     errors = ErrorMap(np.arange(2), np.full((2, 5), 1e-3), 1e-5, (HOSTILE,) * 5)
     found = Verification(HOSTILE, None, None, (rung,), 1.0, errors)
-    given = Given(Episode(HOSTILE, obs), None, verified(found), runs=1)
+    given = Given(Episode(HOSTILE, obs), None, verified(found), calls=1)
     page = render(build(artifact, policy, given))
     reader = Reader(page)
     assert "script" not in {tag for tag, _ in reader.tags}
@@ -250,7 +250,16 @@ def test_an_artifact_that_is_not_calibrated(toy_compiled: Path, tmp_path: Path) 
 
 
 @pytest.mark.parametrize(
-    "content", ["nothing", "[1]", '{"points": [{"error": "x"}]}', '{"points": [{"error": NaN, "latency_ms": 1}]}', "{}"]
+    "content",
+    [
+        "nothing",
+        "[1]",
+        '{"comparison": {"points": [{"error": "x"}]}}',
+        '{"comparison": {"points": [{"error": NaN, "latency_ms": 1}]}}',
+        '{"points": [{"error": 1, "latency_ms": 1}]}',
+        '{"comparison": null}',
+        "{}",
+    ],
 )
 def test_what_is_no_comparison_is_refused_and_nothing_is_written(
     content: str, calibrated: Path, tmp_path: Path
@@ -258,7 +267,7 @@ def test_what_is_no_comparison_is_refused_and_nothing_is_written(
     (tmp_path / "c.json").write_text(content)
     result = run(calibrated, "-o", tmp_path / "r.html", "--comparison", tmp_path / "c.json")
     assert result.exit_code == 2
-    assert "compare" in result.stderr
+    assert "Give what 'ttscompile bench DIRECTORY -t FILE... --json' printed" in result.stderr
     assert not (tmp_path / "r.html").exists()
 
 

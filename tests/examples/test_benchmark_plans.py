@@ -16,8 +16,8 @@ from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile import Source
 from ttscompile.artifact import load_artifact
 from ttscompile.artifact.view import view_of
-from ttscompile.cli.timing import Contestant, Measurement
 from ttscompile.errors import RuntimeUnavailableError
+from ttscompile.report.timing import Contestant, Measurement
 from ttscompile.runtimes.onnxruntime.sessions import Bound, Sessions
 from ttscompile.runtimes.onnxruntime.workspace import Workspace
 from ttscompile.runtimes.random_calls import random_calls

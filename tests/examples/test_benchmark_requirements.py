@@ -24,7 +24,7 @@ from requirements import (
 from rounds import DENSE, EAGER, Effort
 
 import ttscompile
-from ttscompile.cli.timing import Measurement
+from ttscompile.report.timing import Measurement
 
 MET = {"p50_ms": 20.0, "p99_ms": 24.0, "calls": 2000, "rss_mb": [100.0, 100.0], "before_load_mb": 60.0}
 MET |= {"growth_kb_a_call": 0.01, "repeatable": True}
@@ -41,7 +41,7 @@ def timed(
     """Medians of the right size; ``floor`` is what the plan's cells take at the speed of the blocks."""
 
     def one(label: str, ms: float, flops: float = 1.0) -> Measurement:
-        return Measurement(label, "", (ms,), 0.5, 0.0, flops=flops)
+        return Measurement(label, "", (ms,), {"prologue": 0.5}, flops=flops)
 
     cells = 4.0 * sum(of.artifact.manifest.flops.blocks)
     alone = one(FLOOR, floor, cells)

@@ -13,7 +13,7 @@ import torch
 import ttscompile
 from tests.once import Once
 from ttscompile.artifact.load import load_artifact
-from ttscompile.cli.timing import original_policy
+from ttscompile.cli.contestants import original_policy
 from ttscompile.core.spec import Noise
 from ttscompile.errors import CheckpointError, ObservationError
 from ttscompile.frontends import load_checkpoint_policy

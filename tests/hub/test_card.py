@@ -57,7 +57,7 @@ def test_a_card_of_a_calibrated_artifact_has_its_figures(
         "variants": [{**variant, "episodes": [{}] * 8}, {**variant, "identity": "0" * 64, "episodes": []}],
     }
     (tmp_path / "success.json").write_text(json.dumps(document))
-    words = ["push", str(calibrated), "org/name", "--dry-run", "--runs", "1", "--evaluation"]
+    words = ["push", str(calibrated), "org/name", "--dry-run", "--evaluation"]
     result = CliRunner().invoke(main, [*words, str(tmp_path / "success.json")])
     assert result.exit_code == 0, result.output
     record = load_artifact(calibrated).manifest.calibration

@@ -77,9 +77,9 @@ def test_trajectories_that_do_not_fit_give_status_2(sound: Path, tmp_path: Path)
 
 COMMANDS: list[tuple[Any, ...]] = [
     ("inspect",),
-    ("bench", "--runs", 1),
-    ("realtime", "--control-hz", 5, "--runs", 1, "--plan", "schedule"),
-    ("compare", "--strategies", "", "--sparsities", 0.8, "--calls", 2, "--trajectories", "RECORDING"),
+    ("bench", "--calls", 1),
+    ("bench", "--control-hz", 5, "--calls", 1, "--plan", "schedule"),
+    ("bench", "--calls", 2, "--trajectories", "RECORDING"),
     ("doctor",),
 ]
 

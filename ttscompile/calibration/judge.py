@@ -119,13 +119,13 @@ def further(score: Score, other: Score) -> tuple[float, float]:
 
 
 def timed(entrants: Sequence[tuple[Trials, Plan]], threads: int, rounds: int = TIMED) -> list[Times]:
-    """What calls of plans take with onnxruntime, of one stream, in turn: whatever else the machine does hits all.
+    """What calls of plans take, of one stream, in turn: whatever else the machine does hits all.
 
     Every call computes all of its frames. Weights that are in memory alone are timed as the original's. All trials are
     of the same episodes.
     """
     filed = [(trials, _filed(trials, plan)) for trials, plan in entrants]
-    opened = [open_runtime(trials.artifact, "onnxruntime", threads, plan=plan) for trials, plan in filed]
+    opened = [open_runtime(one.artifact, one.runtime, threads, _device(one), plan) for one, plan in filed]
     timer, sample = Timer(len(filed), WARM_UP), entrants[0][0].held_out
     for number in range(WARM_UP + rounds):
         stretch, row = sample.calls[number % len(sample.calls)].tolist()
@@ -139,6 +139,11 @@ def timed(entrants: Sequence[tuple[Trials, Plan]], threads: int, rounds: int = T
             timer.time(i, partial(runtime.predict, obs, noise, plan))
             runtime.reset()
     return timer.times
+
+
+def _device(trials: Trials) -> str | None:
+    """Where its runtime computes: onnxruntime on the CPU, whatever the device of what is learned."""
+    return str(trials.device) if trials.runtime == "torch" and trials.device is not None else None
 
 
 def _filed(trials: Trials, plan: Plan) -> Plan:
@@ -174,9 +179,9 @@ class _Answers:
         self._trials, self._sample = trials, sample
         self._plan = plan.exact if trials.fresh else plan
         self._spec = _loop_spec(trials, self._plan)
-        name, device = "onnxruntime", None
+        name, device = trials.runtime, _device(trials)
         if trials.fresh:
-            name = "reference"
+            name, device = "reference", None
         elif trials.device is not None and self._plan is self._plan.exact:
             name, device = "torch", str(trials.device)
         threads = 1 if name == "reference" else trials.threads

@@ -96,6 +96,7 @@ class Trials:
         bar: told how far it is.
         pool: where the original answers.
         device: where the network computes; None for the CPU.
+        runtime: that executes what is judged, where it can.
     """
 
     artifact: Artifact
@@ -109,6 +110,7 @@ class Trials:
     bar: Bar = field(default_factory=partial(Bar, shown=False))
     pool: Pool = field(default_factory=Here)
     device: torch.device | None = None
+    runtime: str = "onnxruntime"
     fresh: bool = False
     limits: tuple[int, int] = (FEWEST_CALLS, FEWEST_CALLS)
     observations: int = OBSERVATIONS
