@@ -61,8 +61,8 @@ def test_the_distance_of_known_answers(constant: Path, recording: Path, tmp_path
         apart += [np.abs(answers[i] - answers[j]).mean() for i, j in combinations(range(DRAWS), 2)]
     assert other_noise(trials) == pytest.approx(np.mean(apart), rel=1e-4)
     assert other_noise(trials) > 0.01
-    assert other_noise(trials) == other_noise(trials_of(constant, recording, tmp_path / "new", 7, most))
-    assert other_noise(trials) != other_noise(trials_of(constant, recording, tmp_path / "new", 8, most))
+    assert other_noise(trials) == other_noise(trials_of(constant, recording, tmp_path, 7, most))
+    assert other_noise(trials) != other_noise(trials_of(constant, recording, tmp_path, 8, most))
 
 
 def result(other_noise: float | None) -> CalibrationResult:

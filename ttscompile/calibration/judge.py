@@ -6,7 +6,7 @@ For draws i < j of noise of one observation, with x the plan's answers and y the
     h = |x_i - y_j| + |x_j - y_i| - |x_i - x_j| - |y_i - y_j|
 
 has the energy distance of the two distributions of answers as its mean, whether or not draw i of the plan has the noise
-of draw i of the original. Where it has, x_i is near y_i, the terms nearly cancel, and h varies little. ``distance`` is
+of draw i of the original, as long as it shares none with another draw. Where it has, x_i is near y_i, the terms nearly cancel, and h varies little. ``distance`` is
 the root of the mean of h over the mean of |y_i - y_j|: 0 where nothing can be told apart; the root grows as the error
 does. ``docs/decisions.md`` has the measurements behind norm and root.
 """
@@ -352,5 +352,5 @@ def _paired(trials: Trials, plan: Plan) -> bool:
     def kind(table: SamplerTable) -> tuple[str, int, bool]:
         return table.name, table.steps, table.stochastic
 
-    manifest = trials.artifact.manifest
-    return plan.otherwise is None and kind(manifest.sampler_of(plan.loop)) == kind(manifest.spec.sampler)
+    original = trials.executor.view.artifact.manifest.spec.sampler
+    return plan.otherwise is None and kind(trials.artifact.manifest.sampler_of(plan.loop)) == kind(original)

@@ -54,19 +54,13 @@ class Kept:
         """The best so far."""
         return self.plans[self.default]
 
-    def consider(self, proposal: Proposal, margin: float | None = None) -> bool:
-        """Judge a proposal on held-out episodes, and keep it if it holds.
-
-        Args:
-            proposal: see ``Proposal``.
-            margin: in place of the proposal's, if that is a number.
-        """
+    def consider(self, proposal: Proposal) -> bool:
+        """Judge a proposal on held-out episodes, and keep it if it holds."""
         trials = self.trials.holding(proposal)
         score = judge(trials, proposal.plan)
         reason = proposal.refusal(score, self.scores)
         if reason is None and not proposal.beside:
-            allowed = proposal.margin if proposal.margin is None or margin is None else margin
-            reason = self._no_better(trials, score, allowed)
+            reason = self._no_better(trials, score, proposal.margin)
         if reason is not None:
             self.refused[proposal.name] = reason
             return False

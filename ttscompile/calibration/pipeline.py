@@ -30,6 +30,7 @@ from .schedule import SCHEDULE, Schedule
 from .state import StateFile
 from .step_counts import FAST, SAFE
 from .strategies import DEFAULT, Strategy, strategy_of
+from .targets import REPEATS
 from .trials import Trials, base_of
 
 
@@ -173,7 +174,7 @@ def calibrate(
             _warn(trials, rows, chosen, corrects)
             kept, told = Kept(trials, anew=SCHEDULE in learn), dict[str, str]()
             for number, (row, proposer) in enumerate(made, 1):
-                _propose(row, proposer, kept, clock.until(number / len(made)), max_distance)
+                _propose(row, proposer, kept, clock.until(number / len(made)))
                 told[row.name] = proposer.told
             if not kept.learned:
                 why = " ".join(f"plan {name!r} {reason}" for name, reason in kept.refused.items())
@@ -203,7 +204,7 @@ def calibrate(
         return result
 
 
-def _propose(row: Row, proposer: Proposer, kept: Kept, clock: Clock, max_distance: float | None) -> None:
+def _propose(row: Row, proposer: Proposer, kept: Kept, clock: Clock) -> None:
     """Judge what a proposer proposes, one plan after the other.
 
     Raises:
@@ -213,7 +214,7 @@ def _propose(row: Row, proposer: Proposer, kept: Kept, clock: Clock, max_distanc
     try:
         proposal = next(proposals)
         while True:
-            held = kept.consider(proposal, max_distance)
+            held = kept.consider(proposal)
             proposal = proposals.send(held)
     except StopIteration:
         return
@@ -235,15 +236,11 @@ def _warn(trials: Trials, rows: Sequence[Row], strategy: Strategy, corrects: boo
             f"{short} of {len(trials.episodes)} episodes have fewer than {window} calls, and are left out where"
             f" {window} consecutive ones are learned from."
         )
-    if corrects and (count := trials.calls.count) < fewest:
+    rows_recorded = sum(trials.episodes[n].calls for n in trials.split.calibration)
+    if corrects and (count := REPEATS * rows_recorded) < fewest:
         bar.warn(
             f"the recordings give {count} calls to learn from, and a correction needs {fewest}: it may do harm where"
             " nothing was recorded. Record more episodes."
-        )
-    if trials.clock.left() < 0:
-        bar.warn(
-            f"{trials.clock.limit / 60:g} minutes were over when the original had answered the calls to learn from:"
-            f" {fewest} are needed. The search is the shortest there is; allow more time."
         )
 
 

@@ -153,6 +153,11 @@ class Trials:
             self._calls[window] = with_targets(
                 self.executor, name, calls, fewest, self.state, self.clock, self.bar, self.pool
             )
+            if self.clock.left() < 0:
+                self.bar.warn(
+                    f"{self.clock.limit / 60:g} minutes were over when the calls to learn from had been answered:"
+                    f" {fewest} are needed. The search is the shortest there is; allow more time."
+                )
         return self._calls[window]
 
     @property

@@ -1,0 +1,232 @@
+"""The one yardstick: what it says of answers that are known, and of plans that cannot share the original's noise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import erf
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ttscompile
+from tests.once import Once
+from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.manifest import StartRecord
+from ttscompile.calibration.calls import load_episodes
+from ttscompile.calibration.judge import Score, _Answers, further, judge, pairs, rooted, timed
+from ttscompile.calibration.proposer import Proposal
+from ttscompile.calibration.state import StateFile
+from ttscompile.calibration.trials import DRAWS, HELD_OUT, LEARNED, STRETCH, Trials
+from ttscompile.core.lattice import dense_plan, uniform_plan, whole_steps_plan
+from ttscompile.core.plan import Plan
+from ttscompile.errors import CalibrationError
+from ttscompile.samplers.flow import flow_matching_table
+
+from . import policies
+
+
+def trials_of(directory: Path, recording: Path, state: Path, **fields: Any) -> Trials:
+    artifact = load_artifact(directory)
+    episodes = load_episodes(artifact.manifest.spec, [recording], None)
+    return Trials.of(artifact, episodes, StateFile(state, {}), **fields)
+
+
+@pytest.fixture
+def trials(compiled: Path, recording: Path, tmp_path: Path) -> Trials:
+    return trials_of(compiled, recording, tmp_path)
+
+
+def distance(x: np.ndarray, y: np.ndarray) -> float:
+    h, apart = pairs(x, y)
+    return rooted(float(h.mean()), float(apart.mean()))
+
+
+def test_by_hand() -> None:
+    """Two draws of one call with one number each: |x0 - y1| + |x1 - y0| - |x0 - x1| - |y0 - y1|."""
+    x, y = np.array([[[0.0], [5.0]]]), np.array([[[1.0], [3.0]]])
+    h, apart = pairs(x, y)
+    assert (h.tolist(), apart.tolist()) == ([3 + 4 - 5 - 2], [2.0])
+    x, y = np.array([[[3.0, 4.0], [0.0, 0.0]]]), np.zeros((1, 2, 2))
+    root = (25 / 2) ** 0.5  # of the mean square of two numbers
+    assert pairs(x, y)[0].tolist() == [pytest.approx(0 + root - root - 0)]
+
+
+@pytest.mark.parametrize("paired", [True, False])
+def test_it_is_the_energy_distance_whether_or_not_noise_is_shared(paired: bool) -> None:
+    """Of two normal distributions a shift apart: 2 E|N(s, 2)| - 2 E|N(0, 2)|, over E|N(0, 2)|."""
+    draw, shift = np.random.default_rng(0), 1.5
+    y = draw.standard_normal((20000, 2, 1))
+    x = shift + (y if paired else draw.standard_normal(y.shape))
+    apart = 2 / np.pi**0.5
+    moved = apart * np.exp(-(shift**2) / 4) + shift * erf(shift / 2)
+    assert distance(x, y) == pytest.approx(((2 * moved - 2 * apart) / apart) ** 0.5, rel=0.02)
+
+
+def test_the_same_distribution_is_at_no_distance_and_another_spread_is_not() -> None:
+    draw = np.random.default_rng(1)
+    y, other = draw.standard_normal((2, 40000, 2, 3))
+    assert abs(distance(other, y)) < 0.05
+    assert distance(0.3 * other, y) > 0.3
+    assert distance(np.zeros_like(y), y) > 0.5  # one answer for all noise
+
+
+def test_shared_noise_makes_it_precise_and_the_root_grows_as_the_error_does() -> None:
+    draw = np.random.default_rng(2)
+    y, other = draw.standard_normal((2, 4000, 2, 16))
+    small, large, alone = (distance(x, y) for x in (y + 0.05, y + 0.1, other + 0.05))
+    assert large == pytest.approx(2 * small, rel=0.02)
+    spread = {name: pairs(x, y)[0].std() for name, x in (("shared", y + 0.05), ("own", other + 0.05))}
+    assert spread["shared"] < 0.01 * spread["own"]
+    assert abs(alone - small) < 0.1
+
+
+def test_dense_is_the_original_and_fewer_steps_are_further(trials: Trials) -> None:
+    dense = judge(trials, trials.artifact.plans["dense"])
+    assert dense.distance == pytest.approx(0.0, abs=1e-3)
+    assert dense.error == pytest.approx(0.0, abs=1e-6)
+    assert (dense.sparsity, dense.plans, dense.tokens) == (0.0, 1, 1.0)
+    two, five = (judge(trials, Plan(cells=whole_steps_plan(10, 6, steps))) for steps in ((0, 9), (0, 6, 7, 8, 9)))
+    assert (two.sparsity, five.sparsity) == (0.8, 0.5)
+    assert 0.01 < five.distance < 0.9 * two.distance
+    assert five.interval[0] < five.distance < five.interval[1]
+    assert two.flops_saved > five.flops_saved > 0.4
+    again = Plan(cells=whole_steps_plan(10, 6, (0, 9)))
+    assert two == judge(trials, again), "the same noise, whatever was judged before"
+    assert judge(trials, again, threads=1).milliseconds is not None
+    assert judge(trials, again, LEARNED) != two
+
+
+def test_errors_are_of_calls_with_the_same_noise(trials: Trials, compiled: Path) -> None:
+    """Call by call through the public interface."""
+    plan, policy, sample = Plan(cells=uniform_plan(10, 6, 5)), ttscompile.load(compiled), trials.held_out
+    errors = []
+    for stretch, row in sample.calls.tolist():
+        episode = trials.episodes[sample.stretches[stretch, 0]]
+        obs = {key: array[row : row + 1] for key, array in episode.observations.items()}
+        for draw in range(DRAWS):
+            noise = trials.noise(trials.artifact.manifest.spec, [trials.key(HELD_OUT, stretch, row, draw)])
+            made = []
+            for each in (plan, "dense"):
+                policy.reset()
+                made.append(policy.predict_action(obs, noise=noise, plan=each)["action"])
+            errors.append(np.abs(made[0] - made[1]).mean())
+    score = judge(trials, plan)
+    assert score.error == pytest.approx(np.mean(errors), rel=1e-3)
+    assert score.error_p90 == pytest.approx(np.quantile(errors, 0.9), rel=1e-3)
+
+
+def test_a_plan_that_reads_earlier_calls_makes_them_all_in_order(trials: Trials) -> None:
+    """All cells of step 1 of the call before: the answers differ from those of calls of their own."""
+    cells = dense_plan(10, 6)
+    cells[1:] = 2
+    reading = cells.copy()
+    reading[1] = 3
+    alternating = [judge(trials, Plan(cells=one)) for one in (cells, reading)]
+    # A schedule never reads what it never computes: repaired, the two are one plan.
+    assert alternating[0].distance == pytest.approx(alternating[1].distance, rel=1e-4)
+    assert alternating[1].plans == 1
+
+
+def test_limits_of_a_difference_are_over_episodes() -> None:
+    def score(*gaps: float) -> Score:
+        return Score(rooted(float(np.mean(gaps)), 1.0), (0, 0), None, None, 0, 0, 0, 1, gaps=(gaps, 1.0))
+
+    near, far = score(0.04, 0.04, 0.04), score(0.09, 0.09, 0.09)
+    assert further(far, near) == (pytest.approx(0.1), pytest.approx(0.1))
+    assert further(near, far) == (pytest.approx(-0.1), pytest.approx(-0.1))
+    mixed = score(0.01, 0.04, 0.25)
+    difference, limit = further(mixed, near)
+    assert difference == pytest.approx(0.1**0.5 - 0.2)
+    assert limit > difference
+
+
+def test_one_split_and_every_answered_call_has_one_before_it(trials: Trials) -> None:
+    for part, numbers in ((LEARNED, trials.split.calibration), (HELD_OUT, trials.split.validation)):
+        sample = trials.sample(part)
+        assert set(sample.episodes) <= set(numbers)
+        assert sample.answers.shape == (len(sample.calls), DRAWS, policies.HORIZON, policies.CHANNELS)
+        for number, first, last in sample.stretches.tolist():
+            assert 0 <= first < last < trials.episodes[number].calls
+            assert last - first < STRETCH
+        firsts, lasts = sample.stretches[sample.calls[:, 0], 1:].T
+        assert (firsts < sample.calls[:, 1]).all()
+        assert (sample.calls[:, 1] <= lasts).all()
+    assert not set(trials.learned.episodes) & set(trials.held_out.episodes)
+
+
+def test_answers_are_kept_and_go_on(compiled: Path, recording: Path, tmp_path: Path) -> None:
+    whole = trials_of(compiled, recording, tmp_path).held_out.answers
+    resumed = trials_of(compiled, recording, tmp_path)
+    assert resumed.state.load()
+    kept = resumed.state.get(f"{HELD_OUT} answers")
+    np.testing.assert_array_equal(kept["samples"].reshape(whole.shape), whole)
+    resumed.state.put(f"{HELD_OUT} answers", {**kept, "samples": kept["samples"][:3]})
+    np.testing.assert_array_equal(resumed.held_out.answers, whole)
+    forged = trials_of(compiled, recording, tmp_path)
+    forged.state.put(f"{HELD_OUT} answers", {**kept, "samples": np.zeros((1, 3), np.float32)})
+    with pytest.raises(CalibrationError, match="does not fit this calibration"):
+        _ = forged.held_out
+
+
+@pytest.fixture(scope="session")
+def flowing(once: Once) -> Path:
+    """A policy whose sampler tells what its sample is made of in the middle."""
+
+    def make(directory: Path) -> None:
+        spec = policies.spec()
+        sampler = replace(flow_matching_table(policies.STEPS), timesteps=spec.sampler.timesteps)
+        ttscompile.compile_denoiser(policies.Mixer(0).eval(), replace(spec, sampler=sampler), directory)
+
+    return once.compiled("flowing mixer", make)[0]
+
+
+def warm(trials: Trials, last: int) -> Proposal:
+    dense = trials.artifact.plans["dense"]
+    plan = Plan("rest", cells=dense_plan(last, 6), otherwise=dense)
+    return Proposal("warm", plan, starts={"rest": StartRecord("original", last)})
+
+
+def test_a_plan_that_begins_with_the_chunk_before_is_judged_in_both_ways(
+    flowing: Path, recording: Path, tmp_path: Path
+) -> None:
+    trials = trials_of(flowing, recording, tmp_path)
+    scores = {}
+    for last in (1, 9):
+        proposal = warm(trials, last)
+        held = trials.holding(proposal)
+        assert not held.fresh  # onnxruntime can do it
+        answers = list(_Answers(held, proposal.plan, held.held_out).all())
+        assert len(answers) == 2
+        distances = [distance(executed(made), executed(held.held_out.answers)) for made in answers]
+        scores[last] = judge(held, proposal.plan, threads=1)
+        assert scores[last].distance == pytest.approx(max(distances), rel=0.1)
+        assert distances[0] != distances[1]
+        assert scores[last].error is None
+        assert scores[last].sparsity == 0.0
+        assert (scores[last].milliseconds or 0.0) > 0
+    assert scores[9].distance < scores[1].distance
+    assert scores[1].flops_saved > scores[9].flops_saved
+
+
+def executed(samples: np.ndarray) -> np.ndarray:
+    """What is executed, as the network has it."""
+    return samples[:, :, 1:5].reshape(*samples.shape[:2], -1).astype(np.float64)
+
+
+def test_of_single_calls_nothing_begins_with_the_chunk_before(flowing: Path, tmp_path: Path) -> None:
+    path = tmp_path / "short.npz"
+    np.savez(path, obs=np.zeros((3, 2, 3), np.float32), episode_ends=[1, 2, 3])
+    trials = trials_of(flowing, path, tmp_path)
+    proposal = warm(trials, 3)
+    with pytest.raises(CalibrationError, match="on calls that have one before them"):
+        judge(trials.holding(proposal), proposal.plan)
+    assert judge(trials, trials.base).distance == pytest.approx(0.0, abs=1e-3)
+
+
+def test_calls_are_timed_in_turn(trials: Trials) -> None:
+    plans = [trials.artifact.plans["dense"], Plan(cells=uniform_plan(10, 6, 2))]
+    times = timed([(trials, plan) for plan in plans], 1, rounds=5)
+    assert [len(one.ms) for one in times] == [5, 5]
+    assert all(one.median > 0 for one in times)
