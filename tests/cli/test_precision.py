@@ -97,12 +97,12 @@ def test_a_part_cannot_stay_fp32_beside_fp32(tmp_path: Path) -> None:
 
 
 def test_bench_times_the_rival_in_fp32_and_names_the_precision(converted: tuple[Path, dict[str, Any]]) -> None:
-    result = run("bench", converted[0], "--runs", 2, "--plan", "dense", "--json")
+    result = run("bench", converted[0], "--runs", 2, "--plan", "full", "--json")
     labels = [contestant["label"] for contestant in json.loads(result.stdout)["contestants"]]
     assert labels == ["compiled, int8", "dense onnxruntime"]
-    entered = contestants(load_artifact(converted[0]), Compiled(), "dense", ["onnxruntime-dense"], None)
+    entered = contestants(load_artifact(converted[0]), Compiled(), "full", ["onnxruntime-dense"], None)
     ((obs, noise),) = random_calls(entered[0].spec, 1, 0)
     answers = [one.call(obs, noise)["action"] for one in entered]  # type: ignore[index]
-    expected = ttscompile.load(converted[0], precision="fp32").predict_action(obs, noise=noise, plan="dense")["action"]
+    expected = ttscompile.load(converted[0], plan="dense").predict_action(obs, noise=noise)["action"]
     np.testing.assert_array_equal(answers[1], expected)
     assert not np.array_equal(answers[0], expected)
