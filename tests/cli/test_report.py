@@ -181,8 +181,7 @@ def test_hostile_names_stay_text(calibrated: Path) -> None:
     spec = replace(manifest.spec, source={HOSTILE: HOSTILE}, sampler=replace(manifest.spec.sampler, name=HOSTILE))
     blocks = tuple(replace(block, kind=HOSTILE, reason=HOSTILE) for block in manifest.blocks)
     record = {HOSTILE: HOSTILE, "plans": {HOSTILE: SCORE, "other": HOSTILE}, "skipped": {HOSTILE: HOSTILE}}
-    record["precision"] = {"name": HOSTILE, "parts": {HOSTILE: HOSTILE, "step": [HOSTILE], "blocks": 0.5}}
-    record["distilled"] = {"plan": HOSTILE, "matrices": [HOSTILE], "before": {"error": HOSTILE}, "after": HOSTILE}
+    record |= {"told": {HOSTILE: HOSTILE, "weights": [HOSTILE]}, "learned": [HOSTILE, HOSTILE]}
     plans = {HOSTILE: manifest.plans["schedule"]}
     manifest = replace(manifest, spec=spec, blocks=blocks, plans=plans, default_plan=HOSTILE, calibration=record)
     artifact = replace(artifact, manifest=manifest, schedules={HOSTILE: artifact.schedules["schedule"]})

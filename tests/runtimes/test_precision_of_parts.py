@@ -16,6 +16,7 @@ from tests.lower.whole_call import Episode, inputs
 from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import Manifest
+from ttscompile.artifact.view import view_of
 from ttscompile.driver import transform
 from ttscompile.errors import LoweringError
 from ttscompile.ir.flops import graph_flops
@@ -53,8 +54,8 @@ def compiled(path: Path, loud: float = 0.0, **options: object) -> tuple[Manifest
 
 
 def operations(path: Path, piece: str) -> set[str]:
-    artifact = load_artifact(path)
-    return {node.op_type for node in onnx.load(artifact.onnx_path(piece), load_external_data=False).graph.node}
+    model = onnx.load(path / view_of(load_artifact(path)).onnx_file(piece), load_external_data=False)
+    return {node.op_type for node in model.graph.node}
 
 
 @pytest.mark.slow

@@ -233,11 +233,10 @@ def _made(manifest: Manifest, base: HubName | None) -> Section:
         goals = ("target_sparsity", "target_flops", "latency_ms", "max_action_error")
         asked = {k: budget[k] for k in goals if isinstance(budget, Mapping) and isinstance(budget.get(k), int | float)}
         words = " ".join(f"--{k.replace('_', '-')} {_word(v)}" for k, v in (asked | told).items())
+        learned = record.get("learned")
+        if isinstance(learned, list) and learned not in ([], ["schedule"]):
+            words += f" --learn {_word(','.join(map(str, learned)))}"
         lines.append(f"ttscompile calibrate DIR --trajectories CALLS {words}")
-    if manifest.weights:
-        trained = facts.distillation(record)
-        words = " ".join(f"--{key} {_word(trained[key])}" for key in ("plan", "rank", "updates") if key in trained)
-        lines.append(f"ttscompile distill DIR --trajectories CALLS {words}".rstrip())
     lines.append("ttscompile verify DIR")
     text = (
         f"With ttscompile {manifest.ttscompile_version}, by commands like these, from what the artifact records;"

@@ -34,6 +34,8 @@ from ttscompile.core.correction import no_correction
 from ttscompile.core.lattice import whole_steps_plan
 from ttscompile.core.plan import DENSE, Plan
 from ttscompile.errors import ArtifactError, CalibrationError, CalibrationFailedError
+from ttscompile.report import facts
+from ttscompile.report.card import card
 from ttscompile.runtimes.open import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.runtimes.reference.model import ReferenceModel
@@ -93,6 +95,17 @@ def test_the_artifact_gets_a_plan_that_is_nearer_to_the_dense_policy(distilled: 
     record = artifact.manifest.calibration
     assert record is not None
     assert record["plans"][NAME]["distance"] == result.plans[NAME].distance
+
+
+def test_people_are_told_that_it_is_another_network(distilled: Trained, scheduled: Path) -> None:
+    artifact = load_artifact(distilled[0])
+    record = artifact.manifest.calibration
+    assert record is not None
+    remarks = facts.remarks(record)
+    assert f"Learned, weights: 9 matrices of blocks were trained in {UPDATES} updates." in remarks
+    assert any("is another network" in remark for remark in remarks)
+    assert "--learn schedule,weights`" in card(artifact, "org/name", [], [], None)
+    assert "--learn" not in card(load_artifact(scheduled), "o/n", [], [], None)
 
 
 def test_all_other_plans_are_what_they_were(scheduled: Path, distilled: Trained) -> None:
