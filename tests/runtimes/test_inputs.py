@@ -241,7 +241,7 @@ def test_numbers_that_no_training_has_seen_are_refused(policy: CompiledPolicy, n
             actions(policy, noise=noise)
         values.flat[0] = kept
     with pytest.raises(ObservationError, match=r"prefix must be between .* when normalised"):
-        check_prefix(np.full((1, 1, 2), min(10 * number, 3.4e38), np.float32), 1, policy._manifest.spec, None)
+        check_prefix(np.full((1, 1, 2), min(10 * number, 3.4e38), np.float32), 1, policy._spec, None)
 
 
 def test_the_limit_is_the_limit_in_every_entry(policy: CompiledPolicy) -> None:
