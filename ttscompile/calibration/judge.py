@@ -6,9 +6,9 @@ For draws i < j of noise of one observation, with x the plan's answers and y the
     h = |x_i - y_j| + |x_j - y_i| - |x_i - x_j| - |y_i - y_j|
 
 has the energy distance of the two distributions of answers as its mean, whether or not draw i of the plan has the noise
-of draw i of the original, as long as it shares none with another draw. Where it has, x_i is near y_i, the terms nearly cancel, and h varies little. ``distance`` is
-the root of the mean of h over the mean of |y_i - y_j|: 0 where nothing can be told apart; the root grows as the error
-does. ``docs/decisions.md`` has the measurements behind norm and root.
+of draw i of the original, as long as it shares none with another draw. Where it has, x_i is near y_i, the terms nearly
+cancel, and h varies little. ``distance`` is the root of the mean of h over the mean of |y_i - y_j|: 0 where nothing can
+be told apart; the root grows as the error does. ``docs/decisions.md`` has the measurements behind norm and root.
 """
 
 from __future__ import annotations
