@@ -55,7 +55,7 @@ def frontier_of(points: list[Point], monkeypatch: pytest.MonkeyPatch) -> Figure:
     """The figure of a frontier, laid out."""
     drawn: list[Figure] = []
     monkeypatch.setattr(frontier, "write_picture", lambda figure, path: drawn.append(figure))
-    frontier.plot_frontier(points, sorted(points, key=lambda p: p.latency_ms), {}, Path(), "title")
+    frontier.plot_frontier(points, sorted(points, key=lambda p: p.latency_ms), Path(), "title")
     drawn[0].canvas.draw()
     return drawn[0]
 

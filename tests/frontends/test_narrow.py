@@ -109,7 +109,9 @@ def test_the_rest_of_the_prediction_is_the_original(payload: Build, save: Save, 
     artifact = load_artifact(folder)
     assert to_json(artifact.manifest.spec.whole_horizon) == to_json(original)
     # Of the original's FLOPs two thirds are left, and less where more than tokens counts.
-    assert artifact.manifest.flops.call(artifact.plans["dense"].cells, pruned=False) < 0.7 * program.dense_flops
+    dense = artifact.plans["dense"].cells
+    assert dense is not None
+    assert artifact.manifest.flops.call(dense, pruned=False) < 0.7 * program.dense_flops
 
     obs = np.random.default_rng(0).standard_normal((STREAMS, 2, 5), dtype=np.float32)
     rng = np.random.default_rng(3)

@@ -15,7 +15,7 @@ from tests.rounding import assert_equal_but_for_rounding
 from ttscompile import Noise, Source
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.core.lattice import uniform_plan
-from ttscompile.errors import ArtifactError, IllegalPlanError, ObservationError, RuntimeUnavailableError
+from ttscompile.errors import IllegalPlanError, ObservationError, RuntimeUnavailableError
 
 from .agreement import call_terms
 from .conftest import MakeArtifact
@@ -132,7 +132,7 @@ def test_a_schedule_that_a_module_cannot_have_is_refused(artifact: Artifact) -> 
 
 
 def test_an_unknown_plan_is_refused(artifact: Artifact) -> None:
-    with pytest.raises(ArtifactError, match="no schedule 'best'"):
+    with pytest.raises(IllegalPlanError, match="no plan 'best'"):
         ttscompile.to_module(artifact.path, "best")
 
 
