@@ -12,8 +12,9 @@ from torch import nn
 
 import ttscompile
 from ttscompile import Source
-from ttscompile.artifact.write import update_calibration
+from ttscompile.artifact.write import update_plans
 from ttscompile.core.lattice import PlanArray, uniform_plan
+from ttscompile.core.plan import Plan
 from ttscompile.core.spec import ORIGINAL, ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.conditioning import TokensDenoiser
@@ -134,4 +135,5 @@ def compile_with_plans(network: Network, directory: Path, sparsities: Sequence[f
 
 def store_plans(directory: Path, plans: Mapping[str, PlanArray]) -> None:
     """Give an artifact these schedules, the last of them as the default."""
-    update_calibration(directory, None, plans, list(plans)[-1], {"strategy": "benchmark"})
+    found = {name: Plan(cells=cells, repair=True) for name, cells in plans.items()}
+    update_plans(directory, found, list(plans)[-1], {"strategy": "benchmark"})

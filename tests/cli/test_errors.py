@@ -37,14 +37,13 @@ def test_a_file_that_is_no_checkpoint(no_checkpoint: Path) -> None:
     assert list(no_checkpoint.parent.iterdir()) == [no_checkpoint]
 
 
-@pytest.mark.parametrize("command", ["inspect", "bench", "calibrate", "distill"])
+@pytest.mark.parametrize("command", ["inspect", "bench", "calibrate"])
 @pytest.mark.parametrize("made", [False, True])
 def test_what_is_no_artifact(command: str, made: bool, tmp_path: Path) -> None:
     directory = tmp_path / "nothing"
     if made:
         directory.mkdir()
-    recorded = command in ("calibrate", "distill")
-    arguments = [command, str(directory)] + ["--trajectories", "calls.npz"] * recorded
+    arguments = [command, str(directory)] + ["--trajectories", "calls.npz"] * (command == "calibrate")
     result = CliRunner().invoke(main, arguments)
     assert result.exit_code == 2
     assert result.stdout == ""

@@ -352,5 +352,5 @@ def _paired(trials: Trials, plan: Plan) -> bool:
     def kind(table: SamplerTable) -> tuple[str, int, bool]:
         return table.name, table.steps, table.stochastic
 
-    manifest = trials.artifact.manifest
-    return plan.otherwise is None and kind(manifest.sampler_of(plan.loop)) == kind(manifest.spec.sampler)
+    original = trials.executor.view.artifact.manifest.spec.sampler
+    return plan.otherwise is None and kind(trials.artifact.manifest.sampler_of(plan.loop)) == kind(original)
