@@ -352,7 +352,7 @@ def test_bench_prints_the_same_as_a_table_and_as_json(
     assert labels == ["this artifact: dense", "this artifact: half", "five: dense"]
     points = record["comparison"]["points"]
     assert [f"{point['series']}: {point['name']}" for point in points] == labels
-    assert points[1]["error"] > points[0]["error"] == 0
+    assert points[1]["error"] > 1e-3 and points[0]["error"] < 1e-6  # of two runtimes
     assert points[2]["error"] is None  # another sampler takes other noise
     assert points[1]["distance"] > 1e-3 > points[0]["distance"]
     identity, other = (load_artifact(path).manifest.identity for path in (planned, other_sampler))

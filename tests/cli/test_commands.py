@@ -82,8 +82,9 @@ def test_convert_says_what_it_made_and_explains_on_standard_error(one_layer_chec
     arguments = ("--sampler", "ddim", "--steps", "4", "--explain", "--json")
     result = run("convert", one_layer_checkpoint, "-o", tmp_path / "compiled", *arguments)
     made = json.loads(result.stdout)
-    assert made["sampler"]["name"] == "ddim"
-    assert made["sampler"]["steps"] == 4
+    assert (made["sampler"]["name"], made["sampler"]["steps"]) == ("ddpm", 100)
+    assert made["loops"]["ddim-4"] == {"sampler": "ddim", "steps": 4}
+    assert made["plans"][made["default_plan"]]["loop"] == "ddim-4"
     assert len(made["blocks"]) == 3
     stages = [stage["stage"] for stage in made["stages"]]
     assert stages[0] == "capture"

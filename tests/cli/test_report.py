@@ -184,7 +184,9 @@ def test_hostile_names_stay_text(calibrated: Path) -> None:
     record |= {"told": {HOSTILE: HOSTILE, "weights": [HOSTILE]}, "learned": [HOSTILE, HOSTILE]}
     plans = {HOSTILE: manifest.plans["schedule"]}
     manifest = replace(manifest, spec=spec, blocks=blocks, plans=plans, default_plan=HOSTILE, calibration=record)
-    artifact = replace(artifact, manifest=manifest, schedules={HOSTILE: artifact.schedules["schedule"]})
+    artifact = replace(
+        artifact, manifest=manifest, plans={HOSTILE: artifact.plans["schedule"], "dense": artifact.plans["dense"]}
+    )
     policy = CompiledPolicy(artifact, open_runtime(artifact), seed=0)
     obs = {"obs": np.zeros((2, 2), np.float32)}
     rung = Rung(HOSTILE, "failed", HOSTILE, unit=HOSTILE, remedy=HOSTILE, step=3, blocks=(1, 2))
