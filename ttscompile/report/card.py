@@ -235,7 +235,7 @@ def _made(manifest: Manifest, base: HubName | None) -> Section:
         words = " ".join(f"--{k.replace('_', '-')} {_word(v)}" for k, v in (asked | told).items())
         learned = record.get("learned")
         if isinstance(learned, list) and learned not in ([], ["schedule"]):
-            words += f" --learn {_word(','.join(map(str, learned)))}"
+            words += f" --learn {','.join(map(_word, learned[:8]))}"
         lines.append(f"ttscompile calibrate DIR --trajectories CALLS {words}")
     lines.append("ttscompile verify DIR")
     text = (
