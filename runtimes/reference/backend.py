@@ -22,15 +22,16 @@ class ReferenceBackend:
 
     Args:
         view: of an artifact.
+        device: where the network computes; None for the CPU.
 
     Attributes:
         keeps: all entries of the rollout cache.
         model: what it runs.
     """
 
-    def __init__(self, view: View) -> None:
+    def __init__(self, view: View, device: torch.device | None = None) -> None:
         self._view = view
-        self.model = ReferenceModel.from_view(view)
+        self.model = ReferenceModel.from_view(view, device)
         self.keeps = np.ones((self.model.steps, self.model.blocks), dtype=np.bool_)
         self._residuals: Mapping[tuple[int, int], Tensor] = {}
 

@@ -13,11 +13,15 @@ import ttscompile
 from tests.calibration.policies import record
 from tests.calibration.tasks import MakeTask, in_windows
 from ttscompile.artifact.load import load_artifact
-from ttscompile.calibration import judge
+from ttscompile.calibration import judge, schedule
+from ttscompile.calibration.clock import Clock
+from ttscompile.calibration.judge import Score
+from ttscompile.calibration.kept import Kept
+from ttscompile.calibration.proposer import Proposal
 from ttscompile.calibration.pruner import paper
 from ttscompile.calibration.pruner.paper import Paper
 from ttscompile.calibration.spacing import spacings
-from ttscompile.calibration.task import Clock, Task
+from ttscompile.calibration.task import Task
 from ttscompile.core.lattice import Source, whole_steps_plan
 from ttscompile.runtimes.plans import pruner_plan
 
@@ -132,9 +136,11 @@ def test_going_on_equals_not_stopping(task: Task) -> None:
 def test_an_artifact_executes_it(
     compiled: Path, tmp_path: Path, correct: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The default plan is the pruner's or its frozen schedule, whichever is better; the pruner's is there by name."""
+    """This is about what is executed: no head learns in so few updates, so every one is kept."""
     monkeypatch.setattr(Paper, "intervals", 8)
-    monkeypatch.setattr(judge, "BETTER", 10.0)  # this is about what is executed: no head learns in so few updates
+    monkeypatch.setattr(schedule, "BETTER", 10.0)
+    monkeypatch.setattr(schedule, "one_plan", lambda score, intervals: None)
+    monkeypatch.setattr(Kept, "_no_better", lambda *_: None)
     directory = Path(shutil.copytree(compiled, tmp_path / "compiled"))
     recording = record(tmp_path / "calls.npz", episodes=24)
     result = ttscompile.calibrate(
@@ -151,3 +157,46 @@ def test_an_artifact_executes_it(
         assert report is not None
         assert report.plan_name == "pruner"
         assert call or not (report.plan == Source.ROLLOUT).any()  # nothing can be read in the first call
+
+
+def test_a_head_that_has_learned_nothing_says_so_and_is_no_default(
+    compiled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One update, as on a busy machine: the head makes one plan for all observations, which is the schedule's."""
+    directory = Path(shutil.copytree(compiled, tmp_path / "compiled"))
+    recording, before = record(tmp_path / "calls.npz", episodes=8), load_artifact(compiled).pruner
+    result = ttscompile.calibrate(directory, [recording], 0.6, "tts-paper", max_intervals=1)
+    assert result.default_plan == "schedule"
+    assert "has learned nothing in 1 update" in result.skipped["pruner"]
+    assert "plan 'pruner' is left out: has learned nothing in 1 update" in capsys.readouterr().err
+    artifact = load_artifact(directory)
+    assert artifact.manifest.default_plan == "schedule"
+    assert "pruner" not in artifact.plans
+    for name, array in before.items():
+        np.testing.assert_array_equal(artifact.pruner[name], array)
+
+
+def test_a_head_is_kept_if_it_is_nearer_than_the_schedule_and_its_plans_differ(
+    compiled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Learned after the schedule, from which it departs; judged as any other plan."""
+    directory = Path(shutil.copytree(compiled, tmp_path / "compiled"))
+    recording, considered = record(tmp_path / "calls.npz", episodes=8), list[tuple[str, bool, Score]]()
+    consider = Kept.consider
+
+    def seen(self: Kept, proposal: Proposal) -> bool:
+        score = judge.judge(self.trials.holding(proposal), proposal.plan)
+        considered.append((proposal.name, consider(self, proposal), score))
+        return considered[-1][1]
+
+    monkeypatch.setattr(Kept, "consider", seen)
+    result = ttscompile.calibrate(
+        directory, [recording], 0.6, learn=("schedule", "pruner"), max_intervals=10, progress=False
+    )
+    scores = {name: (kept, score) for name, kept, score in considered}
+    (kept, head), (_, fixed) = scores["pruner"], scores["schedule"]
+    better = head.plans > 1 and head.sparsity >= fixed.sparsity - 1e-9 and head.distance < fixed.distance
+    assert kept == better
+    assert (result.default_plan == "pruner") == better
+    assert ("pruner" in load_artifact(directory).plans) == better
+    assert "updates" in result.told["pruner"]
