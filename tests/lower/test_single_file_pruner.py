@@ -24,7 +24,7 @@ from ttscompile.artifact.block_weights import BlockWeights
 from ttscompile.artifact.write import update_plans
 from ttscompile.core.lattice import Source, uniform_plan
 from ttscompile.core.plan import Plan
-from ttscompile.errors import ArtifactError, IllegalPlanError
+from ttscompile.errors import IllegalPlanError
 from ttscompile.lower.program import lower_program
 from ttscompile.lower.single_file import lower_single_file
 from ttscompile.runtimes.single_file import inputs_of
@@ -140,7 +140,7 @@ def test_a_policy_without_a_pruner_has_no_such_input(tmp_path: Path) -> None:
     assert not [name for name in names if "pruner" in name]
     with pytest.raises(InvalidArgument, match="use_pruner"):
         Episode(model, 1).call(obs, noise, np.zeros((5, 5)), use_pruner=np.array(True))
-    with pytest.raises(ArtifactError, match=r"has no plan 'pruner'; it has \['dense'\]"):
+    with pytest.raises(IllegalPlanError, match=r"has no plan 'pruner'; it has \['dense'\]"):
         inputs_of(tmp_path / "artifact", "pruner")
 
 
