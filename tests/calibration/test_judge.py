@@ -221,7 +221,7 @@ def test_of_single_calls_nothing_begins_with_the_chunk_before(flowing: Path, tmp
     np.savez(path, obs=np.arange(18, dtype=np.float32).reshape(3, 2, 3), episode_ends=[1, 2, 3])
     trials = trials_of(flowing, path, tmp_path)
     proposal = warm(trials, 3)
-    with pytest.raises(CalibrationError, match="on calls that have one before them"):
+    with pytest.raises(CalibrationError, match="is judged on episodes of two calls at least"):
         judge(holding(trials, proposal), proposal.plan)
     assert judge(trials, trials.base).distance == pytest.approx(0.0, abs=1e-3)
 
